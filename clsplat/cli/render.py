@@ -90,8 +90,8 @@ class Render(Verb):
     """Photographs' cameras that are fisheyes: undistort, as the pinhole cameras that they hold; native, through their
     own lens. If not given: as the run was trained, but for --path, which is of pinhole cameras, else undistort."""
     channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
-    """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
-    and id (of Gaussians). docs/render.md has each."""
+    """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion (to
+    the next frame), backward (to the one before), count and id (of Gaussians). docs/render.md has each."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None

@@ -43,16 +43,16 @@ class FramePipeline:
         self._renderer, self._gaussians, self._background = renderer, gaussians, background
 
     def draw(
-        self, at: Callable[[float], Camera], after: Camera | None = None
+        self, at: Callable[[float], Camera], after: Camera | None = None, before: Camera | None = None
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that
         makes its planes the file's, which needs no device.
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
-        after: that of the next frame, for motion.
+        after, before: those of the next frame and of the frame before, for motion.
         """
         config, colours, space = self.config, self.colours, self.colours.model
-        draw = drawn_by(self._renderer, self._gaussians, self._background, after)
+        draw = drawn_by(self._renderer, self._gaussians, self._background, after, before)
         if config.sampling.on or config.framing.supersample > 1:
             space, drawn = colours.light, draw
 

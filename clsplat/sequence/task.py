@@ -24,9 +24,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.frame_files import VIDEO, Header, camera_matrices
 from clsplat.shots import Shot
+from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
-from clsplat.shots.motion import camera_after as following
-from clsplat.shots.motion import stretches
 
 SETTINGS = "clsplat:settings"
 """The attribute of EXR and PNG files that holds it."""
@@ -59,8 +58,9 @@ class Record:
 @dataclass(frozen=True, eq=False)
 class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
-    camera that motion goes to, of the same size, where motion is asked for; stretch: where the camera is while the
-    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`.
+    camera that motion goes to, of the same size, where motion is asked for; earlier: that of backward motion likewise;
+    stretch: where the camera is while the shutter is open, None where it stands still; path: of the file; before: see
+    `existing.stamp`.
     """
 
     number: int
@@ -68,6 +68,7 @@ class Task:
     camera: Camera
     path: Path
     after: Camera | None = None
+    earlier: Camera | None = None
     stretch: Shot | None = None
     before: tuple[int, ...] | None = None
 
@@ -81,7 +82,8 @@ class Task:
         def seen(camera: Camera) -> Camera:
             return camera.before(gaussians.near).along_rays(gaussians.by_rays)
 
-        return replace(self, camera=seen(self.camera), after=None if self.after is None else seen(self.after))
+        after, earlier = (other and seen(other) for other in (self.after, self.earlier))
+        return replace(self, camera=seen(self.camera), after=after, earlier=earlier)
 
     @property
     def is_video(self) -> bool:
@@ -100,23 +102,27 @@ def make_tasks(
     """The frames of `chosen`, which are of the shot `whole`. Raises InputError for files that would be one, unless it
     is a video, and for cameras that these channels, or the lens, are not defined for."""
     sampling = sampling or SamplingConfig()
-    motion = "motion" in channels
+    motion, backward = "motion" in channels, "backward" in channels
     whole.check(channels)
     indices = {frame.number: index for index, frame in enumerate(whole.frames)}
     if Path(pattern).suffix.lower() == VIDEO:
         paths = [Path(pattern)] * len(chosen.frames)
     else:
         paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
-    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if sampling.moves else lambda number: None
+    stretch: Callable[[int], Shot | None] = lambda number: None  # noqa: E731
+    if sampling.moves:
+        stretch = moving.stretches(whole, resize, *sampling.shutter, motion=motion, backward=backward)
     tasks = []
     for frame, path in zip(chosen.frames, paths, strict=True):
         camera = resize(frame.camera)
         if sampling.has_lens and camera.projection != "perspective":
             raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
-        after = None
+        after = earlier = None
         if motion:
-            after = resize(following(whole, indices[frame.number])).resized(camera.width, camera.height)
-        tasks.append(Task(frame.number, frame.name, camera, path, after, stretch(frame.number)))
+            after = resize(moving.camera_after(whole, indices[frame.number])).resized(camera.width, camera.height)
+        if backward:
+            earlier = resize(moving.camera_before(whole, indices[frame.number])).resized(camera.width, camera.height)
+        tasks.append(Task(frame.number, frame.name, camera, path, after, earlier, stretch(frame.number)))
     return tasks
 
 
@@ -152,6 +158,12 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     return task.after if middle == 0 or task.after is None else task.at(middle + 1)
 
 
+def camera_before(task: Task, options: RenderOptions) -> Camera | None:
+    """The camera of the whole frame that backward motion goes to: a frame before the middle of the shutter."""
+    middle = options.pictures.sampling.middle
+    return task.earlier if middle == 0 or task.earlier is None else task.at(middle - 1)
+
+
 def plain(value: Any) -> Any:
     """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
     added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
@@ -184,6 +196,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     cameras = [picture_camera(task, options)]
     if "motion" in options.channels and (after := camera_after(task, options)) is not None:
         cameras.append(after)
+    if "backward" in options.channels and (before := camera_before(task, options)) is not None:
+        cameras.append(before)
     if pictures.sampling.moves:
         opens, closes = pictures.sampling.shutter
         cameras += [task.at(opens + (closes - opens) * part / 4) for part in range(5)]

@@ -63,13 +63,14 @@ class Shot:
 
     def check(self, channels: Iterable[str] = ()) -> None:
         """Raises InputError where these channels are not defined: motion from one projection to another."""
-        if "motion" not in channels:
+        if not (moving := [name for name in channels if name in ("motion", "backward")]):
             return
         for before, frame in pairwise(self.frames):
             kind, wanted = frame.camera.projection, before.camera.projection
             if kind != wanted:
                 raise InputError(
-                    f"--channels motion: frame {frame.number} is {kind}, expected {wanted} as frame {before.number} is"
+                    f"--channels {moving[0]}: frame {frame.number} is {kind}, expected {wanted} as frame "
+                    f"{before.number} is"
                 )
 
     def at(self, frame: float) -> Camera:

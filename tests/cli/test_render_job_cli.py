@@ -28,7 +28,7 @@ from clsplat.shots import choose_shot
 from clsplat.shots.motion import camera_after
 
 COUNT = 6
-ALL = "rgb,alpha,depth,normals,position,motion,median,first,count,id"
+ALL = "rgb,alpha,depth,normals,position,motion,backward,median,first,count,id"
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,8 @@ def test_every_channel_is_that_of_the_renderer(shot: list[str], tmp_path: Path, 
     found, (spec,) = read(tmp_path / "a.0002.exr")
     assert list(spec.channelnames[:5]) == ["R", "G", "B", "A", "Z"]
     gaussians = Gaussians.load(shot[0])
-    camera, after = frames[1].camera, frames[2].camera
-    image, own = Renderer().render_channels(gaussians, camera, ("normal", "position", "motion"), after=after)
+    camera, others = frames[1].camera, {"after": frames[2].camera, "before": frames[0].camera}
+    image, own = Renderer().render_channels(gaussians, camera, ("normal", "position", "motion", "backward"), **others)
     wanted = {
         "A": image.alpha,
         "Z": own["depth"],
@@ -86,6 +86,7 @@ def test_every_channel_is_that_of_the_renderer(shot: list[str], tmp_path: Path, 
         "count": own["count"],
     }
     wanted |= {"id": own["index"], "forward.u": own["motion"][:, :, 0], "forward.v": -own["motion"][:, :, 1]}
+    wanted |= {"backward.u": own["backward"][:, :, 0], "backward.v": -own["backward"][:, :, 1]}
     for index in range(3):
         wanted["RGB"[index]] = image.image[:, :, index]
         wanted[f"N.{'xyz'[index]}"] = own["normal"][:, :, index]
