@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -35,6 +36,7 @@ from clsplat.config.pictures import (
 )
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.stereo import StereoConfig
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import check_new, digest
@@ -67,7 +69,7 @@ class Render(Verb):
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
     """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name
     of a video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included,
-    or else the frame's number; ####, %04d and {frame} are the frame's number."""
+    or else the frame's number; ####, %04d and {frame} are the frame's number; {eye} and %V left or right."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
     nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each. Not
@@ -121,6 +123,7 @@ class Render(Verb):
     colour: Annotated[ColourConfig, arg(name="")] = field(default_factory=ColourConfig)
     framing: Annotated[FramingConfig, arg(name="")] = field(default_factory=FramingConfig)
     sampling: Annotated[SamplingConfig, arg(name="")] = field(default_factory=SamplingConfig)
+    pairs: Annotated[StereoConfig, arg(name="")] = field(default_factory=StereoConfig)
     deep: Flag = False
     """Write deep EXR: of each pixel colour, alpha and depth in slices of the scene. docs/pictures.md has how."""
     slices: Annotated[DeepConfig, arg(name="deep")] = field(default_factory=DeepConfig)
@@ -202,7 +205,8 @@ def _read_job(verb: Render) -> Job:
     from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file
     from clsplat.sequence import existing
-    from clsplat.sequence.task import digest_of, make_tasks
+    from clsplat.sequence.pairs import make_views
+    from clsplat.sequence.task import digest_of
     from clsplat.shots import check_around
 
     if verb.cameras is None:
@@ -212,10 +216,9 @@ def _read_job(verb: Render) -> Job:
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
-    whole, gaussians = _whole_shot(verb)
-    chosen = whole if verb.frames is None else whole.only(verb.frames)
+    shots, gaussians = _shots(verb)
     sampling = options.pictures.sampling
-    tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
+    tasks, chosen = make_views(shots, verb.frames, verb.output, resize, options.channels, sampling=sampling)
     check_pictures(tasks, options)
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
@@ -237,30 +240,36 @@ def _read_job(verb: Render) -> Job:
     attributes["clsplat:colorspace"] = colours.output
     options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer), gains=gains)
     spaces = (colours.model, colours.output)
-    video = _video(verb, whole)
+    video = _video(verb, chosen)
     on_farm = verb.workers is not None or verb.scheduler is not None
     return Job(
         options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing
     )
 
 
-def _whole_shot(verb: Render) -> tuple[Shot, Gaussians | None]:
-    """All frames that there are, whatever --frames says, and the model where they follow from it. Raises
-    InputError."""
+def _shots(verb: Render) -> tuple[dict[str, Shot], Gaussians | None]:
+    """All frames that there are, whatever --frames says, for each eye of a pair, else under ""; and the model where
+    they follow from it. Raises InputError."""
+    from clsplat.cli.render_eyes import ROLE, shots_of, stage_cameras
     from clsplat.gaussians import Gaussians
     from clsplat.runs.run import model_file
     from clsplat.shots import choose_shot, shot_around
 
     size: dict[str, Any] = {"count": verb.count, "size": (verb.width, verb.height)}
+    pairs = verb.pairs
+    paths = stage_cameras(pairs, verb.cameras, verb.usd_camera) if pairs.of_stage else {}
     if verb.cameras is not None:
         if verb.up is not None:
             raise InputError(f"--up {verb.up}: is of paths around the model, expected no --cameras with it")
-        of_cameras: dict[str, Any] = {"usd_camera": verb.usd_camera, "lenses": verb.lenses or "undistort"}
-        return choose_shot(verb.cameras, path=verb.path, **size, **of_cameras), None
+        of_cameras: dict[str, Any] = {"lenses": verb.lenses or "undistort", "applied": [ROLE] if paths else []}
+        read = partial(choose_shot, verb.cameras, path=verb.path, **size, **of_cameras)
+        whole = read(usd_camera=next(iter(paths.values()), verb.usd_camera))
+        return shots_of(pairs, whole, lambda path: read(usd_camera=path), paths), None
     if verb.usd_camera is not None:
         raise InputError(f"--usd-camera {verb.usd_camera}: expected the USD stage in --cameras with it")
     gaussians = Gaussians.load(model_file(verb.model))
-    return shot_around(gaussians, verb.path, up=verb.up, **size), gaussians
+    whole = shot_around(gaussians, verb.path, up=verb.up, **size)
+    return shots_of(pairs, whole, lambda _: whole, {}), gaussians
 
 
 def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
@@ -308,6 +317,7 @@ def _options(verb: Render) -> RenderOptions:
     if "alpha" in channels and verb.background is not None:
         flag = "--deep" if verb.deep else "--alpha" if verb.alpha else "--channels alpha"
         raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
+    verb.pairs.check()
     verb.slices.check()
     verb.video.check()
     if verb.deep:
@@ -381,7 +391,7 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
         check_foreign(job, there)
     existing.make_folders(tasks)
     existing.remove_temporaries(tasks)
-    records: dict[int, Record] = {}
+    records: dict[str, Record] = {}
     lines = sys.stdout if not verb.json else sys.stderr if verb.progress in ("json", "openjd") else None
     start = time.monotonic()
     try:
@@ -391,13 +401,13 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
         ):
 
             def done(record: Record) -> None:
-                records[record.frame] = record
+                records[record.key] = record
                 progress(record)
 
             for task in tasks:
-                if task.number in there:
+                if task.key in there:
                     done(workers.record_of(task, options, skipped=True))
-            left = [task for task in tasks if task.number not in there]
+            left = [task for task in tasks if task.key not in there]
             if job.on_farm:
                 _on_farm(verb, job, left, done, video)
             else:
@@ -409,7 +419,7 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"
         error.args = (f"after {count}; {advice}",)
         raise
-    if blank := [number for number, record in sorted(records.items()) if record.blank]:
+    if blank := [task.key for task in tasks if records[task.key].blank]:
         warn(
             f"{len(blank)} of {len(tasks)} frames show nothing of the model: {examples(blank)}; are the cameras in the "
             "model's world?"
@@ -417,7 +427,7 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
     if verb.profile:
         _print_profile(records.values(), time.monotonic() - start, len(renderers))
     if verb.json:
-        print(json.dumps([records[task.number].document() for task in tasks], indent=2))
+        print(json.dumps([records[task.key].document() for task in tasks], indent=2))
     return 0
 
 

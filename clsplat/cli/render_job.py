@@ -48,18 +48,18 @@ class Job:
         return self.tasks[0].is_video
 
 
-def frames_there(job: Job) -> set[int]:
-    """The numbers of the frames that `--skip-existing` leaves out. Warns of files that do not record the settings they
+def frames_there(job: Job) -> set[str]:
+    """The keys of the frames that `--skip-existing` leaves out. Warns of files that do not record the settings they
     were made with, and of those that are rendered again."""
     if not job.skip_existing:
         return set()
     there = existing.complete(job.tasks, job.options)
-    if unknown := existing.untold([task for task in job.tasks if task.number in there]):
+    if unknown := existing.untold([task for task in job.tasks if task.key in there]):
         warn(
             f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
             f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
         )
-    if changed := existing.changed([task for task in job.tasks if task.number not in there], job.options):
+    if changed := existing.changed([task for task in job.tasks if task.key not in there], job.options):
         warn(
             f"--skip-existing: {len(changed)} of the frames that are there were made of another model, or with other "
             f"cameras or settings, such as {changed[0]}: they are rendered again"
@@ -67,9 +67,9 @@ def frames_there(job: Job) -> set[int]:
     return there
 
 
-def check_foreign(job: Job, there: Collection[int]) -> None:
+def check_foreign(job: Job, there: Collection[str]) -> None:
     """Raise InputError where a frame that is not `there` would replace another program's picture."""
-    if others := existing.foreign([task for task in job.tasks if task.number not in there]):
+    if others := existing.foreign([task for task in job.tasks if task.key not in there]):
         raise InputError(
             f"{examples(others)}: there already, and no frames of clsplat; name other files, or give --overwrite to "
             "replace pictures that it did not make"
@@ -85,7 +85,9 @@ def for_workers(colour: ColourConfig) -> ColourConfig:
 
 
 def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
-    """Raise InputError for a frame that the framing does not suit, and for a video of several sizes."""
+    """Raise InputError for a frame that the framing does not suit, a video of several sizes, deep pairs in a file."""
+    if options.deep is not None and tasks[0].right is not None:
+        raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
     sizes = set()
     for task in tasks:
         camera = picture_camera(task, options)

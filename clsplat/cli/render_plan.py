@@ -55,9 +55,11 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
     for task in tasks:
         camera = picture_camera(task, options)
         frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
-        frame |= {"width": camera.width, "height": camera.height, "skipped": task.number in skipped}
+        frame |= {"width": camera.width, "height": camera.height, "skipped": task.key in skipped}
         if window := camera.window:
             frame["window"] = [window.x, window.y, window.width, window.height]
+        if task.eye and task.right is None:
+            frame["eye"] = task.eye
         frames.append(frame)
     return {
         "model": str(job.model),

@@ -43,13 +43,15 @@ VIDEO = ".mp4"
 @dataclass(frozen=True, eq=False)
 class Header:
     """Contents of a file beside pixels; window: None where the picture is the display window; chromaticities: x and y
-    of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's."""
+    of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's; view: left or
+    right of a stereo pair."""
 
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)
     window: Window | None = None
     chromaticities: Sequence[float] = ()
     is_srgb: bool = True
+    view: str = ""
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
@@ -79,6 +81,14 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
         projection[2, 2] = along
         projection[3] = [*centre, -along * camera.near, 1.0]
     return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
+
+
+def is_whole_panorama(camera: Camera) -> bool:
+    """True if the picture shows all directions once, the middle of it straight ahead, as EXR's envmap wants it."""
+    if camera.projection != "equirectangular" or camera.window is not None:
+        return False
+    whole = (camera.fx * 2 * np.pi, camera.fy * np.pi, 2 * camera.cx, 2 * camera.cy)
+    return bool(np.allclose(whole, (camera.width, camera.height) * 2, rtol=1e-9))
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
@@ -121,21 +131,34 @@ def write_channels(
     channels: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
     numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `writing.write_image`.
     """
-    encoding, header = encoding or Encoding(), header or Header()
-    check_target(path, channels)
-    pairs = encoded(path.suffix.lower(), channels, encoding, header)
-    write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
+    write_views(path, [(channels, header or Header())], encoding)
+
+
+def write_views(
+    path: Path, views: Sequence[tuple[Mapping[str, NDArray[Any]], Header]], encoding: Encoding | None = None
+) -> None:
+    """`write_channels` of several views in one file: EXR, of which each has parts of its own, named after it."""
+    encoding = encoding or Encoding()
+    check_target(path, views[0][0])
+    extension = path.suffix.lower()
+    several = len(views) > 1
+    pairs = [part for planes, header in views for part in encoded(extension, planes, encoding, header, several=several)]
+    write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], extension[1:])
 
 
 def encoded(
-    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, several: bool = False
 ) -> list[tuple[NDArray[Any], Any]]:
-    """(pixels, OpenImageIO's specification) of each part of a file."""
+    """(pixels, OpenImageIO's specification) of each part of a file. several: the file has other views too, so that
+    parts are named after theirs."""
     channels = {name: channels[name] for name in CHANNELS if name in channels}
     if extension != ".exr":
         return [_picture(extension, channels, encoding, header)]
     groups = _parts(tuple(channels)) if encoding.parts == "several" else [tuple(channels)]
-    return [_exr_part(group, channels, encoding, header, named=len(groups) > 1) for group in groups]
+    view = header.view if several else ""
+    names = [CHANNELS[group[0]].part if len(groups) > 1 else "" for group in groups]
+    named = [".".join(filter(None, (name, view))) for name in names]
+    return [_exr_part(group, channels, encoding, header, name) for group, name in zip(groups, named, strict=True)]
 
 
 def is_whole(
@@ -147,12 +170,13 @@ def is_whole(
     attributes: Mapping[str, str | int | float] | None = None,
     *,
     deep: bool = False,
+    views: int = 1,
 ) -> bool:
     """True if the file holds these channels as `write_channels` writes them, and is whole.
 
     It has to have that size and no other values of these attributes, and to decode to its last row; with a block of
     zeros in it every row is decoded. A file that was cut short fails. deep: expect a deep picture, whose channels are
-    DEEP.
+    DEEP; views: of a stereo pair, each with these channels.
     """
     channels = [name for name in CHANNELS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
@@ -167,6 +191,7 @@ def is_whole(
     with opened(path) as source:
         if source is None:
             return False
+        groups = groups * views
         for part, group in enumerate(groups):
             if not source.seek_subimage(part, 0):
                 return False
@@ -208,7 +233,7 @@ def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def _exr_part(
-    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
+    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, part: str
 ) -> tuple[NDArray[Any], Any]:
     kinds = [CHANNELS[name].kind for name in names for _ in CHANNELS[name].names]
     planes = [np.atleast_3d(channels[name]) for name in names]
@@ -230,8 +255,8 @@ def _exr_part(
     spec = _exr_spec(pixels.shape, [channel for name in names for channel in CHANNELS[name].names], formats, header)
     deflated = encoding.compression.startswith("zip")
     spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
-    if named:
-        spec.attribute("oiio:subimagename", CHANNELS[names[0]].part)
+    if part:
+        spec.attribute("oiio:subimagename", part)
     return np.ascontiguousarray(pixels), spec
 
 
@@ -281,6 +306,8 @@ def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[An
         spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
     if "A" in names:
         spec.alpha_channel = names.index("A")
+    if header.view:
+        spec.attribute("view", header.view)
     for name, matrix in header.matrices.items():
         spec.attribute(name, oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
     return spec

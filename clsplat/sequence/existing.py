@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from clsplat.errors import InputError, reason_of
 from clsplat.files import abandoned, is_file
@@ -53,12 +54,13 @@ def is_complete(task: Task, options: RenderOptions) -> bool:
     attributes = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
     attributes[SETTINGS] = settings_digest(task, options)
     camera, deep = picture_camera(task, options), options.deep is not None
-    return is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, attributes, deep=deep)
+    kind: dict[str, Any] = {"deep": deep, "views": len(task.views)}
+    return is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, attributes, **kind)
 
 
-def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
-    """The numbers of the frames that `--skip-existing` leaves out."""
-    return {task.number for task in _those(tasks, lambda task: is_complete(task, options))}
+def complete(tasks: Sequence[Task], options: RenderOptions) -> set[str]:
+    """The keys of the frames that `--skip-existing` leaves out."""
+    return {task.key for task in _those(tasks, lambda task: is_complete(task, options))}
 
 
 def untold(tasks: Sequence[Task]) -> list[Path]:

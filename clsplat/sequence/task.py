@@ -22,22 +22,29 @@ from clsplat.files import digest, is_file
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
-from clsplat.images.frame_files import VIDEO, Header, camera_matrices
+from clsplat.images.frame_files import VIDEO, Header, camera_matrices, is_whole_panorama
 from clsplat.shots import Shot
 from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
 
 SETTINGS = "clsplat:settings"
 """The attribute of EXR and PNG files that holds it."""
+LATLONG: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
+"""OpenImageIO's words for EXR's envmap; and that no smaller versions follow, for which it would keep the file open."""
 _ENCODED = {".exr": ("depth", "parts", "compression"), ".png": ("bits",)}
 """Settings of the encoding that a file of that extension depends on."""
+
+
+def key_of(number: int, eye: str) -> str:
+    """Name of a frame among those of a job."""
+    return f"{number} {eye}" if eye else str(number)
 
 
 @dataclass(frozen=True)
 class Record:
     """Record of a frame that is done. seconds: of rendering and writing it, without waiting; skipped: it was there;
-    blank: nothing of the model is in it, None where that was not looked at; kernel_ms, transfer_ms: the device's, where
-    that was asked for."""
+    eye: of a stereo pair in two files; blank: nothing of the model is in it, None where that was not looked at;
+    kernel_ms, transfer_ms: the device's, where that was asked for."""
 
     name: str
     frame: int
@@ -45,10 +52,16 @@ class Record:
     width: int
     height: int
     seconds: float
+    eye: str | None = None
     skipped: bool = False
     blank: bool | None = None
     kernel_ms: float | None = None
     transfer_ms: float | None = None
+
+    @property
+    def key(self) -> str:
+        """That of its task."""
+        return key_of(self.frame, self.eye or "")
 
     def document(self) -> dict[str, Any]:
         """The record for JSON, without what was not measured."""
@@ -60,7 +73,7 @@ class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
     camera that motion goes to, of the same size, where motion is asked for; earlier: that of backward motion likewise;
     stretch: where the camera is while the shutter is open, None where it stands still; path: of the file; before: see
-    `existing.stamp`.
+    `existing.stamp`; eye: left or right of a stereo pair; right: the frame of the right eye, where one file has both.
     """
 
     number: int
@@ -71,6 +84,18 @@ class Task:
     earlier: Camera | None = None
     stretch: Shot | None = None
     before: tuple[int, ...] | None = None
+    eye: str = ""
+    right: Task | None = None
+
+    @property
+    def key(self) -> str:
+        """Name of the frame among those of its job."""
+        return key_of(self.number, "" if self.right else self.eye)
+
+    @property
+    def views(self) -> tuple[Task, ...]:
+        """The frames that its file holds: itself, and that of the right eye where one file has both."""
+        return (self,) if self.right is None else (self, self.right)
 
     def at(self, time: float) -> Camera:
         """The camera of the whole frame at a time in frames from the frame."""
@@ -83,7 +108,8 @@ class Task:
             return camera.before(gaussians.near).along_rays(gaussians.by_rays)
 
         after, earlier = (other and seen(other) for other in (self.after, self.earlier))
-        return replace(self, camera=seen(self.camera), after=after, earlier=earlier)
+        right = self.right and self.right.seen_by(gaussians)
+        return replace(self, camera=seen(self.camera), after=after, earlier=earlier, right=right)
 
     @property
     def is_video(self) -> bool:
@@ -205,7 +231,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
-    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling)
+    right = [settings_digest(task.right, options)] if task.right is not None else []
+    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling, *right)
 
 
 def _content(source: str) -> str:
@@ -238,14 +265,17 @@ def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG0
     return tuple(sorted({str(home / folder / file) for folder in folders | {""} for file in files}))
 
 
-def header(task: Task, options: RenderOptions) -> Header:
-    """Frame, model, version, settings and colour space; the matrices of a camera that has them; in EXR the window."""
+def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Header:
+    """Frame, model, version, settings and colour space; the matrices of a camera that has them; in EXR the window, and
+    that a panorama is one. whole: the task of the file, where that has other views too."""
     camera = picture_camera(task, options)
     matrices = camera_matrices(camera)
-    attributes = {**options.attributes, "clsplat:frame": task.number, SETTINGS: settings_digest(task, options)}
+    attributes = {**options.attributes, "clsplat:frame": task.number, SETTINGS: settings_digest(whole or task, options)}
     space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
         return Header(attributes, matrices, is_srgb=space == SRGB)
     if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
-    return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()))
+    if is_whole_panorama(camera):
+        attributes |= LATLONG
+    return Header(attributes, matrices, camera.window, CHROMATICITIES.get(space, ()), view=task.eye)

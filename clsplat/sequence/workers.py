@@ -48,7 +48,9 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
         assert frame.planes is not None, "frames of a video are not written one by one"
         yuv = frame_planes(frame.finish(frame.planes)["rgb"])
     elif frame.planes is not None:
-        frame_files.write_channels(task.path, frame.finish(frame.planes), options.encoding, header(task, options))
+        views = zip(task.views, (frame.planes, frame.right), strict=False)
+        made = [(frame.finish(planes or {}), header(view, options, task)) for view, planes in views]
+        frame_files.write_views(task.path, made, options.encoding)
     seconds = frame.seconds + time.monotonic() - start
     return record_of(task, options, seconds=seconds, **frame.measured), yuv
 
@@ -56,13 +58,15 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
 def record_of(task: Task, options: RenderOptions, **values: Any) -> Record:
     """The frame's record with these values beside those of the task."""
     camera = picture_camera(task, options)
-    return Record(task.name, task.number, str(task.path), camera.width, camera.height, **{"seconds": 0.0, **values})
+    whose = {"eye": task.eye} if task.eye and task.right is None else {}
+    what = {"seconds": 0.0, **whose, **values}
+    return Record(task.name, task.number, str(task.path), camera.width, camera.height, **what)
 
 
 def frame_bytes(task: Task, options: RenderOptions) -> int:
     """Main memory that a frame takes until it is written; of one in strips what a strip takes."""
     camera, framing = picture_camera(task, options), options.pictures.framing
-    pixels, finer = camera.width * camera.height, framing.supersample**2
+    pixels, finer = camera.width * camera.height * len(task.views), framing.supersample**2
     if not task.is_video:
         pixels = min(pixels, STRIP_PIXELS // finer)
     if options.deep is not None:
@@ -156,13 +160,13 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
         for record, _ in results:
             yield record
         return
-    waiting: dict[int, tuple[Record, YuvPlanes]] = {}
+    waiting: dict[str, tuple[Record, YuvPlanes]] = {}
     for task in tasks:
-        while task.number not in waiting:
+        while task.key not in waiting:
             record, planes = next(results)
             assert planes is not None
-            waiting[record.frame] = record, planes
-        record, planes = waiting.pop(task.number)
+            waiting[record.key] = record, planes
+        record, planes = waiting.pop(task.key)
         start = time.monotonic()
         video.add(planes)
         yield replace(record, seconds=record.seconds + time.monotonic() - start)

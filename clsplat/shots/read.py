@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,11 +67,12 @@ def choose_shot(
     size: tuple[int | None, int | None] = (None, None),
     usd_camera: str | None = None,
     lenses: Lenses = "undistort",
+    applied: Collection[str] = (),
 ) -> Shot:
     """The shot that --cameras, --path and --count ask for together.
 
     path: turntable, spiral or through: `count` frames of that path, made from the cameras; else the cameras themselves.
-    Raises InputError.
+    applied: names of what the call applies of a stage beside, of which it is not warned. Raises InputError.
     """
     if count is not None and path is None:
         raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
@@ -84,7 +85,8 @@ def choose_shot(
             )
         shot = Shot(_path(path, shot.cameras, count), shot.warnings, unapplied=shot.unapplied)
     far = min(frame.camera.far for frame in shot.frames)
-    unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *shot.unapplied)
+    named = tuple(text for text in shot.unapplied if text.partition(" (")[0] not in applied)
+    unapplied = (*((f"far plane ({far:g})",) if far < math.inf else ()), *named)
     if unapplied:
         shot = replace(shot, warnings=(*shot.warnings, f"{cameras}: not applied: {', '.join(unapplied)}"))
     return shot
