@@ -33,6 +33,7 @@ from clsplat.config.pictures import (
     PictureConfig,
     SamplingConfig,
     VideoConfig,
+    WarpConfig,
 )
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
@@ -123,6 +124,7 @@ class Render(Verb):
     colour: Annotated[ColourConfig, arg(name="")] = field(default_factory=ColourConfig)
     framing: Annotated[FramingConfig, arg(name="")] = field(default_factory=FramingConfig)
     sampling: Annotated[SamplingConfig, arg(name="")] = field(default_factory=SamplingConfig)
+    warp: Annotated[WarpConfig, arg(name="")] = field(default_factory=WarpConfig)
     pairs: Annotated[StereoConfig, arg(name="")] = field(default_factory=StereoConfig)
     deep: Flag = False
     """Write deep EXR: of each pixel colour, alpha and depth in slices of the scene. docs/pictures.md has how."""
@@ -168,6 +170,8 @@ class Render(Verb):
 
         if "lenses" in given and self.cameras is None:
             raise InputError(f"--lenses {self.lenses}: is of the cameras of photographs, expected --cameras with it")
+        if self.lenses is not None and self.warp.distort:
+            raise InputError(f"--lenses {self.lenses} and --distort exclude each other: that bends as photographs are")
         bundle, lenses = PRESETS["default"], self.lenses or "undistort"
         if self.model.is_dir() and (is_run(self.model) or model_path(self.model) == self.model):
             config = Run.open(self.model).config  # refuses a folder that is neither run nor model
@@ -262,6 +266,7 @@ def _shots(verb: Render) -> tuple[dict[str, Shot], Gaussians | None]:
         if verb.up is not None:
             raise InputError(f"--up {verb.up}: is of paths around the model, expected no --cameras with it")
         of_cameras: dict[str, Any] = {"lenses": verb.lenses or "undistort", "applied": [ROLE] if paths else []}
+        of_cameras["distort"] = verb.warp.distort
         read = partial(choose_shot, verb.cameras, path=verb.path, **size, **of_cameras)
         whole = read(usd_camera=next(iter(paths.values()), verb.usd_camera))
         return shots_of(pairs, whole, lambda path: read(usd_camera=path), paths), None
@@ -303,11 +308,11 @@ def _video(verb: Render, shot: Shot) -> VideoConfig:
 
 
 def _options(verb: Render) -> RenderOptions:
-    from clsplat.cli.render_job import for_workers, parse_colour
+    from clsplat.cli.render_job import for_workers, parse_colour, warp_for_workers
     from clsplat.images.frame_files import VIDEO, check_format, parse_channels
     from clsplat.sequence.task import RenderOptions
 
-    pictures = PictureConfig(for_workers(verb.colour), verb.framing, verb.sampling)
+    pictures = PictureConfig(for_workers(verb.colour), verb.framing, verb.sampling, warp_for_workers(verb.warp))
     pictures.check()
     video = Path(verb.output).suffix.lower() == VIDEO
     channels = parse_channels(f"{verb.channels},alpha" if verb.alpha or verb.deep else verb.channels)
@@ -317,7 +322,8 @@ def _options(verb: Render) -> RenderOptions:
     if "alpha" in channels and verb.background is not None:
         flag = "--deep" if verb.deep else "--alpha" if verb.alpha else "--channels alpha"
         raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
-    verb.pairs.check()
+    verb.pairs.check(distort=verb.warp.distort)
+    verb.warp.check(channels, deep=verb.deep)
     verb.slices.check()
     verb.video.check()
     if verb.deep:

@@ -8,15 +8,16 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from clsplat.camera import Camera
-from clsplat.config.pictures import ColourConfig, VideoConfig
+from clsplat.camera import Camera, Window
+from clsplat.config.pictures import ColourConfig, VideoConfig, WarpConfig
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples, warn
+from clsplat.frame.lens import ByMap
 from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.sequence import existing
-from clsplat.sequence.task import RenderOptions, Task, picture_camera
+from clsplat.sequence.task import RenderOptions, Task, picture_camera, warp_of
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,17 @@ def for_workers(colour: ColourConfig) -> ColourConfig:
     return replace(colour, ocio_config=source)
 
 
+def warp_for_workers(warp: WarpConfig) -> WarpConfig:
+    """The lens with the absolute path of its map, likewise."""
+    return replace(warp, stmap=str(Path(warp.stmap).absolute())) if warp.stmap else warp
+
+
 def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
     """Raise InputError for a frame that the framing does not suit, a video of several sizes, deep pairs in a file."""
     if options.deep is not None and tasks[0].right is not None:
         raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
     sizes = set()
+    check_warps(tasks, options)
     for task in tasks:
         camera = picture_camera(task, options)
         if options.pictures.framing.supersample > 1:
@@ -103,6 +110,34 @@ def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
         from clsplat.images.video import check_size
 
         check_size(tasks[0].path, camera.width, camera.height)
+
+
+def check_warps(tasks: list[Task], options: RenderOptions) -> None:
+    """Raise InputError for frames that no lens bends, and a map without values for the picture. Warns where nothing is
+    seen in a part of it."""
+    flag = f"--stmap {options.pictures.warp.stmap}" if options.pictures.warp.stmap else "--distort"
+    empty = {}
+    for task in tasks:
+        if (warp := warp_of(task, options)) is None:
+            continue
+        if task.camera.projection == "equirectangular":
+            raise InputError(f"{flag}: frame {task.number} is a panorama, expected a picture with edges")
+        if isinstance(warp.source, ByMap):
+            camera, stmap = picture_camera(task, options), warp.source.stmap
+            window = camera.window or Window(0, 0, camera.width, camera.height)
+            if not stmap.covers(window.x, window.y, camera.width, camera.height):
+                raise InputError(
+                    f"{flag}: has values for {stmap.values.shape[1]}x{stmap.values.shape[0]} pixels from {stmap.x},"
+                    f"{stmap.y} on, expected all of the picture; leave --overscan out, or write a larger data window"
+                )
+        if (part := warp.empty) > 0:
+            empty[task.number] = part
+    if empty:
+        number, part = max(empty.items(), key=lambda item: item[1])
+        warn(
+            f"{flag}: {100 * part:.0f} % of frame {number} have no place in the straight picture, or one more than a "
+            "frame beyond its edges; they stay black and transparent"
+        )
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:

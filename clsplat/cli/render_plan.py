@@ -22,7 +22,7 @@ from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import held_sh
 from clsplat.sequence import workers
-from clsplat.sequence.task import picture_camera
+from clsplat.sequence.task import picture_camera, straight_camera
 from clsplat.shots.frame_numbers import ranges
 from clsplat.stages.deep import DEEP_FLOATS
 
@@ -121,7 +121,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     framing, names = options.pictures.framing, set(options.channels)
     features = feature_floats(names)
     plans = []
-    cameras = [picture_camera(task, options) for task in job.tasks]
+    cameras = [straight_camera(task, options) for task in job.tasks]
     for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
         if options.deep:
             rows, planes = deep_rows(device, camera, options.deep.bins), 4 * DEEP_FLOATS * options.deep.bins

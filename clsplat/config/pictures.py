@@ -4,6 +4,7 @@ command line is made from them."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from math import inf
 from typing import Literal
@@ -82,6 +83,28 @@ def parse_region(text: str) -> tuple[int, int, int, int]:
         raise InputError(f"--region {text}: expected X,Y,WIDTH,HEIGHT in pixels such as 100,50,640,480")
     x, y, width, height = (int(word) for word in words)
     return x, y, width, height
+
+
+@dataclass(frozen=True)
+class WarpConfig:
+    """Lenses that bend."""
+
+    stmap: str = ""
+    """STMap, an EXR file, that the picture is bent by: R and G say where each pixel comes from, in parts of the frame
+    from its lower left corner. The frame is rendered as far as they reach; '' bends nothing."""
+    distort: bool = False
+    """Bend pictures as the photographs' lenses do, so that they lie on the photographs as they were taken. For cameras
+    of a COLMAP model or a transforms.json."""
+
+    def check(self, channels: Collection[str] = (), *, deep: bool = False) -> None:
+        """Raise InputError for settings that exclude each other, and for what a bent picture has not."""
+        if self.stmap and self.distort:
+            raise InputError("--stmap and --distort exclude each other: both bend the picture")
+        flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
+        if flag and deep:
+            raise InputError(f"{flag}: deep EXR has no bent pictures, expected a flat one")
+        if flag and (moving := [name for name in channels if name in ("motion", "backward")]):
+            raise InputError(f"{flag}: {', '.join(moving)} of a bent picture is not defined, expected other --channels")
 
 
 @dataclass(frozen=True)
@@ -166,11 +189,12 @@ class SamplingConfig:
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Settings of a picture beside its channels: colour, framing, sampling."""
+    """Settings of a picture beside its channels: colour, framing, sampling, a lens that bends."""
 
     colour: ColourConfig = field(default_factory=ColourConfig)
     framing: FramingConfig = field(default_factory=FramingConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""

@@ -29,13 +29,16 @@ class StereoConfig:
     eye: Literal["both", "left", "right"] = "both"
     """Render one eye of --stereo alone, such as for a video."""
 
-    def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+    def check(self, *, distort: bool = False) -> None:
+        """Raise InputError naming the first setting whose value makes no sense. distort: pictures are bent as
+        photographs are."""
         if not self.stereo:
             for flag, given in (("--convergence", self.convergence is not None), ("--eye", self.eye != "both")):
                 if given:
                     raise InputError(f"{flag}: is of stereo pairs, expected --stereo DISTANCE with it")
             return
+        if distort:
+            raise InputError("--stereo and --distort exclude each other: a photograph was taken by one eye")
         if self.of_stage:
             if self.convergence is not None:
                 raise InputError("--convergence: the cameras of --stereo stage have their own, expected it without")

@@ -22,7 +22,7 @@ from clsplat.models.edit import exposed
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
 from clsplat.selftest.trust import require
-from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, picture_camera
+from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, lens_of, picture_camera
 
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
@@ -95,7 +95,8 @@ class FrameRenderer:
             above = header(task, options)
             empty = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
             return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
-        draw, finish = pipeline.draw(task.at, camera_after(task, options), camera_before(task, options))
+        around = camera_after(task, options), camera_before(task, options)
+        draw, finish = pipeline.draw(task.at, *around, lens_of(task, options))
         rows = self._rows(camera)
         if rows < camera.height and not task.is_video:
             blanks: list[bool | None] = []

@@ -19,10 +19,13 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.files import digest, is_file
+from clsplat.frame.lens import ByLens, ByMap, Places, Warp
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.frame_files import VIDEO, Header, camera_matrices, is_whole_panorama
+from clsplat.images.stmap import read_stmap
+from clsplat.scenes.data_set import Lens
 from clsplat.shots import Shot
 from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
@@ -73,7 +76,8 @@ class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
     camera that motion goes to, of the same size, where motion is asked for; earlier: that of backward motion likewise;
     stretch: where the camera is while the shutter is open, None where it stands still; path: of the file; before: see
-    `existing.stamp`; eye: left or right of a stereo pair; right: the frame of the right eye, where one file has both.
+    `existing.stamp`; eye: left or right of a stereo pair; right: the frame of the right eye, where one file has both;
+    lens: of the photograph that the picture is bent as.
     """
 
     number: int
@@ -86,6 +90,7 @@ class Task:
     before: tuple[int, ...] | None = None
     eye: str = ""
     right: Task | None = None
+    lens: Lens | None = None
 
     @property
     def key(self) -> str:
@@ -148,7 +153,8 @@ def make_tasks(
             after = resize(moving.camera_after(whole, indices[frame.number])).resized(camera.width, camera.height)
         if backward:
             earlier = resize(moving.camera_before(whole, indices[frame.number])).resized(camera.width, camera.height)
-        tasks.append(Task(frame.number, frame.name, camera, path, after, earlier, stretch(frame.number)))
+        where = (after, earlier, stretch(frame.number))
+        tasks.append(Task(frame.number, frame.name, camera, path, *where, lens=frame.lens))
     return tasks
 
 
@@ -171,11 +177,34 @@ class RenderOptions:
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
-    """The camera of the picture that is written: its size, its window, the middle of the shutter.
+    """The camera of the picture that is written: its size, its window, the middle of the shutter. Of a bent picture it
+    says size and window alone.
 
     Raises InputError for a region that is not in the frame.
     """
-    return framed(task.at(options.pictures.sampling.middle), options.pictures.framing)
+    warp = warp_of(task, options)
+    shown = task.at(options.pictures.sampling.middle) if warp is None else warp.shown
+    return framed(shown, options.pictures.framing)
+
+
+def lens_of(task: Task, options: RenderOptions) -> Places | None:
+    """The lens or the map that bends the picture, None where nothing does. Raises InputError for a map that cannot be
+    read."""
+    if stmap := options.pictures.warp.stmap:
+        return ByMap(read_stmap(Path(stmap)))
+    return ByLens(task.lens) if task.lens is not None else None
+
+
+def warp_of(task: Task, options: RenderOptions) -> Warp | None:
+    """How the picture is bent."""
+    lens = lens_of(task, options)
+    return None if lens is None else Warp(lens, task.at(options.pictures.sampling.middle))
+
+
+def straight_camera(task: Task, options: RenderOptions) -> Camera:
+    """The camera of the picture that is drawn: `picture_camera`, or what a bent one looks at."""
+    camera, warp = picture_camera(task, options), warp_of(task, options)
+    return camera if warp is None else warp.of_window(camera)[1] or camera
 
 
 def camera_after(task: Task, options: RenderOptions) -> Camera | None:
@@ -231,8 +260,11 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
-    right = [settings_digest(task.right, options)] if task.right is not None else []
-    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling, *right)
+    more: list[Any] = [settings_digest(task.right, options)] if task.right is not None else []
+    if (lens := lens_of(task, options)) is not None:
+        bends = lens.stmap.digest if isinstance(lens, ByMap) else task.lens
+        more += [bends, task.at(pictures.sampling.middle)]
+    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling, *more)
 
 
 def _content(source: str) -> str:
@@ -270,6 +302,8 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Hea
     that a panorama is one. whole: the task of the file, where that has other views too."""
     camera = picture_camera(task, options)
     matrices = camera_matrices(camera)
+    if warp_of(task, options) is not None:
+        matrices.pop("worldToNDC", None)  # no matrix bends
     attributes = {**options.attributes, "clsplat:frame": task.number, SETTINGS: settings_digest(whole or task, options)}
     space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config.channels import CHANNELS, DEEP
-from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig
+from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig, WarpConfig
 from clsplat.device.child import abandon
 from clsplat.images import frame_files
 from clsplat.images.video import VideoWriter, frame_planes, video_writer
@@ -73,6 +73,7 @@ def frame_bytes(task: Task, options: RenderOptions) -> int:
         return COPIES * 4 * min(len(DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
     floats = sum(len(CHANNELS[name].names) for name in options.channels)
     light = 4 if options.pictures.sampling.on or finer > 1 else 0
+    floats += floats if options.pictures.warp != WarpConfig() else 0
     return 4 * pixels * (COPIES * floats + light * (finer if finer > 1 else 2))
 
 

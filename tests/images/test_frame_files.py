@@ -74,7 +74,7 @@ def test_exr(parts: Any, depth: Any, tmp_path: Path) -> None:
     write_channels(path, layers, Encoding(depth=depth, parts=parts))
     found, specs = read(path)
     assert [name for spec in specs for name in spec.channelnames].count("R") == 1
-    assert len(specs) == (1 if parts == "one" else 9)
+    assert len(specs) == (1 if parts == "one" else 10)
     for name, layer in CHANNELS.items():
         planes = layers[name].reshape(HEIGHT, WIDTH, -1)
         for index, channel in enumerate(layer.names):
@@ -91,7 +91,7 @@ def test_parts_have_names_and_formats(tmp_path: Path) -> None:
     write_channels(tmp_path / "a.exr", everything(), Encoding("half", parts="several"))
     _, specs = read(tmp_path / "a.exr")
     names = [spec.get_string_attribute("oiio:subimagename") for spec in specs]
-    assert names == ["rgba", "depth", "median", "first", "N", "P", "forward", "count", "id"]
+    assert names == ["rgba", "depth", "median", "first", "N", "P", "forward", "backward", "count", "id"]
     assert specs[0].channelnames == ("R", "G", "B", "A")
     assert formats(specs[0]) == {"half"}
     assert formats(specs[1]) == {"float"}
