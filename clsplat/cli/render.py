@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from clsplat.shots import Shot
 
 
-_PICTURES = (".png", ".tif", ".tiff")
+_PICTURES = (".png", ".tif", ".tiff", ".dpx")
 _USED_BY = {
     **dict.fromkeys(("exr", "parts", "compression"), (".exr",)),
     "bits": _PICTURES,
@@ -68,9 +68,10 @@ class Render(Verb):
     model: RunOrModel
     """A run's folder or a model file."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
-    """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name
-    of a video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included,
-    or else the frame's number; ####, %04d and {frame} are the frame's number; {eye} and %V left or right."""
+    """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF, JPEG or DPX; or the
+    name of a video of all frames, turn.mp4 or, in ProRes, turn.mov. {name} is the image's name without its extension,
+    sub-folders included, or else the frame's number; ####, %04d and {frame} are the frame's number; {eye} and %V left
+    or right."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
     nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each. Not
@@ -110,8 +111,8 @@ class Render(Verb):
     channel."""
     compression: Compression = "zip"
     """Compression of EXR files. pxr24, dwaa and dwab change the values a little; the others keep every bit."""
-    bits: Literal[8, 16] = 8
-    """Bits of each channel in PNG and TIFF files."""
+    bits: Annotated[Literal[8, 10, 16] | None, arg(metavar="8|10|16")] = None
+    """Bits of each channel: 8 or 16 in PNG and TIFF files, 8 if not given; 10 or 16 in DPX files, 10 if not given."""
     quality: int = 95
     """Quality of JPEG files, from 1 to 100, the best."""
     width: OptionalInt = None
@@ -138,7 +139,7 @@ class Render(Verb):
     but for --skip-existing."""
     skip_existing: Flag = False
     """Leave out frames whose file is there and can be read to its end, of this size, these channels, this model and,
-    as far as it says so (EXR, PNG), made with these cameras and settings."""
+    as far as it says so, made with these cameras and settings."""
     dry_run: Flag = False
     """Print what would be done, and do nothing: frames, sizes, channels, memory, files."""
     progress: Literal["auto", "json", "openjd", "none"] = "auto"
@@ -202,10 +203,10 @@ def run(verb: Render, services: Services) -> int:
 def _read_job(verb: Render) -> Job:
     """All that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
     import clsplat
-    from clsplat.cli.render_job import Job, check_pictures, resizer
+    from clsplat.cli.render_job import Job, check_pictures, is_ours, resizer
     from clsplat.gaussians import Gaussians
     from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
-    from clsplat.images.frame_files import VIDEO
+    from clsplat.images.frame_files import VIDEOS
     from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file
     from clsplat.sequence import existing
@@ -226,7 +227,8 @@ def _read_job(verb: Render) -> Job:
     check_pictures(tasks, options)
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
-        check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
+        ours = verb.skip_existing and is_ours(tasks[0].path)
+        check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run or ours)
     _warn_of_unused(verb, options.channels)
     for text in chosen.warnings:
         warn(text)
@@ -237,7 +239,7 @@ def _read_job(verb: Render) -> Job:
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
     extension = Path(verb.output).suffix.lower()
-    colours.check_file(verb.output, extension, VIDEO)
+    colours.check_file(verb.output, extension, VIDEOS)
     if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
         warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
@@ -294,10 +296,10 @@ def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
 
 def _video(verb: Render, shot: Shot) -> VideoConfig:
     """The video's settings, with the rate of the shot where no other is asked for. Raises InputError."""
-    from clsplat.images.frame_files import VIDEO
+    from clsplat.images.frame_files import VIDEOS
 
     video = verb.video if verb.video.fps is not None or shot.fps is None else replace(verb.video, fps=shot.fps)
-    if Path(verb.output).suffix.lower() == VIDEO and video is not verb.video:
+    if Path(verb.output).suffix.lower() in VIDEOS and video is not verb.video:
         try:
             video.check()
         except InputError:
@@ -308,13 +310,15 @@ def _video(verb: Render, shot: Shot) -> VideoConfig:
 
 
 def _options(verb: Render) -> RenderOptions:
-    from clsplat.cli.render_job import for_workers, parse_colour, warp_for_workers
-    from clsplat.images.frame_files import VIDEO, check_format, parse_channels
+    from clsplat.cli.render_job import bits_of, for_workers, parse_colour, warp_for_workers
+    from clsplat.images.frame_files import VIDEOS, check_format, parse_channels
+    from clsplat.images.video import check_codec
     from clsplat.sequence.task import RenderOptions
 
     pictures = PictureConfig(for_workers(verb.colour), verb.framing, verb.sampling, warp_for_workers(verb.warp))
     pictures.check()
-    video = Path(verb.output).suffix.lower() == VIDEO
+    extension = Path(verb.output).suffix.lower()
+    video = extension in VIDEOS
     channels = parse_channels(f"{verb.channels},alpha" if verb.alpha or verb.deep else verb.channels)
     check_format(verb.output, channels, video=True)
     if not 1 <= verb.quality <= 100:
@@ -332,10 +336,12 @@ def _options(verb: Render) -> RenderOptions:
     elif verb.slices != DeepConfig():
         raise InputError("--deep.bins, --deep.near and --deep.far are of deep EXR, expected --deep with them")
     if video:
+        check_codec(verb.output, verb.video, channels)
         _check_video(verb)
     elif verb.video != VideoConfig():
-        raise InputError(f"-o {verb.output}: --video flags are of videos, expected the name of an {VIDEO} file")
-    encoding = Encoding(verb.exr, verb.parts, verb.compression, verb.bits, verb.quality)
+        raise InputError(f"-o {verb.output}: --video flags are of videos, expected the name of an .mp4 or .mov file")
+    bits = bits_of(verb.output, verb.bits, channels)
+    encoding = Encoding(verb.exr, verb.parts, verb.compression, bits, verb.quality, verb.video.prores)
     colour = parse_colour(verb.background or "black")
     return RenderOptions(channels, colour, encoding, pictures=pictures, deep=verb.slices if verb.deep else None)
 
@@ -354,10 +360,6 @@ def _check_video(verb: Render) -> None:
 
     if reason := video_missing():
         raise InputError(f"{verb.output}: {reason}")
-    if verb.skip_existing:
-        raise InputError(
-            "--skip-existing: a video is written as a whole; leave the flag out, or write a picture for each frame"
-        )
 
 
 def _devices(verb: Render) -> tuple[str | None, ...]:
@@ -397,13 +399,14 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
         check_foreign(job, there)
     existing.make_folders(tasks)
     existing.remove_temporaries(tasks)
+    left = [task for task in tasks if task.key not in there]
     records: dict[str, Record] = {}
     lines = sys.stdout if not verb.json else sys.stderr if verb.progress in ("json", "openjd") else None
     start = time.monotonic()
     try:
         with (
             FrameProgress(len(tasks), verb.progress, lines=lines) as progress,
-            workers.open_video(tasks, job.video) as video,
+            workers.open_video(left, job.video, options) as video,
         ):
 
             def done(record: Record) -> None:
@@ -413,13 +416,11 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
             for task in tasks:
                 if task.key in there:
                     done(workers.record_of(task, options, skipped=True))
-            left = [task for task in tasks if task.key not in there]
             if job.on_farm:
                 _on_farm(verb, job, left, done, video)
             else:
-                workers.run_tasks(
-                    left, renderers, options, done, video, Sharing(options) if job.skip_existing else None
-                )
+                shared = job.skip_existing and not job.is_video
+                workers.run_tasks(left, renderers, options, done, video, Sharing(options) if shared else None)
     except KeyboardInterrupt as error:
         count = f"{len(records)} of {len(tasks)} frames"
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"

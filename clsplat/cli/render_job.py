@@ -12,10 +12,12 @@ from clsplat.camera import Camera, Window
 from clsplat.config.pictures import ColourConfig, VideoConfig, WarpConfig
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples, warn
+from clsplat.files import is_file
 from clsplat.frame.lens import ByMap
 from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
+from clsplat.images.video import video_record
 from clsplat.sequence import existing
 from clsplat.sequence.task import RenderOptions, Task, picture_camera, warp_of
 
@@ -54,6 +56,8 @@ def frames_there(job: Job) -> set[str]:
     were made with, and of those that are rendered again."""
     if not job.skip_existing:
         return set()
+    if job.is_video:
+        return _video_there(job)
     there = existing.complete(job.tasks, job.options)
     if unknown := existing.untold([task for task in job.tasks if task.key in there]):
         warn(
@@ -66,6 +70,24 @@ def frames_there(job: Job) -> set[str]:
             f"cameras or settings, such as {changed[0]}: they are rendered again"
         )
     return there
+
+
+def _video_there(job: Job) -> set[str]:
+    """All frames or none: a video is written as a whole."""
+    path, wanted = job.tasks[0].path, existing.made_of(job.tasks, job.options, job.video)
+    if is_file(path) and video_record(path, len(job.tasks)) == wanted:
+        return {task.key for task in job.tasks}
+    if is_file(path):
+        warn(
+            f"--skip-existing: {path} is not whole, or was made of another model or frames, or with other cameras or "
+            "settings: it is rendered again"
+        )
+    return set()
+
+
+def is_ours(path: Path) -> bool:
+    """True if a video was made by clsplat, as far as its header says."""
+    return is_file(path) and bool(video_record(path))
 
 
 def check_foreign(job: Job, there: Collection[str]) -> None:
@@ -83,6 +105,19 @@ def for_workers(colour: ColourConfig) -> ColourConfig:
     if source and "://" not in source:
         source = str(Path(source).absolute())
     return replace(colour, ocio_config=source)
+
+
+def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
+    """Bits of each channel in files of that name, by --bits. Raises InputError for what their format has not."""
+    extension = Path(path).suffix.lower()
+    if extension == ".dpx" and bits == 8:
+        raise InputError(f"--bits 8: {path} has 10 or 16 bits, expected one of them")
+    if extension != ".dpx" and bits == 10:
+        raise InputError(f"--bits 10: is of DPX, expected 8 or 16 for {path}")
+    chosen = bits or (10 if extension == ".dpx" else 8)
+    if extension == ".dpx" and chosen == 10 and "alpha" in channels:
+        raise InputError(f"{path}: a DPX of 10 bits is written without alpha here, expected --bits 16 with it")
+    return chosen
 
 
 def warp_for_workers(warp: WarpConfig) -> WarpConfig:

@@ -230,6 +230,7 @@ class DeepConfig:
             raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
 
 
+ProRes = Literal["422", "hq", "4444"]
 FPS = 24.0
 """Frames a second of a video where neither a flag nor the cameras' file says another rate."""
 
@@ -242,9 +243,11 @@ class VideoConfig:
     """Frames a second; if not given the rate of the cameras' file, or 24 where that has none. 23.976, 29.97 and
     their like are 24000/1001, 30000/1001 and so on."""
     crf: int = 18
-    """Quality: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
+    """Quality of an .mp4: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
     preset: str = "medium"
     """Effort of the encoder for a smaller file, from ultrafast to veryslow."""
+    prores: ProRes = "hq"
+    """ProRes of a .mov: 422, hq (422 HQ), or 4444, which may have alpha."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -264,10 +267,11 @@ Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwa
 
 @dataclass(frozen=True)
 class Encoding:
-    """Encoding of pictures. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
+    """Encoding of pictures. bits: 8 or 16, of PNG and TIFF, 10 or 16 of DPX; quality: of JPEG; prores: of MOV."""
 
     depth: ExrDepth = EXR_DEPTH
     parts: Parts = "one"
     compression: Compression = "zip"
     bits: int = 8
     quality: int = 95
+    prores: ProRes = "hq"

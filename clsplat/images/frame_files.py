@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of rendered frames: channels in EXR, one part or several, or a plain picture.
 
-Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
+Alpha is associated in EXR, TIFF and DPX, unassociated in PNG. Matrices in the header are those of row
 vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
 """
 
@@ -24,6 +24,7 @@ from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.images.alpha import unassociate
 from clsplat.images.reading import decodes, image_size, opened
+from clsplat.images.records import PLACES, attribute_of, record_text
 from clsplat.images.writing import steps_of, write_spec
 
 HALF_MAX = np.float32(65504)
@@ -36,8 +37,8 @@ _LARGEST_FLOAT_INDEX = 2**24
 _BLOCK = 1 << 12
 """Bytes of a disk's block."""
 
-EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
-VIDEO = ".mp4"
+EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".dpx")
+VIDEOS = (".mp4", ".mov")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,16 +104,16 @@ def parse_channels(text: str) -> tuple[str, ...]:
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
     """Raise InputError where a file of that name cannot hold the channels. video: it may be one, too."""
-    extension, known = Path(path).suffix.lower(), (*EXTENSIONS, VIDEO) if video else EXTENSIONS
+    extension, known = Path(path).suffix.lower(), (*EXTENSIONS, *VIDEOS) if video else EXTENSIONS
     if extension not in known:
         raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
     if extension == ".exr":
         return
-    holds = ("rgb",) if extension in (".jpg", ".jpeg", VIDEO) else ("rgb", "alpha")
+    holds = ("rgb",) if extension in (".jpg", ".jpeg", ".mp4") else ("rgb", "alpha")
     over = [name for name in channels if name not in holds]
     if over or "rgb" not in channels:
         lacking = f"cannot hold {', '.join(over)}" if over else "needs rgb"
-        article = "an" if extension == VIDEO else "a"
+        article = "an" if extension == ".mp4" else "a"
         raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
 
 
@@ -201,7 +202,7 @@ def is_whole(
                 return False
             if sorted(spec.channelnames) != sorted(names):  # OpenImageIO has its own order of an EXR's
                 return False
-            if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
+            if any(attribute_of(spec, key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
             if not decodes(source, part, spec.height - 1) or (holed and not decodes(source, part, 0)):
                 return False
@@ -224,7 +225,7 @@ def is_foreign(path: Path) -> bool:
 def attribute(path: Path, name: str) -> Any:
     """The value of an attribute of a file's first part, None where it has none or is no picture."""
     with opened(path) as source:
-        return None if source is None else source.spec().getattribute(name)
+        return None if source is None else attribute_of(source.spec(), name)
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
@@ -276,7 +277,14 @@ def _picture(
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
     whole = steps_of(planes, bits)
+    if bits == 10:  # OpenImageIO cuts off what 16 bits have more, so that these have to be those of the ten
+        whole = (whole << 6) | (whole >> 4)
     spec = _spec(whole.shape, "RGBA", oiio.UINT8 if bits == 8 else oiio.UINT16, header)
+    if extension in PLACES and (text := record_text(header.attributes)):
+        spec.attribute(PLACES[extension], text)
+    if extension == ".dpx":
+        spec.attribute("oiio:BitsPerSample", bits)
+        spec.attribute("oiio:Endian", "big")
     if extension == ".png":
         if not header.is_srgb:  # else OpenImageIO says so in the chunks sRGB, gAMA and cHRM
             spec.attribute("oiio:ColorSpace", "unknown")

@@ -10,13 +10,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from clsplat.config.pictures import VideoConfig
 from clsplat.errors import InputError, reason_of
 from clsplat.files import abandoned, is_file
 from clsplat.images.frame_files import attribute, is_foreign, is_whole
-from clsplat.sequence.task import SETTINGS, RenderOptions, Task, picture_camera, settings_digest
+from clsplat.images.records import MODEL, SETTINGS
+from clsplat.sequence.task import RenderOptions, Task, digest_of, picture_camera, settings_digest
 
 MOST_WRITERS = 8
-WHAT_IT_IS = ("clsplat:model", "clsplat:colorspace")
+WHAT_IT_IS = (MODEL, "clsplat:colorspace")
 """Attributes of a file that say whether it is the one that is wanted."""
 
 
@@ -56,6 +58,12 @@ def is_complete(task: Task, options: RenderOptions) -> bool:
     camera, deep = picture_camera(task, options), options.deep is not None
     kind: dict[str, Any] = {"deep": deep, "views": len(task.views)}
     return is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, attributes, **kind)
+
+
+def made_of(tasks: Sequence[Task], options: RenderOptions, config: VideoConfig) -> dict[str, Any]:
+    """The record of a video of these frames."""
+    frames = [(task.number, settings_digest(task, options)) for task in tasks]
+    return {MODEL: options.attributes.get(MODEL), SETTINGS: digest_of(frames, config)}
 
 
 def complete(tasks: Sequence[Task], options: RenderOptions) -> set[str]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.images.frame_files import VIDEO
+from clsplat.images.frame_files import VIDEOS
 from clsplat.sequence.task import Task, make_tasks
 from clsplat.shots import Shot
 from clsplat.shots.stereo import FIELD, for_eye
@@ -33,7 +33,7 @@ def make_views(
     first = next(iter(chosen.values()))
     if not any(shots) and FIELD.search(pattern.replace("%v", "")):
         raise InputError(f"{pattern}: has an eye's name in it, expected --stereo DISTANCE with it")
-    if len(shots) == 2 and Path(pattern).suffix.lower() == VIDEO:
+    if len(shots) == 2 and Path(pattern).suffix.lower() in VIDEOS:
         raise InputError(f"{pattern}: a video is of one eye, expected --eye left or right with it")
     one_file = len(shots) == 2 and not FIELD.search(pattern)
     if one_file and Path(pattern).suffix.lower() != ".exr":

@@ -23,18 +23,22 @@ from clsplat.frame.lens import ByLens, ByMap, Places, Warp
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
-from clsplat.images.frame_files import VIDEO, Header, camera_matrices, is_whole_panorama
+from clsplat.images.frame_files import VIDEOS, Header, camera_matrices, is_whole_panorama
+from clsplat.images.records import SETTINGS
 from clsplat.images.stmap import read_stmap
 from clsplat.scenes.data_set import Lens
 from clsplat.shots import Shot
 from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
 
-SETTINGS = "clsplat:settings"
-"""The attribute of EXR and PNG files that holds it."""
 LATLONG: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
 """OpenImageIO's words for EXR's envmap; and that no smaller versions follow, for which it would keep the file open."""
-_ENCODED = {".exr": ("depth", "parts", "compression"), ".png": ("bits",)}
+_ENCODED = {
+    ".exr": ("depth", "parts", "compression"),
+    **dict.fromkeys((".png", ".tif", ".tiff", ".dpx"), ("bits",)),
+    **dict.fromkeys((".jpg", ".jpeg"), ("quality",)),
+    ".mov": ("prores",),
+}
 """Settings of the encoding that a file of that extension depends on."""
 
 
@@ -119,7 +123,7 @@ class Task:
     @property
     def is_video(self) -> bool:
         """True if the file holds other frames too."""
-        return self.path.suffix.lower() == VIDEO
+        return self.path.suffix.lower() in VIDEOS
 
 
 def make_tasks(
@@ -136,7 +140,7 @@ def make_tasks(
     motion, backward = "motion" in channels, "backward" in channels
     whole.check(channels)
     indices = {frame.number: index for index, frame in enumerate(whole.frames)}
-    if Path(pattern).suffix.lower() == VIDEO:
+    if Path(pattern).suffix.lower() in VIDEOS:
         paths = [Path(pattern)] * len(chosen.frames)
     else:
         paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])

@@ -18,21 +18,18 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from clsplat.config.channels import CHANNELS, DEEP
 from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig, WarpConfig
 from clsplat.device.child import abandon
 from clsplat.images import frame_files
-from clsplat.images.video import VideoWriter, frame_planes, video_writer
-from clsplat.sequence.existing import MOST_WRITERS
+from clsplat.images.records import record_text
+from clsplat.images.video import VideoPlanes, VideoWriter, planes_of, video_writer
+from clsplat.sequence.existing import MOST_WRITERS, made_of
 from clsplat.sequence.frame_renderer import RenderedFrame, RenderFrame
 from clsplat.sequence.sharing import FrameQueue, Sharing
 from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera
 
-YuvPlanes = NDArray[np.uint8]
-Result = tuple[Record, YuvPlanes | None]
+Result = tuple[Record, VideoPlanes | None]
 """Record of a frame; with the planes that a video takes of it, if it is one's."""
 HOST_BYTES = 1 << 30
 """Main memory for frames that wait to be written, as a guide: three are held in any case."""
@@ -46,7 +43,8 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
     start, yuv = time.monotonic(), None
     if task.is_video:
         assert frame.planes is not None, "frames of a video are not written one by one"
-        yuv = frame_planes(frame.finish(frame.planes)["rgb"])
+        finished = frame.finish(frame.planes)
+        yuv = planes_of(task.path, finished["rgb"], finished.get("alpha"), options.encoding.prores)
     elif frame.planes is not None:
         views = zip(task.views, (frame.planes, frame.right), strict=False)
         made = [(frame.finish(planes or {}), header(view, options, task)) for view, planes in views]
@@ -161,7 +159,7 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
         for record, _ in results:
             yield record
         return
-    waiting: dict[str, tuple[Record, YuvPlanes]] = {}
+    waiting: dict[str, tuple[Record, VideoPlanes]] = {}
     for task in tasks:
         while task.key not in waiting:
             record, planes = next(results)
@@ -173,7 +171,11 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
         yield replace(record, seconds=record.seconds + time.monotonic() - start)
 
 
-def open_video(tasks: Sequence[Task], config: VideoConfig) -> AbstractContextManager[VideoWriter | None]:
+def open_video(
+    tasks: Sequence[Task], config: VideoConfig, options: RenderOptions
+) -> AbstractContextManager[VideoWriter | None]:
     """The video that the tasks are frames of, None where they have files of their own. It takes its name at the end of
     the block, if that ends well."""
-    return video_writer(tasks[0].path, config) if tasks and tasks[0].is_video else nullcontext()
+    if not (tasks and tasks[0].is_video):
+        return nullcontext()
+    return video_writer(tasks[0].path, config, record_text(made_of(tasks, options, config)))

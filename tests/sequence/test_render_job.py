@@ -303,19 +303,20 @@ def written(tmp_path: Path, extension: str, options: RenderOptions) -> Task:
     return task
 
 
-@pytest.mark.parametrize("extension", ["exr", "png", "tif", "jpg"])
+@pytest.mark.parametrize("extension", ["exr", "png", "tif", "jpg", "dpx"])
 @pytest.mark.parametrize("parts", ["one", "several"])
 def test_a_file_is_complete_or_not(extension: str, parts: Any, tmp_path: Path, capfd: Any) -> None:
     channels: tuple[str, ...] = ("rgb", "alpha", "depth", "id") if extension == "exr" else ("rgb", "alpha")
     channels = ("rgb",) if extension == "jpg" else channels
-    options = RenderOptions(channels, encoding=Encoding(parts=parts), attributes={"clsplat:model": "abc"})
+    encoding = Encoding(parts=parts, bits=16 if extension == "dpx" else 8)
+    options = RenderOptions(channels, encoding=encoding, attributes={"clsplat:model": "abc"})
     task = written(tmp_path, extension, options)
     assert is_complete(task, options)
     assert not is_complete(replace(task, path=tmp_path / f"b.{extension}"), options)
     assert not is_complete(replace(task, camera=tilted_camera(41, 30)), options)
     assert not is_complete(task, replace(options, channels=("rgb",) if len(channels) > 1 else ("rgb", "alpha")))
-    if extension in ("exr", "png"):  # the others have no place for it
-        assert not is_complete(task, replace(options, attributes={"clsplat:model": "abd"}))
+    assert not is_complete(task, replace(options, attributes={"clsplat:model": "abd"}))
+    assert not is_complete(task, replace(options, background=(0.0, 0.0, 0.5)))
     if extension == "exr":
         other = Encoding(parts="several" if parts == "one" else "one")
         assert not is_complete(task, replace(options, encoding=other))
