@@ -169,9 +169,10 @@ def check_warps(tasks: list[Task], options: RenderOptions) -> None:
             empty[task.number] = part
     if empty:
         number, part = max(empty.items(), key=lambda item: item[1])
+        advice = "" if options.pictures.warp.stmap else "; --lenses native renders fisheyes without a straight picture"
         warn(
             f"{flag}: {100 * part:.0f} % of frame {number} have no place in the straight picture, or one more than a "
-            "frame beyond its edges; they stay black and transparent"
+            f"frame beyond its edges; they stay black and transparent{advice}"
         )
 
 

@@ -95,7 +95,7 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
     spaces = dict.fromkeys((document["model_colorspace"], document["colorspace"]))
     deep = f" in {document['deep_bins']} slices by depth" if document["deep_bins"] else ""
     yield f"model     {document['model']}: {document['gaussians']:,} Gaussians, SHA-256 {document['digest'][:12]}"
-    yield f"frames    {len(frames)}: {ranges([frame['frame'] for frame in frames])}; {examples(_sizes(frames))}"
+    yield f"frames    {len(frames)}: {ranges(sorted({frame['frame'] for frame in frames}))}; {examples(_sizes(frames))}"
     yield f"files     {' to '.join(paths)}"
     if job.is_video:
         from clsplat.images.video import rate_of
@@ -110,8 +110,8 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
         yield f"device    {device.device}: {device.plan}{strips}"
     yield f"host      about {amount(document['host_bytes'])} for frames that wait to be written"
     if job.skip_existing:
-        skipped = sorted(frame["frame"] for frame in frames if frame["skipped"])
-        yield f"skipped   {len(skipped)}" + (f": {ranges(skipped)}" if skipped else "")
+        skipped = [frame["frame"] for frame in frames if frame["skipped"]]
+        yield f"skipped   {len(skipped)}" + (f": {ranges(sorted(set(skipped)))}" if skipped else "")
 
 
 def _device_plan(job: Job, selector: str | None) -> DevicePlan:

@@ -20,6 +20,8 @@ from clsplat.scenes.data_set import Lens
 
 BEYOND = 1.0
 """Frames beyond each edge of the straight frame from which on there is nothing: a map may say anything there."""
+STEP = 2.0**-20
+"""Pixels that places are whole multiples of, so that counting them from a window's corner rounds nothing."""
 MARGIN = 2
 """Pixels around a place that its interpolation looks at."""
 GRID = 33
@@ -86,7 +88,7 @@ class Warp:
 
     def at(self, x: Float64, y: Float64) -> Float64:
         """Places (h, w, 2), NaN also where they are too far out."""
-        places = self.source.places(self.frame, x, y)
+        places = np.round(self.source.places(self.frame, x, y) / STEP) * STEP
         size = np.array([self.frame.width, self.frame.height])
         with np.errstate(invalid="ignore"):
             inside = np.logical_and(places >= -BEYOND * size, places <= (1 + BEYOND) * size).all(axis=2)

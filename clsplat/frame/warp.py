@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float64
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera, Window
 from clsplat.config.channels import CHANNELS
 from clsplat.frame.draw import Draw, Planes
@@ -75,28 +75,30 @@ def cubic(plane: NDArray[Any], places: Float64) -> NDArray[Any]:
     darker or brighter than these. 0 where places are NaN."""
     there = ~np.isnan(places[:, :, 0])
     at = np.where(there[:, :, None], places, 0.5) - 0.5
-    first = np.floor(at)
-    weights = [_catmull_rom(at[:, :, axis] - first[:, :, axis]) for axis in (0, 1)]
-    columns, rows = (
-        [np.clip(first[:, :, axis].astype(np.int64) + step, 0, plane.shape[1 - axis] - 1) for step in (-1, 0, 1, 2)]
-        for axis in (0, 1)
-    )
-    wide = plane.ndim == 3
+    first = np.floor(at).astype(np.int64)
+    weights = [_catmull_rom((at - first)[:, :, axis].astype(np.float32)) for axis in (0, 1)]
+    # the border is repeated, so that the sixteen are at one distance from each other everywhere
+    edges = [(2, 2), (2, 2)] + [(0, 0)] * (plane.ndim - 2)
+    padded = np.pad(np.asarray(plane, np.float32), edges, mode="edge")
+    height, width = padded.shape[:2]
+    x, y = np.clip(first[:, :, 0] + 1, 0, width - 4), np.clip(first[:, :, 1] + 1, 0, height - 4)
+    begin, lines = y * width + x, padded.reshape(height * width, *plane.shape[2:])
     total = np.zeros((*there.shape, *plane.shape[2:]), np.float32)
     low, high = np.full_like(total, np.inf), np.full_like(total, -np.inf)
-    for row, down in zip(rows, weights[1], strict=True):
-        for column, across in zip(columns, weights[0], strict=True):
-            values = plane[row, column]
-            weight = (down * across).astype(np.float32)
-            total += values * (weight[:, :, None] if wide else weight)
+    for row, down in enumerate(weights[1]):
+        for column, across in enumerate(weights[0]):
+            values = lines.take(begin + (row * width + column), axis=0)
             np.minimum(low, values, out=low)
             np.maximum(high, values, out=high)
+            weight = down * across
+            values *= weight[:, :, None] if plane.ndim == 3 else weight
+            total += values
     result = np.clip(total, low, high)
     result[~there] = 0
     return result
 
 
-def _catmull_rom(t: Float64) -> tuple[Float64, Float64, Float64, Float64]:
+def _catmull_rom(t: Float32) -> tuple[Float32, Float32, Float32, Float32]:
     """Weights of the four pixels around a place, t behind the second."""
     return (
         0.5 * t * (t * (2 - t) - 1),

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
-from clsplat.errors import InputError, examples
+from clsplat.errors import InputError, examples, warn
 from clsplat.gaussians import Gaussians
 from clsplat.scenes import colmap, transforms
 from clsplat.scenes.colmap import find_model, read_cameras
-from clsplat.scenes.data_set import PANORAMA, PosedImage
+from clsplat.scenes.data_set import PANORAMA, PosedImage, absurd
 from clsplat.scenes.transforms import load_document, read_poses
 from clsplat.shots.around import cameras_around, parse_up
 from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
@@ -118,6 +118,8 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
         raise InputError(f"{path}: has no lenses of photographs, expected a COLMAP model's folder or a transforms.json")
     if wrong := [image.name for image in images if image.lens.model == PANORAMA]:
         raise InputError(f"{path}: {examples(wrong)} are panoramas, which no straight picture is bent to")
+    if doubt := absurd([(image.name, image.lens) for image in images]):
+        warn(doubt)
     return images
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,13 @@ from tiny import hidden_model
 
 from clsplat.camera import Camera
 from clsplat.cli.main import main
+from clsplat.device.context import Device
 from clsplat.frame.lens import ByLens, ByMap, Warp, distorted_places, undistorted_places
+from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.strips import in_strips
 from clsplat.frame.warp import cubic, nearest, warped
 from clsplat.images.stmap import StMap, read_stmap, write_stmap
+from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.data_set import Lens, undistort
 
 WIDTH, HEIGHT = 96, 64
@@ -199,6 +204,17 @@ def test_where_nothing_is() -> None:
     assert warp.empty > 0
 
 
+def test_strips_have_the_pixels_of_the_whole(default_device: Device) -> None:
+    gaussians, camera = scenes.random_cloud(300, 3, WIDTH, HEIGHT)
+    camera = replace(camera, fx=90.0, fy=88.0, cx=47.0, cy=33.0)
+    names = ("rgb", "alpha", "depth", "id")
+    draw, _ = FramePipeline(Renderer(default_device), gaussians).draw(lambda _: camera, lens=ByLens(LENS))
+    whole, parts = draw(camera, names), in_strips(draw, 16)(camera, names)
+    assert whole["alpha"].max() > 0.5
+    for name in names:
+        np.testing.assert_array_equal(parts[name], whole[name], err_msg=name)
+
+
 def test_interpolation() -> None:
     rng = np.random.default_rng(0)
     plane = rng.uniform(0, 1, (8, 9, 2)).astype(np.float32)
@@ -230,6 +246,8 @@ def test_a_lens_in_another_size() -> None:
 def test_skip_existing_goes_by_the_map(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     write_stmap(tmp_path / "a.exr", grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
     (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes())
+    assert render(shot, tmp_path / "frame.exr", f"--stmap {tmp_path}/a.exr --dry-run") == 0
+    assert f"{WIDTH}x{HEIGHT}" in capsys.readouterr().out
     assert render(shot, tmp_path / "frame.exr", f"--stmap {tmp_path}/a.exr") == 0
     stamp = (tmp_path / "frame.exr").stat().st_mtime_ns
     assert render(shot, tmp_path / "frame.exr", f"--stmap {tmp_path}/b.exr --skip-existing") == 0

@@ -150,6 +150,10 @@ def test_records_tell_the_eyes_apart(shot: list[str], tmp_path: Path, capsys: Ca
     ]
     assert render(shot, tmp_path / "{eye}.##.png", "--stereo 0.1 --skip-existing --dry-run --json") == 0
     assert all(frame["skipped"] for frame in json.loads(capsys.readouterr().out)["frames"])
+    assert render(shot, tmp_path / "{eye}.##.png", "--stereo 0.1 --skip-existing --dry-run") == 0
+    plan = capsys.readouterr().out
+    assert "frames    4: 1-2;" in plan
+    assert "skipped   4: 1-2" in plan
     assert render(shot, tmp_path / "one.##.png", "--stereo 0.1 --eye right --frames 2") == 0
     assert (tmp_path / "one.02.png").read_bytes() == (tmp_path / "right.02.png").read_bytes()
 
