@@ -48,7 +48,11 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
     elif frame.planes is not None:
         views = zip(task.views, (frame.planes, frame.right), strict=False)
         made = [(frame.finish(planes or {}), header(view, options, task)) for view, planes in views]
-        frame_files.write_views(task.path, made, options.encoding)
+        if len(made) == 1:
+            (planes, above), *_ = made
+            frame_files.write_channels(task.path, planes, options.encoding, above)
+        else:
+            frame_files.write_views(task.path, made, options.encoding)
     seconds = frame.seconds + time.monotonic() - start
     return record_of(task, options, seconds=seconds, **frame.measured), yuv
 
