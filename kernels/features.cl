@@ -3,9 +3,10 @@
 //
 // Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
 // Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
-// Buffers: camera: the frame's own; after: the one that motion goes to; tile_counts (n): 0 where not visible; means,
-//   quaternions, log_scales as in project.cl; splats (n, SPLAT_SIZE), all of one projection -> features (n, FEATURES),
-//   written where visible: depth and position in world units, a normal of unit length, motion in pixels.
+// Buffers: camera: the frame's own; after, before: those that motion goes to and backward motion goes back to;
+//   tile_counts (n): 0 where not visible; means, quaternions, log_scales as in project.cl; splats (n, SPLAT_SIZE), all
+//   of one projection -> features (n, FEATURES), written where visible: depth and position in world units, a normal of
+//   unit length, motion in pixels.
 // Equations: docs/channels.md, (61) to (64), (74) and (75).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -32,7 +33,7 @@ static inline void normal_of(__global const float *q, __global const float *log_
 }
 #endif
 
-#ifdef FEATURE_MOTION
+#if defined(FEATURE_MOTION) || defined(FEATURE_BACKWARD)
 // (64): from the mean's place on the image to that under another camera, in pixels; 0 where that has it behind its near
 // plane.
 #if defined(RAYS) && RAYS != 3
@@ -51,7 +52,7 @@ static inline InCamera in_camera(__constant float *camera, float x, float y, flo
 
 // Angles by what the coordinates have grown by (74), (75): a small motion is nothing beside the rounding of two angles.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
-                             __global float *motion) {
+                             __global const float *splat, __global float *motion) {
   motion[0] = motion[1] = 0.0f;
   const InCamera here = in_camera(camera, x, y, z), there = in_camera(after, x, y, z);
   float p[3], q[3], d[3];
@@ -119,7 +120,7 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 #endif
 #endif
 
-__kernel void features(const uint n, __constant float *camera, __constant float *after,
+__kernel void features(const uint n, __constant float *camera, __constant float *after, __constant float *before,
                        __global const uint *tile_counts, __global const float *means, __global const float *quaternions,
                        __global const float *log_scales, __global const float *splats, __global float *features) {
   const size_t i = get_global_id(0);
@@ -144,10 +145,9 @@ __kernel void features(const uint n, __constant float *camera, __constant float 
   row[FEATURE_POSITION + 2] = z;
 #endif
 #ifdef FEATURE_MOTION
-#if defined(RAYS) && RAYS != 3
-  motion_of(camera, after, x, y, z, row + FEATURE_MOTION);
-#else
   motion_of(camera, after, x, y, z, splat, row + FEATURE_MOTION);
 #endif
+#ifdef FEATURE_BACKWARD
+  motion_of(camera, before, x, y, z, splat, row + FEATURE_BACKWARD);
 #endif
 }

@@ -29,6 +29,7 @@ VERBS = {
     "train": "Train a scene.",
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS where the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
+    "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
     "thumbnail": "Draw one picture of a model, without cameras: of all of it, or of what a scene has most detail of.",
     "view": "Look at a model in the browser: the device renders, the page shows it.",
     "report": "Write a run's report: one HTML file with curves, pictures, figures and settings, that "

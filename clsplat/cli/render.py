@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -32,9 +33,11 @@ from clsplat.config.pictures import (
     PictureConfig,
     SamplingConfig,
     VideoConfig,
+    WarpConfig,
 )
 from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.config.stereo import StereoConfig
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import check_new, digest
@@ -49,7 +52,7 @@ if TYPE_CHECKING:
     from clsplat.shots import Shot
 
 
-_PICTURES = (".png", ".tif", ".tiff")
+_PICTURES = (".png", ".tif", ".tiff", ".dpx")
 _USED_BY = {
     **dict.fromkeys(("exr", "parts", "compression"), (".exr",)),
     "bits": _PICTURES,
@@ -65,9 +68,10 @@ class Render(Verb):
     model: RunOrModel
     """A run's folder or a model file."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
-    """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name
-    of a video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included,
-    or else the frame's number; ####, %04d and {frame} are the frame's number."""
+    """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF, JPEG or DPX; or the
+    name of a video of all frames, turn.mp4 or, in ProRes, turn.mov. {name} is the image's name without its extension,
+    sub-folders included, or else the frame's number; ####, %04d and {frame} are the frame's number; {eye} and %V left
+    or right."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
     nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each. Not
@@ -90,8 +94,8 @@ class Render(Verb):
     """Photographs' cameras that are fisheyes: undistort, as the pinhole cameras that they hold; native, through their
     own lens. If not given: as the run was trained, but for --path, which is of pinhole cameras, else undistort."""
     channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
-    """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
-    and id (of Gaussians). docs/render.md has each."""
+    """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion (to
+    the next frame), backward (to the one before), count and id (of Gaussians). docs/render.md has each."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
@@ -107,8 +111,8 @@ class Render(Verb):
     channel."""
     compression: Compression = "zip"
     """Compression of EXR files. pxr24, dwaa and dwab change the values a little; the others keep every bit."""
-    bits: Literal[8, 16] = 8
-    """Bits of each channel in PNG and TIFF files."""
+    bits: Annotated[Literal[8, 10, 16] | None, arg(metavar="8|10|16")] = None
+    """Bits of each channel: 8 or 16 in PNG and TIFF files, 8 if not given; 10 or 16 in DPX files, 10 if not given."""
     quality: int = 95
     """Quality of JPEG files, from 1 to 100, the best."""
     width: OptionalInt = None
@@ -121,6 +125,8 @@ class Render(Verb):
     colour: Annotated[ColourConfig, arg(name="")] = field(default_factory=ColourConfig)
     framing: Annotated[FramingConfig, arg(name="")] = field(default_factory=FramingConfig)
     sampling: Annotated[SamplingConfig, arg(name="")] = field(default_factory=SamplingConfig)
+    warp: Annotated[WarpConfig, arg(name="")] = field(default_factory=WarpConfig)
+    pairs: Annotated[StereoConfig, arg(name="")] = field(default_factory=StereoConfig)
     deep: Flag = False
     """Write deep EXR: of each pixel colour, alpha and depth in slices of the scene. docs/pictures.md has how."""
     slices: Annotated[DeepConfig, arg(name="deep")] = field(default_factory=DeepConfig)
@@ -133,7 +139,7 @@ class Render(Verb):
     but for --skip-existing."""
     skip_existing: Flag = False
     """Leave out frames whose file is there and can be read to its end, of this size, these channels, this model and,
-    as far as it says so (EXR, PNG), made with these cameras and settings."""
+    as far as it says so, made with these cameras and settings."""
     dry_run: Flag = False
     """Print what would be done, and do nothing: frames, sizes, channels, memory, files."""
     progress: Literal["auto", "json", "openjd", "none"] = "auto"
@@ -165,6 +171,8 @@ class Render(Verb):
 
         if "lenses" in given and self.cameras is None:
             raise InputError(f"--lenses {self.lenses}: is of the cameras of photographs, expected --cameras with it")
+        if self.lenses is not None and self.warp.distort:
+            raise InputError(f"--lenses {self.lenses} and --distort exclude each other: that bends as photographs are")
         bundle, lenses = PRESETS["default"], self.lenses or "undistort"
         if self.model.is_dir() and (is_run(self.model) or model_path(self.model) == self.model):
             config = Run.open(self.model).config  # refuses a folder that is neither run nor model
@@ -195,15 +203,16 @@ def run(verb: Render, services: Services) -> int:
 def _read_job(verb: Render) -> Job:
     """All that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
     import clsplat
-    from clsplat.cli.render_job import Job, check_pictures, resizer
+    from clsplat.cli.render_job import Job, check_pictures, is_ours, resizer
     from clsplat.cli.render_stage import with_stage
     from clsplat.gaussians import Gaussians
     from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
-    from clsplat.images.frame_files import VIDEO
+    from clsplat.images.frame_files import VIDEOS
     from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file
     from clsplat.sequence import existing
-    from clsplat.sequence.task import digest_of, make_tasks
+    from clsplat.sequence.pairs import make_views
+    from clsplat.sequence.task import digest_of
     from clsplat.shots import check_around
 
     if verb.cameras is None:
@@ -213,15 +222,17 @@ def _read_job(verb: Render) -> Job:
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
-    whole, gaussians = _whole_shot(verb)
-    whole = whole.without_optics() if verb.deep else whole
-    chosen = whole if verb.frames is None else whole.only(verb.frames)
-    tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, options.pictures.sampling)
-    options, unapplied = with_stage(options, verb.cameras, whole, tasks)
+    shots, gaussians = _shots(verb)
+    if verb.deep:
+        shots = {eye: shot.without_optics() for eye, shot in shots.items()}
+    sampling = options.pictures.sampling
+    tasks, chosen = make_views(shots, verb.frames, verb.output, resize, options.channels, sampling=sampling)
+    options, unapplied = with_stage(options, verb.cameras, chosen, tasks)
     check_pictures(tasks, options)
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
-        check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
+        ours = verb.skip_existing and is_ours(tasks[0].path)
+        check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run or ours)
     _warn_of_unused(verb, options.channels)
     for text in chosen.told(verb.cameras, *unapplied):
         warn(text)
@@ -232,37 +243,44 @@ def _read_job(verb: Render) -> Job:
     recorded = recorded_space(model)
     colours = Colours(options.pictures.colour, recorded)
     extension = Path(verb.output).suffix.lower()
-    colours.check_file(verb.output, extension, VIDEO)
+    colours.check_file(verb.output, extension, VIDEOS)
     if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
         warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
     attributes["clsplat:colorspace"] = colours.output
     options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer), gains=gains)
     spaces = (colours.model, colours.output)
-    video = _video(verb, whole)
+    video = _video(verb, chosen)
     on_farm = verb.workers is not None or verb.scheduler is not None
     return Job(
         options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing
     )
 
 
-def _whole_shot(verb: Render) -> tuple[Shot, Gaussians | None]:
-    """All frames that there are, whatever --frames says, and the model where they follow from it. Raises
-    InputError."""
+def _shots(verb: Render) -> tuple[dict[str, Shot], Gaussians | None]:
+    """All frames that there are, whatever --frames says, for each eye of a pair, else under ""; and the model where
+    they follow from it. Raises InputError."""
+    from clsplat.cli.render_eyes import ROLE, shots_of, stage_cameras
     from clsplat.gaussians import Gaussians
     from clsplat.runs.run import model_file
     from clsplat.shots import choose_shot, shot_around
 
     size: dict[str, Any] = {"count": verb.count, "size": (verb.width, verb.height)}
+    pairs = verb.pairs
+    paths = stage_cameras(pairs, verb.cameras, verb.usd_camera) if pairs.of_stage else {}
     if verb.cameras is not None:
         if verb.up is not None:
             raise InputError(f"--up {verb.up}: is of paths around the model, expected no --cameras with it")
-        of_cameras: dict[str, Any] = {"usd_camera": verb.usd_camera, "lenses": verb.lenses or "undistort"}
-        return choose_shot(verb.cameras, path=verb.path, **size, **of_cameras), None
+        of_cameras: dict[str, Any] = {"lenses": verb.lenses or "undistort", "applied": [ROLE] if paths else []}
+        of_cameras["distort"] = verb.warp.distort
+        read = partial(choose_shot, verb.cameras, path=verb.path, **size, **of_cameras)
+        whole = read(usd_camera=next(iter(paths.values()), verb.usd_camera))
+        return shots_of(pairs, whole, lambda path: read(usd_camera=path), paths), None
     if verb.usd_camera is not None:
         raise InputError(f"--usd-camera {verb.usd_camera}: expected the USD stage in --cameras with it")
     gaussians = Gaussians.load(model_file(verb.model))
-    return shot_around(gaussians, verb.path, up=verb.up, **size), gaussians
+    whole = shot_around(gaussians, verb.path, up=verb.up, **size)
+    return shots_of(pairs, whole, lambda _: whole, {}), gaussians
 
 
 def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
@@ -282,10 +300,10 @@ def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
 
 def _video(verb: Render, shot: Shot) -> VideoConfig:
     """The video's settings, with the rate of the shot where no other is asked for. Raises InputError."""
-    from clsplat.images.frame_files import VIDEO
+    from clsplat.images.frame_files import VIDEOS
 
     video = verb.video if verb.video.fps is not None or shot.fps is None else replace(verb.video, fps=shot.fps)
-    if Path(verb.output).suffix.lower() == VIDEO and video is not verb.video:
+    if Path(verb.output).suffix.lower() in VIDEOS and video is not verb.video:
         try:
             video.check()
         except InputError:
@@ -296,13 +314,15 @@ def _video(verb: Render, shot: Shot) -> VideoConfig:
 
 
 def _options(verb: Render) -> RenderOptions:
-    from clsplat.cli.render_job import for_workers, parse_colour
-    from clsplat.images.frame_files import VIDEO, check_format, parse_channels
+    from clsplat.cli.render_job import bits_of, for_workers, parse_colour, warp_for_workers
+    from clsplat.images.frame_files import VIDEOS, check_format, parse_channels
+    from clsplat.images.video import check_codec
     from clsplat.sequence.task import RenderOptions
 
-    pictures = PictureConfig(for_workers(verb.colour), verb.framing, verb.sampling)
+    pictures = PictureConfig(for_workers(verb.colour), verb.framing, verb.sampling, warp_for_workers(verb.warp))
     pictures.check(whole=False)
-    video = Path(verb.output).suffix.lower() == VIDEO
+    extension = Path(verb.output).suffix.lower()
+    video = extension in VIDEOS
     channels = parse_channels(f"{verb.channels},alpha" if verb.alpha or verb.deep else verb.channels)
     check_format(verb.output, channels, video=True)
     if not 1 <= verb.quality <= 100:
@@ -310,6 +330,8 @@ def _options(verb: Render) -> RenderOptions:
     if "alpha" in channels and verb.background is not None:
         flag = "--deep" if verb.deep else "--alpha" if verb.alpha else "--channels alpha"
         raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
+    verb.pairs.check(distort=verb.warp.distort)
+    verb.warp.check(channels, deep=verb.deep)
     verb.slices.check()
     verb.video.check()
     if verb.deep:
@@ -318,10 +340,12 @@ def _options(verb: Render) -> RenderOptions:
     elif verb.slices != DeepConfig():
         raise InputError("--deep.bins, --deep.near and --deep.far are of deep EXR, expected --deep with them")
     if video:
+        check_codec(verb.output, verb.video, channels)
         _check_video(verb)
     elif verb.video != VideoConfig():
-        raise InputError(f"-o {verb.output}: --video flags are of videos, expected the name of an {VIDEO} file")
-    encoding = Encoding(verb.exr, verb.parts, verb.compression, verb.bits, verb.quality)
+        raise InputError(f"-o {verb.output}: --video flags are of videos, expected the name of an .mp4 or .mov file")
+    bits = bits_of(verb.output, verb.bits, channels)
+    encoding = Encoding(verb.exr, verb.parts, verb.compression, bits, verb.quality, verb.video.prores)
     colour = parse_colour(verb.background or "black")
     return RenderOptions(channels, colour, encoding, pictures=pictures, deep=verb.slices if verb.deep else None)
 
@@ -340,10 +364,6 @@ def _check_video(verb: Render) -> None:
 
     if reason := video_missing():
         raise InputError(f"{verb.output}: {reason}")
-    if verb.skip_existing:
-        raise InputError(
-            "--skip-existing: a video is written as a whole; leave the flag out, or write a picture for each frame"
-        )
 
 
 def _devices(verb: Render) -> tuple[str | None, ...]:
@@ -383,35 +403,34 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
         check_foreign(job, there)
     existing.make_folders(tasks)
     existing.remove_temporaries(tasks)
-    records: dict[int, Record] = {}
+    left = [task for task in tasks if task.key not in there]
+    records: dict[str, Record] = {}
     lines = sys.stdout if not verb.json else sys.stderr if verb.progress in ("json", "openjd") else None
     start = time.monotonic()
     try:
         with (
             FrameProgress(len(tasks), verb.progress, lines=lines) as progress,
-            workers.open_video(tasks, job.video) as video,
+            workers.open_video(left, job.video, options) as video,
         ):
 
             def done(record: Record) -> None:
-                records[record.frame] = record
+                records[record.key] = record
                 progress(record)
 
             for task in tasks:
-                if task.number in there:
+                if task.key in there:
                     done(workers.record_of(task, options, skipped=True))
-            left = [task for task in tasks if task.number not in there]
             if job.on_farm:
                 _on_farm(verb, job, left, done, video)
             else:
-                workers.run_tasks(
-                    left, renderers, options, done, video, Sharing(options) if job.skip_existing else None
-                )
+                shared = job.skip_existing and not job.is_video
+                workers.run_tasks(left, renderers, options, done, video, Sharing(options) if shared else None)
     except KeyboardInterrupt as error:
         count = f"{len(records)} of {len(tasks)} frames"
         advice = "nothing is left of the video" if job.is_video else "go on with --skip-existing"
         error.args = (f"after {count}; {advice}",)
         raise
-    if blank := [number for number, record in sorted(records.items()) if record.blank]:
+    if blank := [task.key for task in tasks if records[task.key].blank]:
         warn(
             f"{len(blank)} of {len(tasks)} frames show nothing of the model: {examples(blank)}; are the cameras in the "
             "model's world?"
@@ -419,7 +438,7 @@ def _write_frames(verb: Render, job: Job, renderers: Sequence[Any]) -> int:
     if verb.profile:
         _print_profile(records.values(), time.monotonic() - start, len(renderers))
     if verb.json:
-        print(json.dumps([records[task.number].document() for task in tasks], indent=2))
+        print(json.dumps([records[task.key].document() for task in tasks], indent=2))
     return 0
 
 

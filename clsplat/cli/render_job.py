@@ -8,15 +8,18 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from clsplat.camera import Camera
-from clsplat.config.pictures import ColourConfig, VideoConfig
+from clsplat.camera import Camera, Window
+from clsplat.config.pictures import ColourConfig, VideoConfig, WarpConfig
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples, warn
+from clsplat.files import is_file
+from clsplat.frame.lens import ByMap
 from clsplat.frame.samples import finer
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
+from clsplat.images.video import video_record
 from clsplat.sequence import existing
-from clsplat.sequence.task import RenderOptions, Task, picture_camera
+from clsplat.sequence.task import RenderOptions, Task, picture_camera, warp_of
 
 
 @dataclass(frozen=True)
@@ -48,18 +51,20 @@ class Job:
         return self.tasks[0].is_video
 
 
-def frames_there(job: Job) -> set[int]:
-    """The numbers of the frames that `--skip-existing` leaves out. Warns of files that do not record the settings they
+def frames_there(job: Job) -> set[str]:
+    """The keys of the frames that `--skip-existing` leaves out. Warns of files that do not record the settings they
     were made with, and of those that are rendered again."""
     if not job.skip_existing:
         return set()
+    if job.is_video:
+        return _video_there(job)
     there = existing.complete(job.tasks, job.options)
-    if unknown := existing.untold([task for task in job.tasks if task.number in there]):
+    if unknown := existing.untold([task for task in job.tasks if task.key in there]):
         warn(
             f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
             f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
         )
-    if changed := existing.changed([task for task in job.tasks if task.number not in there], job.options):
+    if changed := existing.changed([task for task in job.tasks if task.key not in there], job.options):
         warn(
             f"--skip-existing: {len(changed)} of the frames that are there were made of another model, or with other "
             f"cameras or settings, such as {changed[0]}: they are rendered again"
@@ -67,9 +72,27 @@ def frames_there(job: Job) -> set[int]:
     return there
 
 
-def check_foreign(job: Job, there: Collection[int]) -> None:
+def _video_there(job: Job) -> set[str]:
+    """All frames or none: a video is written as a whole."""
+    path, wanted = job.tasks[0].path, existing.made_of(job.tasks, job.options, job.video)
+    if is_file(path) and video_record(path, len(job.tasks)) == wanted:
+        return {task.key for task in job.tasks}
+    if is_file(path):
+        warn(
+            f"--skip-existing: {path} is not whole, or was made of another model or frames, or with other cameras or "
+            "settings: it is rendered again"
+        )
+    return set()
+
+
+def is_ours(path: Path) -> bool:
+    """True if a video was made by clsplat, as far as its header says."""
+    return is_file(path) and bool(video_record(path))
+
+
+def check_foreign(job: Job, there: Collection[str]) -> None:
     """Raise InputError where a frame that is not `there` would replace another program's picture."""
-    if others := existing.foreign([task for task in job.tasks if task.number not in there]):
+    if others := existing.foreign([task for task in job.tasks if task.key not in there]):
         raise InputError(
             f"{examples(others)}: there already, and no frames of clsplat; name other files, or give --overwrite to "
             "replace pictures that it did not make"
@@ -84,9 +107,30 @@ def for_workers(colour: ColourConfig) -> ColourConfig:
     return replace(colour, ocio_config=source)
 
 
+def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
+    """Bits of each channel in files of that name, by --bits. Raises InputError for what their format has not."""
+    extension = Path(path).suffix.lower()
+    if extension == ".dpx" and bits == 8:
+        raise InputError(f"--bits 8: {path} has 10 or 16 bits, expected one of them")
+    if extension != ".dpx" and bits == 10:
+        raise InputError(f"--bits 10: is of DPX, expected 8 or 16 for {path}")
+    chosen = bits or (10 if extension == ".dpx" else 8)
+    if extension == ".dpx" and chosen == 10 and "alpha" in channels:
+        raise InputError(f"{path}: a DPX of 10 bits is written without alpha here, expected --bits 16 with it")
+    return chosen
+
+
+def warp_for_workers(warp: WarpConfig) -> WarpConfig:
+    """The lens with the absolute path of its map, likewise."""
+    return replace(warp, stmap=str(Path(warp.stmap).absolute())) if warp.stmap else warp
+
+
 def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
-    """Raise InputError for a frame that the framing does not suit, and for a video of several sizes."""
+    """Raise InputError for a frame that the framing does not suit, a video of several sizes, deep pairs in a file."""
+    if options.deep is not None and tasks[0].right is not None:
+        raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
     sizes = set()
+    check_warps(tasks, options)
     for task in tasks:
         camera = picture_camera(task, options)
         if options.pictures.framing.supersample > 1:
@@ -101,6 +145,35 @@ def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
         from clsplat.images.video import check_size
 
         check_size(tasks[0].path, camera.width, camera.height)
+
+
+def check_warps(tasks: list[Task], options: RenderOptions) -> None:
+    """Raise InputError for frames that no lens bends, and a map without values for the picture. Warns where nothing is
+    seen in a part of it."""
+    flag = f"--stmap {options.pictures.warp.stmap}" if options.pictures.warp.stmap else "--distort"
+    empty = {}
+    for task in tasks:
+        if (warp := warp_of(task, options)) is None:
+            continue
+        if task.camera.projection == "equirectangular":
+            raise InputError(f"{flag}: frame {task.number} is a panorama, expected a picture with edges")
+        if isinstance(warp.source, ByMap):
+            camera, stmap = picture_camera(task, options), warp.source.stmap
+            window = camera.window or Window(0, 0, camera.width, camera.height)
+            if not stmap.covers(window.x, window.y, camera.width, camera.height):
+                raise InputError(
+                    f"{flag}: has values for {stmap.values.shape[1]}x{stmap.values.shape[0]} pixels from {stmap.x},"
+                    f"{stmap.y} on, expected all of the picture; leave --overscan out, or write a larger data window"
+                )
+        if (part := warp.empty) > 0:
+            empty[task.number] = part
+    if empty:
+        number, part = max(empty.items(), key=lambda item: item[1])
+        advice = "" if options.pictures.warp.stmap else "; --lenses native renders fisheyes without a straight picture"
+        warn(
+            f"{flag}: {100 * part:.0f} % of frame {number} have no place in the straight picture, or one more than a "
+            f"frame beyond its edges; they stay black and transparent{advice}"
+        )
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:

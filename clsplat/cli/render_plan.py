@@ -22,7 +22,7 @@ from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import held_sh
 from clsplat.sequence import workers
-from clsplat.sequence.task import picture_camera, sampling_of
+from clsplat.sequence.task import picture_camera, sampling_of, straight_camera
 from clsplat.shots.frame_numbers import ranges
 from clsplat.stages.deep import DEEP_FLOATS
 
@@ -55,9 +55,11 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
     for task in tasks:
         camera = picture_camera(task, options)
         frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
-        frame |= {"width": camera.width, "height": camera.height, "skipped": task.number in skipped}
+        frame |= {"width": camera.width, "height": camera.height, "skipped": task.key in skipped}
         if window := camera.window:
             frame["window"] = [window.x, window.y, window.width, window.height]
+        if task.eye and task.right is None:
+            frame["eye"] = task.eye
         frames.append(frame)
     return {
         "model": str(job.model),
@@ -93,7 +95,7 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
     spaces = dict.fromkeys((document["model_colorspace"], document["colorspace"]))
     deep = f" in {document['deep_bins']} slices by depth" if document["deep_bins"] else ""
     yield f"model     {document['model']}: {document['gaussians']:,} Gaussians, SHA-256 {document['digest'][:12]}"
-    yield f"frames    {len(frames)}: {ranges([frame['frame'] for frame in frames])}; {examples(_sizes(frames))}"
+    yield f"frames    {len(frames)}: {ranges(sorted({frame['frame'] for frame in frames}))}; {examples(_sizes(frames))}"
     yield f"files     {' to '.join(paths)}"
     if job.is_video:
         from clsplat.images.video import rate_of
@@ -108,8 +110,8 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
         yield f"device    {device.device}: {device.plan}{strips}"
     yield f"host      about {amount(document['host_bytes'])} for frames that wait to be written"
     if job.skip_existing:
-        skipped = sorted(frame["frame"] for frame in frames if frame["skipped"])
-        yield f"skipped   {len(skipped)}" + (f": {ranges(skipped)}" if skipped else "")
+        skipped = [frame["frame"] for frame in frames if frame["skipped"]]
+        yield f"skipped   {len(skipped)}" + (f": {ranges(sorted(set(skipped)))}" if skipped else "")
 
 
 def _device_plan(job: Job, selector: str | None) -> DevicePlan:
@@ -119,7 +121,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     framing, names = options.pictures.framing, set(options.channels)
     features = feature_floats(names)
     plans = []
-    cameras = [picture_camera(task, options) for task in job.tasks]
+    cameras = [straight_camera(task, options) for task in job.tasks]
     for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
         if options.deep:
             rows, planes = deep_rows(device, camera, options.deep.bins), 4 * DEEP_FLOATS * options.deep.bins

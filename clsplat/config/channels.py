@@ -47,11 +47,12 @@ CHANNELS: dict[str, Channel] = {
     "normals": Channel(("N.x", "N.y", "N.z"), "colour", "N", "features", "normal"),
     "position": Channel(("P.x", "P.y", "P.z"), "exact", "P", "features", "position"),
     "motion": Channel(("forward.u", "forward.v"), "exact", "forward", "features", "motion", signs=(1, -1)),
+    "backward": Channel(("backward.u", "backward.v"), "exact", "backward", "features", "backward", signs=(1, -1)),
     "count": Channel(("count",), "whole", "count", "whole", "count"),
     "id": Channel(("id",), "whole", "id", "whole", "index"),
 }
-"""Every channel that `--channels` takes, in the order of a file and of the kernels' planes. The v of motion is up in
-files, and docs/channels.md has y down."""
+"""Every channel that `--channels` takes, in the order of a file and of the kernels' planes. The v of both motions is
+up in files, and docs/channels.md has y down."""
 
 DEEP = ("R", "G", "B", "A", "Z", "ZBack")
 """Channels of a deep picture."""

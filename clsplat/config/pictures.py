@@ -4,6 +4,7 @@ command line is made from them."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from math import inf
 from typing import Literal
@@ -84,6 +85,28 @@ def parse_region(text: str) -> tuple[int, int, int, int]:
         raise InputError(f"--region {text}: expected X,Y,WIDTH,HEIGHT in pixels such as 100,50,640,480")
     x, y, width, height = (int(word) for word in words)
     return x, y, width, height
+
+
+@dataclass(frozen=True)
+class WarpConfig:
+    """Lenses that bend."""
+
+    stmap: str = ""
+    """STMap, an EXR file, that the picture is bent by: R and G say where each pixel comes from, in parts of the frame
+    from its lower left corner. The frame is rendered as far as they reach; '' bends nothing."""
+    distort: bool = False
+    """Bend pictures as the photographs' lenses do, so that they lie on the photographs as they were taken. For cameras
+    of a COLMAP model or a transforms.json."""
+
+    def check(self, channels: Collection[str] = (), *, deep: bool = False) -> None:
+        """Raise InputError for settings that exclude each other, and for what a bent picture has not."""
+        if self.stmap and self.distort:
+            raise InputError("--stmap and --distort exclude each other: both bend the picture")
+        flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
+        if flag and deep:
+            raise InputError(f"{flag}: deep EXR has no bent pictures, expected a flat one")
+        if flag and (moving := [name for name in channels if name in ("motion", "backward")]):
+            raise InputError(f"{flag}: {', '.join(moving)} of a bent picture is not defined, expected other --channels")
 
 
 @dataclass(frozen=True)
@@ -174,11 +197,12 @@ class SamplingConfig:
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Settings of a picture beside its channels: colour, framing, sampling."""
+    """Settings of a picture beside its channels: colour, framing, sampling, a lens that bends."""
 
     colour: ColourConfig = field(default_factory=ColourConfig)
     framing: FramingConfig = field(default_factory=FramingConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    warp: WarpConfig = field(default_factory=WarpConfig)
 
     def check(self, *, whole: bool = True) -> None:
         """Raise InputError naming the first setting whose value makes no sense. whole: as of `SamplingConfig.check`."""
@@ -214,6 +238,7 @@ class DeepConfig:
             raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
 
 
+ProRes = Literal["422", "hq", "4444"]
 FPS = 24.0
 """Frames a second of a video where neither a flag nor the cameras' file says another rate."""
 
@@ -226,9 +251,11 @@ class VideoConfig:
     """Frames a second; if not given the rate of the cameras' file, or 24 where that has none. 23.976, 29.97 and
     their like are 24000/1001, 30000/1001 and so on."""
     crf: int = 18
-    """Quality: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
+    """Quality of an .mp4: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
     preset: str = "medium"
     """Effort of the encoder for a smaller file, from ultrafast to veryslow."""
+    prores: ProRes = "hq"
+    """ProRes of a .mov: 422, hq (422 HQ), or 4444, which may have alpha."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
@@ -248,10 +275,11 @@ Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwa
 
 @dataclass(frozen=True)
 class Encoding:
-    """Encoding of pictures. bits: 8 or 16, of PNG and TIFF; quality: of JPEG."""
+    """Encoding of pictures. bits: 8 or 16, of PNG and TIFF, 10 or 16 of DPX; quality: of JPEG; prores: of MOV."""
 
     depth: ExrDepth = EXR_DEPTH
     parts: Parts = "one"
     compression: Compression = "zip"
     bits: int = 8
     quality: int = 95
+    prores: ProRes = "hq"

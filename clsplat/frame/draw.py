@@ -29,8 +29,9 @@ def drawn_by(
     gaussians: Gaussians,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     after: Camera | None = None,
+    before: Camera | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after: the camera of a whole frame that motion goes to.
+    """A Draw by the kernels; after, before: the cameras of a whole frame that motion and backward motion go to.
 
     Planes need not be contiguous: the encoder, which may be another thread, puts them in order.
     """
@@ -47,6 +48,7 @@ def drawn_by(
                 camera,
                 feature_names(rest),
                 after=after and reframed(after, camera),
+                before=before and reframed(before, camera),
                 background=background,
                 contiguous=False,
             )

@@ -12,9 +12,12 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import PictureConfig, SamplingConfig
+from clsplat.config.pictures import PictureConfig, SamplingConfig, WarpConfig
 from clsplat.frame.draw import Draw, Planes, drawn_by
+from clsplat.frame.lens import Places, Warp
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
+from clsplat.frame.strips import in_strips, strip_rows
+from clsplat.frame.warp import warped
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
 from clsplat.rendering.renderer import Renderer
@@ -43,18 +46,24 @@ class FramePipeline:
         self._renderer, self._gaussians, self._background = renderer, gaussians, background
 
     def draw(
-        self, at: Callable[[float], Camera], after: Camera | None = None, sampling: SamplingConfig | None = None
+        self,
+        at: Callable[[float], Camera],
+        after: Camera | None = None,
+        before: Camera | None = None,
+        lens: Places | None = None,
+        sampling: SamplingConfig | None = None,
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that
         makes its planes the file's, which needs no device.
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
-        after: that of the next frame, for motion; sampling: of this frame, else that of all.
+        after, before: those of the next frame and of the frame before, for motion; lens: it bends the picture;
+        sampling: of this frame, else that of all.
         """
         sampling = sampling or self.config.sampling
         config, colours, space = self.config, self.colours, self.colours.model
-        draw = drawn_by(self._renderer, self._gaussians, self._background, after)
-        if sampling.on or config.framing.supersample > 1:
+        draw = drawn_by(self._renderer, self._gaussians, self._background, after, before)
+        if self._in_light(sampling) or lens is not None:
             space, drawn = colours.light, draw
 
             def in_light(camera: Camera, names: Collection[str]) -> Planes:
@@ -63,7 +72,18 @@ class FramePipeline:
             draw = supersampled(in_light, config.framing)
         if sampling.on:
             draw = sampled(draw, *sample_cameras(at, sampling))
+        if lens is not None:
+            device, straight = self._renderer.device, draw
+
+            def rows(camera: Camera, names: Collection[str]) -> Planes:
+                return in_strips(straight, strip_rows(device, camera, names, config.framing))(camera, names)
+
+            draw = warped(rows, Warp(lens, at(sampling.middle)))
         return draw, lambda planes: converted(planes, colours, space, colours.output)
+
+    def _in_light(self, sampling: SamplingConfig) -> bool:
+        """True if frames are made of several, in linear light."""
+        return sampling.on or self.config.framing.supersample > 1
 
     def is_blank(self, planes: Planes, sampling: SamplingConfig | None = None) -> bool | None:
         """True if planes of `draw`, not converted, show nothing but the background, None where none of them tells."""
@@ -74,7 +94,7 @@ class FramePipeline:
         if "rgb" not in planes:
             return None
         behind = np.array(self._background, np.float32).reshape(1, 1, 3)
-        if sampling.on or self.config.framing.supersample > 1:
+        if self._in_light(sampling) or self.config.warp != WarpConfig():
             behind = self.colours.convert(behind, None, self.colours.model, self.colours.light)
         return bool(np.abs(planes["rgb"] - behind).max() <= UNSEEN)
 

@@ -60,8 +60,13 @@ def in_strips(draw: Draw, rows: int) -> Draw:
     return drawn
 
 
-def check_parts(camera: Camera, encoding: Encoding) -> None:
-    """Raise InputError for several parts, which a file has one after the other."""
+def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
+    """Raise InputError for several parts, which a file has one after the other. views: of a stereo pair in the file."""
+    if views > 1:
+        raise InputError(
+            f"--stereo: a picture of {camera.width}x{camera.height} is written in strips here, expected a file for "
+            "each eye: {eye} in -o"
+        )
     if encoding.parts == "several":
         raise InputError(
             f"--parts several: a picture of {camera.width}x{camera.height} is written in strips here, expected one part"

@@ -9,7 +9,7 @@ OpenImageIO. sRGB's curve is done here: OpenColorIO's own is a quick approximati
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -139,13 +139,13 @@ class Colours:
         one, rest = colours[:3][np.eye(3, dtype=bool)], colours[:3][~np.eye(3, dtype=bool)]
         return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *colours[3]], colours[3, 0], atol=2e-3))
 
-    def check_file(self, path: str, extension: str, video: str) -> None:
+    def check_file(self, path: str, extension: str, videos: Collection[str]) -> None:
         """Raise InputError where a file of that extension would be shown in other colours than it holds. Whole numbers
-        are not for linear light, and a video, whose extension is `video`, has to be in Rec.709."""
+        are not for linear light, and a video, whose extension is one of `videos`, has to be in Rec.709."""
         advice = "write .exr, or give --colorspace sRGB"
         if extension != ".exr" and self.is_linear(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, which is linear, expected sRGB; {advice}")
-        if extension == video and not self.has_rec709(self.output):
+        if extension in videos and not self.has_rec709(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, expected sRGB's primaries; {advice}")
 
     @cached_property

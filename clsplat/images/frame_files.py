@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of rendered frames: channels in EXR, one part or several, or a plain picture.
 
-Alpha is associated in EXR and TIFF, unassociated in PNG. Matrices in the header are those of row
+Alpha is associated in EXR, TIFF and DPX, unassociated in PNG. Matrices in the header are those of row
 vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
 """
 
@@ -24,6 +24,7 @@ from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.images.alpha import unassociate
 from clsplat.images.reading import decodes, image_size, opened
+from clsplat.images.records import PLACES, attribute_of, record_text
 from clsplat.images.writing import steps_of, write_spec
 
 HALF_MAX = np.float32(65504)
@@ -36,15 +37,15 @@ _LARGEST_FLOAT_INDEX = 2**24
 _BLOCK = 1 << 12
 """Bytes of a disk's block."""
 
-EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
-VIDEO = ".mp4"
+EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".dpx")
+VIDEOS = (".mp4", ".mov")
 
 
 @dataclass(frozen=True, eq=False)
 class Header:
     """Contents of a file beside pixels; window: None where the picture is the display window; chromaticities: x and y
     of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's; typed:
-    attributes of EXR, with OpenImageIO's names of their types."""
+    attributes of EXR, with OpenImageIO's names of their types; view: left or right of a stereo pair."""
 
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)
@@ -52,6 +53,7 @@ class Header:
     chromaticities: Sequence[float] = ()
     is_srgb: bool = True
     typed: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
+    view: str = ""
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
@@ -83,6 +85,14 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
     return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
 
 
+def is_whole_panorama(camera: Camera) -> bool:
+    """True if the picture shows all directions once, the middle of it straight ahead, as EXR's envmap wants it."""
+    if camera.projection != "equirectangular" or camera.window is not None:
+        return False
+    whole = (camera.fx * 2 * np.pi, camera.fy * np.pi, 2 * camera.cx, 2 * camera.cy)
+    return bool(np.allclose(whole, (camera.width, camera.height) * 2, rtol=1e-9))
+
+
 def parse_channels(text: str) -> tuple[str, ...]:
     """The names in `text`, comma-separated, in the order of CHANNELS. Raises InputError."""
     asked = [word.strip() for word in text.split(",") if word.strip()]
@@ -95,16 +105,16 @@ def parse_channels(text: str) -> tuple[str, ...]:
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
     """Raise InputError where a file of that name cannot hold the channels. video: it may be one, too."""
-    extension, known = Path(path).suffix.lower(), (*EXTENSIONS, VIDEO) if video else EXTENSIONS
+    extension, known = Path(path).suffix.lower(), (*EXTENSIONS, *VIDEOS) if video else EXTENSIONS
     if extension not in known:
         raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
     if extension == ".exr":
         return
-    holds = ("rgb",) if extension in (".jpg", ".jpeg", VIDEO) else ("rgb", "alpha")
+    holds = ("rgb",) if extension in (".jpg", ".jpeg", ".mp4") else ("rgb", "alpha")
     over = [name for name in channels if name not in holds]
     if over or "rgb" not in channels:
         lacking = f"cannot hold {', '.join(over)}" if over else "needs rgb"
-        article = "an" if extension == VIDEO else "a"
+        article = "an" if extension == ".mp4" else "a"
         raise InputError(f"{path}: {article} {extension[1:].upper()} {lacking}; write .exr, or other --channels")
 
 
@@ -123,21 +133,34 @@ def write_channels(
     channels: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
     numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `writing.write_image`.
     """
-    encoding, header = encoding or Encoding(), header or Header()
-    check_target(path, channels)
-    pairs = encoded(path.suffix.lower(), channels, encoding, header)
-    write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], path.suffix.lower()[1:])
+    write_views(path, [(channels, header or Header())], encoding)
+
+
+def write_views(
+    path: Path, views: Sequence[tuple[Mapping[str, NDArray[Any]], Header]], encoding: Encoding | None = None
+) -> None:
+    """`write_channels` of several views in one file: EXR, of which each has parts of its own, named after it."""
+    encoding = encoding or Encoding()
+    check_target(path, views[0][0])
+    extension = path.suffix.lower()
+    several = len(views) > 1
+    pairs = [part for planes, header in views for part in encoded(extension, planes, encoding, header, several=several)]
+    write_spec(path, [pixels for pixels, _ in pairs], [spec for _, spec in pairs], extension[1:])
 
 
 def encoded(
-    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, several: bool = False
 ) -> list[tuple[NDArray[Any], Any]]:
-    """(pixels, OpenImageIO's specification) of each part of a file."""
+    """(pixels, OpenImageIO's specification) of each part of a file. several: the file has other views too, so that
+    parts are named after theirs."""
     channels = {name: channels[name] for name in CHANNELS if name in channels}
     if extension != ".exr":
         return [_picture(extension, channels, encoding, header)]
     groups = _parts(tuple(channels)) if encoding.parts == "several" else [tuple(channels)]
-    return [_exr_part(group, channels, encoding, header, named=len(groups) > 1) for group in groups]
+    view = header.view if several else ""
+    names = [CHANNELS[group[0]].part if len(groups) > 1 else "" for group in groups]
+    named = [".".join(filter(None, (name, view))) for name in names]
+    return [_exr_part(group, channels, encoding, header, name) for group, name in zip(groups, named, strict=True)]
 
 
 def is_whole(
@@ -149,12 +172,13 @@ def is_whole(
     attributes: Mapping[str, str | int | float] | None = None,
     *,
     deep: bool = False,
+    views: int = 1,
 ) -> bool:
     """True if the file holds these channels as `write_channels` writes them, and is whole.
 
     It has to have that size and no other values of these attributes, and to decode to its last row; with a block of
     zeros in it every row is decoded. A file that was cut short fails. deep: expect a deep picture, whose channels are
-    DEEP.
+    DEEP; views: of a stereo pair, each with these channels.
     """
     channels = [name for name in CHANNELS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
@@ -169,6 +193,7 @@ def is_whole(
     with opened(path) as source:
         if source is None:
             return False
+        groups = groups * views
         for part, group in enumerate(groups):
             if not source.seek_subimage(part, 0):
                 return False
@@ -178,7 +203,7 @@ def is_whole(
                 return False
             if sorted(spec.channelnames) != sorted(names):  # OpenImageIO has its own order of an EXR's
                 return False
-            if any(spec.getattribute(key) not in (None, value) for key, value in (attributes or {}).items()):
+            if any(attribute_of(spec, key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
             if not decodes(source, part, spec.height - 1) or (holed and not decodes(source, part, 0)):
                 return False
@@ -201,7 +226,7 @@ def is_foreign(path: Path) -> bool:
 def attribute(path: Path, name: str) -> Any:
     """The value of an attribute of a file's first part, None where it has none or is no picture."""
     with opened(path) as source:
-        return None if source is None else source.spec().getattribute(name)
+        return None if source is None else attribute_of(source.spec(), name)
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
@@ -210,7 +235,7 @@ def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def _exr_part(
-    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, named: bool
+    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, part: str
 ) -> tuple[NDArray[Any], Any]:
     kinds = [CHANNELS[name].kind for name in names for _ in CHANNELS[name].names]
     planes = [np.atleast_3d(channels[name]) for name in names]
@@ -232,8 +257,8 @@ def _exr_part(
     spec = _exr_spec(pixels.shape, [channel for name in names for channel in CHANNELS[name].names], formats, header)
     deflated = encoding.compression.startswith("zip")
     spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
-    if named:
-        spec.attribute("oiio:subimagename", CHANNELS[names[0]].part)
+    if part:
+        spec.attribute("oiio:subimagename", part)
     return np.ascontiguousarray(pixels), spec
 
 
@@ -253,7 +278,14 @@ def _picture(
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
     whole = steps_of(planes, bits)
+    if bits == 10:  # OpenImageIO cuts off what 16 bits have more, so that these have to be those of the ten
+        whole = (whole << 6) | (whole >> 4)
     spec = _spec(whole.shape, "RGBA", oiio.UINT8 if bits == 8 else oiio.UINT16, header)
+    if extension in PLACES and (text := record_text(header.attributes)):
+        spec.attribute(PLACES[extension], text)
+    if extension == ".dpx":
+        spec.attribute("oiio:BitsPerSample", bits)
+        spec.attribute("oiio:Endian", "big")
     if extension == ".png":
         if not header.is_srgb:  # else OpenImageIO says so in the chunks sRGB, gAMA and cHRM
             spec.attribute("oiio:ColorSpace", "unknown")
@@ -283,6 +315,8 @@ def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[An
         spec.channelformats = tuple(oiio.TypeDesc(one) for one in formats)
     if "A" in names:
         spec.alpha_channel = names.index("A")
+    if header.view:
+        spec.attribute("view", header.view)
     for name, matrix in header.matrices.items():
         spec.attribute(name, oiio.TypeMatrix, tuple(float(value) for value in matrix.ravel()))
     for name, (kind, value) in header.typed.items():

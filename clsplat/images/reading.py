@@ -37,7 +37,7 @@ _ROWS = 64
 MAX_FILE_BYTES, FREE_FILE_BYTES = 1 << 30, 1 << 26
 SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
-    *(b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
+    *(b"SDPX", b"XPDS", b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
 )
 """First bytes of pictures larger than FREE_FILE_BYTES: some decoders read the whole of a file that is not theirs."""
 # libjpeg's notes about data that it can do without; every other message means that pixels are lost

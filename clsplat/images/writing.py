@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,8 @@ def _write(path: Path, specs: Sequence[Any], kind: str, steps: Callable[[Any, st
                 written = opens and all(steps(file, name)) and file.close()
             # the last bytes of a full disk are lost without a word
             if written and _is_whole(temporary, kind, len(specs)):
+                if kind == "dpx":
+                    _without_name(temporary)
                 return
             reason = "the file is not whole" if written else file.geterror()
             if error := room_error(temporary.parent):  # OpenImageIO seldom says that the system refuses to write
@@ -116,6 +119,19 @@ def _write(path: Path, specs: Sequence[Any], kind: str, steps: Callable[[Any, st
             raise ClsplatError(f"{path}: cannot be written: {plain(one_line(reason))}")
         finally:
             file.close()
+
+
+_DPX_NAME = slice(36, 136)
+"""Bytes of a DPX's header that have the file's name (SMPTE ST 268)."""
+
+
+def _without_name(path: Path) -> None:
+    """Empty the place of a DPX's header where OpenImageIO writes the path: of the same frame all bytes are the same."""
+    with open(path, "r+b") as file:
+        file.seek(_DPX_NAME.start)
+        file.write(bytes(_DPX_NAME.stop - _DPX_NAME.start))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:

@@ -19,14 +19,15 @@ from clsplat.reference.render import parameters
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """(H, W) each but for normal and position (H, W, 3) and motion (H, W, 2): eqs. (60) to (67). All 0, and index -1,
-    where nothing is added. doubt (H, W): the least distance of what decides to its threshold: transmittance to one
-    half, and the largest weight to the second largest, both as differences."""
+    """(H, W) each but for normal and position (H, W, 3), motion and backward (H, W, 2): eqs. (60) to (67). All 0, and
+    index -1, where nothing is added. doubt (H, W): the least distance of what decides to its threshold: transmittance
+    to one half, and the largest weight to the second largest, both as differences."""
 
     depth: Float64
     normal: Float64
     position: Float64
     motion: Float64
+    backward: Float64
     median: Float64
     first: Float64
     count: Int64
@@ -54,8 +55,11 @@ def motions(means: Float64, camera: Camera, after: Camera) -> Float64:
     return np.where(moved[:, None], there - here, 0.0)
 
 
-def features(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera) -> dict[str, Float64]:
-    """Features of each Gaussian, (N, 1 to 3), by the name of the channel that they are blended to."""
+def features(
+    projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, before: Camera | None = None
+) -> dict[str, Float64]:
+    """Features of each Gaussian, (N, 1 to 3), by the name of the channel that they are blended to. before: the camera
+    of backward motion, `after` if None."""
     arrays = parameters(gaussians)
     means = arrays["means"]
     return {
@@ -63,13 +67,16 @@ def features(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camer
         "normal": normals(means, arrays["quaternions"], arrays["log_scales"], camera),
         "position": means,
         "motion": motions(means, camera, after),
+        "backward": motions(means, camera, before or after),
     }
 
 
-def channels(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera) -> Channels:
-    """Blend front to back."""
+def channels(
+    projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, earlier: Camera | None = None
+) -> Channels:
+    """Blend front to back. earlier: the camera of backward motion, `after` if None."""
     width, height = camera.width, camera.height
-    rows = np.concatenate(list(features(projected, gaussians, camera, after).values()), axis=1)
+    rows = np.concatenate(list(features(projected, gaussians, camera, after, earlier).values()), axis=1)
     sums, total = np.zeros((height, width, rows.shape[1])), np.zeros((height, width))
     median, first, largest, second = (np.zeros((height, width)) for _ in range(4))
     count, index = np.zeros((height, width), np.int64), np.full((height, width), -1, np.int64)
@@ -97,6 +104,7 @@ def channels(projected: Seen, gaussians: Gaussians, camera: Camera, after: Camer
         normal=normal,
         position=means_of[:, :, 4:7],
         motion=means_of[:, :, 7:9],
+        backward=means_of[:, :, 9:11],
         median=median,
         first=first,
         count=count,

@@ -95,29 +95,35 @@ class Renderer:
         wanted: Collection[str] = (),
         *,
         after: Camera | None = None,
+        before: Camera | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         contiguous: bool = True,
     ) -> tuple[RenderResult, ChannelResult]:
         """Render a view with channels beside colour (docs/channels.md).
 
-        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None. The
-        rest is like `render`. Raises InputError for motion from one projection to another.
+        wanted: of "normal", "position", "motion" and "backward"; after, before: the cameras that motion and backward
+        motion go to, the view's own if None. The rest is like `render`. Raises InputError for motion from one
+        projection to another.
         """
         features = Features.of(wanted)
-        after = after or camera
         camera.check()
-        after.check()
-        if "motion" in wanted and any(camera.radial):
-            raise InputError("motion is not defined for a fisheye with coefficients, expected one without or a pinhole")
-        if "motion" in wanted and after.projection != camera.projection:
-            raise InputError(
-                f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
-            )
+        others = {"motion": after or camera, "backward": before or camera}
+        for name, other in others.items():
+            other.check()
+            if name in wanted and any(camera.radial):
+                raise InputError(
+                    f"{name} is not defined for a fisheye with coefficients, expected one without or a pinhole"
+                )
+            if name in wanted and other.projection != camera.projection:
+                raise InputError(
+                    f"{name} goes from a camera to one that is {other.projection}, expected {camera.projection}"
+                )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
         on_device, camera = self._placed(gaussians, camera, features.floats)
-        after = gaussians.local(after) if isinstance(gaussians, Gaussians) else after
+        local = gaussians.local if isinstance(gaussians, Gaussians) else lambda other: other
         frame = self._forward(on_device, camera, background)
-        planes = self._rasterizer.channels(on_device, frame, features, upload(self.device, pack_camera(after)))
+        packed = [upload(self.device, pack_camera(local(other))) for other in others.values()]
+        planes = self._rasterizer.channels(on_device, frame, features, *packed)
         height, width = camera.height, camera.width
         means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
         if contiguous:

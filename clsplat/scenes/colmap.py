@@ -86,10 +86,16 @@ def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera
     scene is trained with (`Lens.camera`), at full size. Raises InputError and warns as `read_model`, and
     warns of lenses beyond reason.
     """
+    return cameras_of(read_images(folder), lenses)
+
+
+def read_images(folder: Path) -> list[PosedImage]:
+    """The images of a model, sorted by name, of a folder as of `read_cameras`. Raises InputError and warns as
+    `read_model`."""
     model = find_model(Path(folder))
     if model is None:
         raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
-    return cameras_of(_read_posed_images(model), lenses)
+    return _read_posed_images(model)
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,6 +117,12 @@ class Lens:
         where = (self.width, self.height, *focal, *centre, rotation, translation)
         return Camera(*where, projection="fisheye", radial=radial)
 
+    def bare(self, rotation: Float64, translation: Float64) -> Camera:
+        """The pinhole camera of its size, focal lengths and principal point, as if it did not bend."""
+        of = self._camera()
+        focal, centre = (of.focal_length_x, of.focal_length_y), (of.principal_point_x, of.principal_point_y)
+        return Camera(self.width, self.height, *focal, *centre, rotation, translation)
+
     def resized(self, width: int, height: int) -> Lens:
         """The same lens on another pixel grid."""
         if self.model == PANORAMA:
@@ -143,6 +149,10 @@ class Lens:
     def img_from_cam(self, points: Float64) -> Float64:
         """Project points (N, 3) in camera space to pixels (N, 2); NaN where the model has no image of them."""
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
+
+    def cam_from_img(self, pixels: Float64) -> Float64:
+        """Where the rays of pixels (N, 2) meet the plane z = 1, (N, 2); NaN where the model has none."""
+        return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
         camera = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))

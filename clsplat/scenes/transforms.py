@@ -75,7 +75,12 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
     `size`, (width, height). Raises InputError as `read_transforms`; warns of what contradicts itself, and of
     lenses beyond reason.
     """
-    return cameras_of(_images(path, _readers(path, load_document(path)), size), lenses)
+    return cameras_of(read_images(path, size), lenses)
+
+
+def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
+    """The images of a transforms.json, in its order, whose pictures need not be there, as of `read_poses`."""
+    return _images(path, _readers(path, load_document(path)), size)
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:

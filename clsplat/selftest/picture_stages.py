@@ -23,7 +23,8 @@ from clsplat.stages.channels import WIDTHS, Channels, Features, channels, featur
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera
 
-ALL = Features.of(WIDTHS)
+ALL = Features.of(name for name in WIDTHS if name != "backward")
+"""Backward motion is motion to another camera, by the same function."""
 SIDEWAYS = 1e-4
 """Cosine between a normal and the direction to the camera under which a rounding decides which side is seen."""
 DOUBT = 1e-5

@@ -8,14 +8,17 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+from clsplat.config.pictures import VideoConfig
 from clsplat.errors import InputError, reason_of
 from clsplat.files import abandoned, is_file
 from clsplat.images.frame_files import attribute, is_foreign, is_whole
-from clsplat.sequence.task import SETTINGS, RenderOptions, Task, picture_camera, settings_digest
+from clsplat.images.records import MODEL, SETTINGS
+from clsplat.sequence.task import RenderOptions, Task, digest_of, picture_camera, settings_digest
 
 MOST_WRITERS = 8
-WHAT_IT_IS = ("clsplat:model", "clsplat:colorspace")
+WHAT_IT_IS = (MODEL, "clsplat:colorspace")
 """Attributes of a file that say whether it is the one that is wanted."""
 
 
@@ -53,12 +56,19 @@ def is_complete(task: Task, options: RenderOptions) -> bool:
     attributes = {name: value for name, value in options.attributes.items() if name in WHAT_IT_IS}
     attributes[SETTINGS] = settings_digest(task, options)
     camera, deep = picture_camera(task, options), options.deep is not None
-    return is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, attributes, deep=deep)
+    kind: dict[str, Any] = {"deep": deep, "views": len(task.views)}
+    return is_whole(task.path, camera.width, camera.height, options.channels, options.encoding, attributes, **kind)
 
 
-def complete(tasks: Sequence[Task], options: RenderOptions) -> set[int]:
-    """The numbers of the frames that `--skip-existing` leaves out."""
-    return {task.number for task in _those(tasks, lambda task: is_complete(task, options))}
+def made_of(tasks: Sequence[Task], options: RenderOptions, config: VideoConfig) -> dict[str, Any]:
+    """The record of a video of these frames."""
+    frames = [(task.number, settings_digest(task, options)) for task in tasks]
+    return {MODEL: options.attributes.get(MODEL), SETTINGS: digest_of(frames, config)}
+
+
+def complete(tasks: Sequence[Task], options: RenderOptions) -> set[str]:
+    """The keys of the frames that `--skip-existing` leaves out."""
+    return {task.key for task in _those(tasks, lambda task: is_complete(task, options))}
 
 
 def untold(tasks: Sequence[Task]) -> list[Path]:

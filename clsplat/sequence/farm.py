@@ -122,11 +122,11 @@ def render_on_farm(
     if not job.options.channels:
         raise ValueError("no channels")
     placed = [replace(task, path=task.path.absolute(), before=stamp(task.path)) for task in tasks]
-    names = {task.number: str(task.path) for task in tasks}
+    names = {task.key: str(task.path) for task in tasks}
     with _client(scheduler, workers) as client, _telling_of_no_workers(client, scheduler):
         results = _results(client, placed, job, video)
         for record in encoded(placed, results, video):
-            on_done(replace(record, path=names[record.frame]))
+            on_done(replace(record, path=names[record.key]))
     # A worker that was killed while it wrote has left a file; none writes any more.
     remove_temporaries(tasks)
 
@@ -140,7 +140,7 @@ def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWri
 
     def submit(count: int) -> list[Any]:
         return [
-            client.submit(render_frame, task, job, key=f"{prefix}-{task.number}", pure=False)
+            client.submit(render_frame, task, job, key=f"{prefix}-{task.key}", pure=False)
             for task in islice(left, count)
         ]
 

@@ -22,7 +22,16 @@ from clsplat.models.edit import exposed
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
 from clsplat.selftest.trust import require
-from clsplat.sequence.task import RenderOptions, Task, camera_after, header, picture_camera, sampling_of
+from clsplat.sequence.task import (
+    RenderOptions,
+    Task,
+    camera_after,
+    camera_before,
+    header,
+    lens_of,
+    picture_camera,
+    sampling_of,
+)
 
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
@@ -32,12 +41,13 @@ TRANSFERS = ("read", "write", "fill")
 class RenderedFrame:
     """A frame before it is encoded. planes: None for one that was written strip by strip; seconds: time that it took;
     finish: the rest of the work on the planes, which the encoding thread does; measured: further values of its
-    `Record`."""
+    `Record`; right: planes of the right eye, where one file has both."""
 
     planes: Planes | None
     seconds: float
     finish: Callable[[Planes], Planes] = lambda planes: planes
     measured: Mapping[str, Any] = field(default_factory=dict)
+    right: Planes | None = None
 
 
 RenderFrame = Callable[[Task], RenderedFrame]
@@ -58,23 +68,32 @@ class FrameRenderer:
 
     def check(self, tasks: Sequence[Task]) -> None:
         """Raise InputError for a frame that the file's kind cannot hold as it has to be rendered here."""
-        if self.options.encoding.parts == "one":
-            return
-        for camera in (picture_camera(task, self.options) for task in tasks if not task.is_video):
+        several = self.options.encoding.parts != "one"
+        for task in (task for task in tasks if not task.is_video and (several or task.right)):
+            camera = picture_camera(task, self.options)
             if self._rows(camera) < camera.height:
-                check_parts(camera, self.options.encoding)
+                check_parts(camera, self.options.encoding, views=len(task.views))
 
     def __call__(self, task: Task) -> RenderedFrame:
         """The frame. Raises ClsplatError where it cannot be rendered, or, if it is written here, not be written."""
         device = self._renderer.device
         if not device.profile:
-            return self._frame(task)
+            return self._pair(task)
         with device.recorder.recording(wait=False) as stages:
-            frame = self._frame(task)
+            frame = self._pair(task)
         times = [(name, taken) for record in stages.values() for name, taken in record.kernels.items()]
         kernels = sum(taken for name, taken in times if name not in TRANSFERS)
         device_ms = {"kernel_ms": kernels, "transfer_ms": sum(taken for _, taken in times) - kernels}
         return replace(frame, measured={**frame.measured, **device_ms})
+
+    def _pair(self, task: Task) -> RenderedFrame:
+        """The frame, with that of the right eye where its file has both."""
+        left = self._frame(task)
+        if task.right is None:
+            return left
+        right = self._frame(task.right)
+        blank = {"blank": left.measured["blank"] and right.measured["blank"]}
+        return replace(left, right=right.planes, seconds=left.seconds + right.seconds, measured=blank)
 
     def _frame(self, task: Task) -> RenderedFrame:
         self._trust(task.camera)
@@ -86,7 +105,8 @@ class FrameRenderer:
             empty = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
             return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
         sampling = sampling_of(task, options)
-        draw, finish = pipeline.draw(task.at, camera_after(task, options), sampling)
+        around = camera_after(task, options), camera_before(task, options)
+        draw, finish = pipeline.draw(task.at, *around, lens_of(task, options), sampling)
         rows = self._rows(camera)
         if rows < camera.height and not task.is_video:
             blanks: list[bool | None] = []

@@ -32,7 +32,7 @@ class Sharing:
 
     def __init__(self, options: RenderOptions) -> None:
         self.options = options
-        self._claims: dict[int, Path] = {}
+        self._claims: dict[str, Path] = {}
         self._changing, self._closed = threading.Lock(), threading.Event()
         threading.Thread(target=self._hold, name="clsplat-claims", daemon=True).start()
 
@@ -47,7 +47,7 @@ class Sharing:
             give_back(claimed)
             return "done"
         with self._changing:
-            self._claims[task.number] = claimed
+            self._claims[task.key] = claimed
         return "ours"
 
     def _hold(self) -> None:
@@ -61,7 +61,7 @@ class Sharing:
     def end(self, task: Task) -> None:
         """The frame's file is there, or will not be."""
         with self._changing:
-            claimed = self._claims.pop(task.number, None)
+            claimed = self._claims.pop(task.key, None)
         if claimed is not None:
             give_back(claimed)
 

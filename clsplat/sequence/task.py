@@ -20,28 +20,42 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.files import digest, is_file
+from clsplat.frame.lens import ByLens, ByMap, Places, Warp
 from clsplat.frame.times import shutter_times
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
-from clsplat.images.frame_files import VIDEO, Header, camera_matrices
+from clsplat.images.frame_files import VIDEOS, Header, camera_matrices, is_whole_panorama
+from clsplat.images.records import SETTINGS
+from clsplat.images.stmap import read_stmap
+from clsplat.scenes.data_set import Lens
 from clsplat.shots import Shot
+from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
-from clsplat.shots.motion import Moments, continued, moments, stretches
-from clsplat.shots.motion import camera_after as following
+from clsplat.shots.motion import Moments, moments
 from clsplat.shots.optics import Optics, headers, settled
 
-SETTINGS = "clsplat:settings"
-"""The attribute of EXR and PNG files that holds it."""
-_ENCODED = {".exr": ("depth", "parts", "compression"), ".png": ("bits",)}
+LATLONG: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
+"""OpenImageIO's words for EXR's envmap; and that no smaller versions follow, for which it would keep the file open."""
+_ENCODED = {
+    ".exr": ("depth", "parts", "compression"),
+    **dict.fromkeys((".png", ".tif", ".tiff", ".dpx"), ("bits",)),
+    **dict.fromkeys((".jpg", ".jpeg"), ("quality",)),
+    ".mov": ("prores",),
+}
 """Settings of the encoding that a file of that extension depends on."""
+
+
+def key_of(number: int, eye: str) -> str:
+    """Name of a frame among those of a job."""
+    return f"{number} {eye}" if eye else str(number)
 
 
 @dataclass(frozen=True)
 class Record:
     """Record of a frame that is done. seconds: of rendering and writing it, without waiting; skipped: it was there;
-    blank: nothing of the model is in it, None where that was not looked at; kernel_ms, transfer_ms: the device's, where
-    that was asked for."""
+    eye: of a stereo pair in two files; blank: nothing of the model is in it, None where that was not looked at;
+    kernel_ms, transfer_ms: the device's, where that was asked for."""
 
     name: str
     frame: int
@@ -49,10 +63,16 @@ class Record:
     width: int
     height: int
     seconds: float
+    eye: str | None = None
     skipped: bool = False
     blank: bool | None = None
     kernel_ms: float | None = None
     transfer_ms: float | None = None
+
+    @property
+    def key(self) -> str:
+        """That of its task."""
+        return key_of(self.frame, self.eye or "")
 
     def document(self) -> dict[str, Any]:
         """The record for JSON, without what was not measured."""
@@ -62,9 +82,11 @@ class Record:
 @dataclass(frozen=True, eq=False)
 class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
-    camera that motion goes to, of the same size, where motion is asked for; stretch: where the camera is while the
-    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`; sampling: shutter and
-    lens, None for those of all; optics: what a stage has of them.
+    camera that motion goes to, of the same size, where motion is asked for; earlier: that of backward motion likewise;
+    stretch: where the camera is while the shutter is open, None where it stands still; path: of the file; before: see
+    `existing.stamp`; sampling: shutter and lens, None for those of all; optics: what a stage has of them; eye: left or
+    right of a stereo pair; right: the frame of the right eye, where one file has both; lens: of the photograph that the
+    picture is bent as.
     """
 
     number: int
@@ -72,10 +94,24 @@ class Task:
     camera: Camera
     path: Path
     after: Camera | None = None
+    earlier: Camera | None = None
     stretch: Shot | Moments | None = None
     before: tuple[int, ...] | None = None
     sampling: SamplingConfig | None = None
     optics: Optics | None = None
+    eye: str = ""
+    right: Task | None = None
+    lens: Lens | None = None
+
+    @property
+    def key(self) -> str:
+        """Name of the frame among those of its job."""
+        return key_of(self.number, "" if self.right else self.eye)
+
+    @property
+    def views(self) -> tuple[Task, ...]:
+        """The frames that its file holds: itself, and that of the right eye where one file has both."""
+        return (self,) if self.right is None else (self, self.right)
 
     def at(self, time: float) -> Camera:
         """The camera of the whole frame at a time in frames from the frame."""
@@ -87,12 +123,14 @@ class Task:
         def seen(camera: Camera) -> Camera:
             return camera.before(gaussians.near).along_rays(gaussians.by_rays)
 
-        return replace(self, camera=seen(self.camera), after=None if self.after is None else seen(self.after))
+        after, earlier = (other and seen(other) for other in (self.after, self.earlier))
+        right = self.right and self.right.seen_by(gaussians)
+        return replace(self, camera=seen(self.camera), after=after, earlier=earlier, right=right)
 
     @property
     def is_video(self) -> bool:
         """True if the file holds other frames too."""
-        return self.path.suffix.lower() == VIDEO
+        return self.path.suffix.lower() in VIDEOS
 
 
 def make_tasks(
@@ -106,15 +144,16 @@ def make_tasks(
     """The frames of `chosen`, which are of the shot `whole`. Raises InputError for files that would be one, unless it
     is a video, and for cameras that these channels, or the lens, are not defined for."""
     sampling = sampling or SamplingConfig()
-    motion = "motion" in channels
+    motion, backward = "motion" in channels, "backward" in channels
     whole.check(channels)
     indices = {frame.number: index for index, frame in enumerate(whole.frames)}
-    if Path(pattern).suffix.lower() == VIDEO:
+    if Path(pattern).suffix.lower() in VIDEOS:
         paths = [Path(pattern)] * len(chosen.frames)
     else:
         paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
-    moves = sampling.moves and whole.moment is None
-    stretch = stretches(whole, resize, *sampling.shutter, motion=motion) if moves else lambda number: None
+    stretch: Callable[[int], Shot | None] = lambda number: None  # noqa: E731
+    if sampling.moves and whole.moment is None:
+        stretch = moving.stretches(whole, resize, *sampling.shutter, motion=motion, backward=backward)
     tasks = []
     for frame, path in zip(chosen.frames, paths, strict=True):
         camera = resize(frame.camera)
@@ -122,27 +161,30 @@ def make_tasks(
         own.check()
         if own.has_lens and camera.projection != "perspective":
             raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
-        after = None
+        after = earlier = None
         if motion:
-            after = resize(following(whole, indices[frame.number])).resized(camera.width, camera.height)
+            after = resize(moving.camera_after(whole, indices[frame.number])).resized(camera.width, camera.height)
+        if backward:
+            earlier = resize(moving.camera_before(whole, indices[frame.number])).resized(camera.width, camera.height)
         looked_at: Shot | Moments | None = stretch(frame.number)
         if whole.moment is not None and own.shutter != (0.0, 0.0):
             times = [own.middle, *own.shutter, *(shutter_times(own) if own.moves else ())]
             looked_at = moments(whole, resize, frame.number, times)
-            if motion:
-                after = _after_middle(whole, resize, frame.number, own.middle)
-        more = (own, frame.optics) if frame.optics is not None else ()
-        tasks.append(Task(frame.number, frame.name, camera, path, after, looked_at, None, *more))
+            after = _beside_middle(whole, resize, frame.number, own.middle, 1) if motion else None
+            earlier = _beside_middle(whole, resize, frame.number, own.middle, -1) if backward else None
+        looks = (after, earlier, looked_at, None, None if frame.optics is None else own, frame.optics)
+        tasks.append(Task(frame.number, frame.name, camera, path, *looks, lens=frame.lens))
     return tasks
 
 
-def _after_middle(shot: Shot, resize: Callable[[Camera], Camera], number: int, middle: float) -> Camera:
-    """The camera a frame after the middle of the shutter; after the shot's last frame it goes on as it did."""
+def _beside_middle(shot: Shot, resize: Callable[[Camera], Camera], number: int, middle: float, way: int) -> Camera:
+    """The camera a frame after the middle of the shutter (way 1) or before it (-1); beyond the shot's ends it goes on
+    as it did."""
     assert shot.moment is not None
-    time = number + middle
-    if time + 1 <= shot.frames[-1].number or len(shot.frames) == 1:
-        return resize(shot.moment(time + 1))
-    return continued(resize(shot.moment(time - 1)), resize(shot.moment(time)))
+    time, first, last = number + middle, shot.frames[0].number, shot.frames[-1].number
+    if first <= time + way <= last or first == last:
+        return resize(shot.moment(time + way))
+    return moving.continued(resize(shot.moment(time - way)), resize(shot.moment(time)))
 
 
 def sampling_of(task: Task, options: RenderOptions) -> SamplingConfig:
@@ -169,11 +211,34 @@ class RenderOptions:
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
-    """The camera of the picture that is written: its size, its window, the middle of the shutter.
+    """The camera of the picture that is written: its size, its window, the middle of the shutter. Of a bent picture it
+    says size and window alone.
 
     Raises InputError for a region that is not in the frame.
     """
-    return framed(task.at(sampling_of(task, options).middle), options.pictures.framing)
+    warp = warp_of(task, options)
+    shown = task.at(sampling_of(task, options).middle) if warp is None else warp.shown
+    return framed(shown, options.pictures.framing)
+
+
+def lens_of(task: Task, options: RenderOptions) -> Places | None:
+    """The lens or the map that bends the picture, None where nothing does. Raises InputError for a map that cannot be
+    read."""
+    if stmap := options.pictures.warp.stmap:
+        return ByMap(read_stmap(Path(stmap)))
+    return ByLens(task.lens) if task.lens is not None else None
+
+
+def warp_of(task: Task, options: RenderOptions) -> Warp | None:
+    """How the picture is bent."""
+    lens = lens_of(task, options)
+    return None if lens is None else Warp(lens, task.at(sampling_of(task, options).middle))
+
+
+def straight_camera(task: Task, options: RenderOptions) -> Camera:
+    """The camera of the picture that is drawn: `picture_camera`, or what a bent one looks at."""
+    camera, warp = picture_camera(task, options), warp_of(task, options)
+    return camera if warp is None else warp.of_window(camera)[1] or camera
 
 
 def camera_after(task: Task, options: RenderOptions) -> Camera | None:
@@ -181,6 +246,13 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     middle = sampling_of(task, options).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
+
+
+def camera_before(task: Task, options: RenderOptions) -> Camera | None:
+    """The camera of the whole frame that backward motion goes to: a frame before the middle of the shutter."""
+    middle = sampling_of(task, options).middle
+    still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
+    return task.earlier if still else task.at(middle - 1)
 
 
 def plain(value: Any) -> Any:
@@ -215,6 +287,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     cameras: list[Camera | Moments] = [picture_camera(task, options)]
     if "motion" in options.channels and (after := camera_after(task, options)) is not None:
         cameras.append(after)
+    if "backward" in options.channels and (before := camera_before(task, options)) is not None:
+        cameras.append(before)
     if sampling.moves and isinstance(task.stretch, Moments):
         cameras.append(task.stretch)
     elif sampling.moves:
@@ -225,7 +299,11 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made += (options.gains,) if options.gains else ()
     made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera show what is beyond it
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
-    return digest_of(cameras, made, encoding, colour, pictures.framing, used)
+    more: list[Any] = [settings_digest(task.right, options)] if task.right is not None else []
+    if (lens := lens_of(task, options)) is not None:
+        bends = lens.stmap.digest if isinstance(lens, ByMap) else task.lens
+        more += [bends, task.at(sampling.middle)]
+    return digest_of(cameras, made, encoding, colour, pictures.framing, used, *more)
 
 
 def _content(source: str) -> str:
@@ -258,16 +336,21 @@ def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG0
     return tuple(sorted({str(home / folder / file) for folder in folders | {""} for file in files}))
 
 
-def header(task: Task, options: RenderOptions) -> Header:
-    """Frame, model, version, settings and colour space; the matrices of a camera that has them; in EXR the window."""
+def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Header:
+    """Frame, model, version, settings and colour space; the matrices of a camera that has them; in EXR the window, and
+    that a panorama is one. whole: the task of the file, where that has other views too."""
     camera = picture_camera(task, options)
     matrices = camera_matrices(camera)
-    attributes = {**options.attributes, "clsplat:frame": task.number, SETTINGS: settings_digest(task, options)}
+    if warp_of(task, options) is not None:
+        matrices.pop("worldToNDC", None)  # no matrix bends
+    attributes = {**options.attributes, "clsplat:frame": task.number, SETTINGS: settings_digest(whole or task, options)}
     space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
         return Header(attributes, matrices, is_srgb=space == SRGB)
     if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
+    if is_whole_panorama(camera):
+        attributes |= LATLONG
     sampling = sampling_of(task, options)
     typed = headers(task.at(sampling.middle), task.number, task.optics, sampling)
-    return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()), typed=typed)
+    return Header(attributes, matrices, camera.window, CHROMATICITIES.get(space, ()), view=task.eye, typed=typed)

@@ -18,21 +18,18 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from clsplat.config.channels import CHANNELS, DEEP
-from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig
+from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig, WarpConfig
 from clsplat.device.child import abandon
 from clsplat.images import frame_files
-from clsplat.images.video import VideoWriter, frame_planes, video_writer
-from clsplat.sequence.existing import MOST_WRITERS
+from clsplat.images.records import record_text
+from clsplat.images.video import VideoPlanes, VideoWriter, planes_of, video_writer
+from clsplat.sequence.existing import MOST_WRITERS, made_of
 from clsplat.sequence.frame_renderer import RenderedFrame, RenderFrame
 from clsplat.sequence.sharing import FrameQueue, Sharing
 from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera, sampling_of
 
-YuvPlanes = NDArray[np.uint8]
-Result = tuple[Record, YuvPlanes | None]
+Result = tuple[Record, VideoPlanes | None]
 """Record of a frame; with the planes that a video takes of it, if it is one's."""
 HOST_BYTES = 1 << 30
 """Main memory for frames that wait to be written, as a guide: three are held in any case."""
@@ -46,9 +43,16 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
     start, yuv = time.monotonic(), None
     if task.is_video:
         assert frame.planes is not None, "frames of a video are not written one by one"
-        yuv = frame_planes(frame.finish(frame.planes)["rgb"])
+        finished = frame.finish(frame.planes)
+        yuv = planes_of(task.path, finished["rgb"], finished.get("alpha"), options.encoding.prores)
     elif frame.planes is not None:
-        frame_files.write_channels(task.path, frame.finish(frame.planes), options.encoding, header(task, options))
+        views = zip(task.views, (frame.planes, frame.right), strict=False)
+        made = [(frame.finish(planes or {}), header(view, options, task)) for view, planes in views]
+        if len(made) == 1:
+            (planes, above), *_ = made
+            frame_files.write_channels(task.path, planes, options.encoding, above)
+        else:
+            frame_files.write_views(task.path, made, options.encoding)
     seconds = frame.seconds + time.monotonic() - start
     return record_of(task, options, seconds=seconds, **frame.measured), yuv
 
@@ -56,19 +60,22 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
 def record_of(task: Task, options: RenderOptions, **values: Any) -> Record:
     """The frame's record with these values beside those of the task."""
     camera = picture_camera(task, options)
-    return Record(task.name, task.number, str(task.path), camera.width, camera.height, **{"seconds": 0.0, **values})
+    whose = {"eye": task.eye} if task.eye and task.right is None else {}
+    what = {"seconds": 0.0, **whose, **values}
+    return Record(task.name, task.number, str(task.path), camera.width, camera.height, **what)
 
 
 def frame_bytes(task: Task, options: RenderOptions) -> int:
     """Main memory that a frame takes until it is written; of one in strips what a strip takes."""
     camera, framing = picture_camera(task, options), options.pictures.framing
-    pixels, finer = camera.width * camera.height, framing.supersample**2
+    pixels, finer = camera.width * camera.height * len(task.views), framing.supersample**2
     if not task.is_video:
         pixels = min(pixels, STRIP_PIXELS // finer)
     if options.deep is not None:
         return COPIES * 4 * min(len(DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
     floats = sum(len(CHANNELS[name].names) for name in options.channels)
     light = 4 if sampling_of(task, options).on or finer > 1 else 0
+    floats += floats if options.pictures.warp != WarpConfig() else 0
     return 4 * pixels * (COPIES * floats + light * (finer if finer > 1 else 2))
 
 
@@ -156,19 +163,23 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
         for record, _ in results:
             yield record
         return
-    waiting: dict[int, tuple[Record, YuvPlanes]] = {}
+    waiting: dict[str, tuple[Record, VideoPlanes]] = {}
     for task in tasks:
-        while task.number not in waiting:
+        while task.key not in waiting:
             record, planes = next(results)
             assert planes is not None
-            waiting[record.frame] = record, planes
-        record, planes = waiting.pop(task.number)
+            waiting[record.key] = record, planes
+        record, planes = waiting.pop(task.key)
         start = time.monotonic()
         video.add(planes)
         yield replace(record, seconds=record.seconds + time.monotonic() - start)
 
 
-def open_video(tasks: Sequence[Task], config: VideoConfig) -> AbstractContextManager[VideoWriter | None]:
+def open_video(
+    tasks: Sequence[Task], config: VideoConfig, options: RenderOptions
+) -> AbstractContextManager[VideoWriter | None]:
     """The video that the tasks are frames of, None where they have files of their own. It takes its name at the end of
     the block, if that ends well."""
-    return video_writer(tasks[0].path, config) if tasks and tasks[0].is_video else nullcontext()
+    if not (tasks and tasks[0].is_video):
+        return nullcontext()
+    return video_writer(tasks[0].path, config, record_text(made_of(tasks, options, config)))

@@ -87,9 +87,19 @@ def camera_after(shot: Shot, index: int) -> Camera:
         return following.camera if following.number == frame.number + 1 else shot.at(frame.number + 1)
     if index == 0:
         return frame.camera
-    before = shot.frames[index - 1]
-    earlier = before.camera if before.number == frame.number - 1 else shot.at(frame.number - 1)
-    return continued(earlier, frame.camera)
+    return continued(camera_before(shot, index), frame.camera)
+
+
+def camera_before(shot: Shot, index: int) -> Camera:
+    """The shot's camera one frame number before its frame of this index.
+
+    Before the first it goes back as it goes on after it: the same rigid motion the other way, as `camera_after`.
+    """
+    frame = shot.frames[index]
+    if index > 0:
+        before = shot.frames[index - 1]
+        return before.camera if before.number == frame.number - 1 else shot.at(frame.number - 1)
+    return frame.camera if len(shot.frames) == 1 else continued(camera_after(shot, 0), frame.camera)
 
 
 def continued(earlier: Camera, now: Camera) -> Camera:
@@ -100,16 +110,24 @@ def continued(earlier: Camera, now: Camera) -> Camera:
 
 
 def stretches(
-    shot: Shot, resize: Callable[[Camera], Camera], opens: float, closes: float, *, motion: bool = False
+    shot: Shot,
+    resize: Callable[[Camera], Camera],
+    opens: float,
+    closes: float,
+    *,
+    motion: bool = False,
+    backward: bool = False,
 ) -> Callable[[int], Shot | None]:
     """The part of the shot that a frame's shutter looks at, by the frame's number, from which its own numbers count;
-    None where nothing can move. opens, closes: frames from the frame; motion: with the middle of the next frame's
-    shutter.
+    None where nothing can move. opens, closes: frames from the frame; motion, backward: with the middle of the shutter
+    of the next frame, and of the frame before.
 
     Before its first frame and after its last the shot goes on as it does there, as for motion. Raises InputError where
     the frames' pictures have several sizes or projections, which is no camera that moves.
     """
-    closes = max(closes, 0.5 * (opens + closes) + 1) if motion else closes
+    middle = 0.5 * (opens + closes)
+    opens = min(opens, middle - 1) if backward else opens
+    closes = max(closes, middle + 1) if motion else closes
     frames = [(frame.number, resize(frame.camera)) for frame in shot.frames]
     if len(frames) == 1:
         return lambda number: None

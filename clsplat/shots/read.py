@@ -3,20 +3,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
-from clsplat.errors import InputError, examples
+from clsplat.errors import InputError, examples, warn
 from clsplat.gaussians import Gaussians
+from clsplat.scenes import colmap, transforms
 from clsplat.scenes.colmap import find_model, read_cameras
+from clsplat.scenes.data_set import PANORAMA, PosedImage, absurd
 from clsplat.scenes.transforms import load_document, read_poses
 from clsplat.shots.around import cameras_around, parse_up
 from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
 from clsplat.shots.generated import PATHS
 from clsplat.shots.nerfstudio import read_camera_path
-from clsplat.shots.shot import MOST_FRAMES, Frame, Shot, named, numbered
+from clsplat.shots.shot import MOST_FRAMES, Frame, Shot, named, numbered, photographs
 from clsplat.shots.usd import read_usd
 from clsplat.shots.usd_settings import window_named
 from clsplat.shots.viewpoints import COLMAP_UP
@@ -66,16 +69,24 @@ def choose_shot(
     size: tuple[int | None, int | None] = (None, None),
     usd_camera: str | None = None,
     lenses: Lenses = "undistort",
+    applied: Collection[str] = (),
+    distort: bool = False,
 ) -> Shot:
     """The shot that --cameras, --path and --count ask for together.
 
     path: turntable, spiral or through: `count` frames of that path, made from the cameras; else the cameras themselves.
-    Raises InputError.
+    applied: names of what the call applies of a stage beside, of which it is not warned. distort: the
+    cameras are those of photographs as they were taken, their lenses with them. Raises InputError.
     """
     if count is not None and path is None:
         raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
     _check_count(count)
-    shot = read_shot(cameras, size=size, usd_camera=usd_camera, lenses=lenses)
+    if distort and path is not None:
+        raise InputError(f"--distort: is of the photographs' own cameras, expected it without --path {path}")
+    if distort:
+        shot = Shot(photographs(photographed(cameras, size)))
+    else:
+        shot = read_shot(cameras, size=size, usd_camera=usd_camera, lenses=lenses)
     if path is not None:
         if not (first := shot.frames[0].camera).kind.flat:
             raise InputError(
@@ -84,7 +95,36 @@ def choose_shot(
         shot = shot.without_optics()
         unapplied = (*shot.unapplied, *window_named(shot.window))
         shot = Shot(_path(path, shot.cameras, count), shot.warnings, unapplied=unapplied)
+    if applied:
+        shot = replace(shot, unapplied=tuple(text for text in shot.unapplied if text.partition(" (")[0] not in applied))
     return shot
+
+
+def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
+    """The photographs' own cameras, with their lenses, of a COLMAP model or a transforms.json. Raises InputError for
+    another source of cameras, for panoramas, which no pinhole shows, and as `read_shot`."""
+    images: list[PosedImage] | None = None
+    if path.is_dir():
+        listed = sorted(file.name for file in path.glob("transforms*.json"))
+        model = find_model(path)
+        if model is not None and not (listed and "colmap" in model.relative_to(path).parts):
+            images = colmap.read_images(path)
+        elif listed == ["transforms.json"]:
+            images = transforms.read_images(path / listed[0], _both(size))
+    elif path.suffix.lower() == ".json" and "frames" in load_document(path, "a transforms.json"):
+        images = transforms.read_images(path, _both(size))
+    if images is None:
+        raise InputError(f"{path}: has no lenses of photographs, expected a COLMAP model's folder or a transforms.json")
+    if wrong := [image.name for image in images if image.lens.model == PANORAMA]:
+        raise InputError(f"{path}: {examples(wrong)} are panoramas, which no straight picture is bent to")
+    if doubt := absurd([(image.name, image.lens) for image in images]):
+        warn(doubt)
+    return images
+
+
+def _both(size: tuple[int | None, int | None]) -> tuple[int, int] | None:
+    width, height = size
+    return (width, height) if width is not None and height is not None else None
 
 
 def shot_around(
@@ -150,6 +190,4 @@ def _read_json(path: Path, size: tuple[int | None, int | None], lenses: Lenses) 
             f"{path}: has neither '{VERSION_KEY}' (a clsplat camera file) nor 'camera_path' (nerfstudio's) nor "
             "'frames' (a transforms.json), expected one of them"
         )
-    width, height = size
-    both = (width, height) if width is not None and height is not None else None
-    return Shot(named(read_poses(path, both, lenses)))
+    return Shot(named(read_poses(path, _both(size), lenses)))

@@ -10,6 +10,7 @@ from math import ceil, floor, isfinite
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
+from clsplat.scenes.data_set import Lens, PosedImage
 from clsplat.shots.frame_numbers import parse_frames, ranges
 from clsplat.shots.keys import Key, interpolate
 from clsplat.shots.optics import Optics
@@ -22,13 +23,15 @@ gigabytes of cameras from a file of few lines."""
 @dataclass(frozen=True, eq=False)
 class Frame:
     """number: what `--frames` and `####` mean; name: what `{name}` means, a picture's path or the number in four
-    digits; time: seconds from the first frame, where the source has any; optics: of a stage, shutter and lens."""
+    digits; time: seconds from the first frame, where the source has any; optics: of a stage, shutter and lens; lens: of
+    the photograph that the frame is to be bent as."""
 
     number: int
     camera: Camera
     name: str
     time: float | None = None
     optics: Optics | None = None
+    lens: Lens | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +86,14 @@ class Shot:
 
     def check(self, channels: Iterable[str] = ()) -> None:
         """Raises InputError where these channels are not defined: motion from one projection to another."""
-        if "motion" not in channels:
+        if not (moving := [name for name in channels if name in ("motion", "backward")]):
             return
         for before, frame in pairwise(self.frames):
             kind, wanted = frame.camera.projection, before.camera.projection
             if kind != wanted:
                 raise InputError(
-                    f"--channels motion: frame {frame.number} is {kind}, expected {wanted} as frame {before.number} is"
+                    f"--channels {moving[0]}: frame {frame.number} is {kind}, expected {wanted} as frame "
+                    f"{before.number} is"
                 )
 
     def at(self, frame: float) -> Camera:
@@ -113,6 +117,15 @@ def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None
         Frame(first + index, camera, f"{first + index:04d}", None if fps is None else index / fps)
         for index, camera in enumerate(cameras)
     )
+
+
+def photographs(images: Iterable[PosedImage]) -> tuple[Frame, ...]:
+    """Frames of pictures as they were taken, by name, from 1 on: pinhole cameras, with the lens where it bends."""
+    frames = []
+    for index, image in enumerate(images, 1):
+        lens = None if image.lens.is_pinhole else image.lens
+        frames.append(Frame(index, image.lens.bare(image.rotation, image.translation), image.name, lens=lens))
+    return tuple(frames)
 
 
 def named(cameras: dict[str, Camera]) -> tuple[Frame, ...]:

@@ -84,8 +84,10 @@ def features(
     camera_array: DeviceArray,
     after: DeviceArray,
     projected: Projected,
+    before: DeviceArray | None = None,
 ) -> DeviceArray:
-    """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
+    """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to; before: the
+    one of backward motion, the same if None."""
     rows = work.array("features", (gaussians.count, wanted.floats))
     for start, stop, (part,) in parts(work, gaussians):
         splats = projected.rows(start, stop)
@@ -96,6 +98,7 @@ def features(
             part.count,
             camera_array,
             after,
+            after if before is None else before,
             splats.tile_counts,
             part["means"],
             part["quaternions"],

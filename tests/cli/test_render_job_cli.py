@@ -28,7 +28,7 @@ from clsplat.shots import choose_shot
 from clsplat.shots.motion import camera_after
 
 COUNT = 6
-ALL = "rgb,alpha,depth,normals,position,motion,median,first,count,id"
+ALL = "rgb,alpha,depth,normals,position,motion,backward,median,first,count,id"
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +76,8 @@ def test_every_channel_is_that_of_the_renderer(shot: list[str], tmp_path: Path, 
     found, (spec,) = read(tmp_path / "a.0002.exr")
     assert list(spec.channelnames[:5]) == ["R", "G", "B", "A", "Z"]
     gaussians = Gaussians.load(shot[0])
-    camera, after = frames[1].camera, frames[2].camera
-    image, own = Renderer().render_channels(gaussians, camera, ("normal", "position", "motion"), after=after)
+    camera, others = frames[1].camera, {"after": frames[2].camera, "before": frames[0].camera}
+    image, own = Renderer().render_channels(gaussians, camera, ("normal", "position", "motion", "backward"), **others)
     wanted = {
         "A": image.alpha,
         "Z": own["depth"],
@@ -86,6 +86,7 @@ def test_every_channel_is_that_of_the_renderer(shot: list[str], tmp_path: Path, 
         "count": own["count"],
     }
     wanted |= {"id": own["index"], "forward.u": own["motion"][:, :, 0], "forward.v": -own["motion"][:, :, 1]}
+    wanted |= {"backward.u": own["backward"][:, :, 0], "backward.v": -own["backward"][:, :, 1]}
     for index in range(3):
         wanted["RGB"[index]] = image.image[:, :, index]
         wanted[f"N.{'xyz'[index]}"] = own["normal"][:, :, index]
@@ -128,12 +129,15 @@ def test_up_in_a_file_is_up_in_the_picture(shot: list[str], tmp_path: Path) -> N
         ("png", "--bits 16 --alpha", "uint16"),
         ("tif", "--alpha", "uint8"),
         ("jpg", "--quality 60", "uint8"),
+        ("dpx", "", "uint10"),
+        ("dpx", "--bits 16 --alpha", "uint16"),
     ],
 )
 def test_formats(extension: str, flags: str, format_: str, shot: list[str], tmp_path: Path) -> None:
     assert render(shot, tmp_path, "--frames", "1", *flags.split(), pattern=f"a.{extension}") == 0
     _, (spec,) = read(tmp_path / f"a.{extension}")
-    assert str(spec.format) == format_
+    bits = spec.get_int_attribute("oiio:BitsPerSample")
+    assert (f"uint{bits}" if extension == "dpx" else str(spec.format)) == format_
     assert spec.nchannels == (4 if "--alpha" in flags else 3)
 
 
@@ -371,7 +375,7 @@ def test_frames_in_strips_and_deep_ones_that_show_nothing(
         assert ("1 of 1 frames show nothing of the model: 2; are the cameras" in captured.err) is blank
 
 
-@pytest.mark.parametrize("extension", ["png", "jpg", "tif", "exr"])
+@pytest.mark.parametrize("extension", ["png", "jpg", "tif", "exr", "dpx"])
 def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     pattern, photo = f"a.####.{extension}", tmp_path / f"a.0002.{extension}"
     pixels = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)

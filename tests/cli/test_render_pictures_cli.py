@@ -260,9 +260,43 @@ def test_a_frame_of_other_settings_is_not_what_is_wanted(
     assert all(line.endswith("not used for .exr: --quality") for line in told if line not in again)
 
 
-def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    assert render(shot, tmp_path, "", "a.####.jpg") == 0
+@pytest.mark.parametrize("extension", ["tif", "jpg", "dpx"])
+def test_files_without_attributes_say_how_they_were_made(
+    extension: str, shot: list[str], tmp_path: Path, capsys: Capture
+) -> None:
+    """In a text of their header, so that there is no file beside them."""
+    pattern = f"a.####.{extension}"
+    assert render(shot, tmp_path, "--frames 1,2", pattern) == 0
+    assert len(list(tmp_path.iterdir())) == 2
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert render(shot, tmp_path, "--frames 1,2 --skip-existing", pattern) == 0
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
     assert capsys.readouterr().err == ""
+    document = json.loads(Path(shot[2]).read_text())
+    document["keys"][1]["position"] = [0.5, 0, -3.9]  # frame 1 is where it was, frame 2 is not
+    (tmp_path / "moved.json").write_text(json.dumps(document))
+    moved = [*shot[:2], str(tmp_path / "moved.json")]
+    assert render(moved, tmp_path, "--frames 1,2 --skip-existing", pattern) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "1 of the frames that are there were made of another model, or with other cameras or settings" in line
+    changed = {path.name for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
+    assert changed == {f"a.0002.{extension}"}
+    other = {"jpg": "--quality 50"}.get(extension, "--bits 16")
+    assert render(moved, tmp_path, f"--frames 1,2 --skip-existing {other}", pattern) == 0
+    assert "2 of the frames that are there were made of another model, or with other" in capsys.readouterr().err
+    replace(hidden_model(), sh=0.9 * hidden_model().sh).save(tmp_path / "other.ply")
+    assert render([str(tmp_path / "other.ply"), *moved[1:]], tmp_path, f"--skip-existing {other}", pattern) == 0
+    assert "2 of the frames that are there were made of another model" in capsys.readouterr().err
+
+
+def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    for number in range(1, 5):
+        spec = oiio.ImageSpec(WIDTH, HEIGHT, 3, oiio.UINT8)
+        spec.attribute("Software", "clsplat of an earlier version")
+        file = oiio.ImageOutput.create("jpg")
+        assert file.open(str(tmp_path / f"a.{number:04d}.jpg"), spec)
+        assert file.write_image(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        assert file.close()
     for more in ("", "--dry-run"):
         assert render(shot, tmp_path, f"--skip-existing --quality 5 {more}", "a.####.jpg") == 0
         (line,) = capsys.readouterr().err.splitlines()
@@ -299,6 +333,30 @@ def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
         lumas = [16 + 219 * np.clip(image, 0, 1) @ [0.2126, 0.7152, 0.0722] for image in means]
         errors = [np.abs(frame[:HEIGHT] - luma).mean() for luma in lumas]
         assert index == 5 or errors[0] < errors[1]
+
+
+@pytest.mark.needs("av")
+@pytest.mark.parametrize(("name", "flags"), [("a.mp4", "--video.crf 10"), ("a.mov", "--video.prores 4444 --alpha")])
+def test_a_video_says_how_it_was_made(name: str, flags: str, shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    video = tmp_path / name
+    assert render(shot, tmp_path, flags, name) == 0
+    stamp, whole = video.stat().st_mtime_ns, video.read_bytes()
+    assert render(shot, tmp_path, f"{flags} --skip-existing --json", name) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert all(record["skipped"] for record in json.loads(captured.out))
+    assert video.stat().st_mtime_ns == stamp
+    for change, content in (("--frames 1-3", whole), ("--region 0,0,8,8", whole), ("", whole[: len(whole) * 2 // 3])):
+        video.write_bytes(content)
+        assert render(shot, tmp_path, f"{flags} --skip-existing {change}", name) == 0
+        assert (
+            f"--skip-existing: {video} is not whole, or was made of another model or frames" in capsys.readouterr().err
+        )
+    assert video.read_bytes() == whole
+    video.write_bytes(b"precious")
+    assert render(shot, tmp_path, f"{flags} --skip-existing", name) == 2
+    assert "is there already" in error_line(capsys)
+    assert video.read_bytes() == b"precious"
 
 
 @pytest.mark.needs("av")
@@ -452,11 +510,16 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--deep", "a.#.tif", "cannot hold deep samples, expected an .exr file"),
         ("--deep --background white", "a.#.exr", "--deep and --background exclude each other"),
         ("--deep.bins 8", "a.#.exr", "expected --deep with them"),
-        ("--video.fps 25", "a.#.exr", "--video flags are of videos, expected the name of an .mp4 file"),
+        ("--video.fps 25", "a.#.exr", "--video flags are of videos, expected the name of an .mp4 or .mov file"),
         ("--channels rgb,depth", "a.mp4", "an MP4 cannot hold depth"),
         ("--alpha", "a.mp4", "an MP4 cannot hold alpha"),
         ("--alpha", "a.#.jpg", "a JPG cannot hold alpha"),
-        ("--skip-existing", "a.mp4", "--skip-existing: a video is written as a whole"),
+        ("--video.prores 422", "a.mp4", "--video.prores 422: is of ProRes, expected the name of a .mov"),
+        ("--video.crf 5", "a.mov", "--video.crf 5: is of H.264, expected the name of an .mp4"),
+        ("--alpha", "a.mov", "ProRes hq cannot hold alpha, expected --video.prores 4444"),
+        ("--bits 8", "a.#.dpx", "a.#.dpx has 10 or 16 bits, expected one of them"),
+        ("--bits 10", "a.#.png", "--bits 10: is of DPX, expected 8 or 16"),
+        ("--alpha", "a.#.dpx", "a DPX of 10 bits is written without alpha here, expected --bits 16"),
         ("--video.crf 99", "a.mp4", "--video.crf 99: expected 0 to 51"),
         ("--colorspace ACEScg", "a.#.png", "its colours would be ACEScg, which is linear, expected sRGB; write .exr"),
         ("--colorspace lin_rec709 --bits 16", "a.#.tif", "would be lin_rec709, which is linear, expected sRGB"),

@@ -51,13 +51,14 @@ def test_the_planes_behind_the_features_are_those_of_the_kernel() -> None:
 def test_a_frame_taken_apart_has_every_plane_once() -> None:
     features = Features.of(WIDTHS)
     assert features.defines == {
-        "FEATURES": 9,
+        "FEATURES": 11,
         "FEATURE_DEPTH": 0,
         "FEATURE_NORMAL": 1,
         "FEATURE_POSITION": 4,
         "FEATURE_MOTION": 7,
+        "FEATURE_BACKWARD": 9,
     }
-    means, whole = np.arange(11.0).reshape(1, 1, 11), np.arange(20, 22).reshape(1, 1, 2)
+    means, whole = np.arange(13.0).reshape(1, 1, 13), np.arange(20, 22).reshape(1, 1, 2)
     planes = features.named(means, whole)
     rest = [channel for channel in CHANNELS.values() if not channel.is_light]
     assert set(planes) == {channel.kernel for channel in rest}
@@ -65,7 +66,7 @@ def test_a_frame_taken_apart_has_every_plane_once() -> None:
         count = len(channel.names)
         assert planes[channel.kernel].shape == ((1, 1) if count == 1 else (1, 1, count))
     together = np.concatenate([planes[channel.kernel].ravel() for channel in rest])
-    assert sorted(together) == [*range(11), 20, 21]
+    assert sorted(together) == [*range(13), 20, 21]
 
 
 def test_light_is_what_files_call_colour_of_the_image() -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from clsplat.config.pictures import VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.images.video import check_video, frame_planes, video_writer
+from clsplat.images.video import check_video, frame_planes, prores_planes, video_record, video_writer
 
 require("av")
 import av  # noqa: E402
@@ -116,6 +116,76 @@ def test_the_same_bytes_twice_and_smaller_at_less_quality(tmp_path: Path) -> Non
     assert len(sizes["c"]) < len(sizes["a"]) / 2
 
 
+def ramps(width: int, height: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A smooth picture, and its alpha, which it is associated with."""
+    image = frames(1, width, height)[0]
+    alpha = np.broadcast_to(np.linspace(0.1, 1, width, dtype=np.float32), (height, width))
+    return image * alpha[:, :, None], alpha
+
+
+def straight(path: Path) -> tuple[list[NDArray[np.float64]], Any]:
+    """Planes of a ProRes file's first frame, from 0 to 1023, and its stream."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frame = next(container.decode(stream))
+        scale = 2 ** (int(frame.format.name[-4:-2]) - 10)  # FFmpeg decodes 4444 to twelve bits
+        planes = []
+        for plane in frame.planes:
+            values = np.frombuffer(plane, np.uint16).reshape(plane.height, -1)[:, : plane.width]
+            planes.append(values.astype(np.float64) / scale)
+        return planes, stream
+
+
+@pytest.mark.parametrize(("prores", "tag"), [("422", "apcn"), ("hq", "apch"), ("4444", "ap4h")])
+@pytest.mark.parametrize("width", [64, 63])
+def test_prores(prores: Any, tag: str, width: int, tmp_path: Path) -> None:
+    path, planes = tmp_path / "a.mov", prores_planes(frames(1, width, 48)[0], None, prores)
+    written = set()
+    for _ in range(2):
+        with video_writer(path, VideoConfig(fps=25, prores=prores), "clsplat model ab settings cd") as video:
+            video.add(planes)
+            video.add(planes)
+        written.add(path.read_bytes())
+    assert len(written) == 1
+    got, stream = straight(path)
+    context = stream.codec_context
+    assert (context.name, context.codec_tag, stream.average_rate, stream.frames) == ("prores", tag, 25, 2)
+    assert (context.color_range, context.colorspace, context.color_primaries, context.color_trc) == (1, 1, 1, 1)
+    assert stream.width == (width if prores == "4444" else 64)
+    # quantisation of a smooth ramp: 4 of 876 steps at the most, less than one in the mean
+    for values, wanted in zip(got, planes, strict=True):
+        assert np.abs(values - wanted).max() <= 4
+        assert np.abs(values - wanted).mean() < 1
+    assert video_record(path, 2) == {"clsplat:model": "ab", "clsplat:settings": "cd"}
+    assert video_record(path, 3) == {}
+
+
+def test_prores_with_alpha(tmp_path: Path) -> None:
+    path, (image, alpha) = tmp_path / "a.mov", ramps(64, 48)
+    with video_writer(path, VideoConfig(prores="4444")) as video:
+        video.add(prores_planes(image, alpha, "4444"))
+    got, stream = straight(path)
+    assert stream.codec_context.pix_fmt.startswith("yuva444")
+    # ProRes loses nothing of it: half of a step of ten bits, and of the twelve that FFmpeg decodes, 0 to 4095
+    np.testing.assert_allclose(got[3] * 4 * 1023 / 4095, 1023 * alpha, atol=0.5 + 0.125)
+    luma = frames(1, 64, 48)[0] @ np.array([0.2126, 0.7152, 0.0722])
+    assert np.abs(got[0] - (64 + 876 * luma)).max() <= 6  # straight, and quantised
+
+
+def test_prores_by_hand() -> None:
+    """Black, white and pure red in ten bits of Rec.709 in limited range."""
+    rgb = np.zeros((2, 4, 3), np.float32)
+    rgb[1], rgb[0, 2:] = 1, (1, 0, 0)
+    luma, blue, red = prores_planes(rgb, None, "4444")
+    assert (luma[0, 0], luma[1, 0]) == (64, 940)
+    assert (blue[1] == 512).all()
+    # 64 + 876 * 0.2126; 512 - 896 * 0.2126 / 1.8556; 512 + 896 / 2
+    assert (luma[0, 3], blue[0, 3], red[0, 3]) == (250, 409, 960)
+    narrow = prores_planes(rgb, None, "hq")
+    assert [plane.shape for plane in narrow] == [(2, 4), (2, 2), (2, 2)]
+    assert narrow[2][0, 1] == 848  # of a red pixel at the left site's right, and a black one at its left: 3/4
+
+
 def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     path.write_bytes(b"before")
@@ -134,7 +204,7 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"a\.avi: has the extension '\.avi', expected \.mp4"):
+    with pytest.raises(InputError, match=r"a\.avi: has the extension '\.avi', expected \.mp4 or \.mov"):
         check_video(tmp_path / "a.avi")
     with pytest.raises(InputError, match=r"no such folder to write a\.mp4 to"):
         check_video(tmp_path / "none" / "a.mp4")

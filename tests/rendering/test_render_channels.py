@@ -6,10 +6,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import scenes
 from compare import assert_same_bits
 
+from clsplat.camera import PROJECTIONS, Projection
 from clsplat.device.context import open_device
+from clsplat.errors import InputError
 from clsplat.rendering.renderer import ChannelResult, Renderer, RenderResult
 
 SCENE = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
@@ -48,3 +51,33 @@ def test_the_picture_is_that_of_render() -> None:
     still = renderer.render_channels(*SCENE, ("motion",))[1]
     assert not still["motion"].any()
     assert np.abs(found["motion"]).max() > 0.1
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_backward_motion_is_forward_motion_of_the_frame_before(projection: Projection) -> None:
+    """Of one Gaussian all pixels have the same motion, so that it does not matter which of them a frame shows."""
+    gaussians, camera = scenes.one()
+    focals = {"equirectangular": camera.width / (2 * np.pi), "orthographic": 0.3 * camera.width}
+    focal = focals.get(projection, camera.fx)
+    first = replace(camera, fx=focal, fy=focal, projection=projection)
+    second = first.moved(np.array([0.01, -0.02, 0.015, 0.05, -0.03, 0.1]))
+    renderer = Renderer(open_device())
+    there, back = (
+        renderer.render_channels(gaussians, view, (name,), **{way: other})[1]
+        for view, name, way, other in (
+            (first, "motion", "after", second),
+            (second, "backward", "before", first),
+        )
+    )
+    forward = there["motion"][there["count"] > 0][0]
+    backward = back["backward"][back["count"] > 0][0]
+    assert np.abs(forward).max() > 0.1  # a panorama has few pixels a radian
+    # a pixel's place has about 1e-5 of rounding, of each of the two
+    np.testing.assert_allclose(backward, -forward, atol=1e-4)
+
+
+def test_backward_motion_of_another_projection_is_refused() -> None:
+    gaussians, camera = scenes.one()
+    other = replace(camera, projection="orthographic")
+    with pytest.raises(InputError, match="backward goes from a camera to one that is orthographic, expected perspec"):
+        Renderer(open_device()).render_channels(gaussians, camera, ("backward",), before=other)

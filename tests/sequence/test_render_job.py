@@ -20,16 +20,17 @@ from scenes import tilted_camera
 
 from clsplat.camera import Camera
 from clsplat.config.channels import CHANNELS
-from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig
+from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import temporary_name
 from clsplat.frame.draw import Planes
 from clsplat.sequence import existing, workers
+from clsplat.sequence import task as sequence_task
 from clsplat.sequence.existing import is_complete
 from clsplat.sequence.frame_renderer import FrameRenderer, RenderedFrame
 from clsplat.sequence.task import Record, RenderOptions, Task, make_tasks, settings_digest
 from clsplat.sequence.workers import encode_frame, run_tasks
-from clsplat.shots.motion import camera_after, stretches
+from clsplat.shots.motion import camera_after, camera_before, stretches
 from clsplat.shots.shot import Frame, Shot, numbered
 
 EVERYTHING = tuple(CHANNELS)
@@ -83,6 +84,28 @@ def test_motion_goes_to_the_next_frame_number() -> None:
     before, last = gappy.at(4), shot.frames[4].camera
     further = camera_after(gappy, 2)
     np.testing.assert_allclose(further.rotation @ last.rotation.T, last.rotation @ before.rotation.T, atol=1e-12)
+
+
+def test_backward_motion_goes_to_the_frame_number_before() -> None:
+    shot = circle(5)
+    for index in range(1, 5):
+        assert camera_before(shot, index) is shot.frames[index - 1].camera
+    assert_same_pose(camera_before(shot, 0), turned(-0.1))  # a turntable turned before
+    alone = Shot(shot.frames[2:3])
+    assert camera_before(alone, 0) is shot.frames[2].camera
+    gappy = Shot((shot.frames[0], shot.frames[2], shot.frames[4]))
+    assert_same_pose(camera_before(gappy, 1), gappy.at(2))
+    (task,) = make_tasks(shot.only("1"), shot, "{frame}.exr", lambda camera: camera, ("rgb", "backward"))
+    assert task.earlier is not None
+    assert task.after is None
+    assert_same_pose(task.earlier, turned(-0.1))
+    # of a shutter that is open after the frame: from its middle to the middle before
+    late = SamplingConfig(shutter_open=0.0, shutter_close=0.5)
+    (task,) = make_tasks(shot.only("1"), shot, "{frame}.exr", lambda camera: camera, ("rgb", "backward"), late)
+    before = sequence_task.camera_before(task, RenderOptions(pictures=PictureConfig(sampling=late)))
+    assert before is not None
+    # a circle's cameras between frames are interpolated: within a thousandth of a frame's way
+    np.testing.assert_allclose(before.rotation, turned(-0.075).rotation, atol=1e-4)
 
 
 def test_tasks_know_the_whole_shot(tmp_path: Path) -> None:
@@ -152,6 +175,7 @@ class FakeRenderer:
         }
         fields = {"normal": np.full((*size, 3), 7.0), "position": np.full((*size, 3), 8.0)}
         fields["motion"] = np.broadcast_to(np.float32([2, 3]), (*size, 2))
+        fields["backward"] = np.broadcast_to(np.float32([4, 5]), (*size, 2))
         planes |= {name: fields[name] for name in wanted if name in fields}
         return self.render(gaussians, camera, None), planes
 
@@ -171,9 +195,12 @@ def test_shade_takes_each_channel_from_its_place(tmp_path: Path) -> None:
     for name, value in {**ones, "normals": 7, "position": 8}.items():
         assert (made[name] == value).all(), name
     assert (made["motion"] == [2, -3]).all()  # y is down in docs/channels.md, v is up in a file
+    assert (made["backward"] == [4, -5]).all()
     wanted, how = renderer.asked[0]
-    assert set(wanted) == {"depth", "normal", "position", "motion"}
+    assert set(wanted) == {"depth", "normal", "position", "motion", "backward"}
     assert task.after is not None
+    assert task.earlier is not None
+    assert how["before"].translation is task.earlier.translation
     assert (how["after"].width, how["after"].translation is task.after.translation) == (task.after.width, True)
     renderer.asked.clear()
     plain = shade(renderer, task, RenderOptions(("alpha",), (1, 0, 0)))
@@ -276,19 +303,20 @@ def written(tmp_path: Path, extension: str, options: RenderOptions) -> Task:
     return task
 
 
-@pytest.mark.parametrize("extension", ["exr", "png", "tif", "jpg"])
+@pytest.mark.parametrize("extension", ["exr", "png", "tif", "jpg", "dpx"])
 @pytest.mark.parametrize("parts", ["one", "several"])
 def test_a_file_is_complete_or_not(extension: str, parts: Any, tmp_path: Path, capfd: Any) -> None:
     channels: tuple[str, ...] = ("rgb", "alpha", "depth", "id") if extension == "exr" else ("rgb", "alpha")
     channels = ("rgb",) if extension == "jpg" else channels
-    options = RenderOptions(channels, encoding=Encoding(parts=parts), attributes={"clsplat:model": "abc"})
+    encoding = Encoding(parts=parts, bits=16 if extension == "dpx" else 8)
+    options = RenderOptions(channels, encoding=encoding, attributes={"clsplat:model": "abc"})
     task = written(tmp_path, extension, options)
     assert is_complete(task, options)
     assert not is_complete(replace(task, path=tmp_path / f"b.{extension}"), options)
     assert not is_complete(replace(task, camera=tilted_camera(41, 30)), options)
     assert not is_complete(task, replace(options, channels=("rgb",) if len(channels) > 1 else ("rgb", "alpha")))
-    if extension in ("exr", "png"):  # the others have no place for it
-        assert not is_complete(task, replace(options, attributes={"clsplat:model": "abd"}))
+    assert not is_complete(task, replace(options, attributes={"clsplat:model": "abd"}))
+    assert not is_complete(task, replace(options, background=(0.0, 0.0, 0.5)))
     if extension == "exr":
         other = Encoding(parts="several" if parts == "one" else "one")
         assert not is_complete(task, replace(options, encoding=other))

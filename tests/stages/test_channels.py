@@ -21,7 +21,7 @@ from clsplat.reference import render as reference
 from clsplat.stages.channels import Features, channels, features
 from clsplat.stages.device_camera import pack_camera
 
-ALL = Features.of(("normal", "position", "motion"))
+ALL = Features.of(("normal", "position", "motion", "backward"))
 SCENES = {
     "overlap": scenes.NAMED["overlap"],
     "saturating": scenes.NAMED["saturating"],
@@ -34,13 +34,19 @@ def moved(camera: Camera) -> Camera:
     return replace(camera, translation=camera.translation + np.array([-0.07, 0.03, -0.05]), fx=1.02 * camera.fx)
 
 
+def earlier(camera: Camera) -> Camera:
+    """A step to the other side, and a turn."""
+    return replace(camera.moved(np.array([0.0, 0.02, -0.01, 0.05, 0.0, 0.03])), cx=camera.cx - 0.5)
+
+
 def run(device: Device, scene: tuple[Gaussians, Camera], wanted: Features = ALL) -> dict[str, NDArray[np.float32]]:
     """The channels on the host, cropped; (H, W, fields)."""
     pipeline = Pipeline.run(device, scene)
     rasterizer, frame, camera = pipeline.rasterizer, pipeline.frame, pipeline.camera
     device, work = rasterizer.device, rasterizer.work
     after = upload(device, pack_camera(moved(camera)))
-    rows = features(device, work, wanted, pipeline.gaussians, frame.camera_array, after, frame.projected)
+    before = upload(device, pack_camera(earlier(camera)))
+    rows = features(device, work, wanted, pipeline.gaussians, frame.camera_array, after, frame.projected, before)
     found = channels(device, work, wanted, rows, frame.part.lists, frame.projected, frame.blended, camera.height)
     means, whole = pipeline.crop(found.means.get()), pipeline.crop(found.whole.get())
     result = {name: means[:, :, at : at + width] for name, at, width in fields(wanted)}
@@ -50,7 +56,7 @@ def run(device: Device, scene: tuple[Gaussians, Camera], wanted: Features = ALL)
 
 
 def fields(wanted: Features) -> list[tuple[str, int, int]]:
-    widths = {"depth": 1, "normal": 3, "position": 3, "motion": 2}
+    widths = {"depth": 1, "normal": 3, "position": 3, "motion": 2, "backward": 2}
     return [(name, at, widths[name]) for name, at in wanted.offsets.items()]
 
 
@@ -59,7 +65,7 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = scene = SCENES[name]()
     got = run(shaped_device, scene)
     forward = reference.forward(gaussians, camera)
-    wanted = twin.channels(forward.projected, gaussians, camera, moved(camera))
+    wanted = twin.channels(forward.projected, gaussians, camera, moved(camera), earlier(camera))
     margin = forward.blended.margin
     # Where a Gaussian may be in or out, or another the heaviest, there is nothing to compare.
     sure = (margin > 1e-4) & (wanted.doubt > 1e-5)
@@ -72,7 +78,7 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
     solid = sure & (1 - forward.blended.transmittance > 0.5)
     assert solid.any()
     # The issue's bound, relative to what a value is made of: a coordinate or a motion near zero is a sum that cancels.
-    for field in ("depth", "normal", "position", "motion"):
+    for field in ("depth", "normal", "position", "motion", "backward"):
         of = getattr(wanted, field).reshape(*solid.shape, -1)[solid]
         size = np.abs(of).max(axis=1, keepdims=True)
         assert_close(got[field][solid] / size, of / size, absolute=1e-4, name=field)
@@ -90,7 +96,12 @@ def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
 def test_what_is_not_wanted_is_not_there(default_device: Device) -> None:
     scene = scenes.random_cloud(300, 3, 40, 30)
     everything = run(default_device, scene)
-    for wanted in (Features.of(()), Features.of(("motion",)), Features.of(("position", "normal"))):
+    for wanted in (
+        Features.of(()),
+        Features.of(("motion",)),
+        Features.of(("backward",)),
+        Features.of(("position", "normal")),
+    ):
         got = run(default_device, scene, wanted)
         assert set(got) - {"median", "first", "count", "index", "alpha"} == set(wanted.names)
         for name, values in got.items():

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat stmaps`: the lenses of photographs as STMaps, for compositors."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from clsplat.cli.options import Flag, Verb
+from clsplat.cli.session import Services
+from clsplat.errors import InputError, examples, reason_of
+
+
+@dataclass(frozen=True)
+class Stmaps(Verb):
+    """Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.
+
+    NAME.distort.exr makes the photograph's distortion of an undistorted picture, such as `clsplat render --cameras
+    SCENE` renders; NAME.undistort.exr takes it out of the photograph.
+    """
+
+    scene: Annotated[Positional[Path], arg(metavar="SCENE")]
+    """A COLMAP model's folder, a scene's that holds one, or a transforms.json."""
+    output: Annotated[Path, arg(aliases=("-o",), metavar="FOLDER")]
+    """Folder of the maps; it is made. Each lens has a pair: lens-1.distort.exr, lens-1.undistort.exr and so on."""
+    json: Flag = False
+    """Print the lenses as JSON: name, model, size, size undistorted, files, pictures."""
+
+
+def run(verb: Stmaps, _: Services) -> int:
+    """A pair of maps for each lens that bends."""
+    import numpy as np
+
+    from clsplat.frame.lens import distorted_places, undistorted_places
+    from clsplat.images.stmap import write_stmap
+    from clsplat.shots.read import photographed
+
+    if not verb.scene.exists():
+        raise InputError(f"{verb.scene}: no such folder or file, expected a COLMAP model or a transforms.json")
+    pictures: dict[Any, list[str]] = {}
+    for image in photographed(verb.scene):
+        if not image.lens.is_pinhole:
+            pictures.setdefault(image.lens, []).append(image.name)
+    if not pictures:
+        raise InputError(
+            f"{verb.scene}: its lenses do not distort, expected the cameras of the photographs as they were taken"
+        )
+    if verb.output.exists() and not verb.output.is_dir():
+        raise InputError(f"{verb.output}: is a file, expected a folder to write STMaps to")
+    try:
+        verb.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{verb.output}: cannot be made: {reason_of(error)}") from None
+    records = []
+    for index, (lens, names) in enumerate(pictures.items(), 1):
+        straight = lens.pinhole(np.eye(3), np.zeros(3))
+        files = [verb.output / f"lens-{index}.{direction}.exr" for direction in ("distort", "undistort")]
+        write_stmap(files[0], distorted_places(lens, straight), straight.width, straight.height)
+        write_stmap(files[1], undistorted_places(lens, straight), lens.width, lens.height)
+        records.append(
+            {
+                "name": f"lens-{index}",
+                "model": lens.model,
+                "size": [lens.width, lens.height],
+                "undistorted": [straight.width, straight.height],
+                "files": [str(file) for file in files],
+                "pictures": names,
+            }
+        )
+        if not verb.json:
+            sizes = f"{lens.width}x{lens.height}, undistorted {straight.width}x{straight.height}"
+            print(f"{files[0]}, {files[1]}: {lens.model} {sizes}, of {examples(names)}")
+    if verb.json:
+        print(json.dumps(records, indent=2))
+    return 0

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bent pictures, of straight ones and the places of their pixels (docs/pictures.md). A window of a bent picture has the
+pixels that the whole has there."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera, Window
+from clsplat.config.channels import CHANNELS
+from clsplat.frame.draw import Draw, Planes
+from clsplat.frame.lens import Warp
+
+_ROWS = 128
+"""Rows of samples that are taken at once: bounds the host's memory."""
+
+
+def warped(draw: Draw, warp: Warp) -> Draw:
+    """A Draw of bent pictures; the camera that is drawn says the size and the window alone.
+
+    `draw` makes straight windows, with rgb in linear light. rgb and alpha are means of
+    `Warp.samples` samples of a pixel, of Catmull and Rom's cubic between pixels; other channels those of the nearest
+    pixel. Where nothing is seen all is 0, and the index -1.
+    """
+
+    def bent(camera: Camera, names: Collection[str]) -> Planes:
+        places, window = warp.of_window(camera)
+        whole = Window(0, 0, warp.frame.width, warp.frame.height)
+        straight = window or replace(warp.frame, width=1, height=1, window=whole)
+        planes = draw(straight, names)
+        assert straight.window is not None
+        places = places - (straight.window.x, straight.window.y)
+        return {name: _taken(np.asarray(plane), places, warp.samples, name) for name, plane in planes.items()}
+
+    return bent
+
+
+def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDArray[Any]:
+    """A plane (h, w) or (h, w, floats) at places (k rows, k columns, 2)."""
+    height, width = places.shape[0] // samples, places.shape[1] // samples
+    channel = CHANNELS.get(name)
+    result = np.empty((height, width, *plane.shape[2:]), plane.dtype)
+    step = max(_ROWS // samples, 1)
+    for top in range(0, height, step):
+        some = places[top * samples : (top + step) * samples]
+        if channel is None or channel.is_light:
+            values = cubic(plane, some)
+            rows = len(some) // samples
+            values = values.reshape(rows, samples, width, samples, *plane.shape[2:]).mean(axis=(1, 3))
+        else:
+            middle = some[samples // 2 :: samples, samples // 2 :: samples]
+            values = nearest(plane, middle, -1 if name == "id" else 0)
+        result[top : top + step] = values
+    return result
+
+
+def nearest(plane: NDArray[Any], places: Float64, nothing: float = 0) -> NDArray[Any]:
+    """The pixels of a plane that places (h, w, 2) are in; `nothing` where these are NaN."""
+    there = ~np.isnan(places[:, :, 0])
+    at = np.where(there[:, :, None], np.floor(places), 0).astype(np.int64)
+    x, y = (np.clip(at[:, :, axis], 0, plane.shape[1 - axis] - 1) for axis in (0, 1))
+    values = plane[y, x]
+    values[~there] = nothing
+    return values
+
+
+def cubic(plane: NDArray[Any], places: Float64) -> NDArray[Any]:
+    """A plane between its pixels, by Catmull and Rom's cubic, held within the sixteen pixels around, so that nothing is
+    darker or brighter than these. 0 where places are NaN."""
+    there = ~np.isnan(places[:, :, 0])
+    at = np.where(there[:, :, None], places, 0.5) - 0.5
+    first = np.floor(at).astype(np.int64)
+    weights = [_catmull_rom((at - first)[:, :, axis].astype(np.float32)) for axis in (0, 1)]
+    # the border is repeated, so that the sixteen are at one distance from each other everywhere
+    edges = [(2, 2), (2, 2)] + [(0, 0)] * (plane.ndim - 2)
+    padded = np.pad(np.asarray(plane, np.float32), edges, mode="edge")
+    height, width = padded.shape[:2]
+    x, y = np.clip(first[:, :, 0] + 1, 0, width - 4), np.clip(first[:, :, 1] + 1, 0, height - 4)
+    begin, lines = y * width + x, padded.reshape(height * width, *plane.shape[2:])
+    total = np.zeros((*there.shape, *plane.shape[2:]), np.float32)
+    low, high = np.full_like(total, np.inf), np.full_like(total, -np.inf)
+    for row, down in enumerate(weights[1]):
+        for column, across in enumerate(weights[0]):
+            values = lines.take(begin + (row * width + column), axis=0)
+            np.minimum(low, values, out=low)
+            np.maximum(high, values, out=high)
+            weight = down * across
+            values *= weight[:, :, None] if plane.ndim == 3 else weight
+            total += values
+    result = np.clip(total, low, high)
+    result[~there] = 0
+    return result
+
+
+def _catmull_rom(t: Float32) -> tuple[Float32, Float32, Float32, Float32]:
+    """Weights of the four pixels around a place, t behind the second."""
+    return (
+        0.5 * t * (t * (2 - t) - 1),
+        0.5 * (t * t * (3 * t - 5) + 2),
+        0.5 * t * (t * (4 - 3 * t) + 1),
+        0.5 * t * t * (t - 1),
+    )

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stereo pairs: the cameras of the eyes beside a shot's own, and those that a USD stage has."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.config.stereo import EYES, Eye
+from clsplat.errors import InputError, examples
+from clsplat.models.formats.usd import open_stage, readable, survive
+from clsplat.shots.shot import Shot
+
+FIELD = re.compile(r"\{eye\}|%V|%v")
+"""An eye's name in a file's: {eye} or %V for all of it, %v for its first letter, as Nuke writes them."""
+
+
+def for_eye(pattern: str, eye: str) -> str:
+    """The pattern of files with the eye's name in it; the same for none."""
+    return FIELD.sub(lambda match: eye[:1] if match[0] == "%v" else eye, pattern) if eye else pattern
+
+
+def seen_by(camera: Camera, eye: Eye, distance: float, convergence: float = math.inf) -> Camera:
+    """The camera of an eye of a pair that is `distance` world units apart, about a camera of a whole frame.
+
+    It looks in the same direction. Its principal point is shifted, so that what is at the depth `convergence` is in the
+    same place for both. Raises InputError for another camera than a perspective one.
+    """
+    if camera.projection != "perspective":
+        raise InputError(f"--stereo: a frame is {camera.projection}, expected perspective cameras")
+    aside = (-0.5 if eye == "left" else 0.5) * distance
+    moved = camera.translation - np.array([aside, 0.0, 0.0])
+    return replace(camera, translation=moved, cx=camera.cx + camera.fx * aside / convergence)
+
+
+def shot_of(shot: Shot, eye: Eye, distance: float, convergence: float = math.inf) -> Shot:
+    """The shot as the eye sees it. Raises InputError as `seen_by`."""
+
+    def seen(camera: Camera) -> Camera:
+        return seen_by(camera, eye, distance, convergence)
+
+    frames = tuple(replace(frame, camera=seen(frame.camera)) for frame in shot.frames)
+    moment = shot.moment
+    return replace(shot, frames=frames, moment=None if moment is None else lambda time: seen(moment(time)))
+
+
+def pair_of_stage(path: Path, prim: str | None = None) -> tuple[str, str]:
+    """Paths of the cameras of a USD stage whose stereoRole is left and right, and that are children of one prim.
+
+    prim: path or name of that, or of one of the cameras, where the stage has several pairs. Raises InputError where
+    there is no such pair, or are several, and as `usd.read_usd`.
+    """
+    survive(path, "clsplat.shots.stereo:pair_here", prim=prim)
+    return pair_here(path, prim)
+
+
+def pair_here(path: Path, prim: str | None = None) -> tuple[str, str]:
+    """`pair_of_stage` of a file that is known not to end the process."""
+    from pxr import UsdGeom, UsdUtils
+
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
+    stage = open_stage(path, path)
+    rigs: dict[str, dict[str, list[Any]]] = {}
+    with readable(path):
+        for item in stage.Traverse():
+            if item.IsA(UsdGeom.Camera) and (role := str(UsdGeom.Camera(item).GetStereoRoleAttr().Get())) in EYES:
+                rigs.setdefault(str(item.GetParent().GetPath()), {}).setdefault(role, []).append(item)
+    delegate.TakeUncoalescedDiagnostics()
+    pairs = {
+        rig: (roles["left"][0], roles["right"][0])
+        for rig, roles in rigs.items()
+        if all(len(roles.get(eye, ())) == 1 for eye in EYES)
+    }
+    asked = {
+        rig: pair
+        for rig, pair in pairs.items()
+        if prim is None
+        or prim in (rig, rig.rpartition("/")[2])
+        or any(prim in (str(camera.GetPath()), camera.GetName()) for camera in pair)
+    }
+    if len(asked) != 1:
+        if not pairs:
+            raise InputError(
+                f"{path}: --stereo stage: no prim has one camera of stereoRole left and one of right among its "
+                "children, expected such a pair; or give --stereo DISTANCE"
+            )
+        flag = "" if prim is None else f"--usd-camera {prim}: "
+        problem = "is of no pair" if prim is not None and not asked else f"has {len(asked)} pairs"
+        raise InputError(f"{path}: {flag}{problem}, expected --usd-camera with one of {examples(sorted(pairs))}")
+    left, right = next(iter(asked.values()))
+    return str(left.GetPath()), str(right.GetPath())
