@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""As much of pycolmap as a scene of pinhole cameras needs: an archive of tools/measure_gpu.py has this in its place, as
-the package itself takes more room than all others together."""
+"""Pinhole cameras, as pycolmap has them: an archive of tools/measure_gpu.py has this in its place, as the package
+itself takes more room than all others together."""
 
 from __future__ import annotations
 
