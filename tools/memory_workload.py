@@ -169,7 +169,7 @@ def pictures(device: Device) -> None:
         motion = ("motion",) if view is flat else ()
         after = replace(view, translation=np.array([0.1, 0.0, 0.1]))
         _, found = renderer.render_channels(gaussians, view, ("normal", "position", *motion), after=after)
-        slices = renderer.render_deep(gaussians, view, np.array([2.0, 3.0], np.float32))
+        slices = renderer.render_deep(gaussians, view, 3)
         if not all(np.isfinite(values).all() for values in (*found.values(), slices)):
             raise SystemExit(f"a channel of the {view.projection} camera is not finite")
         if not found["count"].any():

@@ -314,7 +314,7 @@ def _options(verb: Render) -> RenderOptions:
         pictures.check_deep()
         _check_deep(verb, channels)
     elif verb.slices != DeepConfig():
-        raise InputError("--deep.bins, --deep.near and --deep.far are of deep EXR, expected --deep with them")
+        raise InputError("--deep.bins is of deep EXR, expected --deep with it")
     if video:
         _check_video(verb)
     elif verb.video != VideoConfig():

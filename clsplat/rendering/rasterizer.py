@@ -209,11 +209,11 @@ class Rasterizer:
         pixels = (projected, frame.blended, frame.camera.height, frame.camera_array)
         return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
 
-    def deep(self, frame: Frame, bounds: DeviceArray) -> DeviceArray:
+    def deep(self, frame: Frame, bins: int) -> DeviceArray:
         """The frame in slices by depth: the array of `stages.deep`."""
         device = self.device_of(frame.camera)
         pixels = (frame.projected.splats, frame.blended, frame.camera.height, frame.camera_array)
-        return self.by_band(frame, lambda part: deep(device, self.work, bounds, part.lists, *pixels))[-1]
+        return self.by_band(frame, lambda part: deep(device, self.work, bins, part.lists, *pixels))[-1]
 
     def device_of(self, camera: Camera) -> Device:
         """The device with the switches that the camera's projection wants of the kernels."""

@@ -130,16 +130,15 @@ class Renderer:
             named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
         return self._result(frame, contiguous=contiguous), named
 
-    def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
-        """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):
-        red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where there is nothing."""
+    def render_deep(self, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
+        """(bins, H, W, 5): the view in slices by depth, each pixel's front to back, where its light is taken: red,
+        green, blue, associated with alpha; alpha; the slice's depth. All 0 behind a pixel's last slice."""
         camera.check()
-        on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * (len(bounds) + 1))
+        on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
-        slices = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))
-        planes = slices.get()[:, :, : camera.height, : camera.width]
+        planes = self._rasterizer.deep(frame, bins).get()[:, :, : camera.height, : camera.width]
         if (of_distances := camera.depths_of_distances()) is not None:
-            planes[:, [DEEP.index("FIRST"), DEEP.index("LAST")]] *= of_distances
+            planes[:, DEEP.index("DEPTH")] *= of_distances
         return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
     def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:

@@ -27,7 +27,10 @@ ALL = Features.of(WIDTHS)
 SIDEWAYS = 1e-4
 """Cosine between a normal and the direction to the camera under which a rounding decides which side is seen."""
 DOUBT = 1e-5
-"""Margin like `harness.MARGIN`, of the light that is left to one half, and of the two largest weights."""
+"""Margin like `harness.MARGIN`, of the light that is left to one half or to the next slice, and of the two largest
+weights."""
+BINS = 4
+"""Slices of a pixel."""
 
 FEW = 500
 """Gaussians whose picture around the camera the reference makes in a second: it looks at each at every pixel."""
@@ -80,14 +83,14 @@ def _channels(bench: Bench) -> Outcome:
 
 def _deep(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
-    bounds = np.array([1.75, 2.5, 4.0], np.float32)
-    given = upload(device, np.append(bounds, np.float32(0)))
     arguments = (bench.lists, bench.projected.splats, bench.blended, camera.height)
-    _, outcome = bench.twice(lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()])
+    _, outcome = bench.twice(lambda: deep(device, bench.work, BINS, *arguments), lambda slices: [slices.get()])
     (planes,), splats, (_, clear) = outcome.arrays, bench.splats(), bench.blend_reference()
-    wanted = reference_deep.deep(splats, camera.width, camera.height, bounds)[:, clear]
-    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, clear]
-    fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depths": slice(4, 6)}
+    twin = reference_deep.deep(splats, camera.width, camera.height, BINS)
+    sure = clear & (twin.margin > DOUBT)
+    wanted = twin.slices[:, sure]
+    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, sure]
+    fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(4, 5)}
     return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in fields.items()})
 
 
