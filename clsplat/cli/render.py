@@ -20,6 +20,7 @@ from tyro.conf import arg
 from clsplat.cli.options import Flag, Memory, OptionalInt, RunOrModel, Verb, with_given
 from clsplat.cli.session import Services
 from clsplat.config.checks import parse_bytes
+from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import (
     EXR_DEPTH,
     ColourConfig,
@@ -124,6 +125,10 @@ class Render(Verb):
     deep: Flag = False
     """Write deep EXR: of each pixel colour, alpha and depth in slices of the scene. docs/pictures.md has how."""
     slices: Annotated[DeepConfig, arg(name="deep")] = field(default_factory=DeepConfig)
+    holdout: Annotated[str | None, arg(metavar="PATTERN")] = None
+    """Depth EXR or deep EXR of other elements, such as 'cg/depth.####.exr': what is behind their surfaces is left out
+    of every channel. docs/pictures.md has how."""
+    holding: Annotated[HoldoutConfig, arg(name="holdout")] = field(default_factory=HoldoutConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
     """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
@@ -202,6 +207,7 @@ def _read_job(verb: Render) -> Job:
     from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file
     from clsplat.sequence import existing
+    from clsplat.sequence.holdouts import held_out
     from clsplat.sequence.task import digest_of, make_tasks
     from clsplat.shots import check_around
 
@@ -217,6 +223,8 @@ def _read_job(verb: Render) -> Job:
     sampling = options.pictures.sampling
     tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
     check_pictures(tasks, options)
+    if verb.holdout is not None:
+        tasks = held_out(tasks, verb.holdout, verb.holding)
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
         check_new(tasks[0].path, overwrite=verb.overwrite or verb.dry_run)
@@ -294,6 +302,7 @@ def _video(verb: Render, shot: Shot) -> VideoConfig:
 
 
 def _options(verb: Render) -> RenderOptions:
+    from clsplat.cli.render_holdout import holdout_settings
     from clsplat.cli.render_job import for_workers, parse_colour
     from clsplat.images.frame_files import VIDEO, check_format, parse_channels
     from clsplat.sequence.task import RenderOptions
@@ -321,7 +330,8 @@ def _options(verb: Render) -> RenderOptions:
         raise InputError(f"-o {verb.output}: --video flags are of videos, expected the name of an {VIDEO} file")
     encoding = Encoding(verb.exr, verb.parts, verb.compression, verb.bits, verb.quality)
     colour = parse_colour(verb.background or "black")
-    return RenderOptions(channels, colour, encoding, pictures=pictures, deep=verb.slices if verb.deep else None)
+    holdout, deep = holdout_settings(verb.holdout, verb.holding, deep=verb.deep), verb.slices if verb.deep else None
+    return RenderOptions(channels, colour, encoding, pictures=pictures, deep=deep, holdout=holdout)
 
 
 def _check_deep(verb: Render, channels: tuple[str, ...]) -> None:

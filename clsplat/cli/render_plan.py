@@ -25,6 +25,7 @@ from clsplat.sequence import workers
 from clsplat.sequence.task import picture_camera
 from clsplat.shots.frame_numbers import ranges
 from clsplat.stages.deep import DEEP_FLOATS
+from clsplat.stages.holdout import HELD_BYTES
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
         camera = picture_camera(task, options)
         frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
         frame |= {"width": camera.width, "height": camera.height, "skipped": task.number in skipped}
+        if task.holdout is not None:
+            frame["holdout"] = str(task.holdout)
         if window := camera.window:
             frame["window"] = [window.x, window.y, window.width, window.height]
         frames.append(frame)
@@ -101,6 +104,8 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
         yield f"video     {rate_of(document['fps'])} frames a second"
     yield f"channels  {', '.join(document['channels'])}{deep}"
     yield f"colour    {' to '.join(spaces)}"
+    if (held := job.tasks[0].holdout) is not None:
+        yield f"holdout   {' to '.join(dict.fromkeys((str(held), str(job.tasks[-1].holdout))))}"
     if samples := _samples(job):
         yield f"samples   {samples}"
     for device in plans:
@@ -124,7 +129,8 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
         if options.deep:
             rows, planes = deep_rows(device, camera, options.deep.bins), 4 * DEEP_FLOATS * options.deep.bins
         else:
-            rows, planes = strip_rows(device, camera, options.channels, framing), 0
+            planes = HELD_BYTES if options.holdout is not None else 0
+            rows = strip_rows(device, camera, options.channels, framing, planes)
         strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
         drawn = [(strip, features)]
         if framing.supersample > 1 and light_and_rest(names)[0]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from clsplat.config.holdout import HELD
 from clsplat.config.marking import FRESH, UNWANTED, USELESS
 
 TILE = 16
@@ -119,7 +120,8 @@ def header() -> str:
     lines += [f"#define LOSS_COLUMNS {LOSS_COLUMNS}", f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}"]
     lines.append(f"#define POSE_ROWS {POSE_ROWS}u")
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
-    layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
+    layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK}
+    layouts |= {"DEEP": DEEP, "HELD": HELD}
     for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
         lines.append(f"#define {prefix}_SIZE {len(fields)}")

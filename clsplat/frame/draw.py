@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.config.channels import CHANNELS, feature_names, light_and_rest
 from clsplat.device.layout import TILE
+from clsplat.frame.holdout import Cut
 from clsplat.frame.window import crop, reframed
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.renderer import Renderer
@@ -29,8 +30,9 @@ def drawn_by(
     gaussians: Gaussians,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     after: Camera | None = None,
+    cut: Cut | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after: the camera of a whole frame that motion goes to.
+    """A Draw by the kernels; after: the camera of a whole frame that motion goes to; cut: of the frame's hold-out.
 
     Planes need not be contiguous: the encoder, which may be another thread, puts them in order.
     """
@@ -39,8 +41,9 @@ def drawn_by(
         camera, rows, columns = on_tiles(camera)
         _, rest = light_and_rest(names)
         made: Planes = {}
+        holdout = cut(camera) if cut else None
         if not rest:
-            picture = renderer.render(gaussians, camera, background, contiguous=False)
+            picture = renderer.render(gaussians, camera, background, contiguous=False, holdout=holdout)
         else:
             picture, made = renderer.render_channels(
                 gaussians,
@@ -49,6 +52,7 @@ def drawn_by(
                 after=after and reframed(after, camera),
                 background=background,
                 contiguous=False,
+                holdout=holdout,
             )
         planes: Planes = {"rgb": picture.image, "alpha": picture.alpha}
         for name in rest:

@@ -14,6 +14,7 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig
 from clsplat.frame.draw import Draw, Planes, drawn_by
+from clsplat.frame.holdout import Cut
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
@@ -43,16 +44,16 @@ class FramePipeline:
         self._renderer, self._gaussians, self._background = renderer, gaussians, background
 
     def draw(
-        self, at: Callable[[float], Camera], after: Camera | None = None
+        self, at: Callable[[float], Camera], after: Camera | None = None, cut: Cut | None = None
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that
         makes its planes the file's, which needs no device.
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
-        after: that of the next frame, for motion.
+        after: that of the next frame, for motion; cut: of the frame's hold-out, for every sample of the frame.
         """
         config, colours, space = self.config, self.colours, self.colours.model
-        draw = drawn_by(self._renderer, self._gaussians, self._background, after)
+        draw = drawn_by(self._renderer, self._gaussians, self._background, after, cut)
         if config.sampling.on or config.framing.supersample > 1:
             space, drawn = colours.light, draw
 

@@ -36,6 +36,7 @@ from clsplat.stages.duplicate import (
     duplicate_and_sort,
     plan_bands,
 )
+from clsplat.stages.holdout import Held, holdout
 from clsplat.stages.project import Projected, Screen, Slots, add_slots, project, project_grad, thinning_numbers
 from clsplat.stages.ranges import TileLists, tile_lists
 
@@ -202,11 +203,19 @@ class Rasterizer:
         for larger ones of the next."""
         return [work_on(self.part(frame, band)) for band in frame.bands]
 
-    def channels(self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray) -> Channels:
-        """The frame's channels beside colour; after: the packed camera that motion goes to."""
+    def hold_out(self, frame: Frame, held: Held) -> None:
+        """Take from the frame's image and transmittance what is behind the surfaces."""
+        device = self.device_of(frame.camera)
+        pixels = (frame.projected.splats, frame.background, frame.blended, frame.camera.height, frame.camera_array)
+        self.by_band(frame, lambda part: holdout(device, held, part.lists, *pixels))
+
+    def channels(
+        self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray, held: Held | None = None
+    ) -> Channels:
+        """The frame's channels beside colour; after: the packed camera that motion goes to; held: as of `hold_out`."""
         device, work, projected = self.device_of(frame.camera), self.work, frame.projected
         rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
-        pixels = (projected, frame.blended, frame.camera.height, frame.camera_array)
+        pixels = (projected, frame.blended, frame.camera.height, frame.camera_array, held)
         return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
 
     def deep(self, frame: Frame, bins: int) -> DeviceArray:

@@ -19,6 +19,7 @@ from clsplat.device.context import Device, open_device
 from clsplat.device.layout import DEEP
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.images.holdouts import Surfaces
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed_degrees
@@ -26,6 +27,7 @@ from clsplat.stages.channels import DEPTHS, Features
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, ShStorage, host_gaussians, upload_gaussians
+from clsplat.stages.holdout import Held, held_bytes, upload_held
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,16 +79,20 @@ class Renderer:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         *,
         contiguous: bool = True,
+        holdout: Surfaces | None = None,
     ) -> RenderResult:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object; of what is
         on the device the camera has to count from where the means do.
 
-        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting. Raises
-        ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
+        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting; holdout:
+        surfaces of other elements in the picture, behind which the model is not seen, at depths as the kernels have
+        them. Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
         """
         camera.check()
-        on_device, camera = self._placed(gaussians, camera)
-        return self._result(self._forward(on_device, camera, background), contiguous=contiguous)
+        on_device, camera = self._placed(gaussians, camera, planes=held_bytes(holdout))
+        frame = self._forward(on_device, camera, background)
+        self._hold_out(frame, holdout)
+        return self._result(frame, contiguous=contiguous)
 
     def render_channels(
         self,
@@ -97,6 +103,7 @@ class Renderer:
         after: Camera | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         contiguous: bool = True,
+        holdout: Surfaces | None = None,
     ) -> tuple[RenderResult, ChannelResult]:
         """Render a view with channels beside colour (docs/channels.md).
 
@@ -114,10 +121,11 @@ class Renderer:
                 f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
             )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
-        on_device, camera = self._placed(gaussians, camera, features.floats)
+        on_device, camera = self._placed(gaussians, camera, features.floats, held_bytes(holdout))
         after = gaussians.local(after) if isinstance(gaussians, Gaussians) else after
         frame = self._forward(on_device, camera, background)
-        planes = self._rasterizer.channels(on_device, frame, features, upload(self.device, pack_camera(after)))
+        held = self._hold_out(frame, holdout)
+        planes = self._rasterizer.channels(on_device, frame, features, upload(self.device, pack_camera(after)), held)
         height, width = camera.height, camera.width
         means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
         if contiguous:
@@ -147,6 +155,13 @@ class Renderer:
         if colour.shape != (3,) or not np.isfinite(colour).all():
             raise InputError(f"background {background}: expected three finite numbers")
         return self._rasterizer.forward(gaussians, camera, colour, backward=False)
+
+    def _hold_out(self, frame: Frame, holdout: Surfaces | None) -> Held | None:
+        if holdout is None or len(holdout.rows) == 0:
+            return None
+        held = upload_held(self.device, holdout)
+        self._rasterizer.hold_out(frame, held)
+        return held
 
     def _result(self, frame: Frame, *, contiguous: bool) -> RenderResult:
         height, width = frame.camera.height, frame.camera.width

@@ -15,14 +15,17 @@ from clsplat.device.context import open_device
 from clsplat.errors import DriverError
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
+from clsplat.frame.holdout import Cut
 from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import exposed
 from clsplat.rendering.renderer import Renderer
-from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
+from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, HOLDOUT, RAYS
 from clsplat.selftest.trust import require
+from clsplat.sequence.holdouts import cut_of
 from clsplat.sequence.task import RenderOptions, Task, camera_after, header, picture_camera
+from clsplat.stages.holdout import held_bytes
 
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
@@ -85,8 +88,9 @@ class FrameRenderer:
             above = header(task, options)
             empty = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
             return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
-        draw, finish = pipeline.draw(task.at, camera_after(task, options))
-        rows = self._rows(camera)
+        cut = cut_of(task, options)
+        draw, finish = pipeline.draw(task.at, camera_after(task, options), cut)
+        rows = self._rows(camera, cut)
         if rows < camera.height and not task.is_video:
             blanks: list[bool | None] = []
 
@@ -114,9 +118,11 @@ class FrameRenderer:
             )
         self._rays_tested = True
 
-    def _rows(self, camera: Camera) -> int:
+    def _rows(self, camera: Camera, cut: Cut | None = None) -> int:
         """Rows of the strips that the camera's picture is rendered in, its height where that is none."""
-        return strip_rows(self._renderer.device, camera, self.options.channels, self.options.pictures.framing)
+        planes = held_bytes(cut(camera)) if cut else 0
+        options = self.options
+        return strip_rows(self._renderer.device, camera, options.channels, options.pictures.framing, planes)
 
 
 def open_frame_renderer(
@@ -132,5 +138,5 @@ def open_frame_renderer(
     device was busy with. Raises DeviceError."""
     opened = open_device(device, memory_limit, profile=profile)
     kernels = DEEP if options.deep is not None else CHANNELS if light_and_rest(options.channels)[1] else ()
-    opened = require(opened, (*FORWARD, *kernels))
+    opened = require(opened, (*FORWARD, *kernels, *(HOLDOUT if options.holdout is not None else ())))
     return FrameRenderer(Renderer(opened, config=rasterizer), gaussians, options)

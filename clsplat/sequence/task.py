@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, reason_of
 from clsplat.files import digest, is_file
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
@@ -60,7 +61,8 @@ class Record:
 class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
     camera that motion goes to, of the same size, where motion is asked for; stretch: where the camera is while the
-    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`.
+    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`;
+    holdout: an absolute path, None where nothing is held out.
     """
 
     number: int
@@ -70,6 +72,7 @@ class Task:
     after: Camera | None = None
     stretch: Shot | None = None
     before: tuple[int, ...] | None = None
+    holdout: Path | None = None
 
     def at(self, time: float) -> Camera:
         """The camera of the whole frame at a time in frames from the frame."""
@@ -125,7 +128,8 @@ class RenderOptions:
     """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
     header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
     deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the
-    model's colours, none where they are taken as they are."""
+    model's colours, none where they are taken as they are; holdout: how hold-outs
+    are read, None where there are none."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -136,6 +140,7 @@ class RenderOptions:
     deep: DeepConfig | None = None
     drawn: str = ""
     gains: tuple[float, ...] = ()
+    holdout: HoldoutConfig | None = None
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
@@ -178,7 +183,8 @@ def digest_of(*parts: Any) -> str:
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
+    """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer, and the
+    content of its hold-out."""
     pictures = options.pictures
     encoding = {name: getattr(options.encoding, name) for name in _ENCODED.get(task.path.suffix.lower(), ())}
     cameras = [picture_camera(task, options)]
@@ -190,6 +196,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     sampling = pictures.sampling if pictures.sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
+    if task.holdout is not None:
+        made += ("holdout", _digest_at(str(task.holdout), _changed(task.holdout)), options.holdout)
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
     return digest_of(cameras, made, encoding, colour, pictures.framing, sampling)
 
@@ -201,6 +209,14 @@ def _content(source: str) -> str:
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
     tables = sorted({path for pattern in patterns for path in glob(pattern) if is_file(Path(path))})  # noqa: PTH207
     return " ".join(_digest_at(path, Path(path).stat().st_mtime_ns) for path in (source, *tables))
+
+
+def _changed(path: Path) -> int:
+    """When a file was last written, in nanoseconds. Raises InputError."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason_of(error)}") from None
 
 
 @lru_cache(maxsize=4096)

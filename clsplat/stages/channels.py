@@ -19,6 +19,7 @@ from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 from clsplat.stages.blend import Blended, launch_tiles
 from clsplat.stages.device_gaussians import AnyGaussians, parts
+from clsplat.stages.holdout import Held
 from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
@@ -117,13 +118,15 @@ def channels(
     blended: Blended,
     height: int,
     camera_array: DeviceArray | None = None,
+    held: Held | None = None,
 ) -> Channels:
     """Blend the features with the weights of `blended`, which is of the same lists. camera_array: for pixels that are
-    rays."""
+    rays; held: surfaces that hold them out."""
     plane_rows, stride = blended.stops.shape
     means = work.array("channel_means", (wanted.floats + len(DEPTHS), plane_rows, stride))
     whole = work.array("channel_whole", (len(WHOLE), plane_rows, stride), np.int32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, projected.splats, rows, blended.stops, means, whole)
-    rays = (camera_array,) if device.switched("RAYS") else ()
-    launch_tiles(device, "channels", wanted.defines, lists, stride // TILE, height, *arrays, *rays)
+    further = (*(held.arguments if held else ()), *((camera_array,) if device.switched("RAYS") else ()))
+    defines = {**wanted.defines, **({"HOLDOUT": True} if held else {})}
+    launch_tiles(device, "channels", defines, lists, stride // TILE, height, *arrays, *further)
     return Channels(means, whole)
