@@ -15,6 +15,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
+from clsplat.config.holdout import HELD
 from clsplat.errors import InputError, examples
 from clsplat.files import is_file
 from clsplat.images.reading import error_of, one_line, open_image
@@ -37,6 +38,8 @@ class Surfaces:
         """The surfaces of a picture whose column x is column across[x] of this one, and row y row down[y]. Beyond this
         one's edges there are none."""
         height, width = self.counts.shape
+        if np.array_equal(across, np.arange(width)) and np.array_equal(down, np.arange(height)):
+            return self
         inside = ((down >= 0) & (down < height))[:, None] & ((across >= 0) & (across < width))
         source = np.clip(down, 0, height - 1)[:, None] * width + np.clip(across, 0, width - 1)
         counts = np.where(inside, self.counts.ravel()[source], 0)
@@ -85,10 +88,9 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "") -> Holdou
             counts = np.ones(shape[0] * shape[1], np.int64)
         origin = (spec.x - spec.full_x, spec.y - spec.full_y)
     begin, alpha, end = columns
-    begin = np.asarray(begin, np.float64)
-    name = channel or "Z"
-    alpha = np.ones(len(begin)) if alpha is None else np.asarray(alpha, np.float64)
-    end = begin if end is None else np.asarray(end, np.float64)
+    assert begin is not None, "it is looked for by its name"
+    name, end = channel or "Z", begin if end is None else end
+    alpha = np.ones(len(begin), np.float32) if alpha is None else alpha
     for values, what in ((begin, name), (end, "ZBack"), (alpha, "A")):
         if odd := int(np.isnan(values).sum()):
             raise InputError(f"{path}: {odd} values of {what} are not a number, expected depths and alpha of surfaces")
@@ -112,18 +114,22 @@ def _surfaces(
     shown = (begin > 0) & (begin < np.inf) & (alpha > 0)
     pixels = np.repeat(np.arange(len(counts)), counts)[shown]
     begin, end, alpha = begin[shown], end[shown], alpha[shown]
-    order = np.lexsort((begin, pixels))
-    rows = _rows(begin[order], end[order], alpha[order])
+    if counts.max(initial=0) > 1:
+        order = np.lexsort((begin, pixels))
+        begin, end, alpha = begin[order], end[order], alpha[order]
+    rows = _rows(begin, end, alpha)
     return Surfaces(np.bincount(pixels, minlength=len(counts)).reshape(shape), rows)
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
     """HELD. Of an opaque surface nothing behind its beginning is seen."""
-    begin = begin.astype(np.float32)
-    end = np.where((alpha < 1) & (end > begin), end.astype(np.float32), begin)
-    length = end.astype(np.float64) - begin
-    rate = np.log2(1 - alpha, where=length > 0, out=np.zeros(len(alpha))) / np.where(length > 0, length, 1)
-    return np.stack([begin, end, 1 - alpha, rate], axis=1).astype(np.float32)
+    rows = np.zeros((len(begin), len(HELD)), np.float32)
+    rows[:, 0], rows[:, 2] = begin, 1 - alpha
+    rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)
+    long = rows[:, 1] > rows[:, 0]
+    length = rows[long, 1].astype(np.float64) - rows[long, 0]
+    rows[long, 3] = np.log2(1 - alpha[long].astype(np.float64)) / length
+    return rows
 
 
 @contextmanager

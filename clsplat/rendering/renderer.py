@@ -85,8 +85,8 @@ class Renderer:
         on the device the camera has to count from where the means do.
 
         contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting; holdout:
-        surfaces of other elements in the picture, behind which the model is not seen, at depths as the kernels have
-        them. Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
+        surfaces of other elements in the picture, behind which the model is not seen, at the depths of the
+        kernels. Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
         """
         camera.check()
         on_device, camera = self._placed(gaussians, camera, planes=held_bytes(holdout))

@@ -15,7 +15,6 @@ from clsplat.device.context import open_device
 from clsplat.errors import DriverError
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
-from clsplat.frame.holdout import Cut
 from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
@@ -25,7 +24,7 @@ from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, HOLDOUT, RAYS
 from clsplat.selftest.trust import require
 from clsplat.sequence.holdouts import cut_of
 from clsplat.sequence.task import RenderOptions, Task, camera_after, header, picture_camera
-from clsplat.stages.holdout import held_bytes
+from clsplat.stages.holdout import HELD_BYTES, held_bytes
 
 TRANSFERS = ("read", "write", "fill")
 """Names of what a device's recorder notes that are no kernels."""
@@ -64,7 +63,7 @@ class FrameRenderer:
         if self.options.encoding.parts == "one":
             return
         for camera in (picture_camera(task, self.options) for task in tasks if not task.is_video):
-            if self._rows(camera) < camera.height:
+            if self._rows(camera, HELD_BYTES if self.options.holdout is not None else 0) < camera.height:
                 check_parts(camera, self.options.encoding)
 
     def __call__(self, task: Task) -> RenderedFrame:
@@ -90,7 +89,7 @@ class FrameRenderer:
             return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
         cut = cut_of(task, options)
         draw, finish = pipeline.draw(task.at, camera_after(task, options), cut)
-        rows = self._rows(camera, cut)
+        rows = self._rows(camera, held_bytes(cut(camera)) if cut else 0)
         if rows < camera.height and not task.is_video:
             blanks: list[bool | None] = []
 
@@ -118,9 +117,9 @@ class FrameRenderer:
             )
         self._rays_tested = True
 
-    def _rows(self, camera: Camera, cut: Cut | None = None) -> int:
-        """Rows of the strips that the camera's picture is rendered in, its height where that is none."""
-        planes = held_bytes(cut(camera)) if cut else 0
+    def _rows(self, camera: Camera, planes: int) -> int:
+        """Rows of the strips that the camera's picture is rendered in, its height where that is none. planes: bytes of
+        each pixel for a hold-out."""
         options = self.options
         return strip_rows(self._renderer.device, camera, options.channels, options.pictures.framing, planes)
 
