@@ -29,8 +29,10 @@ def drawn_by(
     gaussians: Gaussians,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     after: Camera | None = None,
+    moved: Gaussians | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after: the camera of a whole frame that motion goes to.
+    """A Draw by the kernels; after: the camera of a whole frame that motion goes to; moved: the Gaussians there, where
+    they do not stand still.
 
     Planes need not be contiguous: the encoder, which may be another thread, puts them in order.
     """
@@ -47,6 +49,7 @@ def drawn_by(
                 camera,
                 feature_names(rest),
                 after=after and reframed(after, camera),
+                **({} if moved is None else {"moved": moved}),
                 background=background,
                 contiguous=False,
             )

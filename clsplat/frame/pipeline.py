@@ -14,6 +14,7 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig
 from clsplat.frame.draw import Draw, Planes, drawn_by
+from clsplat.frame.moments import sample_moments
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
@@ -43,26 +44,42 @@ class FramePipeline:
         self._renderer, self._gaussians, self._background = renderer, gaussians, background
 
     def draw(
-        self, at: Callable[[float], Camera], after: Camera | None = None
+        self,
+        at: Callable[[float], Camera],
+        after: Camera | None = None,
+        models: Callable[[float], Gaussians] | None = None,
+        moved: Gaussians | None = None,
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that
         makes its planes the file's, which needs no device.
 
         at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
-        after: that of the next frame, for motion.
+        after: that of the next frame, for motion. models: the Gaussians at these times, where they are not the
+        pipeline's own; moved: those that motion goes to, where they do not stand still.
         """
         config, colours, space = self.config, self.colours, self.colours.model
-        draw = drawn_by(self._renderer, self._gaussians, self._background, after)
-        if config.sampling.on or config.framing.supersample > 1:
-            space, drawn = colours.light, draw
+        in_light = config.sampling.on or config.framing.supersample > 1
 
-            def in_light(camera: Camera, names: Collection[str]) -> Planes:
-                return converted(drawn(camera, names), colours, colours.model, colours.light)
+        def drawn_at(time: float, moved: Gaussians | None = None) -> Draw:
+            def draw(camera: Camera, names: Collection[str]) -> Planes:
+                gaussians = self._gaussians if models is None else models(time)  # when they are drawn, not before
+                return drawn_by(self._renderer, gaussians, self._background, after, moved)(camera, names)
 
-            draw = supersampled(in_light, config.framing)
+            return supersampled(self._in_light(draw), config.framing) if in_light else draw
+
+        if in_light:
+            space = colours.light
+        draw = drawn_at(config.sampling.middle, moved)
         if config.sampling.on:
-            draw = sampled(draw, *sample_cameras(at, config.sampling))
+            times = sample_moments(config.sampling)
+            light = None if models is None else lambda index: drawn_at(times[index])
+            draw = sampled(draw, *sample_cameras(at, config.sampling), light)
         return draw, lambda planes: converted(planes, colours, space, colours.output)
+
+    def _in_light(self, draw: Draw) -> Draw:
+        """The same picture in linear light."""
+        colours = self.colours
+        return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def is_blank(self, planes: Planes) -> bool | None:
         """True if planes of `draw`, not converted, show nothing but the background, None where none of them tells."""

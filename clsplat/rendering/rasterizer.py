@@ -202,10 +202,17 @@ class Rasterizer:
         for larger ones of the next."""
         return [work_on(self.part(frame, band)) for band in frame.bands]
 
-    def channels(self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray) -> Channels:
-        """The frame's channels beside colour; after: the packed camera that motion goes to."""
+    def channels(
+        self,
+        gaussians: AnyGaussians,
+        frame: Frame,
+        wanted: Features,
+        after: DeviceArray,
+        moved: AnyGaussians | None = None,
+    ) -> Channels:
+        """The frame's channels beside colour; after: the packed camera that motion goes to; moved: as of `features`."""
         device, work, projected = self.device_of(frame.camera), self.work, frame.projected
-        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
+        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected, moved)
         pixels = (projected, frame.blended, frame.camera.height, frame.camera_array)
         return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
 

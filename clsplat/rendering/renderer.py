@@ -25,7 +25,15 @@ from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed
 from clsplat.stages.channels import DEPTHS, Features
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
-from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, ShStorage, host_gaussians, upload_gaussians
+from clsplat.stages.device_gaussians import (
+    AnyGaussians,
+    DeviceGaussians,
+    HostArray,
+    HostGaussians,
+    ShStorage,
+    host_gaussians,
+    upload_gaussians,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +103,16 @@ class Renderer:
         wanted: Collection[str] = (),
         *,
         after: Camera | None = None,
+        moved: Gaussians | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         contiguous: bool = True,
     ) -> tuple[RenderResult, ChannelResult]:
         """Render a view with channels beside colour (docs/channels.md).
 
-        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None. The
-        rest is like `render`. Raises InputError for motion from one projection to another.
+        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None;
+        moved: the same Gaussians where motion goes to, of which the means count, None if they stand still. The rest is
+        like `render`. Raises InputError for motion from one projection to another, ValueError for another number of
+        Gaussians that move.
         """
         features = Features.of(wanted)
         after = after or camera
@@ -114,10 +125,13 @@ class Renderer:
                 f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
             )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
-        on_device, camera = self._placed(gaussians, camera, features.floats)
-        after = gaussians.local(after) if isinstance(gaussians, Gaussians) else after
+        moved = moved if "motion" in wanted else None
+        on_device, camera = self._placed(gaussians, camera, features.floats + (3 if moved is not None else 0))
+        then = moved if moved is not None else gaussians
+        after = then.local(after) if isinstance(then, Gaussians) else after
         frame = self._forward(on_device, camera, background)
-        planes = self._rasterizer.channels(on_device, frame, features, upload(self.device, pack_camera(after)))
+        there = None if moved is None else self._moved(on_device, moved)
+        planes = self._rasterizer.channels(on_device, frame, features, upload(self.device, pack_camera(after)), there)
         height, width = camera.height, camera.width
         means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
         if contiguous:
@@ -154,6 +168,14 @@ class Renderer:
         image = frame.blended.image.get()[:, :height, :width].transpose(1, 2, 0)
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
+
+    def _moved(self, gaussians: AnyGaussians, moved: Gaussians) -> AnyGaussians:
+        """The means of `moved`, where the Gaussians are. Raises ValueError for another number of them."""
+        if len(moved) != gaussians.count:
+            raise ValueError(f"{len(moved)} Gaussians to move to, expected {gaussians.count}")
+        if isinstance(gaussians, HostGaussians):
+            return HostGaussians(len(moved), gaussians.coefficients, {"means": HostArray(moved.means)}, gaussians.rows)
+        return DeviceGaussians(len(moved), gaussians.coefficients, {"means": upload(self.device, moved.means)})
 
     def _placed(
         self, gaussians: Gaussians | AnyGaussians, camera: Camera, features: int = 0, planes: int = 0

@@ -19,6 +19,7 @@ from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import exposed
+from clsplat.models.placed import Ensemble
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, RAYS
 from clsplat.selftest.trust import require
@@ -44,13 +45,18 @@ RenderFrame = Callable[[Task], RenderedFrame]
 
 
 class FrameRenderer:
-    """Renders frames of one model on one device. A frame that is too large to be held is written as well."""
+    """Renders frames of one model, or of several, on one device. A frame that is too large to be held is written as
+    well."""
 
-    def __init__(self, renderer: Any, gaussians: Gaussians, options: RenderOptions) -> None:
-        """renderer: a `Renderer`. Raises InputError for settings and colour spaces that make no sense."""
+    def __init__(self, renderer: Any, models: Gaussians | Sequence[Gaussians], options: RenderOptions) -> None:
+        """renderer: a `Renderer`; models: one that is taken as it is, or those that the tasks place. Raises InputError
+        for settings and colour spaces that make no sense."""
         self.options = options
-        gaussians = exposed(gaussians, options.gains) if options.gains else gaussians
-        self._renderer, self._gaussians = renderer, gaussians
+        several = list(models) if isinstance(models, Sequence) else [models]
+        if options.gains:
+            several = [exposed(model, options.gains) for model in several]
+        self._renderer, gaussians = renderer, several[0]
+        self._ensemble = Ensemble(several)
         self._rays_tested = False
         self._pipeline = FramePipeline(
             renderer, gaussians, options.pictures, background=options.background, recorded=options.recorded
@@ -80,12 +86,14 @@ class FrameRenderer:
         self._trust(task.camera)
         start, options, pipeline = time.monotonic(), self.options, self._pipeline
         camera, names, encoding = picture_camera(task, options), options.channels, options.encoding
+        gaussians, moved = self._placed(task)
+        middle = options.pictures.sampling.middle
         if options.deep is not None:
-            model = (self._renderer, self._gaussians)
+            model = (self._renderer, gaussians(middle))
             above = header(task, options)
             empty = write_deep(task.path, *model, camera, options.deep, encoding, above, pipeline.colours)
             return RenderedFrame(None, time.monotonic() - start, measured={"blank": empty})
-        draw, finish = pipeline.draw(task.at, camera_after(task, options))
+        draw, finish = pipeline.draw(task.at, camera_after(task, options), gaussians, moved)
         rows = self._rows(camera)
         if rows < camera.height and not task.is_video:
             blanks: list[bool | None] = []
@@ -101,6 +109,15 @@ class FrameRenderer:
         planes = in_strips(draw, rows)(camera, names)
         blank = pipeline.is_blank(planes)
         return RenderedFrame(planes, time.monotonic() - start, finish, {"blank": blank})
+
+    def _placed(self, task: Task) -> tuple[Callable[[float], Gaussians], Gaussians | None]:
+        """The frame's models as one, at a time in frames from the frame; and there where motion goes to, None if
+        nothing moves there."""
+        ensemble, middle = self._ensemble, self.options.pictures.sampling.middle
+        if (placed := task.placed) is None:
+            return lambda time: ensemble.models[0], None
+        moved = ensemble.moved(placed[middle], placed[middle + 1]) if "motion" in self.options.channels else None
+        return lambda time: ensemble.at(placed[time]), moved
 
     def _trust(self, camera: Camera) -> None:
         """Self-test what panoramas and fisheyes need before the first of them."""
@@ -120,7 +137,7 @@ class FrameRenderer:
 
 
 def open_frame_renderer(
-    gaussians: Gaussians,
+    models: Gaussians | Sequence[Gaussians],
     options: RenderOptions,
     rasterizer: RasterizerConfig,
     *,
@@ -128,9 +145,9 @@ def open_frame_renderer(
     memory_limit: int | None = None,
     profile: bool = False,
 ) -> FrameRenderer:
-    """A renderer of frames of the model on the device that `device` names. profile: each frame's record has what the
+    """A renderer of frames of the models on the device that `device` names. profile: each frame's record has what the
     device was busy with. Raises DeviceError."""
     opened = open_device(device, memory_limit, profile=profile)
     kernels = DEEP if options.deep is not None else CHANNELS if light_and_rest(options.channels)[1] else ()
     opened = require(opened, (*FORWARD, *kernels))
-    return FrameRenderer(Renderer(opened, config=rasterizer), gaussians, options)
+    return FrameRenderer(Renderer(opened, config=rasterizer), models, options)

@@ -19,10 +19,12 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.files import digest, is_file
+from clsplat.frame.moments import sample_moments
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
 from clsplat.images.frame_files import VIDEO, Header, camera_matrices
+from clsplat.models.placed import State
 from clsplat.shots import Shot
 from clsplat.shots.frame_numbers import output_paths
 from clsplat.shots.motion import camera_after as following
@@ -60,7 +62,8 @@ class Record:
 class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
     camera that motion goes to, of the same size, where motion is asked for; stretch: where the camera is while the
-    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`.
+    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`; placed: of the models,
+    by the time in frames from the frame, at all `moments` of it; None for one that stands as it is.
     """
 
     number: int
@@ -70,6 +73,7 @@ class Task:
     after: Camera | None = None
     stretch: Shot | None = None
     before: tuple[int, ...] | None = None
+    placed: Mapping[float, State] | None = None
 
     def at(self, time: float) -> Camera:
         """The camera of the whole frame at a time in frames from the frame."""
@@ -152,6 +156,16 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     return task.after if middle == 0 or task.after is None else task.at(middle + 1)
 
 
+def moments(options: RenderOptions) -> list[float]:
+    """The times at which the models of a frame are looked at, in frames from it: the middle of its shutter, its
+    samples, and where motion goes to."""
+    sampling = options.pictures.sampling
+    times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
+    if "motion" in options.channels:
+        times.append(sampling.middle + 1)
+    return list(dict.fromkeys(times))
+
+
 def plain(value: Any) -> Any:
     """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
     added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
@@ -178,7 +192,8 @@ def digest_of(*parts: Any) -> str:
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
+    """Digest of all that a frame of the models depends on: cameras, channels, encoding, pictures, rasterizer, and where
+    the models are."""
     pictures = options.pictures
     encoding = {name: getattr(options.encoding, name) for name in _ENCODED.get(task.path.suffix.lower(), ())}
     cameras = [picture_camera(task, options)]
@@ -191,7 +206,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
-    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling)
+    placed = [] if task.placed is None else [[task.placed[time] for time in moments(options)]]
+    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling, *placed)
 
 
 def _content(source: str) -> str:

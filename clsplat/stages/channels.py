@@ -84,10 +84,13 @@ def features(
     camera_array: DeviceArray,
     after: DeviceArray,
     projected: Projected,
+    moved: AnyGaussians | None = None,
 ) -> DeviceArray:
-    """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
+    """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to; moved: the
+    Gaussians with the means that it goes to, on the device or the host as the others; None where they stand still."""
     rows = work.array("features", (gaussians.count, wanted.floats))
-    for start, stop, (part,) in parts(work, gaussians):
+    models = (gaussians,) if moved is None else (gaussians, moved)
+    for start, stop, (part, *then) in parts(work, *models):
         splats = projected.rows(start, stop)
         launch_items(
             device,
@@ -100,6 +103,7 @@ def features(
             part["means"],
             part["quaternions"],
             part["log_scales"],
+            (then or [part])[0]["means"],
             splats.splats,
             rows.rows(start, stop),
         )
