@@ -115,9 +115,9 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
 def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
     device, options = open_device(selector, job.memory_limit), job.options
-    gaussians = job.cast.at(job.tasks[0].number)
-    floats, moved = held_sh(gaussians, job.rasterizer).floats, 3 * (job.cast.tracks is not None)
     framing, names = options.pictures.framing, set(options.channels)
+    gaussians = job.cast.at(job.tasks[0].number)
+    floats, moved = held_sh(gaussians, job.rasterizer).floats, job.cast.tracks is not None and "motion" in names
     features = feature_floats(names)
     plans = []
     cameras = [picture_camera(task, options) for task in job.tasks]
@@ -127,12 +127,12 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
         else:
             rows, planes = strip_rows(device, camera, options.channels, framing), 0
         strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
-        drawn = [(strip, features + moved * ("motion" in names))]
+        drawn = [(strip, features)]
         if framing.supersample > 1 and light_and_rest(names)[0]:
             drawn.append((finer(strip, framing), 0))
         for part, floats_beside in drawn:
             sizes = (on_tiles(part)[0], job.rasterizer, floats_beside, planes)
-            plan = plan_frame(device, len(gaussians), floats, *sizes)
+            plan = plan_frame(device, len(gaussians), floats, *sizes, moved)
             plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
     return max(plans, key=lambda device: device.plan.need.total)
 

@@ -20,7 +20,7 @@ from clsplat.models.edit import decompose, faded, graded, merge, transform
 
 IDENTITY = tuple(np.eye(4)[:3].ravel().tolist())
 LUMA = np.array([0.2126, 0.7152, 0.0722])
-"""Rec.709's weights, as ASC CDL's saturation has them."""
+"""Rec.709's weights, which ASC CDL's saturation takes too."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class Track(Protocol):
 
 
 def rows_of(matrix: Float64) -> tuple[float, ...]:
-    """The first three rows of (4, 4), as a `Placement` has them."""
+    """The first three rows of (4, 4), in the order of a `Placement`."""
     return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # + 0.0: no -0, which would be another state
 
 
 def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:
-    """The colour of a `Placement`: gain (3,) and offset (3,), then the saturation, as ASC CDL has them without its
+    """The colour of a `Placement`: gain (3,) and offset (3,), then the saturation: ASC CDL without its
     power; none where nothing changes."""
     if (gain == 1).all() and (offset == 0).all() and saturation == 1:
         return ()

@@ -126,7 +126,7 @@ class Renderer:
             )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
         moved = moved if "motion" in wanted else None
-        on_device, camera = self._placed(gaussians, camera, features.floats + (3 if moved is not None else 0))
+        on_device, camera = self._placed(gaussians, camera, features.floats, moved=moved is not None)
         then = moved if moved is not None else gaussians
         after = then.local(after) if isinstance(then, Gaussians) else after
         frame = self._forward(on_device, camera, background)
@@ -178,10 +178,16 @@ class Renderer:
         return DeviceGaussians(len(moved), gaussians.coefficients, {"means": upload(self.device, moved.means)})
 
     def _placed(
-        self, gaussians: Gaussians | AnyGaussians, camera: Camera, features: int = 0, planes: int = 0
+        self,
+        gaussians: Gaussians | AnyGaussians,
+        camera: Camera,
+        features: int = 0,
+        planes: int = 0,
+        *,
+        moved: bool = False,
     ) -> tuple[AnyGaussians, Camera]:
         """The model on the device, or on the host if a frame of this size leaves too little room for it; and the camera
-        that counts from where it does. planes: bytes of a pixel beside the picture's."""
+        that counts from where it does. planes: bytes of a pixel beside the picture's; moved: with means to move to."""
         if not isinstance(gaussians, Gaussians):
             return gaussians, camera
         if self._sh is None or self._sh[0] is not gaussians:
@@ -190,10 +196,10 @@ class Renderer:
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
         self._rasterizer.antialias(on=gaussians.antialiased)
         sh = self._sh[1]
-        asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes)
+        asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes, moved)
         if self._planned != asked:
             config = self._rasterizer.config
-            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, config, features, planes)
+            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, config, features, planes, moved)
             self._rasterizer.follow(plan)
             if plan.streamed or isinstance(self._held, HostGaussians):
                 self._held = None

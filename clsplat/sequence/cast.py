@@ -38,7 +38,7 @@ class Cast:
 
     @property
     def drawn(self) -> Gaussians | tuple[Gaussians, ...]:
-        """What a `FrameRenderer` takes."""
+        """The models as a `FrameRenderer` takes them."""
         return self.models[0] if self.tracks is None else self.models
 
     def state(self, frame: float) -> State | None:

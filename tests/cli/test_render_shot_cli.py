@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.pictures import SamplingConfig
+from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.frame.moments import sample_moments
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import linear_to_srgb, srgb_to_linear
@@ -28,6 +30,10 @@ from clsplat.models.placed import Ensemble, Placement, grade, placed, rows_of
 from clsplat.reference.blend import layers
 from clsplat.reference.render import forward
 from clsplat.rendering.renderer import Renderer
+from clsplat.sequence.cast import load_cast
+from clsplat.sequence.farm import Failure, WorkerJob, render_frame
+from clsplat.sequence.task import RenderOptions, make_tasks
+from clsplat.shots import read_shot
 from clsplat.shots.layout import parse_transform, read_layout
 from clsplat.spherical_harmonics import C0, sh_basis
 
@@ -130,7 +136,7 @@ def test_sh_turn_with_the_model() -> None:
     np.testing.assert_allclose(after, before, atol=2e-5)  # float32 of 16 terms up to 4
 
 
-@pytest.mark.parametrize("hidden", [{"visible": False}, {"opacity": 0}, {"keys": [{"frame": 9, "visible": False}]}])
+@pytest.mark.parametrize("hidden", [{"opacity": 0}, {"keys": [{"frame": 9, "visible": False}]}])
 def test_a_hidden_model_is_not_there(hidden: dict[str, Any], folder: Path, tmp_path: Path) -> None:
     assert render(folder, layout(folder, "hidden", **hidden), tmp_path, "--frames 2 --channels rgb,alpha,id") == 0
     assert render(folder, folder / "a.ply", tmp_path / "a", "--frames 2 --channels rgb,alpha,id") == 0
@@ -217,6 +223,7 @@ def blended(model: Gaussians, camera: Camera, values: Float64) -> Float64:
     return sums / np.where(total > 0, total, 1.0)
 
 
+@pytest.mark.slow
 def test_the_same_file_twice_and_a_transform_of_all(folder: Path, tmp_path: Path) -> None:
     path, shift = tmp_path / "shot.json", [0.5, 0, 0.2]
     two = [{"name": str(x), "path": str(folder / "a.ply"), "translate": [x, 0, 0]} for x in (-0.5, 0.5)]
@@ -344,11 +351,33 @@ def test_models_that_are_not_drawn_alike(folder: Path, tmp_path: Path, capsys: C
     assert "--appearance x.jpg: is of one run's model" in error_line(capsys)
 
 
+def test_a_worker_places_what_it_has_read(folder: Path, tmp_path: Path) -> None:
+    """Placements come with the tasks: of the shot it reads the models alone."""
+    shot, channels = layout(folder, "farm", **MOVING), ("rgb", "motion")
+    cast, options = load_cast(shot), RenderOptions(channels)
+    cameras = read_shot(folder / "cameras.json")
+    (task,) = cast.seen(make_tasks(cameras.only("2"), cameras, str(tmp_path / "#.exr"), lambda c: c, channels), options)
+    layout(folder, "farm")  # changed meanwhile
+    job = WorkerJob(str(shot), cast.digest, options, RasterizerConfig(), placed=True)
+    assert not isinstance(render_frame(pickle.loads(pickle.dumps(task)), job), Failure)
+    renderer = Renderer()
+    here, there = cast.at(2), cast.at(3)
+    picture, made = renderer.render_channels(here, camera_at(2), ("motion",), after=camera_at(3), moved=there)
+    found = pixels(tmp_path / "2.exr")
+    np.testing.assert_allclose(found[:, :, :3], picture.image, atol=CLOSE)
+    np.testing.assert_allclose(found[:, :, 3:] * [1, -1], made["motion"], atol=1e-4)
+    replace(B, opacity_logits=B.opacity_logits + 1).save(folder / "c.ply")
+    layout(folder, "farm", path="c.ply")
+    failure = render_frame(replace(task, path=tmp_path / "3.exr"), replace(job, memory_limit=1 << 30))
+    assert isinstance(failure, Failure) and "on a worker, expected" in failure.message
+
+
 def test_the_plan_counts_all(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     assert render(folder, layout(folder, "plan", **MOVING), tmp_path, "--dry-run --json --channels motion") == 0
     assert json.loads(capsys.readouterr().out)["gaussians"] == len(A) + len(B)
 
 
+@pytest.mark.slow
 def test_a_path_goes_around_all_models(folder: Path, tmp_path: Path) -> None:
     shot = str(layout(folder, "around"))
     out = ["-o", str(tmp_path / "####.exr"), "--progress", "none", "--width", "20", "--height", "20"]
