@@ -96,7 +96,9 @@ class Render(Verb):
     own lens. If not given: as the run was trained, but for --path, which is of pinhole cameras, else undistort."""
     channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
     """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
-    and id (of Gaussians). docs/render.md has each."""
+    and id (of Gaussians), objects and semantic (Cryptomattes). docs/render.md has each."""
+    ids_from: Annotated[str | None, arg(metavar="PROPERTY")] = None
+    """Property of the models' PLY files that holds a whole number for each Gaussian, for --channels semantic."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
@@ -189,6 +191,7 @@ def run(verb: Render, services: Services) -> int:
     renderers = []
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
+        how |= {"mattes": job.mattes} if job.mattes else {}
         model = (job.cast.drawn, job.options, job.rasterizer)
         renderers = [services.open_frame_renderer(*model, device=selector, **how) for selector in job.devices]
         for renderer in renderers:
@@ -206,6 +209,7 @@ def _read_job(verb: Render) -> Job:
     from clsplat.images.frame_files import VIDEO
     from clsplat.runs.appearance import gains_of
     from clsplat.sequence import existing
+    from clsplat.sequence.mattes import mattes_of, names_of
     from clsplat.sequence.task import digest_of, make_tasks
     from clsplat.shots import check_around
 
@@ -229,7 +233,7 @@ def _read_job(verb: Render) -> Job:
         warn(text)
     cast = read_cast(verb.model, verb.transform, verb.appearance) if cast is None else cast
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
-    tasks = cast.seen(tasks, options)
+    tasks, mattes = cast.seen(tasks, options), mattes_of(cast, options.channels, verb.ids_from or "")
     recorded = cast.space
     colours = Colours(options.pictures.colour, recorded)
     extension = Path(verb.output).suffix.lower()
@@ -239,10 +243,13 @@ def _read_job(verb: Render) -> Job:
     attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": cast.digest}
     attributes["clsplat:colorspace"] = colours.output
     options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer), gains=gains)
+    options = replace(options, mattes=names_of(mattes), ids_from=verb.ids_from or "")
     spaces = (colours.model, colours.output)
     video = _video(verb, whole)
     on_farm = verb.workers is not None or verb.scheduler is not None
-    return Job(options, verb.rasterizer, cast, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing)
+    return Job(
+        options, verb.rasterizer, cast, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing, mattes
+    )
 
 
 def _whole_shot(verb: Render) -> tuple[Shot, Cast | None]:
@@ -295,6 +302,7 @@ def _video(verb: Render, shot: Shot) -> VideoConfig:
 
 def _options(verb: Render) -> RenderOptions:
     from clsplat.cli.render_job import for_workers, parse_colour
+    from clsplat.cli.render_models import check_mattes
     from clsplat.images.frame_files import VIDEO, check_format, parse_channels
     from clsplat.sequence.task import RenderOptions
 
@@ -308,6 +316,7 @@ def _options(verb: Render) -> RenderOptions:
     if "alpha" in channels and verb.background is not None:
         flag = "--deep" if verb.deep else "--alpha" if verb.alpha else "--channels alpha"
         raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
+    check_mattes(channels, verb.ids_from, verb.compression)
     verb.slices.check()
     verb.video.check()
     if verb.deep:

@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import ColourConfig, VideoConfig
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples, warn
+from clsplat.frame.objects import Matte
 from clsplat.frame.samples import finer
 from clsplat.images.alpha import background_colour
 from clsplat.sequence import existing
@@ -35,6 +36,7 @@ class Job:
     video: VideoConfig
     on_farm: bool
     skip_existing: bool
+    mattes: Mapping[str, Matte] = field(default_factory=dict)
 
     @property
     def model(self) -> Path:

@@ -7,7 +7,7 @@ what comes out is converted. A strip is a window of the picture, so that it goes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -15,9 +15,11 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig
 from clsplat.frame.draw import Draw, Planes, drawn_by
 from clsplat.frame.moments import sample_moments
+from clsplat.frame.objects import Matte
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
+from clsplat.images.cryptomatte import ranked
 from clsplat.rendering.renderer import Renderer
 
 UNSEEN = 1e-6
@@ -35,13 +37,16 @@ class FramePipeline:
         *,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         recorded: str = SRGB,
+        mattes: Mapping[str, Matte] | None = None,
     ) -> None:
         """recorded: the model's colour space (`colour.recorded_space`); background: in that space, black where alpha is
-        written. Raises InputError for settings and spaces that make no sense."""
+        written; mattes: by the names of their channels. Raises InputError for settings and spaces that make no
+        sense."""
         self.config = config or PictureConfig()
         self.config.check()
         self.colours = Colours(self.config.colour, recorded)
         self._renderer, self._gaussians, self._background = renderer, gaussians, background
+        self._mattes = mattes or {}
 
     def draw(
         self,
@@ -63,7 +68,7 @@ class FramePipeline:
         def drawn_at(time: float, moved: Gaussians | None = None) -> Draw:
             def draw(camera: Camera, names: Collection[str]) -> Planes:
                 gaussians = self._gaussians if models is None else models(time)  # when they are drawn, not before
-                return drawn_by(self._renderer, gaussians, self._background, after, moved)(camera, names)
+                return drawn_by(self._renderer, gaussians, self._background, after, moved, self._mattes)(camera, names)
 
             return supersampled(self._in_light(draw), config.framing) if in_light else draw
 
@@ -74,7 +79,14 @@ class FramePipeline:
             times = sample_moments(config.sampling)
             light = None if models is None else lambda index: drawn_at(times[index])
             draw = sampled(draw, *sample_cameras(at, config.sampling), light)
-        return draw, lambda planes: converted(planes, colours, space, colours.output)
+        return draw, lambda planes: self._with_ranks(converted(planes, colours, space, colours.output))
+
+    def _with_ranks(self, planes: Planes) -> Planes:
+        """The same planes, those of mattes as they are written."""
+        return {
+            name: ranked(plane, self._mattes[name].names) if name in self._mattes else plane
+            for name, plane in planes.items()
+        }
 
     def _in_light(self, draw: Draw) -> Draw:
         """The same picture in linear light."""

@@ -44,6 +44,8 @@ class RenderResult:
     alpha: Float32
 
 
+SHARES = 8
+"""Objects whose shares are blended at a time."""
 ChannelResult = dict[str, NDArray[Any]]
 """Channels beside colour by their names in the kernels. depth, median, first (H, W) float32, along the camera's axis;
 count, index (H, W) int32, index -1 for nothing. normal and position (H, W, 3), in the world, and motion (H, W, 2), in
@@ -143,6 +145,21 @@ class Renderer:
             shown = named["count"][:, :, None] > 0
             named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
         return self._result(frame, contiguous=contiguous), named
+
+    def render_shares(self, gaussians: Gaussians, camera: Camera, owners: NDArray[np.int32], count: int) -> Float32:
+        """(H, W, count): what each of `count` objects covers of each pixel, the sum of the weights of its Gaussians;
+        owners (n,): the object of each. Raises as `render`."""
+        camera.check()
+        shares = np.zeros((camera.height, camera.width, count), np.float32)
+        on_device, local = self._placed(gaussians, camera, SHARES)
+        frame = self._forward(on_device, local, (0.0, 0.0, 0.0))
+        alpha = self._result(frame, contiguous=False).alpha[:, :, None]
+        for first in range(0, count, SHARES):
+            rows = np.equal.outer(owners, np.arange(first, first + SHARES)).astype(np.float32)
+            planes = self._rasterizer.shares(frame, upload(self.device, rows))
+            means = planes.get()[:SHARES, : camera.height, : camera.width].transpose(1, 2, 0)
+            shares[:, :, first : first + SHARES] = (means * alpha)[:, :, : count - first]
+        return shares
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
         """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):

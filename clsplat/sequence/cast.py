@@ -15,7 +15,7 @@ from clsplat.models.formats import colour_space, format_of
 from clsplat.models.placed import Ensemble, Placement, State, Track, near_of
 from clsplat.runs.run import model_file
 from clsplat.sequence.task import RenderOptions, Task, moments
-from clsplat.shots.layout import KeyedTrack, Within, is_layout, read_layout
+from clsplat.shots.layout import KeyedTrack, Volume, Within, is_layout, read_layout
 from clsplat.shots.read import USD
 from clsplat.shots.stage import read_stage
 
@@ -26,7 +26,7 @@ class Cast:
 
     path: of the file that says so; models: in their own worlds; names: of each; digest: SHA-256 of what they are read
     from, of a model file alone that of the file; space: the colour space of all; tracks: their placements, None for a
-    model that is taken as it is.
+    model that is taken as it is; files: of the models, none of a stage; volumes: of each model, those that have mattes.
     """
 
     path: Path
@@ -35,6 +35,8 @@ class Cast:
     digest: str
     space: str
     tracks: tuple[Track, ...] | None = None
+    files: tuple[Path, ...] = ()
+    volumes: tuple[tuple[Volume, ...], ...] = ()
 
     @property
     def drawn(self) -> Gaussians | tuple[Gaussians, ...]:
@@ -81,7 +83,7 @@ def load_cast(path: Path, transform: KeyedTrack | None = None) -> Cast:
         if stage is not None:
             cast = Cast(file, stage.models, stage.names, stage.digest, stage.space, stage.tracks)
         else:
-            cast = Cast(file, (Gaussians.load(file),), (file.stem,), digest(file), colour_space(file))
+            cast = Cast(file, (Gaussians.load(file),), (file.stem,), digest(file), colour_space(file), None, (file,))
     if transform is None:
         return cast
     inner = cast.tracks or (KeyedTrack(str(path)),)
@@ -115,7 +117,9 @@ def _of_layout(path: Path) -> Cast:
         if model.by_rays != first.by_rays:
             raise InputError(f"{where}: is {_not(model.by_rays)}drawn along rays, '{entries[0].name}' is otherwise")
     names, tracks = tuple(entry.name for entry in entries), tuple(entry.track for entry in entries)
-    return Cast(path, tuple(model for model, _, _ in found), names, sums.hexdigest(), space, tracks)
+    models, volumes = tuple(model for model, _, _ in found), tuple(entry.volumes for entry in entries)
+    paths = tuple(model_file(entry.path) for entry in entries)
+    return Cast(path, models, names, sums.hexdigest(), space, tracks, paths, volumes)
 
 
 def _not(is_so: bool) -> str:

@@ -25,6 +25,7 @@ from clsplat.images.video import VideoWriter
 from clsplat.sequence.cast import load_cast
 from clsplat.sequence.existing import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
+from clsplat.sequence.mattes import mattes_of, names_of
 from clsplat.sequence.task import Record, RenderOptions, Task
 from clsplat.sequence.workers import HOST_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
 
@@ -76,7 +77,10 @@ class _Held:
             if cast.digest != job.digest:
                 raise InputError(f"{job.model}: has SHA-256 {cast.digest[:12]} on a worker, expected {job.digest[:12]}")
             model = cast.models if job.placed else cast.models[0]
-            how: dict[str, Any] = {"device": job.device, "memory_limit": job.memory_limit}
+            mattes = mattes_of(cast, job.options.channels, job.options.ids_from)
+            if names_of(mattes) != job.options.mattes:
+                raise InputError(f"{job.model}: has other mattes on a worker than it had when the job began")
+            how: dict[str, Any] = {"mattes": mattes, "device": job.device, "memory_limit": job.memory_limit}
             self.renderer = open_frame_renderer(model, job.options, job.rasterizer, **how)
             self.key = repr(job)
         return self.renderer

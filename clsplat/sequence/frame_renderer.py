@@ -10,11 +10,14 @@ from typing import Any
 
 from clsplat.camera import Camera
 from clsplat.config.channels import light_and_rest
+from clsplat.config.pictures import DEEP_STRIP_FLOATS
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import open_device
+from clsplat.device.layout import TILE
 from clsplat.errors import DriverError
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
+from clsplat.frame.objects import Matte
 from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
@@ -48,9 +51,15 @@ class FrameRenderer:
     """Renders frames of one model, or of several, on one device. A frame that is too large to be held is written as
     well."""
 
-    def __init__(self, renderer: Any, models: Gaussians | Sequence[Gaussians], options: RenderOptions) -> None:
-        """renderer: a `Renderer`; models: one that is taken as it is, or those that the tasks place. Raises InputError
-        for settings and colour spaces that make no sense."""
+    def __init__(
+        self,
+        renderer: Any,
+        models: Gaussians | Sequence[Gaussians],
+        options: RenderOptions,
+        mattes: Mapping[str, Matte] | None = None,
+    ) -> None:
+        """renderer: a `Renderer`; models: one that is taken as it is, or those that the tasks place; mattes: by the
+        names of their channels. Raises InputError for settings and colour spaces that make no sense."""
         self.options = options
         several = list(models) if isinstance(models, Sequence) else [models]
         if options.gains:
@@ -58,9 +67,9 @@ class FrameRenderer:
         self._renderer, gaussians = renderer, several[0]
         self._ensemble = Ensemble(several)
         self._rays_tested = False
-        self._pipeline = FramePipeline(
-            renderer, gaussians, options.pictures, background=options.background, recorded=options.recorded
-        )
+        how: dict[str, Any] = {"background": options.background, "recorded": options.recorded, "mattes": mattes}
+        self._pipeline = FramePipeline(renderer, gaussians, options.pictures, **how)
+        self._objects = sum(len(matte.names) for matte in (mattes or {}).values())
 
     def check(self, tasks: Sequence[Task]) -> None:
         """Raise InputError for a frame that the file's kind cannot hold as it has to be rendered here."""
@@ -133,7 +142,10 @@ class FrameRenderer:
 
     def _rows(self, camera: Camera) -> int:
         """Rows of the strips that the camera's picture is rendered in, its height where that is none."""
-        return strip_rows(self._renderer.device, camera, self.options.channels, self.options.pictures.framing)
+        rows = strip_rows(self._renderer.device, camera, self.options.channels, self.options.pictures.framing)
+        finer = self.options.pictures.framing.supersample**2
+        most = DEEP_STRIP_FLOATS // max(self._objects * camera.width * finer, 1)  # of all objects' planes
+        return rows if most >= camera.height else min(rows, max(most // TILE, 1) * TILE)
 
 
 def open_frame_renderer(
@@ -144,10 +156,11 @@ def open_frame_renderer(
     device: str | None = None,
     memory_limit: int | None = None,
     profile: bool = False,
+    mattes: Mapping[str, Matte] | None = None,
 ) -> FrameRenderer:
     """A renderer of frames of the models on the device that `device` names. profile: each frame's record has what the
     device was busy with. Raises DeviceError."""
     opened = open_device(device, memory_limit, profile=profile)
-    kernels = DEEP if options.deep is not None else CHANNELS if light_and_rest(options.channels)[1] else ()
+    kernels = DEEP if options.deep is not None else CHANNELS if light_and_rest(options.channels)[1] or mattes else ()
     opened = require(opened, (*FORWARD, *kernels))
-    return FrameRenderer(Renderer(opened, config=rasterizer), models, options)
+    return FrameRenderer(Renderer(opened, config=rasterizer), models, options, mattes)

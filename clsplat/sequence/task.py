@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.config.channels import WRITTEN
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.files import digest, is_file
@@ -23,6 +24,7 @@ from clsplat.frame.moments import sample_moments
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
+from clsplat.images.cryptomatte import header_of
 from clsplat.images.frame_files import VIDEO, Header, camera_matrices
 from clsplat.models.placed import State
 from clsplat.shots import Shot
@@ -125,11 +127,21 @@ def make_tasks(
 
 
 @dataclass(frozen=True)
+class MatteNames:
+    """A matte among the channels: its objects' names, and a digest of which Gaussians are of which."""
+
+    channel: str
+    names: tuple[str, ...]
+    digest: str
+
+
+@dataclass(frozen=True)
 class RenderOptions:
     """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
     header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
     deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the
-    model's colours, none where they are taken as they are."""
+    model's colours, none where they are taken as they are; mattes: those among the channels; ids_from: the property of
+    the models' files that semantic ids are of."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -140,6 +152,8 @@ class RenderOptions:
     deep: DeepConfig | None = None
     drawn: str = ""
     gains: tuple[float, ...] = ()
+    mattes: tuple[MatteNames, ...] = ()
+    ids_from: str = ""
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
@@ -205,6 +219,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     sampling = pictures.sampling if pictures.sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
+    made += (options.mattes,) if options.mattes else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
     placed = [] if task.placed is None else [[task.placed[time] for time in moments(options)]]
     return digest_of(cameras, made, encoding, colour, pictures.framing, sampling, *placed)
@@ -248,6 +263,8 @@ def header(task: Task, options: RenderOptions) -> Header:
     space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
         return Header(attributes, matrices, is_srgb=space == SRGB)
+    for matte in options.mattes:
+        attributes |= header_of(WRITTEN[matte.channel].part, matte.names)
     if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
     return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()))

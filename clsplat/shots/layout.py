@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.errors import InputError
 from clsplat.files import is_file, parse_json, read_document
+from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.models.placed import IDENTITY, Placement, Track, checked, grade, rows_of
 from clsplat.scenes.transforms import Keys, load_document, objects, short
@@ -24,7 +26,7 @@ VECTORS = {"translate": (0.0, 0.0, 0.0), "rotate": (0.0, 0.0, 0.0), "gain": (1.0
 NUMBERS = {"scale": 1.0, "opacity": 1.0, "saturation": 1.0}
 OVER_TIME = ("matrix", *VECTORS, *NUMBERS, "visible")
 """Properties of a model that may change over time."""
-MODEL = ("name", "path", "keys", "matrices", "first_frame", "interpolation", *OVER_TIME)
+MODEL = ("name", "path", "mattes", "keys", "matrices", "first_frame", "interpolation", *OVER_TIME)
 BOUNDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "scale": (lambda value: edit.SCALES[0] < value < edit.SCALES[1], "a number over 0"),
     "opacity": (lambda value: 0 <= value <= 1, "0 to 1"),
@@ -124,13 +126,30 @@ class Within:
         return self.inner.at(frame).within(self.outer.at(frame))
 
 
+@dataclass(frozen=True)
+class Volume:
+    """A part of a model that has a matte of its own, in the model's world: a box, two corners, or a sphere, its centre
+    and its radius."""
+
+    name: str
+    numbers: tuple[float, ...]
+
+    def holds(self, gaussians: Gaussians) -> NDArray[np.bool_]:
+        """Mask (n,) of the Gaussians whose mean is in it."""
+        if len(self.numbers) == 6:
+            return edit.in_box(gaussians, self.numbers[:3], self.numbers[3:])
+        return edit.in_sphere(gaussians, self.numbers[:3], self.numbers[3])
+
+
 @dataclass(frozen=True, eq=False)
 class PlacedModel:
-    """A model of a shot. path: of its file or run."""
+    """A model of a shot. path: of its file or run; volumes: those of its Gaussians that have mattes of their own, of
+    several the first."""
 
     name: str
     path: Path
     track: KeyedTrack
+    volumes: tuple[Volume, ...] = ()
 
 
 def is_layout(path: Path) -> bool:
@@ -153,15 +172,41 @@ def read_layout(path: Path) -> tuple[PlacedModel, ...]:
     if not (entries := objects(document, "models")):
         raise InputError(f"{path}: has no models, expected 'models' to be a list of at least one object")
     models: list[PlacedModel] = []
+    taken: list[str] = []
     for index, entry in enumerate(entries):
         reader = Keys(path, f"model {index}", entry, {})
         name = _text(reader, "name")
         reader.where = f"{path}: model '{name}'"
-        if name in [model.name for model in models]:
+        if name in taken:
             raise InputError(f"{reader.where}: is there twice, expected names of their own")
         _known(reader.where, entry, MODEL)
-        models.append(PlacedModel(name, path.parent / _text(reader, "path"), _track(reader)))
+        volumes = tuple(_volumes(reader))
+        taken += [name, *(volume.name for volume in volumes)]
+        if twice := next((each for each in taken if taken.count(each) > 1), None):
+            raise InputError(f"{reader.where}: has the matte '{twice}', of a name that is there twice")
+        models.append(PlacedModel(name, path.parent / _text(reader, "path"), _track(reader), volumes))
     return tuple(models)
+
+
+def _volumes(reader: Keys) -> Iterator[Volume]:
+    given = reader.frame.get("mattes")
+    entries = objects(reader.frame, "mattes")
+    if given is not None and not entries:
+        raise reader.wrong("mattes", "a list of at least one object with a name and a box or a sphere")
+    for index, entry in enumerate(entries):
+        volume = Keys(reader.path, None, entry, {})
+        volume.where = f"{reader.where}: matte {index}"
+        _known(volume.where, entry, ("name", "box", "sphere"))
+        name = _text(volume, "name")
+        if ("box" in entry) == ("sphere" in entry):
+            raise InputError(f"{volume.where}: expected a 'box' or a 'sphere', and one of them only")
+        kind, count = ("box", 6) if "box" in entry else ("sphere", 4)
+        numbers = volume.vector(kind, count).tolist()
+        if kind == "box" and any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+            raise volume.wrong(kind, "the least x, y and z, then the largest")
+        if kind == "sphere" and numbers[3] < 0:
+            raise volume.wrong(kind, "x, y, z and a radius of at least 0")
+        yield Volume(name, tuple(numbers))
 
 
 def parse_transform(text: str) -> KeyedTrack:

@@ -66,6 +66,18 @@ class Features:
         return planes | {name: whole[:, :, at] for at, name in enumerate(WHOLE)}
 
 
+@dataclass(frozen=True)
+class Floats:
+    """Rows of any values that are blended as features are."""
+
+    floats: int
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """Defines for channels.cl."""
+        return {"FEATURES": self.floats}
+
+
 @dataclass(frozen=True, eq=False)
 class Channels:
     """Planes padded to whole tiles: means (floats + 2, rows, stride) of the features and, behind them, DEPTHS; whole
@@ -114,7 +126,7 @@ def features(
 def channels(
     device: Device,
     work: Workspace,
-    wanted: Features,
+    wanted: Features | Floats,
     rows: DeviceArray,
     lists: TileLists,
     projected: Projected,
