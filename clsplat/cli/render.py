@@ -38,14 +38,14 @@ from clsplat.config.presets import PRESETS, Preset
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples, warn
-from clsplat.files import check_new, digest
+from clsplat.files import check_new
 from clsplat.process import terminable
 from clsplat.progress import FrameProgress
 
 if TYPE_CHECKING:
     from clsplat.cli.render_job import Job
-    from clsplat.gaussians import Gaussians
     from clsplat.images.video import VideoWriter
+    from clsplat.sequence.cast import Cast
     from clsplat.sequence.task import Record, RenderOptions, Task
     from clsplat.shots import Shot
 
@@ -64,7 +64,8 @@ class Render(Verb):
     """Render a model from the cameras of a file or along a path made from them, an image for each frame."""
 
     model: RunOrModel
-    """A run's folder or a model file."""
+    """A run's folder or a model file; or a shot of several models (.json, docs/shot.md), or a USD stage that places
+    some."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
     """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF or JPEG; or the name
     of a video of all frames, such as turn.mp4. {name} is the image's name without its extension, sub-folders included,
@@ -73,6 +74,10 @@ class Render(Verb):
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
     nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each. Not
     needed with --path turntable or spiral."""
+    transform: Annotated[str | None, arg(metavar="FILE|STEPS|M00,M01,...")] = None
+    """Place the model by a 4 x 4 matrix of rotation, one scale and translation: 16 numbers row by row, a file of them,
+    steps in their order such as 'rotate=0,90,0 scale=2 translate=1,0,0', or a JSON file with key frames or a matrix a
+    frame (docs/shot.md)."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
     """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
     rising and sinking, or through them in their order, smoothed. Its frames count from 1. Without --cameras it goes
@@ -92,7 +97,9 @@ class Render(Verb):
     own lens. If not given: as the run was trained, but for --path, which is of pinhole cameras, else undistort."""
     channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
     """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion, count
-    and id (of Gaussians). docs/render.md has each."""
+    and id (of Gaussians), objects and semantic (Cryptomattes). docs/render.md has each."""
+    ids_from: Annotated[str | None, arg(metavar="PROPERTY")] = None
+    """Property of the models' PLY files that holds a whole number for each Gaussian, for --channels semantic."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
@@ -189,7 +196,8 @@ def run(verb: Render, services: Services) -> int:
     renderers = []
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
-        model = (job.gaussians, job.options, job.rasterizer)
+        how |= {"mattes": job.mattes} if job.mattes else {}
+        model = (job.cast.drawn, job.options, job.rasterizer)
         renderers = [services.open_frame_renderer(*model, device=selector, **how) for selector in job.devices]
         for renderer in renderers:
             renderer.check(job.tasks)
@@ -201,13 +209,13 @@ def _read_job(verb: Render) -> Job:
     """All that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
     import clsplat
     from clsplat.cli.render_job import Job, check_pictures, resizer
-    from clsplat.gaussians import Gaussians
-    from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
+    from clsplat.cli.render_models import read_cast
+    from clsplat.images.colour import CHROMATICITIES, Colours
     from clsplat.images.frame_files import VIDEO
     from clsplat.runs.appearance import gains_of
-    from clsplat.runs.run import model_file
     from clsplat.sequence import existing
     from clsplat.sequence.holdouts import held_out
+    from clsplat.sequence.mattes import mattes_of, names_of
     from clsplat.sequence.task import digest_of, make_tasks
     from clsplat.shots import check_around
 
@@ -218,7 +226,7 @@ def _read_job(verb: Render) -> Job:
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
-    whole, gaussians = _whole_shot(verb)
+    whole, cast = _whole_shot(verb)
     chosen = whole if verb.frames is None else whole.only(verb.frames)
     sampling = options.pictures.sampling
     tasks = make_tasks(chosen, whole, verb.output, resize, options.channels, sampling)
@@ -231,32 +239,31 @@ def _read_job(verb: Render) -> Job:
     _warn_of_unused(verb, options.channels)
     for text in chosen.warnings:
         warn(text)
-    model = model_file(verb.model)
+    cast = read_cast(verb.model, verb.transform, verb.appearance) if cast is None else cast
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
-    gaussians = Gaussians.load(model) if gaussians is None else gaussians
-    tasks = [task.seen_by(gaussians) for task in tasks]
-    recorded = recorded_space(model)
+    tasks, mattes = cast.seen(tasks, options), mattes_of(cast, options.channels, verb.ids_from or "")
+    recorded = cast.space
     colours = Colours(options.pictures.colour, recorded)
     extension = Path(verb.output).suffix.lower()
     colours.check_file(verb.output, extension, VIDEO)
     if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
         warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
-    attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
+    attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": cast.digest}
     attributes["clsplat:colorspace"] = colours.output
     options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer), gains=gains)
+    options = replace(options, mattes=names_of(mattes), ids_from=verb.ids_from or "")
     spaces = (colours.model, colours.output)
     video = _video(verb, whole)
     on_farm = verb.workers is not None or verb.scheduler is not None
     return Job(
-        options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing
+        options, verb.rasterizer, cast, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing, mattes
     )
 
 
-def _whole_shot(verb: Render) -> tuple[Shot, Gaussians | None]:
-    """All frames that there are, whatever --frames says, and the model where they follow from it. Raises
+def _whole_shot(verb: Render) -> tuple[Shot, Cast | None]:
+    """All frames that there are, whatever --frames says, and the models where they follow from these. Raises
     InputError."""
-    from clsplat.gaussians import Gaussians
-    from clsplat.runs.run import model_file
+    from clsplat.cli.render_models import read_cast
     from clsplat.shots import choose_shot, shot_around
 
     size: dict[str, Any] = {"count": verb.count, "size": (verb.width, verb.height)}
@@ -267,8 +274,8 @@ def _whole_shot(verb: Render) -> tuple[Shot, Gaussians | None]:
         return choose_shot(verb.cameras, path=verb.path, **size, **of_cameras), None
     if verb.usd_camera is not None:
         raise InputError(f"--usd-camera {verb.usd_camera}: expected the USD stage in --cameras with it")
-    gaussians = Gaussians.load(model_file(verb.model))
-    return shot_around(gaussians, verb.path, up=verb.up, **size), gaussians
+    cast = read_cast(verb.model, verb.transform, verb.appearance)
+    return shot_around(cast.at(1), verb.path, up=verb.up, **size), cast
 
 
 def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
@@ -304,6 +311,7 @@ def _video(verb: Render, shot: Shot) -> VideoConfig:
 def _options(verb: Render) -> RenderOptions:
     from clsplat.cli.render_holdout import holdout_settings
     from clsplat.cli.render_job import for_workers, parse_colour
+    from clsplat.cli.render_models import check_mattes
     from clsplat.images.frame_files import VIDEO, check_format, parse_channels
     from clsplat.sequence.task import RenderOptions
 
@@ -317,6 +325,7 @@ def _options(verb: Render) -> RenderOptions:
     if "alpha" in channels and verb.background is not None:
         flag = "--deep" if verb.deep else "--alpha" if verb.alpha else "--channels alpha"
         raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
+    check_mattes(channels, verb.ids_from, verb.compression)
     verb.slices.check()
     verb.video.check()
     if verb.deep:
@@ -438,8 +447,8 @@ def _on_farm(
 
     if verb.profile:
         warn("--profile is not used: it is for devices of this process")
-    model = str(job.model.absolute())
-    worker_job = WorkerJob(model, job.digest, job.options, job.rasterizer, job.devices[0], job.memory_limit)
+    model, placed = str(job.model.absolute()), job.cast.tracks is not None
+    worker_job = WorkerJob(model, job.digest, job.options, job.rasterizer, job.devices[0], job.memory_limit, placed)
     render_on_farm(tasks, worker_job, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
 
 

@@ -65,7 +65,7 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
     return {
         "model": str(job.model),
         "digest": job.digest,
-        "gaussians": len(job.gaussians),
+        "gaussians": sum(map(len, job.cast.models)),
         "channels": list(options.channels),
         "deep_bins": options.deep.bins if options.deep else 0,
         "model_colorspace": model,
@@ -120,8 +120,9 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
 def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
     device, options = open_device(selector, job.memory_limit), job.options
-    floats = held_sh(job.gaussians, job.rasterizer).floats
     framing, names = options.pictures.framing, set(options.channels)
+    gaussians = job.cast.at(job.tasks[0].number)
+    floats, moved = held_sh(gaussians, job.rasterizer).floats, job.cast.tracks is not None and "motion" in names
     features = feature_floats(names)
     plans = []
     cameras = [picture_camera(task, options) for task in job.tasks]
@@ -134,10 +135,10 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
         strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
         drawn = [(strip, features)]
         if framing.supersample > 1 and light_and_rest(names)[0]:
-            drawn.append((finer(strip, framing), 0))
+            drawn.append((finer(strip, framing), feature_floats(light_and_rest(names)[0])))
         for part, floats_beside in drawn:
             sizes = (on_tiles(part)[0], job.rasterizer, floats_beside, planes)
-            plan = plan_frame(device, len(job.gaussians), floats, *sizes)
+            plan = plan_frame(device, len(gaussians), floats, *sizes, moved)
             plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
     return max(plans, key=lambda device: device.plan.need.total)
 

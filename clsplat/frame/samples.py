@@ -19,6 +19,7 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import Filter, FramingConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, in_two
+from clsplat.frame.moments import sample_moments
 from clsplat.frame.window import crop, reframed
 
 _RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
@@ -80,16 +81,6 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
     return in_two(filtered, draw)
 
 
-def sample_times(count: int) -> Float64:
-    """`count` times in (0, 1), each in an interval of its own, in an order that has nothing to do with the lens's
-    (ranks of van der Corput's sequence)."""
-    index, radical, digit = np.arange(count), np.zeros(count), 0.5
-    while index.any():
-        radical += digit * (index & 1)
-        index, digit = index >> 1, digit / 2
-    return np.asarray((np.argsort(np.argsort(radical)) + 0.5) / count)
-
-
 def lens_points(count: int) -> Float64:
     """(count, 2) on the unit disc, each for as much of its area (Vogel's spiral)."""
     index = np.arange(count)
@@ -123,12 +114,10 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
 
     at: the camera at a time in frames from the frame, such as `Shot.at` gives; one sample is the middle itself.
     """
-    begin, end = config.shutter
     middle = at(config.middle)
     if not config.on or config.samples == 1:
         return middle, [middle]
-    times = begin + (end - begin) * sample_times(config.samples)
-    cameras = [at(float(time)) for time in times] if config.moves else [middle] * config.samples
+    cameras = [at(time) for time in sample_moments(config)] if config.moves else [middle] * config.samples
     if config.has_lens:
         cameras = [
             through_lens(camera, lens_radius(camera, config) * x, lens_radius(camera, config) * y, config.focus)
@@ -137,17 +126,19 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
     return middle, cameras
 
 
-def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera]) -> Draw:
+def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callable[[int], Draw] | None = None) -> Draw:
     """rgb and alpha as the mean over the cameras, of whole frames; other channels, of which there is no mean, from the
-    middle one. The camera that is drawn says the size and the window alone.
+    middle one. The camera that is drawn says the size and the window alone. light: the Draw of each sample, where that
+    is another than `draw`.
 
     `draw` has to give rgb in linear light. Sums are of float64, in the cameras' order.
     """
 
     def blurred(camera: Camera, names: Collection[str]) -> Planes:
         sums: dict[str, Float64] = {}
-        for sample in cameras:
-            for name, plane in draw(reframed(sample, camera), names).items():
+        for index, sample in enumerate(cameras):
+            drawn = draw if light is None else light(index)
+            for name, plane in drawn(reframed(sample, camera), names).items():
                 if name in sums:
                     sums[name] += plane
                 else:

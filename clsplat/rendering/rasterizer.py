@@ -20,7 +20,7 @@ from clsplat.device.layout import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, S
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
 from clsplat.stages.blend import Blended, blend, blend_grad
-from clsplat.stages.channels import Channels, Features, channels, features
+from clsplat.stages.channels import Channels, Features, Floats, channels, features
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera, tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
@@ -210,13 +210,28 @@ class Rasterizer:
         self.by_band(frame, lambda part: holdout(device, held, part.lists, *pixels))
 
     def channels(
-        self, gaussians: AnyGaussians, frame: Frame, wanted: Features, after: DeviceArray, held: Held | None = None
+        self,
+        gaussians: AnyGaussians,
+        frame: Frame,
+        wanted: Features,
+        after: DeviceArray,
+        held: Held | None = None,
+        moved: AnyGaussians | None = None,
     ) -> Channels:
-        """The frame's channels beside colour; after: the packed camera that motion goes to; held: as of `hold_out`."""
+        """The frame's channels beside colour; after: the packed camera that motion goes to; held: as of `hold_out`;
+        moved: as of `features`."""
         device, work, projected = self.device_of(frame.camera), self.work, frame.projected
-        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected)
+        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected, moved)
         pixels = (projected, frame.blended, frame.camera.height, frame.camera_array, held)
         return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
+
+    def shares(self, frame: Frame, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
+        """Planes (floats + 2, rows, stride), of which the first are the means of the rows (n, floats), any values of
+        each Gaussian; held: as of `hold_out`."""
+        device, work = self.device_of(frame.camera), self.work
+        wanted = Floats(rows.shape[1])
+        pixels = (frame.projected, frame.blended, frame.camera.height, frame.camera_array, held)
+        return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1].means
 
     def deep(self, frame: Frame, bins: int) -> DeviceArray:
         """The frame in slices by depth: the array of `stages.deep`."""

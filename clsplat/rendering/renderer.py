@@ -26,7 +26,15 @@ from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed
 from clsplat.stages.channels import DEPTHS, Features
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
-from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, ShStorage, host_gaussians, upload_gaussians
+from clsplat.stages.device_gaussians import (
+    AnyGaussians,
+    DeviceGaussians,
+    HostArray,
+    HostGaussians,
+    ShStorage,
+    host_gaussians,
+    upload_gaussians,
+)
 from clsplat.stages.holdout import Held, held_bytes, upload_held
 
 
@@ -38,6 +46,8 @@ class RenderResult:
     alpha: Float32
 
 
+SHARES = 8
+"""Objects whose shares are blended at a time."""
 ChannelResult = dict[str, NDArray[Any]]
 """Channels beside colour by their names in the kernels. depth, median, first (H, W) float32, along the camera's axis;
 count, index (H, W) int32, index -1 for nothing. normal and position (H, W, 3), in the world, and motion (H, W, 2), in
@@ -101,14 +111,17 @@ class Renderer:
         wanted: Collection[str] = (),
         *,
         after: Camera | None = None,
+        moved: Gaussians | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         contiguous: bool = True,
         holdout: Surfaces | None = None,
     ) -> tuple[RenderResult, ChannelResult]:
         """Render a view with channels beside colour (docs/channels.md).
 
-        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None. The
-        rest is like `render`. Raises InputError for motion from one projection to another.
+        wanted: of "normal", "position" and "motion"; after: the camera that motion goes to, the view's own if None;
+        moved: the same Gaussians where motion goes to, of which the means count, None if they stand still. The rest is
+        like `render`. Raises InputError for motion from one projection to another, ValueError for another number of
+        Gaussians that move.
         """
         features = Features.of(wanted)
         after = after or camera
@@ -121,11 +134,16 @@ class Renderer:
                 f"motion goes from a camera to one that is {after.projection}, expected {camera.projection}"
             )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
-        on_device, camera = self._placed(gaussians, camera, features.floats, held_bytes(holdout))
-        after = gaussians.local(after) if isinstance(gaussians, Gaussians) else after
+        moved = moved if "motion" in wanted else None
+        size = (features.floats, held_bytes(holdout))
+        on_device, camera = self._placed(gaussians, camera, *size, moved=moved is not None)
+        then = moved if moved is not None else gaussians
+        after = then.local(after) if isinstance(then, Gaussians) else after
         frame = self._forward(on_device, camera, background)
         held = self._hold_out(frame, holdout)
-        planes = self._rasterizer.channels(on_device, frame, features, upload(self.device, pack_camera(after)), held)
+        there = None if moved is None else self._moved(on_device, moved)
+        goes_to = upload(self.device, pack_camera(after))
+        planes = self._rasterizer.channels(on_device, frame, features, goes_to, held, there)
         height, width = camera.height, camera.width
         means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
         if contiguous:
@@ -137,6 +155,29 @@ class Renderer:
             shown = named["count"][:, :, None] > 0
             named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
         return self._result(frame, contiguous=contiguous), named
+
+    def render_shares(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        owners: NDArray[np.int32],
+        count: int,
+        holdout: Surfaces | None = None,
+    ) -> Float32:
+        """(H, W, count): what each of `count` objects covers of each pixel, the sum of the weights of its Gaussians;
+        owners (n,): the object of each; holdout: as of `render`. Raises as `render`."""
+        camera.check()
+        shares = np.zeros((camera.height, camera.width, count), np.float32)
+        on_device, local = self._placed(gaussians, camera, SHARES, held_bytes(holdout))
+        frame = self._forward(on_device, local, (0.0, 0.0, 0.0))
+        held = self._hold_out(frame, holdout)
+        alpha = self._result(frame, contiguous=False).alpha[:, :, None]
+        for first in range(0, count, SHARES):
+            rows = np.equal.outer(owners, np.arange(first, first + SHARES)).astype(np.float32)
+            planes = self._rasterizer.shares(frame, upload(self.device, rows), held)
+            means = planes.get()[:SHARES, : camera.height, : camera.width].transpose(1, 2, 0)
+            shares[:, :, first : first + SHARES] = (means * alpha)[:, :, : count - first]
+        return shares
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
         """(bins, H, W, 5): the view in slices by depth, each pixel's front to back, where its light is taken: red,
@@ -169,11 +210,25 @@ class Renderer:
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
 
+    def _moved(self, gaussians: AnyGaussians, moved: Gaussians) -> AnyGaussians:
+        """The means of `moved`, where the Gaussians are. Raises ValueError for another number of them."""
+        if len(moved) != gaussians.count:
+            raise ValueError(f"{len(moved)} Gaussians to move to, expected {gaussians.count}")
+        if isinstance(gaussians, HostGaussians):
+            return HostGaussians(len(moved), gaussians.coefficients, {"means": HostArray(moved.means)}, gaussians.rows)
+        return DeviceGaussians(len(moved), gaussians.coefficients, {"means": upload(self.device, moved.means)})
+
     def _placed(
-        self, gaussians: Gaussians | AnyGaussians, camera: Camera, features: int = 0, planes: int = 0
+        self,
+        gaussians: Gaussians | AnyGaussians,
+        camera: Camera,
+        features: int = 0,
+        planes: int = 0,
+        *,
+        moved: bool = False,
     ) -> tuple[AnyGaussians, Camera]:
         """The model on the device, or on the host if a frame of this size leaves too little room for it; and the camera
-        that counts from where it does. planes: bytes of a pixel beside the picture's."""
+        that counts from where it does. planes: bytes of a pixel beside the picture's; moved: with means to move to."""
         if not isinstance(gaussians, Gaussians):
             return gaussians, camera
         if self._sh is None or self._sh[0] is not gaussians:
@@ -182,10 +237,10 @@ class Renderer:
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
         self._rasterizer.antialias(on=gaussians.antialiased)
         sh = self._sh[1]
-        asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes)
+        asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes, moved)
         if self._planned != asked:
             config = self._rasterizer.config
-            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, config, features, planes)
+            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, config, features, planes, moved)
             self._rasterizer.follow(plan)
             if plan.streamed or isinstance(self._held, HostGaussians):
                 self._held = None

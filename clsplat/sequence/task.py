@@ -16,14 +16,18 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.config.channels import WRITTEN
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import InputError, reason_of
 from clsplat.files import digest, is_file
+from clsplat.frame.moments import sample_moments
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
+from clsplat.images.cryptomatte import header_of
 from clsplat.images.frame_files import VIDEO, Header, camera_matrices
+from clsplat.models.placed import State
 from clsplat.shots import Shot
 from clsplat.shots.frame_numbers import output_paths
 from clsplat.shots.motion import camera_after as following
@@ -61,8 +65,9 @@ class Record:
 class Task:
     """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
     camera that motion goes to, of the same size, where motion is asked for; stretch: where the camera is while the
-    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`;
-    holdout: an absolute path, None where nothing is held out.
+    shutter is open, None where it stands still; path: of the file; before: see `existing.stamp`; holdout: an absolute
+    path, None where nothing is held out; placed: of the models, by the time in frames from the frame, at all `moments`
+    of it; None for one that stands as it is.
     """
 
     number: int
@@ -73,6 +78,7 @@ class Task:
     stretch: Shot | None = None
     before: tuple[int, ...] | None = None
     holdout: Path | None = None
+    placed: Mapping[float, State] | None = None
 
     def at(self, time: float) -> Camera:
         """The camera of the whole frame at a time in frames from the frame."""
@@ -124,12 +130,21 @@ def make_tasks(
 
 
 @dataclass(frozen=True)
+class MatteNames:
+    """A matte among the channels: its objects' names, and a digest of which Gaussians are of which."""
+
+    channel: str
+    names: tuple[str, ...]
+    digest: str
+
+
+@dataclass(frozen=True)
 class RenderOptions:
     """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
     header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
     deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the
-    model's colours, none where they are taken as they are; holdout: how hold-outs
-    are read, None where there are none."""
+    model's colours, none where they are taken as they are; holdout: how hold-outs are read, None where there are none;
+    mattes: those among the channels; ids_from: the property of the models' files that semantic ids are of."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -141,6 +156,8 @@ class RenderOptions:
     drawn: str = ""
     gains: tuple[float, ...] = ()
     holdout: HoldoutConfig | None = None
+    mattes: tuple[MatteNames, ...] = ()
+    ids_from: str = ""
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
@@ -155,6 +172,16 @@ def camera_after(task: Task, options: RenderOptions) -> Camera | None:
     """The camera of the whole frame that motion goes to: a frame later than the middle of the shutter."""
     middle = options.pictures.sampling.middle
     return task.after if middle == 0 or task.after is None else task.at(middle + 1)
+
+
+def moments(options: RenderOptions) -> list[float]:
+    """The times at which the models of a frame are looked at, in frames from it: the middle of its shutter, its
+    samples, and where motion goes to."""
+    sampling = options.pictures.sampling
+    times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
+    if "motion" in options.channels:
+        times.append(sampling.middle + 1)
+    return list(dict.fromkeys(times))
 
 
 def plain(value: Any) -> Any:
@@ -183,8 +210,8 @@ def digest_of(*parts: Any) -> str:
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer, and the
-    content of its hold-out."""
+    """Digest of all that a frame of the models depends on: cameras, channels, encoding, pictures, rasterizer, the
+    content of its hold-out, and where the models are."""
     pictures = options.pictures
     encoding = {name: getattr(options.encoding, name) for name in _ENCODED.get(task.path.suffix.lower(), ())}
     cameras = [picture_camera(task, options)]
@@ -198,8 +225,10 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made += (options.gains,) if options.gains else ()
     if task.holdout is not None:
         made += ("holdout", _digest_at(str(task.holdout), _changed(task.holdout)), options.holdout)
+    made += (options.mattes,) if options.mattes else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
-    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling)
+    placed = [] if task.placed is None else [[task.placed[time] for time in moments(options)]]
+    return digest_of(cameras, made, encoding, colour, pictures.framing, sampling, *placed)
 
 
 def _content(source: str) -> str:
@@ -248,6 +277,8 @@ def header(task: Task, options: RenderOptions) -> Header:
     space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
         return Header(attributes, matrices, is_srgb=space == SRGB)
+    for matte in options.mattes:
+        attributes |= header_of(WRITTEN[matte.channel].part, matte.names)
     if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
     return Header(attributes, matrices, camera.window, chromaticities=CHROMATICITIES.get(space, ()))

@@ -67,6 +67,18 @@ class Features:
         return planes | {name: whole[:, :, at] for at, name in enumerate(WHOLE)}
 
 
+@dataclass(frozen=True)
+class Floats:
+    """Rows of any values that are blended as features are."""
+
+    floats: int
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """Defines for channels.cl."""
+        return {"FEATURES": self.floats}
+
+
 @dataclass(frozen=True, eq=False)
 class Channels:
     """Planes padded to whole tiles: means (floats + 2, rows, stride) of the features and, behind them, DEPTHS; whole
@@ -85,10 +97,13 @@ def features(
     camera_array: DeviceArray,
     after: DeviceArray,
     projected: Projected,
+    moved: AnyGaussians | None = None,
 ) -> DeviceArray:
-    """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to."""
+    """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to; moved: the
+    Gaussians with the means that it goes to, on the device or the host as the others; None where they stand still."""
     rows = work.array("features", (gaussians.count, wanted.floats))
-    for start, stop, (part,) in parts(work, gaussians):
+    models = (gaussians,) if moved is None else (gaussians, moved)
+    for start, stop, (part, *then) in parts(work, *models):
         splats = projected.rows(start, stop)
         launch_items(
             device,
@@ -101,6 +116,7 @@ def features(
             part["means"],
             part["quaternions"],
             part["log_scales"],
+            (then or [part])[0]["means"],
             splats.splats,
             rows.rows(start, stop),
         )
@@ -111,7 +127,7 @@ def features(
 def channels(
     device: Device,
     work: Workspace,
-    wanted: Features,
+    wanted: Features | Floats,
     rows: DeviceArray,
     lists: TileLists,
     projected: Projected,

@@ -133,6 +133,21 @@ def test_the_same_bits_in_every_shape(device: Device, every: bool, name: str) ->
             assert_same_bits(found[feature], first[1][feature])
 
 
+@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective", "perspective of 150 degrees"])
+def test_gaussians_that_move_are_a_camera_that_moves(device: Device, name: str) -> None:
+    camera, gaussians = CAMERAS[name], model_for(CAMERAS[name], 300, 5)
+    there = moved(camera)
+    # R' x + t' is R (R^T (R' x + t' - t)) + t
+    means = (gaussians.means @ there.rotation.T + there.translation - camera.translation) @ camera.rotation
+    still = replace(there, rotation=camera.rotation, translation=camera.translation)
+    then = replace(gaussians, means=means.astype(np.float32))
+    renderer = Renderer(device)
+    wanted = renderer.render_channels(gaussians, camera, ("motion",), after=there)[1]["motion"]
+    found = renderer.render_channels(gaussians, camera, ("motion",), after=still, moved=then)[1]["motion"]
+    assert_close(found, wanted, absolute=1e-3)  # pixels: float32's rounding of means, seen across up to 64 of them
+    assert np.abs(wanted).max() > 0.3
+
+
 def one_at(direction: list[float]) -> Gaussians:
     """A ball at the distance 2, seen under a tenth of a radian."""
     mean = 2.0 * np.array([direction]) / np.linalg.norm(direction)
