@@ -217,7 +217,7 @@ def parse_transform(text: str) -> KeyedTrack:
         words = read_document(Path(text), "16 numbers, or JSON with keys or matrices", MOST_BYTES)
         if words.lstrip()[:1] == "{":
             reader = Keys(Path(text), None, _object(Path(text), words), {})
-            names = tuple(name for name in MODEL if name not in ("name", "path"))
+            names = tuple(name for name in MODEL if name not in ("name", "path", "mattes"))
             _known(reader.where, reader.frame, names)
             return _track(reader)
         where = f"--transform {text}"

@@ -306,7 +306,7 @@ WRONG: list[tuple[dict[str, Any] | str, str]] = [
     ({"opacity": 2}, "model 'b': 'opacity' is 2, expected 0 to 1"),
     ({"visible": 1}, "model 'b': 'visible' is 1, expected true or false"),
     ({"scale": [1, 2, 1]}, "model 'b': 'scale' is [1, 2, 1], expected a number"),
-    ({"colour": 1}, "model 'b': 'colour' is not known here, expected one of name, path, keys"),
+    ({"colour": 1}, "model 'b': 'colour' is not known here, expected one of name, path, mattes, keys"),
     ({"gain": [1, -1, 1]}, "'gain' is [1, -1, 1], expected three numbers of at least 0"),
     ({"keys": []}, "model 'b': has no keys"),
     ({"keys": [{"scale": 1}]}, "model 'b': key 0: has no 'frame'"),
