@@ -8,7 +8,9 @@
 //   unit length; depth of the median and of the first, in world units. whole (2, height, width): count, and the index
 //   of the Gaussian with the largest weight, the first of those, -1 for none. All else is 0 where nothing was added,
 //   and in padding.
-// Equations: docs/channels.md, (60) to (67); with RAYS docs/cameras.md, (14).
+//   With HOLDOUT the weights are those that the surfaces of held.h let through, and a Gaussian of which they let
+//   nothing through does not count.
+// Equations: docs/channels.md, (60) to (67); with HOLDOUT docs/pictures.md, (75); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -16,6 +18,7 @@
 #include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
+#include "shared/held.h"
 
 #define PLANES (FEATURES + 2)
 #define MEDIAN FEATURES
@@ -24,7 +27,7 @@
 GROUP __kernel void channels(const int first_tile, const int tiles_x, const int height, __global const uint *ranges,
                              __global const uint *gaussian_from_sorted, __global const float *splats,
                              __global const float *features, __global const int *stops, __global float *planes,
-                             __global int *whole
+                             __global int *whole HELD_PARAMETERS
 #ifdef RAYS
                              ,
                              __constant float *camera
@@ -36,6 +39,14 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
   floatL t[OWNED], sums[FEATURES + 1][OWNED], median[OWNED], nearest[OWNED], largest[OWNED];
   intL stop[OWNED], count[OWNED], heaviest[OWNED];
   int last = begin;
+#ifdef HOLDOUT
+  floatL cut[OWNED]; // what the surfaces have taken
+  Held held[OWNED];
+  ALL_CELLS(cell) {
+    cut[cell] = (floatL)(0.0f);
+    held[cell] = held_of(held_starts + CELL_IN_PLANE(cell), held_surfaces, stride);
+  }
+#endif
   ALL_CELLS(cell) {
     stop[cell] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
     t[cell] = (floatL)(1.0f);
@@ -58,16 +69,26 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
     const Reach reach = reach_of(splat, tile_x, tile_y);
     FOR_CELLS(cell, reach) {
       const floatL power = LOG2_ALPHA(splat, cell);
-      const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[cell]);
+      intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[cell]);
       if (ANYL(taken)) {
         const floatL before = t[cell];
+#ifdef HOLDOUT // nothing is let through behind where nothing was
+        const floatL through = let_through(depth, held + cell, held_surfaces);
+        taken &= MASKL(through > 0.0f);
+#endif
         const floatL alpha = alpha_where(taken, power);
-        const floatL weight = before * alpha;
         t[cell] = fmaL(-before, alpha, before);
+#ifdef HOLDOUT
+        const floatL weight = before * alpha * through, left_before = before + cut[cell];
+        cut[cell] += before * alpha * (1.0f - through);
+        const floatL left = t[cell] + cut[cell];
+#else
+        const floatL weight = before * alpha, left_before = before, left = t[cell];
+#endif
         for (int field = 0; field < FEATURES; ++field)
           sums[field][cell] = fmaL(weight, (floatL)(own[field]), sums[field][cell]);
         sums[FEATURES][cell] += weight;
-        const intL halving = taken & MASKL(before > 0.5f) & MASKL(t[cell] <= 0.5f);
+        const intL halving = taken & MASKL(left_before > 0.5f) & MASKL(left <= 0.5f);
         median[cell] = halving ? (floatL)(depth) : median[cell];
         const intL opening = taken & MASKL(count[cell] == 0);
         nearest[cell] = opening ? (floatL)(depth) : nearest[cell];

@@ -1,12 +1,12 @@
-// A picture in slices by depth: the Gaussians of each bin of depths blended as if they were alone, up to where the
-// pixel ends in blend.cl. A tile's list is in order of depth, so that the bins come one after the other.
+// A picture in slices by depth, which each pixel has where its light is taken: as many slices as are asked for, cut so
+// that the most by which the light in front of any depth is off comes out as small as it can be.
 //
-// Owner: A group owns a tile, as in blend.cl.
+// Owner: A group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
 // Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
-// Buffers: blend's ranges, gaussian_from_sorted, splats and stops; bounds (bins - 1): the depths at which the next bin
-//   begins, rising, in world units; camera with RAYS -> planes (bins, DEEP_SIZE, height, width): colour associated with
-//   alpha, alpha, least and largest depth in world units. All 0 where nothing is added.
-// Equations: docs/pictures.md, (70) to (73).
+// Buffers: share, 1 / (DEEP_LEVELS bins); blend's ranges, gaussian_from_sorted, splats, transmittance and stops; camera
+//   with RAYS -> planes (bins, DEEP_SIZE, height, width): colour associated with alpha, alpha, depth of the slice in
+//   world units. All 0 behind a pixel's last slice.
+// Equations: docs/pictures.md, (70) to (74).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -15,10 +15,42 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-GROUP __kernel void deep(const int first_tile, const int tiles_x, const int height, const int bins,
-                         __constant float *bounds, __global const uint *ranges,
-                         __global const uint *gaussian_from_sorted, __global const float *splats,
-                         __global const int *stops, __global float *planes
+#define STEPS 8                          // slacks are tried in two walks of the list, in this many steps each
+#define TRIED (STEPS - 1)                // at once
+#define WALKS 3                          // of which the last makes the slices
+#define FIRST_STEP (DEEP_LEVELS / STEPS) // in levels; STEPS * STEPS is DEEP_LEVELS
+
+// Goes on by a Gaussian that takes the light from `before` to `after`, (73). open: the light with which a slice begins,
+// or minus the light behind the Gaussian whose depth is the slice's, once that is known. may_begin: of the lanes that
+// take it, those where another slice may begin. Returns those where it begins one.
+static inline intL begins_slice(floatL *open, floatL before, floatL after, floatL slack, intL taken, intL may_begin) {
+  const intL placed = taken & MASKL(*open - before > slack);
+  const floatL now = placed ? -before : *open;
+  const intL begins = may_begin & MASKL(now < 0.0f) & MASKL(-now - after > slack);
+  *open = begins ? before : now;
+  return begins;
+}
+
+// Writes the slice of each lane of `which` behind those that it has, and begins an empty one.
+static inline void write_slices(Lanes *values, IntLanes *slices, intL which, __global float *planes, size_t plane,
+                                size_t stride) {
+  IntLanes written;
+  written.all = which;
+  for (int lane = 0; lane < LANES; ++lane) {
+    if (written.lane[lane] == 0) continue;
+    __global float *to = planes + plane * DEEP_SIZE * slices->lane[lane] + LANE_IN_PLANE(lane);
+    for (int field = 0; field < DEEP_SIZE; ++field) to[plane * field] = values[field].lane[lane];
+    to[plane * DEEP_ALPHA] = 1.0f - values[DEEP_ALPHA].lane[lane];
+  }
+  for (int field = 0; field < DEEP_SIZE; ++field)
+    values[field].all = which ? (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f) : values[field].all;
+  slices->all -= which;
+}
+
+GROUP __kernel void deep(const int first_tile, const int tiles_x, const int height, const int bins, const float share,
+                         __global const uint *ranges, __global const uint *gaussian_from_sorted,
+                         __global const float *splats, __global const float *transmittance, __global const int *stops,
+                         __global float *planes
 #ifdef RAYS
                          ,
                          __constant float *camera
@@ -27,51 +59,75 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
   TILE_OF_GROUP
   PIXEL_TABLES
   RAY_TABLES
-  floatL values[DEEP_SIZE][OWNED]; // of the bin; DEEP_ALPHA: its transmittance
-  intL stop[OWNED];
+  floatL t[OWNED], unit[OWNED], level[OWNED], open[OWNED][TRIED];
+  intL stop[OWNED], counts[OWNED][TRIED];
+  Lanes values[OWNED][DEEP_SIZE]; // of the slice; DEEP_ALPHA: its transmittance
+  IntLanes slices[OWNED];
   int last = begin;
   ALL_CELLS(cell) {
-    stop[cell] = LOAD_CELL(int, stops + CELL_IN_PLANE(cell), stride);
-    for (int field = 0; field < DEEP_SIZE; ++field) values[field][cell] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
+    const size_t pixel = CELL_IN_PLANE(cell);
+    stop[cell] = LOAD_CELL(int, stops + pixel, stride);
+    unit[cell] = (1.0f - LOAD_CELL(float, transmittance + pixel, stride)) * share;
+    level[cell] = (floatL)(0.0f);
+    slices[cell].all = (intL)(0);
     last = max(last, maxL(stop[cell]));
+    for (int field = 0; field < DEEP_SIZE; ++field)
+      values[cell][field].all = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
+    for (int part = 0; part < bins * DEEP_SIZE; ++part)
+      STORE_CELL(float, (floatL)(0.0f), planes + plane * part + pixel, stride);
   }
   RAISE_TO_GROUP_MAX(last)
 
-  int i = begin;
-  for (int bin = 0; bin < bins; ++bin) {
-    for (; i < last; ++i) {
+  for (int walk = 0, step = FIRST_STEP; walk < WALKS; ++walk, step /= STEPS) {
+    ALL_CELLS(cell) {
+      t[cell] = (floatL)(1.0f);
+      for (int k = 0; k < TRIED; ++k) {
+        open[cell][k] = (floatL)(1.0f);
+        counts[cell][k] = (intL)(1);
+      }
+    }
+    for (int i = begin; i < last; ++i) {
       const uint gaussian = gaussian_from_sorted[i];
       PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i + AHEAD < last ? i + AHEAD : last - 1]);
       __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
       const float depth = splat[SPLAT_DEPTH];
-      if (bin < bins - 1 && depth >= bounds[bin]) break;
       SPLAT_HERE(splat)
       const Reach reach = reach_of(splat, tile_x, tile_y);
       FOR_CELLS(cell, reach) {
         const floatL power = LOG2_ALPHA(splat, cell);
         const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[cell]);
         if (ANYL(taken)) {
-          const floatL before = values[DEEP_ALPHA][cell];
-          const floatL alpha = alpha_where(taken, power);
-          const floatL weight = before * alpha;
-          values[DEEP_ALPHA][cell] = fmaL(-before, alpha, before);
-          for (int channel = 0; channel < 3; ++channel)
-            values[DEEP_RED + channel][cell] =
-                fmaL(weight, (floatL)(splat[SPLAT_RED + channel]), values[DEEP_RED + channel][cell]);
-          const intL opening = taken & MASKL(before == 1.0f);
-          values[DEEP_FIRST][cell] = opening ? (floatL)(depth) : values[DEEP_FIRST][cell];
-          values[DEEP_LAST][cell] = taken ? (floatL)(depth) : values[DEEP_LAST][cell];
+          const floatL alpha = alpha_where(taken, power), before = t[cell];
+          const floatL after = fmaL(-before, alpha, before);
+          t[cell] = after;
+          if (walk < WALKS - 1) {
+            for (int k = 0; k < TRIED; ++k) {
+              const floatL slack = unit[cell] * (level[cell] + (float)(step * (k + 1)));
+              counts[cell][k] -= begins_slice(open[cell] + k, before, after, slack, taken, taken); // -1 where it does
+            }
+          } else {
+            Lanes *slice = values[cell];
+            const intL room =
+                MASKL(slices[cell].all < (intL)(bins - 1)) & MASKL((floatL)(depth) > slice[DEEP_DEPTH].all);
+            const floatL slack = unit[cell] * (level[cell] + 1.0f);
+            const intL begins = begins_slice(open[cell], before, after, slack, taken, taken & room);
+            if (ANYL(begins)) write_slices(slice, slices + cell, begins, planes + CELL_IN_PLANE(cell), plane, stride);
+            const floatL left = slice[DEEP_ALPHA].all, weight = left * alpha;
+            slice[DEEP_ALPHA].all = fmaL(-left, alpha, left);
+            for (int channel = 0; channel < 3; ++channel)
+              slice[DEEP_RED + channel].all =
+                  fmaL(weight, (floatL)(splat[SPLAT_RED + channel]), slice[DEEP_RED + channel].all);
+            const intL placing = taken & MASKL(open[cell][0] > 0.0f);
+            slice[DEEP_DEPTH].all = placing ? (floatL)(depth) : slice[DEEP_DEPTH].all;
+          }
         }
       }
     }
-    ALL_CELLS(cell) {
-      const size_t pixel = CELL_IN_PLANE(cell);
-      for (int field = 0; field < DEEP_SIZE; ++field) {
-        const floatL value = values[field][cell];
-        STORE_CELL(float, field == DEEP_ALPHA ? 1.0f - value : value,
-                   planes + plane * (DEEP_SIZE * bin + field) + pixel, stride);
-        values[field][cell] = (floatL)(field == DEEP_ALPHA ? 1.0f : 0.0f);
-      }
-    }
+    if (walk < WALKS - 1) ALL_CELLS(cell)
+    for (int k = 0; k < TRIED; ++k)
+      level[cell] += counts[cell][k] > (intL)(bins) ? (floatL)((float)step) : (floatL)(0.0f);
   }
+  ALL_CELLS(cell)
+  write_slices(values[cell], slices + cell, MASKL(values[cell][DEEP_ALPHA].all < 1.0f), planes + CELL_IN_PLANE(cell),
+               plane, stride);
 }

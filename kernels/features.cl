@@ -4,9 +4,10 @@
 // Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
 // Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
 // Buffers: camera: the frame's own; after, before: those that motion goes to and backward motion goes back to;
-//   tile_counts (n): 0 where not visible; means, quaternions, log_scales as in project.cl; splats (n, SPLAT_SIZE), all
-//   of one projection -> features (n, FEATURES), written where visible: depth and position in world units, a normal of
-//   unit length, motion in pixels.
+//   tile_counts (n): 0 where not visible; means, quaternions, log_scales as in project.cl; means_after, means_before
+//   (n, 3): where they are when motion has come there, the means themselves where nothing moves; splats
+//   (n, SPLAT_SIZE), all of one projection -> features (n, FEATURES), written where visible: depth and position in
+//   world units, a normal of unit length, motion in pixels.
 // Equations: docs/channels.md, (61) to (64), (74) and (75).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -34,8 +35,8 @@ static inline void normal_of(__global const float *q, __global const float *log_
 #endif
 
 #if defined(FEATURE_MOTION) || defined(FEATURE_BACKWARD)
-// (64): from the mean's place on the image to that under another camera, in pixels; 0 where that has it behind its near
-// plane.
+// (64): from the mean's place on the image to that of the mean `to` under another camera, in pixels; 0 where that has
+// it behind its near plane.
 #if defined(RAYS) && RAYS != 3
 typedef struct {
   Double at[3];
@@ -52,9 +53,9 @@ static inline InCamera in_camera(__constant float *camera, float x, float y, flo
 
 // Angles by what the coordinates have grown by (74), (75): a small motion is nothing beside the rounding of two angles.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
-                             __global const float *splat, __global float *motion) {
+                             __global const float *to, __global const float *splat, __global float *motion) {
   motion[0] = motion[1] = 0.0f;
-  const InCamera here = in_camera(camera, x, y, z), there = in_camera(after, x, y, z);
+  const InCamera here = in_camera(camera, x, y, z), there = in_camera(after, to[0], to[1], to[2]);
   float p[3], q[3], d[3];
   for (int k = 0; k < 3; ++k) {
     p[k] = here.at[k].high;
@@ -104,10 +105,10 @@ static inline int place_of(__constant float *camera, float x, float y, float z, 
 
 // Whole pixels and the rest are subtracted apart, as a float32 of their sum would be cut.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
-                             __global const float *splat, __global float *motion) {
+                             __global const float *to, __global const float *splat, __global float *motion) {
   float whole[2], rest[2];
   motion[0] = motion[1] = 0.0f;
-  if (!place_of(after, x, y, z, whole, rest)) return;
+  if (!place_of(after, to[0], to[1], to[2], whole, rest)) return;
 #ifdef RAYS // a splat has no place
   float own_whole[2], own_rest[2];
   if (!place_of(camera, x, y, z, own_whole, own_rest)) return;
@@ -122,7 +123,8 @@ static inline void motion_of(__constant float *camera, __constant float *after, 
 
 __kernel void features(const uint n, __constant float *camera, __constant float *after, __constant float *before,
                        __global const uint *tile_counts, __global const float *means, __global const float *quaternions,
-                       __global const float *log_scales, __global const float *splats, __global float *features) {
+                       __global const float *log_scales, __global const float *means_after,
+                       __global const float *means_before, __global const float *splats, __global float *features) {
   const size_t i = get_global_id(0);
   if (i >= n || tile_counts[i] == 0) return;
   __global float *row = features + FEATURES * i;
@@ -145,9 +147,9 @@ __kernel void features(const uint n, __constant float *camera, __constant float 
   row[FEATURE_POSITION + 2] = z;
 #endif
 #ifdef FEATURE_MOTION
-  motion_of(camera, after, x, y, z, splat, row + FEATURE_MOTION);
+  motion_of(camera, after, x, y, z, means_after + 3 * i, splat, row + FEATURE_MOTION);
 #endif
 #ifdef FEATURE_BACKWARD
-  motion_of(camera, before, x, y, z, splat, row + FEATURE_BACKWARD);
+  motion_of(camera, before, x, y, z, means_before + 3 * i, splat, row + FEATURE_BACKWARD);
 #endif
 }

@@ -31,6 +31,7 @@ from clsplat.device.context import Device, all_devices
 from clsplat.device.layout import POSE_ROWS, READBACK, WIDEST_SLOTS
 from clsplat.device.shapes import Shape
 from clsplat.gaussians import GROUPS, Gaussians
+from clsplat.images.holdouts import surfaces_of
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.data_set import Lens
@@ -169,7 +170,9 @@ def pictures(device: Device) -> None:
         motion = ("motion",) if view is flat else ()
         after = replace(view, translation=np.array([0.1, 0.0, 0.1]))
         _, found = renderer.render_channels(gaussians, view, ("normal", "position", *motion), after=after)
-        slices = renderer.render_deep(gaussians, view, np.array([2.0, 3.0], np.float32))
+        slices = renderer.render_deep(gaussians, view, 3)
+        wall = np.full((view.height, view.width, 1), 2.5)
+        renderer.render_channels(gaussians, view, holdout=surfaces_of(wall, 1.5 * wall, 0.2 * wall))
         if not all(np.isfinite(values).all() for values in (*found.values(), slices)):
             raise SystemExit(f"a channel of the {view.projection} camera is not finite")
         if not found["count"].any():

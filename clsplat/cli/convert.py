@@ -99,7 +99,7 @@ def run(verb: Convert, services: Services) -> int:
     """Read, edit, write, read back. What is wrong with the call is found before anything is written."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
-    from clsplat.models.formats import format_of, format_of_name, load, save
+    from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
     from clsplat.runs.run import model_file
 
     source, merged = model_file(verb.source), [model_file(path) for path in verb.merge]
@@ -110,13 +110,13 @@ def run(verb: Convert, services: Services) -> int:
     for companion in target_format.side_files(verb.target):
         check_new(companion, overwrite=verb.overwrite)
     options = _of_format(verb, target_format)
-    original, space = load(source), colour.recorded_space(source)
+    original, space = load(source), colour_space(source)
     edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
     if not target_format.floats:
         edited = edit.without_empty_bands(edited)
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK), **options)
-    if space != colour.recorded_space(verb.target):
+    if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
     read = load(verb.target)
     if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
@@ -218,11 +218,11 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
     """Warn where a model that is merged is in another colour space, or far from the source."""
     import numpy as np
 
-    from clsplat.images import colour
     from clsplat.models import edit
+    from clsplat.models.formats import colour_space
 
     (path, other), (first_path, first) = merged, source
-    space, expected = colour.recorded_space(path), colour.recorded_space(first_path)
+    space, expected = colour_space(path), colour_space(first_path)
     if space != expected:
         warn(
             f"--merge {path}: its colours are of {space}, those of {first_path} of {expected}, as which all will count"

@@ -58,7 +58,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     from clsplat.evaluation.held_out import evaluate
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
-    from clsplat.images.colour import recorded_space
+    from clsplat.models.formats import colour_space
     from clsplat.report import NAME
     from clsplat.report.page import write_last
     from clsplat.runs import scene_record
@@ -112,7 +112,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
         step=model_record.get("step"),
         gaussians=len(gaussians),
         seconds=model_record.get("seconds"),
-        space=recorded_space(file),
+        space=colour_space(file),
         corrected=config.appearance != "none",
     )
     if given_run:

@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -21,6 +20,7 @@ from tyro.conf import arg
 from clsplat.cli.options import Flag, Memory, OptionalInt, RunOrModel, Verb, with_given
 from clsplat.cli.session import Services
 from clsplat.config.checks import parse_bytes
+from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import (
     EXR_DEPTH,
     ColourConfig,
@@ -40,14 +40,14 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.stereo import StereoConfig
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples, warn
-from clsplat.files import check_new, digest
+from clsplat.files import check_new
 from clsplat.process import terminable
 from clsplat.progress import FrameProgress
 
 if TYPE_CHECKING:
     from clsplat.cli.render_job import Job
-    from clsplat.gaussians import Gaussians
     from clsplat.images.video import VideoWriter
+    from clsplat.sequence.cast import Cast
     from clsplat.sequence.task import Record, RenderOptions, Task
     from clsplat.shots import Shot
 
@@ -66,7 +66,8 @@ class Render(Verb):
     """Render a model from the cameras of a file or along a path made from them, an image for each frame."""
 
     model: RunOrModel
-    """A run's folder or a model file."""
+    """A run's folder or a model file; or a shot of several models (.json, docs/shot.md), or a USD stage that places
+    some."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
     """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF, JPEG or DPX; or the
     name of a video of all frames, turn.mp4 or, in ProRes, turn.mov. {name} is the image's name without its extension,
@@ -76,6 +77,10 @@ class Render(Verb):
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
     nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each. Not
     needed with --path turntable or spiral."""
+    transform: Annotated[str | None, arg(metavar="FILE|STEPS|M00,M01,...")] = None
+    """Place the model by a 4 x 4 matrix of rotation, one scale and translation: 16 numbers row by row, a file of them,
+    steps in their order such as 'rotate=0,90,0 scale=2 translate=1,0,0', or a JSON file with key frames or a matrix a
+    frame (docs/shot.md)."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
     """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
     rising and sinking, or through them in their order, smoothed. Its frames count from 1. Without --cameras it goes
@@ -95,7 +100,10 @@ class Render(Verb):
     own lens. If not given: as the run was trained, but for --path, which is of pinhole cameras, else undistort."""
     channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
     """Channels of the files: rgb, alpha, and in EXR depth, median and first (depths), normals, position, motion (to
-    the next frame), backward (to the one before), count and id (of Gaussians). docs/render.md has each."""
+    the next frame), backward (to the one before), count and id (of Gaussians), objects and semantic (Cryptomattes).
+    docs/render.md has each."""
+    ids_from: Annotated[str | None, arg(metavar="PROPERTY")] = None
+    """Property of the models' PLY files that holds a whole number for each Gaussian, for --channels semantic."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
@@ -130,6 +138,10 @@ class Render(Verb):
     deep: Flag = False
     """Write deep EXR: of each pixel colour, alpha and depth in slices of the scene. docs/pictures.md has how."""
     slices: Annotated[DeepConfig, arg(name="deep")] = field(default_factory=DeepConfig)
+    holdout: Annotated[str | None, arg(metavar="PATTERN")] = None
+    """Depth EXR or deep EXR of other elements, such as 'cg/depth.####.exr': what is behind their surfaces is left out
+    of every channel. docs/pictures.md has how."""
+    holding: Annotated[HoldoutConfig, arg(name="holdout")] = field(default_factory=HoldoutConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     preset: Annotated[Preset | None, arg(metavar="exact|default|fast")] = None
     """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
@@ -192,7 +204,8 @@ def run(verb: Render, services: Services) -> int:
     renderers = []
     if not job.on_farm:
         how: dict[str, Any] = {"memory_limit": job.memory_limit, "profile": verb.profile}
-        model = (job.gaussians, job.options, job.rasterizer)
+        how |= {"mattes": job.mattes} if job.mattes else {}
+        model = (job.cast.drawn, job.options, job.rasterizer)
         renderers = [services.open_frame_renderer(*model, device=selector, **how) for selector in job.devices]
         for renderer in renderers:
             renderer.check(job.tasks)
@@ -203,14 +216,16 @@ def run(verb: Render, services: Services) -> int:
 def _read_job(verb: Render) -> Job:
     """All that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
     import clsplat
+    from clsplat.cli.render_eyes import Asked, shots_asked
     from clsplat.cli.render_job import Job, check_pictures, is_ours, resizer
+    from clsplat.cli.render_models import read_cast
     from clsplat.cli.render_stage import with_stage
-    from clsplat.gaussians import Gaussians
-    from clsplat.images.colour import CHROMATICITIES, Colours, recorded_space
+    from clsplat.images.colour import CHROMATICITIES, Colours
     from clsplat.images.frame_files import VIDEOS
     from clsplat.runs.appearance import gains_of
-    from clsplat.runs.run import model_file
     from clsplat.sequence import existing
+    from clsplat.sequence.holdouts import held_out
+    from clsplat.sequence.mattes import mattes_of, names_of
     from clsplat.sequence.pairs import make_views
     from clsplat.sequence.task import digest_of
     from clsplat.shots import check_around
@@ -222,13 +237,21 @@ def _read_job(verb: Render) -> Job:
     limit = parse_bytes(verb.max_device_mem)
     resize = resizer(verb.width, verb.height, verb.scale)
     devices = _devices(verb)
-    shots, gaussians = _shots(verb)
+
+    def cast_of() -> Cast:
+        return read_cast(verb.model, verb.transform, verb.appearance)
+
+    source = (verb.cameras, verb.path, verb.count, (verb.width, verb.height), verb.usd_camera)
+    asked = Asked(*source, verb.lenses or "undistort", verb.warp.distort, verb.up, cast_of)
+    shots, cast = shots_asked(asked, verb.pairs)
     if verb.deep:
         shots = {eye: shot.without_optics() for eye, shot in shots.items()}
     sampling = options.pictures.sampling
     tasks, chosen = make_views(shots, verb.frames, verb.output, resize, options.channels, sampling=sampling)
     options, unapplied = with_stage(options, verb.cameras, chosen, tasks)
     check_pictures(tasks, options)
+    if verb.holdout is not None:
+        tasks = held_out(tasks, verb.holdout, verb.holding)
     existing.check_folders(tasks)
     if tasks[0].is_video and (tasks[0].path.exists() or tasks[0].path.is_symlink()):
         ours = verb.skip_existing and is_ours(tasks[0].path)
@@ -236,51 +259,25 @@ def _read_job(verb: Render) -> Job:
     _warn_of_unused(verb, options.channels)
     for text in chosen.told(verb.cameras, *unapplied):
         warn(text)
-    model = model_file(verb.model)
+    cast = cast_of() if cast is None else cast
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
-    gaussians = Gaussians.load(model) if gaussians is None else gaussians
-    tasks = [task.seen_by(gaussians) for task in tasks]
-    recorded = recorded_space(model)
+    tasks, mattes = cast.seen(tasks, options), mattes_of(cast, options.channels, verb.ids_from or "")
+    recorded = cast.space
     colours = Colours(options.pictures.colour, recorded)
     extension = Path(verb.output).suffix.lower()
     colours.check_file(verb.output, extension, VIDEOS)
     if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
         warn(f"{verb.output}: the chromaticities of {colours.output} are not known here, and are not in the files")
-    attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": digest(model)}
+    attributes = {"Software": f"clsplat {clsplat.__version__}", "clsplat:model": cast.digest}
     attributes["clsplat:colorspace"] = colours.output
     options = replace(options, attributes=attributes, recorded=recorded, drawn=digest_of(verb.rasterizer), gains=gains)
+    options = replace(options, mattes=names_of(mattes), ids_from=verb.ids_from or "")
     spaces = (colours.model, colours.output)
     video = _video(verb, chosen)
     on_farm = verb.workers is not None or verb.scheduler is not None
     return Job(
-        options, verb.rasterizer, model, gaussians, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing
+        options, verb.rasterizer, cast, tasks, devices, limit, spaces, video, on_farm, verb.skip_existing, mattes
     )
-
-
-def _shots(verb: Render) -> tuple[dict[str, Shot], Gaussians | None]:
-    """All frames that there are, whatever --frames says, for each eye of a pair, else under ""; and the model where
-    they follow from it. Raises InputError."""
-    from clsplat.cli.render_eyes import ROLE, shots_of, stage_cameras
-    from clsplat.gaussians import Gaussians
-    from clsplat.runs.run import model_file
-    from clsplat.shots import choose_shot, shot_around
-
-    size: dict[str, Any] = {"count": verb.count, "size": (verb.width, verb.height)}
-    pairs = verb.pairs
-    paths = stage_cameras(pairs, verb.cameras, verb.usd_camera) if pairs.of_stage else {}
-    if verb.cameras is not None:
-        if verb.up is not None:
-            raise InputError(f"--up {verb.up}: is of paths around the model, expected no --cameras with it")
-        of_cameras: dict[str, Any] = {"lenses": verb.lenses or "undistort", "applied": [ROLE] if paths else []}
-        of_cameras["distort"] = verb.warp.distort
-        read = partial(choose_shot, verb.cameras, path=verb.path, **size, **of_cameras)
-        whole = read(usd_camera=next(iter(paths.values()), verb.usd_camera))
-        return shots_of(pairs, whole, lambda path: read(usd_camera=path), paths), None
-    if verb.usd_camera is not None:
-        raise InputError(f"--usd-camera {verb.usd_camera}: expected the USD stage in --cameras with it")
-    gaussians = Gaussians.load(model_file(verb.model))
-    whole = shot_around(gaussians, verb.path, up=verb.up, **size)
-    return shots_of(pairs, whole, lambda _: whole, {}), gaussians
 
 
 def _warn_of_unused(verb: Render, channels: Collection[str]) -> None:
@@ -314,7 +311,9 @@ def _video(verb: Render, shot: Shot) -> VideoConfig:
 
 
 def _options(verb: Render) -> RenderOptions:
+    from clsplat.cli.render_holdout import holdout_settings
     from clsplat.cli.render_job import bits_of, for_workers, parse_colour, warp_for_workers
+    from clsplat.cli.render_models import check_mattes
     from clsplat.images.frame_files import VIDEOS, check_format, parse_channels
     from clsplat.images.video import check_codec
     from clsplat.sequence.task import RenderOptions
@@ -332,13 +331,14 @@ def _options(verb: Render) -> RenderOptions:
         raise InputError(f"{flag} and --background exclude each other: with alpha there is no background")
     verb.pairs.check(distort=verb.warp.distort)
     verb.warp.check(channels, deep=verb.deep)
+    check_mattes(channels, verb.ids_from, verb.compression)
     verb.slices.check()
     verb.video.check()
     if verb.deep:
         pictures.check_deep()
         _check_deep(verb, channels)
     elif verb.slices != DeepConfig():
-        raise InputError("--deep.bins, --deep.near and --deep.far are of deep EXR, expected --deep with them")
+        raise InputError("--deep.bins is of deep EXR, expected --deep with it")
     if video:
         check_codec(verb.output, verb.video, channels)
         _check_video(verb)
@@ -347,7 +347,9 @@ def _options(verb: Render) -> RenderOptions:
     bits = bits_of(verb.output, verb.bits, channels)
     encoding = Encoding(verb.exr, verb.parts, verb.compression, bits, verb.quality, verb.video.prores)
     colour = parse_colour(verb.background or "black")
-    return RenderOptions(channels, colour, encoding, pictures=pictures, deep=verb.slices if verb.deep else None)
+    deep, bent = verb.slices if verb.deep else None, verb.warp != WarpConfig()
+    holdout = holdout_settings(verb.holdout, verb.holding, deep=verb.deep, bent=bent)
+    return RenderOptions(channels, colour, encoding, pictures=pictures, deep=deep, holdout=holdout)
 
 
 def _check_deep(verb: Render, channels: tuple[str, ...]) -> None:
@@ -449,8 +451,8 @@ def _on_farm(
 
     if verb.profile:
         warn("--profile is not used: it is for devices of this process")
-    model = str(job.model.absolute())
-    worker_job = WorkerJob(model, job.digest, job.options, job.rasterizer, job.devices[0], job.memory_limit)
+    model, placed = str(job.model.absolute()), job.cast.tracks is not None
+    worker_job = WorkerJob(model, job.digest, job.options, job.rasterizer, job.devices[0], job.memory_limit, placed)
     render_on_farm(tasks, worker_job, done, scheduler=verb.scheduler, workers=verb.workers, video=video)
 
 

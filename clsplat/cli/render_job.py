@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from clsplat.camera import Camera, Window
@@ -14,11 +14,12 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file
 from clsplat.frame.lens import ByMap
+from clsplat.frame.objects import Matte
 from clsplat.frame.samples import finer
-from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.images.video import video_record
 from clsplat.sequence import existing
+from clsplat.sequence.cast import Cast
 from clsplat.sequence.task import RenderOptions, Task, picture_camera, warp_of
 
 
@@ -30,8 +31,7 @@ class Job:
 
     options: RenderOptions
     rasterizer: RasterizerConfig
-    model: Path
-    gaussians: Gaussians
+    cast: Cast
     tasks: list[Task]
     devices: tuple[str | None, ...]
     memory_limit: int | None
@@ -39,10 +39,16 @@ class Job:
     video: VideoConfig
     on_farm: bool
     skip_existing: bool
+    mattes: Mapping[str, Matte] = field(default_factory=dict)
+
+    @property
+    def model(self) -> Path:
+        """The file that says which models there are, of one alone its own."""
+        return self.cast.path
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the model file."""
+        """SHA-256 of the models (`Cast.digest`)."""
         return str(self.options.attributes["clsplat:model"])
 
     @property

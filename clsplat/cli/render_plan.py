@@ -25,6 +25,7 @@ from clsplat.sequence import workers
 from clsplat.sequence.task import picture_camera, sampling_of, straight_camera
 from clsplat.shots.frame_numbers import ranges
 from clsplat.stages.deep import DEEP_FLOATS
+from clsplat.stages.holdout import HELD_BYTES
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
         camera = picture_camera(task, options)
         frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
         frame |= {"width": camera.width, "height": camera.height, "skipped": task.key in skipped}
+        if task.holdout is not None:
+            frame["holdout"] = str(task.holdout)
         if window := camera.window:
             frame["window"] = [window.x, window.y, window.width, window.height]
         if task.eye and task.right is None:
@@ -64,7 +67,7 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
     return {
         "model": str(job.model),
         "digest": job.digest,
-        "gaussians": len(job.gaussians),
+        "gaussians": sum(map(len, job.cast.models)),
         "channels": list(options.channels),
         "deep_bins": options.deep.bins if options.deep else 0,
         "model_colorspace": model,
@@ -103,6 +106,8 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
         yield f"video     {rate_of(document['fps'])} frames a second"
     yield f"channels  {', '.join(document['channels'])}{deep}"
     yield f"colour    {' to '.join(spaces)}"
+    if (held := job.tasks[0].holdout) is not None:
+        yield f"holdout   {' to '.join(dict.fromkeys((str(held), str(job.tasks[-1].holdout))))}"
     if samples := _samples(job):
         yield f"samples   {samples}"
     for device in plans:
@@ -117,8 +122,9 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
 def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
     device, options = open_device(selector, job.memory_limit), job.options
-    floats = held_sh(job.gaussians, job.rasterizer).floats
     framing, names = options.pictures.framing, set(options.channels)
+    gaussians = job.cast.at(job.tasks[0].number)
+    floats, moved = held_sh(gaussians, job.rasterizer).floats, job.cast.tracks is not None and "motion" in names
     features = feature_floats(names)
     plans = []
     cameras = [straight_camera(task, options) for task in job.tasks]
@@ -126,14 +132,15 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
         if options.deep:
             rows, planes = deep_rows(device, camera, options.deep.bins), 4 * DEEP_FLOATS * options.deep.bins
         else:
-            rows, planes = strip_rows(device, camera, options.channels, framing), 0
+            planes = HELD_BYTES if options.holdout is not None else 0
+            rows = strip_rows(device, camera, options.channels, framing, planes)
         strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
         drawn = [(strip, features)]
         if framing.supersample > 1 and light_and_rest(names)[0]:
-            drawn.append((finer(strip, framing), 0))
+            drawn.append((finer(strip, framing), feature_floats(light_and_rest(names)[0])))
         for part, floats_beside in drawn:
             sizes = (on_tiles(part)[0], job.rasterizer, floats_beside, planes)
-            plan = plan_frame(device, len(job.gaussians), floats, *sizes)
+            plan = plan_frame(device, len(gaussians), floats, *sizes, moved)
             plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
     return max(plans, key=lambda device: device.plan.need.total)
 

@@ -54,8 +54,8 @@ def run(verb: View, services: Services) -> int:
     from clsplat.device.child import TrialInterrupted
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
-    from clsplat.images.colour import recorded_space
     from clsplat.models.edit import exposed
+    from clsplat.models.formats import colour_space
     from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file, run_of
     from clsplat.selftest.result import FORWARD
@@ -81,7 +81,7 @@ def run(verb: View, services: Services) -> int:
     scene = _scene(services, verb.scene or (run.scene if run else None), config, given=verb.scene is not None)
     device = verb.device.trusted(services, FORWARD)
     background = background_colour(verb.background or config.background)
-    model = HeldModel(gaussians, device, config.rasterizer, background, recorded_space(file))
+    model = HeldModel(gaussians, device, config.rasterizer, background, colour_space(file))
     views = scene.views if scene else []
     low, high = extent_of(gaussians.means)
     box = (low + gaussians.origin, high + gaussians.origin)

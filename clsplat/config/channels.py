@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 Kind = Literal["colour", "exact", "whole"]
-Source = Literal["image", "features", "depths", "whole"]
+Source = Literal["image", "features", "depths", "whole", "shares"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,8 @@ class Channel:
     depth; whole is uint32 in a part of its own, else float.
     part: its name in a file of several parts.
     source: the kernels' planes that it is taken from. The image is of blend.cl. Features are of features.cl, blended by
-    channels.cl. The depths follow them in the same array, and whole numbers are in another.
+    channels.cl. The depths follow them in the same array, and whole numbers are in another. Shares are blended as
+    features are, one for each object.
     kernel: its name in the kernels, which get a feature's offset as FEATURE_NAME.
     signs: factors from the kernel's values to the file's, none where they are the same.
     """
@@ -35,7 +37,7 @@ class Channel:
     @property
     def is_light(self) -> bool:
         """True if samples and filters add it up. Of other channels the frame has those of the middle sample."""
-        return self.source == "image"
+        return self.source in ("image", "shares")
 
 
 CHANNELS: dict[str, Channel] = {
@@ -53,6 +55,20 @@ CHANNELS: dict[str, Channel] = {
 }
 """Every channel that `--channels` takes, in the order of a file and of the kernels' planes. The v of both motions is
 up in files, and docs/channels.md has y down."""
+
+LAYERS = 3
+"""Layers of a Cryptomatte, of two objects each."""
+
+
+def _matte(name: str) -> Channel:
+    layers = tuple(f"{name}{layer:02d}.{channel}" for layer in range(LAYERS) for channel in "RGBA")
+    return Channel(layers, "exact", name, "shares", name)
+
+
+MATTES: dict[str, Channel] = {"objects": _matte("cryptoobject"), "semantic": _matte("cryptosemantic")}
+"""Cryptomattes, which `--channels` takes too. While a frame is made they have a float for each object."""
+WRITTEN = ChainMap(MATTES, CHANNELS)
+"""Every channel that a file may have, in their order; CHANNELS come first."""
 
 DEEP = ("R", "G", "B", "A", "Z", "ZBack")
 """Channels of a deep picture."""
@@ -72,4 +88,4 @@ def feature_names(names: Iterable[str]) -> tuple[str, ...]:
 def light_and_rest(names: Iterable[str]) -> tuple[list[str], list[str]]:
     """The channels that light is added up in, and the others."""
     asked = list(names)
-    return [name for name in asked if CHANNELS[name].is_light], [name for name in asked if not CHANNELS[name].is_light]
+    return [name for name in asked if WRITTEN[name].is_light], [name for name in asked if not WRITTEN[name].is_light]

@@ -221,21 +221,11 @@ class DeepConfig:
     """Slices of a deep EXR."""
 
     bins: int = 16
-    """Slices by depth, the most samples that a pixel has; each is as many times deeper as the one before."""
-    near: float = 0.0
-    """Depth at which the second slice begins, the first has all before it; 0 goes by what the frame has in view."""
-    far: float = 0.0
-    """Depth at which the last slice begins, which has all behind it; 0 goes by what the frame has in view."""
+    """Slices by depth, the most samples that a pixel has. Each pixel has them where its light is taken."""
 
     def check(self) -> None:
         """Raise InputError naming the first setting whose value makes no sense."""
-        rules: tuple[Rule, ...] = (
-            (("bins",), lambda value: 1 <= value <= _MOST_BINS, f"1 to {_MOST_BINS}"),
-            (("near", "far"), lambda value: 0 <= value < inf, "a depth, or 0 for that of what is in view"),
-        )
-        check_rules(self, "--deep.", rules)
-        if self.near and self.far and not self.near < self.far:
-            raise InputError(f"--deep.far {self.far}: expected more than --deep.near {self.near}")
+        check_rules(self, "--deep.", ((("bins",), lambda value: 1 <= value <= _MOST_BINS, f"1 to {_MOST_BINS}"),))
 
 
 ProRes = Literal["422", "hq", "4444"]

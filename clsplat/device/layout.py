@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from clsplat.config.holdout import HELD
 from clsplat.config.marking import FRESH, UNWANTED, USELESS
 
 TILE = 16
@@ -79,8 +80,11 @@ complement of the smallest depth key and the largest one; 1 from where a pass by
 and what `adam` has counted since."""
 
 
-DEEP = ("RED", "GREEN", "BLUE", "ALPHA", "FIRST", "LAST")
-"""A pixel and bin of a deep picture: colour, associated with alpha; alpha; least and largest depth."""
+DEEP = ("RED", "GREEN", "BLUE", "ALPHA", "DEPTH")
+"""A pixel's slice of a deep picture: colour, associated with alpha; alpha; the depth at which it is."""
+
+DEEP_LEVELS = 64
+"""Steps of the slack that a pixel's slices are cut with."""
 
 
 @dataclass(frozen=True)
@@ -114,12 +118,13 @@ WIDEST_SLOTS = SlotFields(absolute=True, contributions=True, nearness=True)
 
 def header() -> str:
     """The declarations as OpenCL C."""
-    lines = [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}"]
+    lines = [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}", f"#define DEEP_LEVELS {DEEP_LEVELS}"]
     lines += [f"#define LOSS_ROWS {LOSS_ROWS}", f"#define LOSS_COLUMNS {LOSS_COLUMNS}"]
     lines.append(f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}")
     lines.append(f"#define POSE_ROWS {POSE_ROWS}u")
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
-    layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK, "DEEP": DEEP}
+    layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK}
+    layouts |= {"DEEP": DEEP, "HELD": HELD}
     for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
         lines.append(f"#define {prefix}_SIZE {len(fields)}")

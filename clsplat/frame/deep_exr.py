@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deep EXR: the samples of a pixel are slices of the scene by depth, each with its alpha and associated colour.
 
-Over each other, front to back, they are the flat picture: the Gaussians of a slice are those that the pixel takes.
+Over each other, front to back, they are the flat picture: the Gaussians of a slice are those that the pixel takes. Each
+pixel has its slices where its light is taken (docs/pictures.md).
 """
 
 from __future__ import annotations
@@ -9,13 +10,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from itertools import repeat
-from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
@@ -34,43 +33,11 @@ from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.renderer import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
 
-_OUTLIERS = 0.01
-"""Share of the Gaussians in view that is nearer than the first bound, and that is further than the last."""
 
-
-def bin_bounds(gaussians: Gaussians, camera: Camera, config: DeepConfig) -> Float32:
-    """(bins - 1,): the depths at which the next slice begins, a constant ratio apart, for all of a frame's pictures."""
-    if config.bins == 1:
-        return np.zeros(0, np.float32)
-    near, far = config.near, config.far
-    if not (near and far):
-        depths = depths_in_view(gaussians, camera)
-        low, high = np.quantile(depths, [_OUTLIERS, 1 - _OUTLIERS]) if len(depths) else (1.0, 2.0)
-        near, far = near or min(float(low), far or inf), far or max(float(high), near)
-    return np.geomspace(near, far, config.bins - 1).astype(np.float32) if near < far else np.full(1, near, np.float32)
-
-
-def depths_in_view(gaussians: Gaussians, camera: Camera) -> NDArray[np.float64]:
-    """Depths of the means that are in front of the camera and, if it has an image plane, in its frame; for a model that
-    is drawn along rays their distances."""
-    camera = gaussians.local(camera)
-    p = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
-    if not camera.kind.flat:
-        distances: NDArray[np.float64] = np.linalg.norm(p, axis=1)
-        return distances[distances > camera.near]
-    p = p[p[:, 2] > camera.near]
-    frame = camera.window or camera
-    by = p[:, 2] if camera.projection == "perspective" else 1.0
-    x, y = camera.fx * p[:, 0] / by + camera.cx, camera.fy * p[:, 1] / by + camera.cy
-    p = p[(x >= 0) & (x <= frame.width) & (y >= 0) & (y <= frame.height)]
-    return np.asarray(np.linalg.norm(p, axis=1) if camera.kind.rays else p[:, 2])
-
-
-def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
-    """(bins, H, W, 6): red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where a pixel has
-    nothing in a slice."""
+def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
+    """(bins, H, W, 5): red, green, blue, associated with alpha; alpha; depth. All 0 behind a pixel's last slice."""
     larger, rows, columns = on_tiles(camera)
-    return renderer.render_deep(gaussians, larger, bounds)[:, rows, columns]
+    return renderer.render_deep(gaussians, larger, bins)[:, rows, columns]
 
 
 def deep_rows(device: Device, camera: Camera, bins: int) -> int:
@@ -92,22 +59,21 @@ def write_deep(
 ) -> bool:
     """Render and write a deep scanline EXR, atomically, in strips that bound the memory; True if nothing is in it.
 
-    Channels R G B A Z ZBack; a pixel has a sample for each slice that it has something in, with the depths of the first
-    and the last Gaussian that it takes there. Colours are half or float as the encoding says, depths are float. Raises
-    InputError and ClsplatError as `images.frame_files.write_channels`.
+    Channels R G B A Z ZBack; a pixel has a sample for each of its slices, all of it at one depth. Colours are half or
+    float as the encoding says, depths are float. Raises InputError and ClsplatError as
+    `images.frame_files.write_channels`.
     """
     config = config or DeepConfig()
     encoding, header, colours = encoding or Encoding(), header or Header(), colours or Colours()
     if path.suffix.lower() != ".exr":
         raise InputError(f"{path}: deep samples want an .exr file")
-    bounds = bin_bounds(gaussians, camera, config)
     spec = deep_spec(camera.width, camera.height, encoding, header)
-    rows = deep_rows(renderer.device, camera, len(bounds) + 1)
+    rows = deep_rows(renderer.device, camera, config.bins)
     seen: list[bool] = []
 
     def pieces() -> Iterator[tuple[Any, int]]:
         for strip in strips(camera, rows):
-            slices = render_deep(renderer, gaussians, strip, bounds)
+            slices = render_deep(renderer, gaussians, strip, config.bins)
             seen.append(bool(slices[:, :, :, 3].any()))
             for image in slices:
                 rgb, alpha = np.ascontiguousarray(image[:, :, :3]), np.ascontiguousarray(image[:, :, 3])
@@ -132,8 +98,9 @@ def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tup
         pixels = np.nonzero(taken)[0].tolist()
         samples = (np.cumsum(taken, axis=1) - 1)[taken].tolist()
         values = rows[taken]
-        for channel in range(len(DEEP)):
-            _call_with(data.set_deep_value, pixels, repeat(channel), samples, values[:, channel].tolist())
+        for channel in range(len(DEEP)):  # the last is Z again: a slice begins and ends at one depth
+            column = values[:, min(channel, DEEP_FLOATS - 1)].tolist()
+            _call_with(data.set_deep_value, pixels, repeat(channel), samples, column)
         yield data, len(rows) // width
 
 

@@ -3,18 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.channels import CHANNELS, feature_names, light_and_rest
+from clsplat.config.channels import CHANNELS, MATTES, feature_names, light_and_rest
 from clsplat.device.layout import TILE
+from clsplat.frame.holdout import Cut
+from clsplat.frame.objects import Matte
 from clsplat.frame.window import crop, reframed
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.renderer import Renderer
+from clsplat.rendering.renderer import SHARES, Renderer
 from clsplat.stages.channels import Features
 
 Planes = dict[str, NDArray[Any]]
@@ -30,8 +32,14 @@ def drawn_by(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     after: Camera | None = None,
     before: Camera | None = None,
+    cut: Cut | None = None,
+    moved: Gaussians | None = None,
+    earlier: Gaussians | None = None,
+    mattes: Mapping[str, Matte] | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after, before: the cameras of a whole frame that motion and backward motion go to.
+    """A Draw by the kernels; after, before: the cameras of a whole frame that motion and backward motion go to; cut: of
+    the frame's hold-out; moved, earlier: the Gaussians that these motions go to, where they do not stand still; mattes:
+    by the names of their channels.
 
     Planes need not be contiguous: the encoder, which may be another thread, puts them in order.
     """
@@ -40,8 +48,10 @@ def drawn_by(
         camera, rows, columns = on_tiles(camera)
         _, rest = light_and_rest(names)
         made: Planes = {}
+        holdout = cut(camera) if cut else None
+        of_objects = {name: (mattes or {})[name] for name in names if name in MATTES}
         if not rest:
-            picture = renderer.render(gaussians, camera, background, contiguous=False)
+            picture = renderer.render(gaussians, camera, background, contiguous=False, holdout=holdout)
         else:
             picture, made = renderer.render_channels(
                 gaussians,
@@ -49,13 +59,17 @@ def drawn_by(
                 feature_names(rest),
                 after=after and reframed(after, camera),
                 before=before and reframed(before, camera),
+                **{name: then for name, then in (("moved", moved), ("earlier", earlier)) if then is not None},
                 background=background,
                 contiguous=False,
+                holdout=holdout,
             )
         planes: Planes = {"rgb": picture.image, "alpha": picture.alpha}
         for name in rest:
             plane, signs = made[CHANNELS[name].kernel], CHANNELS[name].signs
             planes[name] = plane * np.array(signs, np.float32) if signs else plane
+        for name, matte in of_objects.items():
+            planes[name] = renderer.render_shares(gaussians, camera, matte.owners, len(matte.names), holdout)
         return {name: planes[name][rows, columns] for name in names}
 
     return draw
@@ -75,7 +89,8 @@ def in_two(light: Draw, rest: Draw) -> Draw:
 def feature_floats(names: Collection[str]) -> int:
     """Floats of each Gaussian's that these channels are blended from, 0 where they are colour alone."""
     _, rest = light_and_rest(names)
-    return Features.of(feature_names(rest)).floats if rest else 0
+    floats = Features.of(feature_names(rest)).floats if rest else 0
+    return max(floats, SHARES) if any(name in MATTES for name in names) else floats
 
 
 def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:

@@ -19,7 +19,7 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import SENSOR_WIDTH, Filter, FramingConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, in_two
-from clsplat.frame.times import shutter_times
+from clsplat.frame.times import sample_moments
 from clsplat.frame.window import crop, reframed
 
 _RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
@@ -117,7 +117,7 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
     middle = at(config.middle)
     if not config.on or config.samples == 1:
         return middle, [middle]
-    cameras = [at(time) for time in shutter_times(config)] if config.moves else [middle] * config.samples
+    cameras = [at(time) for time in sample_moments(config)] if config.moves else [middle] * config.samples
     if config.has_lens:
         focus = config.focus or 0.0
         cameras = [
@@ -127,17 +127,19 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
     return middle, cameras
 
 
-def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera]) -> Draw:
+def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callable[[int], Draw] | None = None) -> Draw:
     """rgb and alpha as the mean over the cameras, of whole frames; other channels, of which there is no mean, from the
-    middle one. The camera that is drawn says the size and the window alone.
+    middle one. The camera that is drawn says the size and the window alone. light: the Draw of each sample, where that
+    is another than `draw`.
 
     `draw` has to give rgb in linear light. Sums are of float64, in the cameras' order.
     """
 
     def blurred(camera: Camera, names: Collection[str]) -> Planes:
         sums: dict[str, Float64] = {}
-        for sample in cameras:
-            for name, plane in draw(reframed(sample, camera), names).items():
+        for index, sample in enumerate(cameras):
+            drawn = draw if light is None else light(index)
+            for name, plane in drawn(reframed(sample, camera), names).items():
                 if name in sums:
                     sums[name] += plane
                 else:

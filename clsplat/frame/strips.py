@@ -22,14 +22,19 @@ from clsplat.rendering.memory_needs import frame_pixels
 
 
 def strip_rows(
-    device: Device, camera: Camera, names: Collection[str] = ("rgb",), config: FramingConfig | None = None
+    device: Device,
+    camera: Camera,
+    names: Collection[str] = ("rgb",),
+    config: FramingConfig | None = None,
+    planes: int = 0,
 ) -> int:
     """Rows of a strip that leaves room for the rest, whole tiles of them; the picture's height where it needs none.
 
-    names: of the channels that are wanted; config: supersampling makes strips larger than they are written.
+    names: of the channels that are wanted; config: supersampling makes strips larger than they are written; planes:
+    bytes of each pixel in further planes.
     """
     samples = config.supersample if config else 1
-    most = min(frame_pixels(device, feature_floats(names)), STRIP_PIXELS)
+    most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
     rows = most // across - 2 * TILE  # what a window that begins within a tile, and a filter's margins, add
     if rows >= camera.height:

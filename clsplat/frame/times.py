@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Times of the samples of an open shutter."""
+"""Times of a frame's samples. Policy: no OpenCL."""
 
 from __future__ import annotations
 
@@ -19,7 +19,12 @@ def sample_times(count: int) -> Float64:
     return np.asarray((np.argsort(np.argsort(radical)) + 0.5) / count)
 
 
-def shutter_times(config: SamplingConfig) -> list[float]:
-    """The times of a frame's samples, in frames from the frame, in their order."""
+def sample_moments(config: SamplingConfig) -> list[float]:
+    """The time of each sample, in frames from the frame: all over the shutter's where it stays open, else its
+    middle."""
+    if not config.on or config.samples == 1:
+        return [config.middle]
+    if not config.moves:
+        return [config.middle] * config.samples
     begin, end = config.shutter
     return [float(time) for time in begin + (end - begin) * sample_times(config.samples)]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera, Window
-from clsplat.config.channels import CHANNELS, DEEP
+from clsplat.config.channels import DEEP, WRITTEN
 from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.images.alpha import unassociate
@@ -94,13 +94,13 @@ def is_whole_panorama(camera: Camera) -> bool:
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
-    """The names in `text`, comma-separated, in the order of CHANNELS. Raises InputError."""
+    """The names in `text`, comma-separated, in the order of WRITTEN. Raises InputError."""
     asked = [word.strip() for word in text.split(",") if word.strip()]
-    unknown = [word for word in asked if word not in CHANNELS]
+    unknown = [word for word in asked if word not in WRITTEN]
     if unknown or not asked:
         problem = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
-        raise InputError(f"--channels {text}: {problem}, expected some of {', '.join(CHANNELS)}")
-    return tuple(name for name in CHANNELS if name in asked)
+        raise InputError(f"--channels {text}: {problem}, expected some of {', '.join(WRITTEN)}")
+    return tuple(name for name in WRITTEN if name in asked)
 
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
@@ -153,12 +153,12 @@ def encoded(
 ) -> list[tuple[NDArray[Any], Any]]:
     """(pixels, OpenImageIO's specification) of each part of a file. several: the file has other views too, so that
     parts are named after theirs."""
-    channels = {name: channels[name] for name in CHANNELS if name in channels}
+    channels = {name: channels[name] for name in WRITTEN if name in channels}
     if extension != ".exr":
         return [_picture(extension, channels, encoding, header)]
     groups = _parts(tuple(channels)) if encoding.parts == "several" else [tuple(channels)]
     view = header.view if several else ""
-    names = [CHANNELS[group[0]].part if len(groups) > 1 else "" for group in groups]
+    names = [WRITTEN[group[0]].part if len(groups) > 1 else "" for group in groups]
     named = [".".join(filter(None, (name, view))) for name in names]
     return [_exr_part(group, channels, encoding, header, name) for group, name in zip(groups, named, strict=True)]
 
@@ -180,7 +180,7 @@ def is_whole(
     zeros in it every row is decoded. A file that was cut short fails. deep: expect a deep picture, whose channels are
     DEEP; views: of a stereo pair, each with these channels.
     """
-    channels = [name for name in CHANNELS if name in set(channels)]
+    channels = [name for name in WRITTEN if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
     groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
     if not path.is_file():
@@ -198,7 +198,7 @@ def is_whole(
             if not source.seek_subimage(part, 0):
                 return False
             spec = source.spec()
-            names = DEEP if deep else tuple(channel for name in group for channel in CHANNELS[name].names)
+            names = DEEP if deep else tuple(channel for name in group for channel in WRITTEN[name].names)
             if (spec.width, spec.height, spec.deep) != (width, height, deep):
                 return False
             if sorted(spec.channelnames) != sorted(names):  # OpenImageIO has its own order of an EXR's
@@ -231,13 +231,13 @@ def attribute(path: Path, name: str) -> Any:
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
     """The channels of each part. Those of one part stand together in the table."""
-    return [tuple(group) for _, group in groupby(names, lambda name: CHANNELS[name].part)]
+    return [tuple(group) for _, group in groupby(names, lambda name: WRITTEN[name].part)]
 
 
 def _exr_part(
     names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, part: str
 ) -> tuple[NDArray[Any], Any]:
-    kinds = [CHANNELS[name].kind for name in names for _ in CHANNELS[name].names]
+    kinds = [WRITTEN[name].kind for name in names for _ in WRITTEN[name].names]
     planes = [np.atleast_3d(channels[name]) for name in names]
     if set(kinds) == {"whole"}:
         pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
@@ -254,7 +254,7 @@ def _exr_part(
                 else:
                     pixels[:, :, at] = plane[:, :, channel]
                 at += 1
-    spec = _exr_spec(pixels.shape, [channel for name in names for channel in CHANNELS[name].names], formats, header)
+    spec = _exr_spec(pixels.shape, [channel for name in names for channel in WRITTEN[name].names], formats, header)
     deflated = encoding.compression.startswith("zip")
     spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
     if part:
@@ -263,7 +263,7 @@ def _exr_part(
 
 
 def _check_floats(name: str, plane: NDArray[Any]) -> None:
-    if CHANNELS[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
+    if WRITTEN[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
         raise InputError(
             f"--channels {name}: the largest is {plane.max():,}, more than a float holds exactly; use --parts several, "
             "where it is a whole number"

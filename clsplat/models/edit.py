@@ -25,6 +25,8 @@ FAR = 64.0
 0017)."""
 SCALES = (1e-12, 1e12)
 """Smallest and largest scale; beyond them float32's means would be 0 or infinite."""
+_NOTHING = -80.0
+"""Logit of an opacity that is nothing: exp(80) is a float32."""
 _SIMILAR = 1e-6
 """Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
 
@@ -74,6 +76,24 @@ def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
     sh = gaussians.sh * factors
     sh[:, 0] += 0.5 * (factors - 1) / C0  # colours are SH plus a half
     return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))
+
+
+def graded(gaussians: Gaussians, linear: Float64, shift: Float64) -> Gaussians:
+    """The model whose colours c are linear c + shift, (3, 3) and (3,), before they are cut at 0."""
+    sh = np.einsum("cd,nkd->nkc", linear, gaussians.sh.astype(np.float64))
+    sh[:, 0] += (linear @ np.full(3, 0.5) + shift - 0.5) / C0  # colours are SH plus a half
+    return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))
+
+
+def faded(gaussians: Gaussians, factor: float) -> Gaussians:
+    """The model with each opacity times a factor from 0 to 1; of 0 so little is left that nothing is drawn."""
+    if factor <= 0:
+        return replace(gaussians, opacity_logits=np.full_like(gaussians.opacity_logits, _NOTHING))
+    if factor >= 1:
+        return gaussians
+    # the logit of f / (1 + exp(-l)) is log(f) - log(1 - f + exp(-l))
+    logits = np.log(factor) - np.logaddexp(np.log1p(-factor), -gaussians.opacity_logits.astype(np.float64))
+    return replace(gaussians, opacity_logits=logits.astype(np.float32))
 
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:

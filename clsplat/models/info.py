@@ -15,7 +15,6 @@ from clsplat.arrays import Float32
 from clsplat.camera import NEAR
 from clsplat.files import is_file
 from clsplat.gaussians import Gaussians
-from clsplat.images.colour import recorded_space
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import Format, resolve
 
@@ -33,7 +32,7 @@ def model_info(path: Path) -> dict[str, Any]:
         blocks = iter([replace(model, means=packing.world_means(model).astype(np.float32))])
     result |= form.describe(path)
     result |= _summary(blocks)
-    result["colorspace"] = recorded_space(path)
+    result["colorspace"] = form.space(path)
     result["loses"] = form.loses
     return result
 

@@ -42,17 +42,19 @@ def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: C
     return np.where(away[:, None] > 0, -axes, axes)
 
 
-def motions(means: Float64, camera: Camera, after: Camera) -> Float64:
-    """(64): (N, 2) in pixels, of any projection; of a panorama by the shorter way around."""
-    (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, means)
+def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None = None) -> Float64:
+    """(64): (N, 2) in pixels, of any projection; of a panorama by the shorter way around. moved: the means that motion
+    goes to, where they do not stand still."""
+    to = means if moved is None else moved
+    (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, to)
     if camera.projection == "equirectangular":
         # where the mean is shown may depend on the image's middle; a window's is that of its frame
         frame = camera.window or camera
         here[:, 0] = wrapped(replace(camera, width=frame.width), here[:, 0])
         turned = (there[:, 0] - after.cx) / after.fx - (here[:, 0] - camera.cx) / camera.fx
         there[:, 0] -= np.round(turned / (2 * np.pi)) * period(after)
-    moved = (depths > after.near) & np.isfinite(here + there).all(axis=1)
-    return np.where(moved[:, None], there - here, 0.0)
+    seen = (depths > after.near) & np.isfinite(here + there).all(axis=1)
+    return np.where(seen[:, None], there - here, 0.0)
 
 
 def features(

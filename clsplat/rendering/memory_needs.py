@@ -35,12 +35,13 @@ def plan_frame(
     config: RasterizerConfig,
     features: int = 0,
     planes: int = 0,
+    moved: int = 0,
 ) -> Plan:
     """Memory plan of a frame, without training. floats: parameters of a Gaussian (`ShStorage.floats`); features: floats
-    of each Gaussian's that go into channels beside colour; planes: bytes of a pixel in further planes. Raises
-    CapacityError."""
+    of each Gaussian's that go into channels beside colour; planes: bytes of a pixel in further planes; moved: how
+    many means there are that motion goes to. Raises CapacityError."""
     need = _frame_need(device, gaussians, floats, _plane_bytes(camera, _pixel_bytes(features, planes)), config)
-    return _plan(device, replace(need, row=need.row + 4 * features))
+    return _plan(device, replace(need, row=need.row + 4 * (features + 3 * moved)))
 
 
 def plan_step(

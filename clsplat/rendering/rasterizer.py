@@ -20,7 +20,7 @@ from clsplat.device.layout import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, S
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
 from clsplat.stages.blend import Blended, blend, blend_grad
-from clsplat.stages.channels import Channels, Features, channels, features
+from clsplat.stages.channels import Channels, Features, Floats, channels, features
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera, tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
@@ -36,6 +36,7 @@ from clsplat.stages.duplicate import (
     duplicate_and_sort,
     plan_bands,
 )
+from clsplat.stages.holdout import Held, holdout
 from clsplat.stages.project import Projected, Screen, Slots, add_slots, project, project_grad, thinning_numbers
 from clsplat.stages.ranges import TileLists, tile_lists
 
@@ -202,6 +203,12 @@ class Rasterizer:
         for larger ones of the next."""
         return [work_on(self.part(frame, band)) for band in frame.bands]
 
+    def hold_out(self, frame: Frame, held: Held) -> None:
+        """Take from the frame's image and transmittance what is behind the surfaces."""
+        device = self.device_of(frame.camera)
+        pixels = (frame.projected.splats, frame.background, frame.blended, frame.camera.height, frame.camera_array)
+        self.by_band(frame, lambda part: holdout(device, held, part.lists, *pixels))
+
     def channels(
         self,
         gaussians: AnyGaussians,
@@ -209,18 +216,29 @@ class Rasterizer:
         wanted: Features,
         after: DeviceArray,
         before: DeviceArray | None = None,
+        held: Held | None = None,
+        *moved: AnyGaussians | None,
     ) -> Channels:
-        """The frame's channels beside colour; after, before: the packed cameras that motion goes to, and back to."""
+        """The frame's channels beside colour; after, before: the packed cameras that motion goes to, and back to; held:
+        as of `hold_out`; moved: as `moved` and `earlier` of `features`."""
         device, work, projected = self.device_of(frame.camera), self.work, frame.projected
-        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected, before)
-        pixels = (projected, frame.blended, frame.camera.height, frame.camera_array)
+        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected, before, *moved)
+        pixels = (projected, frame.blended, frame.camera.height, frame.camera_array, held)
         return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
 
-    def deep(self, frame: Frame, bounds: DeviceArray) -> DeviceArray:
+    def shares(self, frame: Frame, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
+        """Planes (floats + 2, rows, stride), of which the first are the means of the rows (n, floats), any values of
+        each Gaussian; held: as of `hold_out`."""
+        device, work = self.device_of(frame.camera), self.work
+        wanted = Floats(rows.shape[1])
+        pixels = (frame.projected, frame.blended, frame.camera.height, frame.camera_array, held)
+        return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1].means
+
+    def deep(self, frame: Frame, bins: int) -> DeviceArray:
         """The frame in slices by depth: the array of `stages.deep`."""
         device = self.device_of(frame.camera)
         pixels = (frame.projected.splats, frame.blended, frame.camera.height, frame.camera_array)
-        return self.by_band(frame, lambda part: deep(device, self.work, bounds, part.lists, *pixels))[-1]
+        return self.by_band(frame, lambda part: deep(device, self.work, bins, part.lists, *pixels))[-1]
 
     def device_of(self, camera: Camera) -> Device:
         """The device with the switches that the camera's projection wants of the kernels."""

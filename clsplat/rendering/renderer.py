@@ -19,13 +19,23 @@ from clsplat.device.context import Device, open_device
 from clsplat.device.layout import DEEP
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.images.holdouts import Surfaces
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed_degrees
 from clsplat.stages.channels import DEPTHS, Features
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
-from clsplat.stages.device_gaussians import AnyGaussians, HostGaussians, ShStorage, host_gaussians, upload_gaussians
+from clsplat.stages.device_gaussians import (
+    AnyGaussians,
+    DeviceGaussians,
+    HostArray,
+    HostGaussians,
+    ShStorage,
+    host_gaussians,
+    upload_gaussians,
+)
+from clsplat.stages.holdout import Held, held_bytes, upload_held
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +46,8 @@ class RenderResult:
     alpha: Float32
 
 
+SHARES = 8
+"""Objects whose shares are blended at a time."""
 ChannelResult = dict[str, NDArray[Any]]
 """Channels beside colour by their names in the kernels. depth, median, first (H, W) float32, along the camera's axis;
 count, index (H, W) int32, index -1 for nothing. normal and position (H, W, 3), in the world, and motion (H, W, 2), in
@@ -77,16 +89,20 @@ class Renderer:
         background: Sequence[float] = (0.0, 0.0, 0.0),
         *,
         contiguous: bool = True,
+        holdout: Surfaces | None = None,
     ) -> RenderResult:
         """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object; of what is
         on the device the camera has to count from where the means do.
 
-        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting. Raises
-        ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
+        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting; holdout:
+        surfaces of other elements in the picture, behind which the model is not seen, at the depths of the
+        kernels. Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
         """
         camera.check()
-        on_device, camera = self._placed(gaussians, camera)
-        return self._result(self._forward(on_device, camera, background), contiguous=contiguous)
+        on_device, camera = self._placed(gaussians, camera, planes=held_bytes(holdout))
+        frame = self._forward(on_device, camera, background)
+        self._hold_out(frame, holdout)
+        return self._result(frame, contiguous=contiguous)
 
     def render_channels(
         self,
@@ -96,14 +112,18 @@ class Renderer:
         *,
         after: Camera | None = None,
         before: Camera | None = None,
+        moved: Gaussians | None = None,
+        earlier: Gaussians | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
         contiguous: bool = True,
+        holdout: Surfaces | None = None,
     ) -> tuple[RenderResult, ChannelResult]:
         """Render a view with channels beside colour (docs/channels.md).
 
         wanted: of "normal", "position", "motion" and "backward"; after, before: the cameras that motion and backward
-        motion go to, the view's own if None. The rest is like `render`. Raises InputError for motion from one
-        projection to another.
+        motion go to, the view's own if None; moved, earlier: the same Gaussians where these go to, of which the means
+        count, None if they stand still. The rest is like `render`. Raises InputError for motion from one projection to
+        another, ValueError for another number of Gaussians that move.
         """
         features = Features.of(wanted)
         camera.check()
@@ -119,11 +139,21 @@ class Renderer:
                     f"{name} goes from a camera to one that is {other.projection}, expected {camera.projection}"
                 )
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
-        on_device, camera = self._placed(gaussians, camera, features.floats)
-        local = gaussians.local if isinstance(gaussians, Gaussians) else lambda other: other
+        moved, earlier = (moved if "motion" in wanted else None), (earlier if "backward" in wanted else None)
+        size = (features.floats, held_bytes(holdout))
+        on_device, camera = self._placed(
+            gaussians, camera, *size, moved=sum(one is not None for one in (moved, earlier))
+        )
         frame = self._forward(on_device, camera, background)
-        packed = [upload(self.device, pack_camera(local(other))) for other in others.values()]
-        planes = self._rasterizer.channels(on_device, frame, features, *packed)
+        goes_to = []
+        for other, then in zip(others.values(), (moved, earlier), strict=True):
+            counted = gaussians if then is None else then
+            local = counted.local(other) if isinstance(counted, Gaussians) else other
+            goes_to.append(upload(self.device, pack_camera(local)))
+        held = self._hold_out(frame, holdout)
+        there = [None if then is None else self._moved(on_device, then) for then in (moved, earlier)]
+        cameras = (goes_to[0], goes_to[1])
+        planes = self._rasterizer.channels(on_device, frame, features, *cameras, held, *there)
         height, width = camera.height, camera.width
         means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
         if contiguous:
@@ -136,16 +166,38 @@ class Renderer:
             named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
         return self._result(frame, contiguous=contiguous), named
 
-    def render_deep(self, gaussians: Gaussians, camera: Camera, bounds: Float32) -> Float32:
-        """(bins, H, W, 6): the view in slices by depth, the next of which begins at each of the bounds (bins - 1,):
-        red, green, blue, associated with alpha; alpha; least and largest depth. All 0 where there is nothing."""
+    def render_shares(
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        owners: NDArray[np.int32],
+        count: int,
+        holdout: Surfaces | None = None,
+    ) -> Float32:
+        """(H, W, count): what each of `count` objects covers of each pixel, the sum of the weights of its Gaussians;
+        owners (n,): the object of each; holdout: as of `render`. Raises as `render`."""
         camera.check()
-        on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * (len(bounds) + 1))
+        shares = np.zeros((camera.height, camera.width, count), np.float32)
+        on_device, local = self._placed(gaussians, camera, SHARES, held_bytes(holdout))
+        frame = self._forward(on_device, local, (0.0, 0.0, 0.0))
+        held = self._hold_out(frame, holdout)
+        alpha = self._result(frame, contiguous=False).alpha[:, :, None]
+        for first in range(0, count, SHARES):
+            rows = np.equal.outer(owners, np.arange(first, first + SHARES)).astype(np.float32)
+            planes = self._rasterizer.shares(frame, upload(self.device, rows), held)
+            means = planes.get()[:SHARES, : camera.height, : camera.width].transpose(1, 2, 0)
+            shares[:, :, first : first + SHARES] = (means * alpha)[:, :, : count - first]
+        return shares
+
+    def render_deep(self, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
+        """(bins, H, W, 5): the view in slices by depth, each pixel's front to back, where its light is taken: red,
+        green, blue, associated with alpha; alpha; the slice's depth. All 0 behind a pixel's last slice."""
+        camera.check()
+        on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
-        slices = self._rasterizer.deep(frame, upload(self.device, np.append(bounds, np.inf).astype(np.float32)))
-        planes = slices.get()[:, :, : camera.height, : camera.width]
+        planes = self._rasterizer.deep(frame, bins).get()[:, :, : camera.height, : camera.width]
         if (of_distances := camera.depths_of_distances()) is not None:
-            planes[:, [DEEP.index("FIRST"), DEEP.index("LAST")]] *= of_distances
+            planes[:, DEEP.index("DEPTH")] *= of_distances
         return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
 
     def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
@@ -155,17 +207,39 @@ class Renderer:
             raise InputError(f"background {background}: expected three finite numbers")
         return self._rasterizer.forward(gaussians, camera, colour, backward=False)
 
+    def _hold_out(self, frame: Frame, holdout: Surfaces | None) -> Held | None:
+        if holdout is None or len(holdout.rows) == 0:
+            return None
+        held = upload_held(self.device, holdout)
+        self._rasterizer.hold_out(frame, held)
+        return held
+
     def _result(self, frame: Frame, *, contiguous: bool) -> RenderResult:
         height, width = frame.camera.height, frame.camera.width
         image = frame.blended.image.get()[:, :height, :width].transpose(1, 2, 0)
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
 
+    def _moved(self, gaussians: AnyGaussians, moved: Gaussians) -> AnyGaussians:
+        """The means of `moved`, where the Gaussians are. Raises ValueError for another number of them."""
+        if len(moved) != gaussians.count:
+            raise ValueError(f"{len(moved)} Gaussians to move to, expected {gaussians.count}")
+        if isinstance(gaussians, HostGaussians):
+            return HostGaussians(len(moved), gaussians.coefficients, {"means": HostArray(moved.means)}, gaussians.rows)
+        return DeviceGaussians(len(moved), gaussians.coefficients, {"means": upload(self.device, moved.means)})
+
     def _placed(
-        self, gaussians: Gaussians | AnyGaussians, camera: Camera, features: int = 0, planes: int = 0
+        self,
+        gaussians: Gaussians | AnyGaussians,
+        camera: Camera,
+        features: int = 0,
+        planes: int = 0,
+        *,
+        moved: int = 0,
     ) -> tuple[AnyGaussians, Camera]:
         """The model on the device, or on the host if a frame of this size leaves too little room for it; and the camera
-        that counts from where it does. planes: bytes of a pixel beside the picture's."""
+        that counts from where it does. planes: bytes of a pixel beside the picture's; moved: how many further
+        means there are."""
         if not isinstance(gaussians, Gaussians):
             return gaussians, camera
         if self._sh is None or self._sh[0] is not gaussians:
@@ -174,10 +248,10 @@ class Renderer:
             self._sh = (gaussians, held_sh(gaussians, self._rasterizer.config))
         self._rasterizer.antialias(on=gaussians.antialiased)
         sh = self._sh[1]
-        asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes)
+        asked = (len(gaussians), sh.floats, camera.width, camera.height, features, planes, moved)
         if self._planned != asked:
             config = self._rasterizer.config
-            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, config, features, planes)
+            plan = plan_frame(self.device, len(gaussians), sh.floats, camera, config, features, planes, moved)
             self._rasterizer.follow(plan)
             if plan.streamed or isinstance(self._held, HostGaussians):
                 self._held = None

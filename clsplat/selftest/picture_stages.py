@@ -13,22 +13,29 @@ import numpy as np
 from clsplat.camera import PROJECTIONS, Camera, Projection
 from clsplat.device.buffers import upload
 from clsplat.device.layout import RAY
+from clsplat.images.holdouts import surfaces_of
 from clsplat.reference import channels as reference_channels
 from clsplat.reference import deep as reference_deep
 from clsplat.reference import every_pixel
+from clsplat.reference import holdout as reference_holdout
 from clsplat.reference import rays as reference_rays
 from clsplat.rendering.rasterizer import Frame, Rasterizer
 from clsplat.selftest.harness import MARGIN, WHITEN, Array, Bench, Outcome, cropped, joined
+from clsplat.stages.blend import Blended
 from clsplat.stages.channels import WIDTHS, Channels, Features, channels, features
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera
+from clsplat.stages.holdout import holdout, upload_held
 
 ALL = Features.of(name for name in WIDTHS if name != "backward")
 """Backward motion is motion to another camera, by the same function."""
 SIDEWAYS = 1e-4
 """Cosine between a normal and the direction to the camera under which a rounding decides which side is seen."""
 DOUBT = 1e-5
-"""Margin like `harness.MARGIN`, of the light that is left to one half, and of the two largest weights."""
+"""Margin like `harness.MARGIN`, of the light that is left to one half or to the next slice, and of the two largest
+weights."""
+BINS = 4
+"""Slices of a pixel."""
 
 FEW = 500
 """Gaussians whose picture around the camera the reference makes in a second: it looks at each at every pixel."""
@@ -81,15 +88,43 @@ def _channels(bench: Bench) -> Outcome:
 
 def _deep(bench: Bench) -> Outcome:
     device, camera = bench.device, bench.camera
-    bounds = np.array([1.75, 2.5, 4.0], np.float32)
-    given = upload(device, np.append(bounds, np.float32(0)))
     arguments = (bench.lists, bench.projected.splats, bench.blended, camera.height)
-    _, outcome = bench.twice(lambda: deep(device, bench.work, given, *arguments), lambda slices: [slices.get()])
+    _, outcome = bench.twice(lambda: deep(device, bench.work, BINS, *arguments), lambda slices: [slices.get()])
     (planes,), splats, (_, clear) = outcome.arrays, bench.splats(), bench.blend_reference()
-    wanted = reference_deep.deep(splats, camera.width, camera.height, bounds)[:, clear]
-    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, clear]
-    fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depths": slice(4, 6)}
+    twin = reference_deep.deep(splats, camera.width, camera.height, BINS)
+    sure = clear & (twin.margin > DOUBT)
+    wanted = twin.slices[:, sure]
+    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, sure]
+    fields = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(4, 5)}
     return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in fields.items()})
+
+
+def _holdout(bench: Bench) -> Outcome:
+    """A surface that is halfway transparent and one that light is lost in, in front of a wall, each in a part of the
+    pixels."""
+    device, camera = bench.device, bench.camera
+    shape = (camera.height, camera.width)
+    at = np.arange(camera.height * camera.width).reshape(shape)
+    wanted_surfaces = []
+    for begin, end, share, every in ((1.5, 1.5, 0.5, 2), (1.75, 3.5, 0.75, 3), (2.75, 2.75, 1.0, 5)):
+        there = at % every == 0
+        depths = (np.where(there, begin, np.inf), np.where(there, end, np.inf))
+        wanted_surfaces.append((*depths, np.full(shape, share)))
+    held = upload_held(device, surfaces_of(*(np.stack(parts, axis=2) for parts in zip(*wanted_surfaces, strict=True))))
+
+    def launch() -> Blended:
+        blended = bench.blended
+        image, left = (upload(device, array.get()) for array in (blended.image, blended.transmittance))
+        anew = Blended(image, left, blended.stops, None)
+        holdout(device, held, bench.lists, bench.projected.splats, bench.background, anew, camera.height)
+        return anew
+
+    _, outcome = bench.twice(launch, lambda anew: [anew.image.get(), anew.transmittance.get()])
+    splats, (_, clear) = bench.splats(), bench.blend_reference()
+    behind = bench.frozen.background.astype(np.float64)
+    image, alpha = reference_holdout.held_out(splats, camera.width, camera.height, wanted_surfaces, behind)
+    got, left = (cropped(planes, camera) for planes in outcome.arrays)
+    return outcome.compared({"colour": (got[clear], image[clear]), "left": (left[clear], 1 - alpha[clear])})
 
 
 def _rays(bench: Bench) -> Outcome:
@@ -166,5 +201,6 @@ PICTURES: dict[str, Callable[[Bench], Outcome]] = {
     "features": _features,
     "channels": _channels,
     "deep": _deep,
+    "holdout": _holdout,
     "rays": _rays,
 }

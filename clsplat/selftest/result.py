@@ -11,6 +11,8 @@ CHANNELS = ("features", "channels")
 """Stages that a frame with more than colour and alpha needs beside FORWARD."""
 DEEP = ("deep",)
 """A frame in slices by depth."""
+HOLDOUT = ("holdout",)
+"""A frame behind the surfaces of other elements."""
 RAYS = ("rays",)
 """A frame of an equirectangular or a fisheye camera."""
 MASKS = ("masks",)
@@ -26,7 +28,7 @@ POSES = ("pose",)
 LENSES = ("lens",)
 """The same of lenses."""
 TRAINING = (*FORWARD, *BACKWARD)
-STAGES = (*FORWARD, *CHANNELS, *DEEP, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH, *POSES, *LENSES)
+STAGES = (*FORWARD, *CHANNELS, *DEEP, *HOLDOUT, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH, *POSES, *LENSES)
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Stages by whose counts and lists the next ones find their way."""
 
@@ -40,6 +42,7 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "features": (64, "6 found; two divisions and a root one after the other"),
     "channels": (256, "13 found, of normals that cancel; else as blend"),
     "deep": (256, "27 found; as blend"),
+    "holdout": (256, "8 found; as blend"),
     "rays": (512, "47 found; directions and rays have several quotients and roots of 3 ulp, not 0.5"),
     "masks": (128, "as loss"),
     "loss": (128, "9 found; the SSIM's quotients may have six times that"),

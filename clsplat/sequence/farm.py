@@ -15,16 +15,17 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import clsplat
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import ClsplatError, InputError, warn
-from clsplat.files import digest
-from clsplat.gaussians import Gaussians
 from clsplat.images.video import VideoWriter
+from clsplat.sequence.cast import load_cast
 from clsplat.sequence.existing import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
+from clsplat.sequence.mattes import mattes_of, names_of
 from clsplat.sequence.task import Record, RenderOptions, Task
 from clsplat.sequence.workers import HOST_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
 
@@ -40,8 +41,8 @@ REMINDER = 10.0
 
 @dataclass(frozen=True)
 class WorkerJob:
-    """Everything that a worker has to load. model: an absolute path, with the SHA-256 of its content; version: of
-    clsplat."""
+    """Everything that a worker has to load. model: an absolute path, with the SHA-256 of its content (`Cast.digest`),
+    of a shot's too, whose placements come with the tasks; version: of clsplat."""
 
     model: str
     digest: str
@@ -49,6 +50,7 @@ class WorkerJob:
     rasterizer: RasterizerConfig
     device: str | None = None
     memory_limit: int | None = None
+    placed: bool = False
     version: str = clsplat.__version__
 
 
@@ -71,12 +73,15 @@ class _Held:
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
         if self.renderer is None or repr(job) != self.key:
             self.key = self.renderer = None  # its memory is free before the next takes some
-            gaussians = Gaussians.load(job.model)
-            if (content := digest(job.model)) != job.digest:
-                raise InputError(f"{job.model}: has SHA-256 {content[:12]} on a worker, expected {job.digest[:12]}")
-            self.renderer = open_frame_renderer(
-                gaussians, job.options, job.rasterizer, device=job.device, memory_limit=job.memory_limit
-            )
+            cast = load_cast(Path(job.model))
+            if cast.digest != job.digest:
+                raise InputError(f"{job.model}: has SHA-256 {cast.digest[:12]} on a worker, expected {job.digest[:12]}")
+            model = cast.models if job.placed else cast.models[0]
+            mattes = mattes_of(cast, job.options.channels, job.options.ids_from)
+            if names_of(mattes) != job.options.mattes:
+                raise InputError(f"{job.model}: has other mattes on a worker than it had when the job began")
+            how: dict[str, Any] = {"mattes": mattes, "device": job.device, "memory_limit": job.memory_limit}
+            self.renderer = open_frame_renderer(model, job.options, job.rasterizer, **how)
             self.key = repr(job)
         return self.renderer
 

@@ -17,17 +17,21 @@ from typing import Any
 import numpy as np
 
 from clsplat.camera import Camera
+from clsplat.config.channels import WRITTEN
+from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
-from clsplat.errors import InputError
+from clsplat.errors import InputError, reason_of
 from clsplat.files import digest, is_file
 from clsplat.frame.lens import ByLens, ByMap, Places, Warp
-from clsplat.frame.times import shutter_times
+from clsplat.frame.times import sample_moments
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
+from clsplat.images.cryptomatte import header_of
 from clsplat.images.frame_files import VIDEOS, Header, camera_matrices, is_whole_panorama
 from clsplat.images.records import SETTINGS
 from clsplat.images.stmap import read_stmap
+from clsplat.models.placed import State
 from clsplat.scenes.data_set import Lens
 from clsplat.shots import Shot
 from clsplat.shots import motion as moving
@@ -86,7 +90,8 @@ class Task:
     stretch: where the camera is while the shutter is open, None where it stands still; path: of the file; before: see
     `existing.stamp`; sampling: shutter and lens, None for those of all; optics: what a stage has of them; eye: left or
     right of a stereo pair; right: the frame of the right eye, where one file has both; lens: of the photograph that the
-    picture is bent as.
+    picture is bent as; holdout: an absolute path, None where nothing is held out; placed: of the models, by the time in
+    frames from the frame, at all `model_times` of it; None for one that stands as it is.
     """
 
     number: int
@@ -102,6 +107,8 @@ class Task:
     eye: str = ""
     right: Task | None = None
     lens: Lens | None = None
+    holdout: Path | None = None
+    placed: Mapping[float, State] | None = None
 
     @property
     def key(self) -> str:
@@ -168,7 +175,7 @@ def make_tasks(
             earlier = resize(moving.camera_before(whole, indices[frame.number])).resized(camera.width, camera.height)
         looked_at: Shot | Moments | None = stretch(frame.number)
         if whole.moment is not None and own.shutter != (0.0, 0.0):
-            times = [own.middle, *own.shutter, *(shutter_times(own) if own.moves else ())]
+            times = [own.middle, *own.shutter, *(sample_moments(own) if own.moves else ())]
             looked_at = moments(whole, resize, frame.number, times)
             after = _beside_middle(whole, resize, frame.number, own.middle, 1) if motion else None
             earlier = _beside_middle(whole, resize, frame.number, own.middle, -1) if backward else None
@@ -193,11 +200,21 @@ def sampling_of(task: Task, options: RenderOptions) -> SamplingConfig:
 
 
 @dataclass(frozen=True)
+class MatteNames:
+    """A matte among the channels: its objects' names, and a digest of which Gaussians are of which."""
+
+    channel: str
+    names: tuple[str, ...]
+    digest: str
+
+
+@dataclass(frozen=True)
 class RenderOptions:
     """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
     header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
     deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the
-    model's colours, none where they are taken as they are."""
+    model's colours, none where they are taken as they are; holdout: how hold-outs are read, None where there are none;
+    mattes: those among the channels; ids_from: the property of the models' files that semantic ids are of."""
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -208,6 +225,9 @@ class RenderOptions:
     deep: DeepConfig | None = None
     drawn: str = ""
     gains: tuple[float, ...] = ()
+    holdout: HoldoutConfig | None = None
+    mattes: tuple[MatteNames, ...] = ()
+    ids_from: str = ""
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
@@ -255,6 +275,15 @@ def camera_before(task: Task, options: RenderOptions) -> Camera | None:
     return task.earlier if still else task.at(middle - 1)
 
 
+def model_times(task: Task, options: RenderOptions) -> list[float]:
+    """The times at which the models of a frame are looked at, in frames from it: the middle of its shutter, its
+    samples, and where motion goes to."""
+    sampling = sampling_of(task, options)
+    times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
+    times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in options.channels]
+    return list(dict.fromkeys(times))
+
+
 def plain(value: Any) -> Any:
     """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
     added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
@@ -281,7 +310,8 @@ def digest_of(*parts: Any) -> str:
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of all that a frame of the model depends on: cameras, channels, encoding, pictures, rasterizer."""
+    """Digest of all that a frame of the models depends on: cameras, channels, encoding, pictures, rasterizer, the
+    content of its hold-out, and where the models are."""
     pictures, sampling = options.pictures, sampling_of(task, options)
     encoding = {name: getattr(options.encoding, name) for name in _ENCODED.get(task.path.suffix.lower(), ())}
     cameras: list[Camera | Moments] = [picture_camera(task, options)]
@@ -298,11 +328,16 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
     made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera show what is beyond it
+    if task.holdout is not None:
+        made += ("holdout", _digest_at(str(task.holdout), _changed(task.holdout)), options.holdout)
+    made += (options.mattes,) if options.mattes else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
     more: list[Any] = [settings_digest(task.right, options)] if task.right is not None else []
     if (lens := lens_of(task, options)) is not None:
         bends = lens.stmap.digest if isinstance(lens, ByMap) else task.lens
         more += [bends, task.at(sampling.middle)]
+    if task.placed is not None:
+        more.append([task.placed[time] for time in model_times(task, options)])
     return digest_of(cameras, made, encoding, colour, pictures.framing, used, *more)
 
 
@@ -313,6 +348,14 @@ def _content(source: str) -> str:
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
     tables = sorted({path for pattern in patterns for path in glob(pattern) if is_file(Path(path))})  # noqa: PTH207
     return " ".join(_digest_at(path, Path(path).stat().st_mtime_ns) for path in (source, *tables))
+
+
+def _changed(path: Path) -> int:
+    """When a file was last written, in nanoseconds. Raises InputError."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason_of(error)}") from None
 
 
 @lru_cache(maxsize=4096)
@@ -347,6 +390,8 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Hea
     space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
         return Header(attributes, matrices, is_srgb=space == SRGB)
+    for matte in options.mattes:
+        attributes |= header_of(WRITTEN[matte.channel].part, matte.names)
     if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
         attributes["colorInteropID"] = name
     if is_whole_panorama(camera):

@@ -18,7 +18,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-from clsplat.config.channels import CHANNELS, DEEP
+from clsplat.config.channels import DEEP, WRITTEN
 from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig, WarpConfig
 from clsplat.device.child import abandon
 from clsplat.images import frame_files
@@ -73,7 +73,7 @@ def frame_bytes(task: Task, options: RenderOptions) -> int:
         pixels = min(pixels, STRIP_PIXELS // finer)
     if options.deep is not None:
         return COPIES * 4 * min(len(DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
-    floats = sum(len(CHANNELS[name].names) for name in options.channels)
+    floats = sum(len(WRITTEN[name].names) for name in options.channels)
     light = 4 if sampling_of(task, options).on or finer > 1 else 0
     floats += floats if options.pictures.warp != WarpConfig() else 0
     return 4 * pixels * (COPIES * floats + light * (finer if finer > 1 else 2))

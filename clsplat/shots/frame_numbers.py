@@ -86,14 +86,19 @@ def _stem(name: str) -> str:
     return stem
 
 
-def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
-    """The file of every frame (number, name). Raises InputError where two would be one, or one would leave the
-    folder, or the pattern is none."""
+def check_pattern(pattern: str) -> None:
+    """Raise InputError for a field in the names of files that is not known."""
     for match in FIELD.finditer(pattern):
         if match["word"] not in (None, "frame") and not (match["word"] == "name" and match["padded"] is None):
             raise InputError(f"{pattern}: {match[0]} is not known, expected {KNOWN}")
     if odd := ODD.search(FIELD.sub("", Path(pattern).name)):
         raise InputError(f"{pattern}: {odd[0]} is not known, expected {KNOWN}")
+
+
+def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
+    """The file of every frame (number, name). Raises InputError where two would be one, or one would leave the
+    folder, or the pattern is none."""
+    check_pattern(pattern)
     if len(frames) > 1 and not FIELD.search(pattern):
         raise InputError(
             f"{pattern}: has no {{name}} in it, expected one to tell {len(frames)} cameras apart, or a frame number "

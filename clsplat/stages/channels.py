@@ -19,6 +19,7 @@ from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 from clsplat.stages.blend import Blended, launch_tiles
 from clsplat.stages.device_gaussians import AnyGaussians, parts
+from clsplat.stages.holdout import Held
 from clsplat.stages.project import Projected
 from clsplat.stages.ranges import TileLists
 
@@ -66,6 +67,18 @@ class Features:
         return planes | {name: whole[:, :, at] for at, name in enumerate(WHOLE)}
 
 
+@dataclass(frozen=True)
+class Floats:
+    """Rows of any values that are blended as features are."""
+
+    floats: int
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """Defines for channels.cl."""
+        return {"FEATURES": self.floats}
+
+
 @dataclass(frozen=True, eq=False)
 class Channels:
     """Planes padded to whole tiles: means (floats + 2, rows, stride) of the features and, behind them, DEPTHS; whole
@@ -85,12 +98,17 @@ def features(
     after: DeviceArray,
     projected: Projected,
     before: DeviceArray | None = None,
+    moved: AnyGaussians | None = None,
+    earlier: AnyGaussians | None = None,
 ) -> DeviceArray:
     """Features of each visible Gaussian, (n, wanted.floats). after: the packed camera that motion goes to; before: the
-    one of backward motion, the same if None."""
+    one of backward motion, the same if None; moved, earlier: the Gaussians with the means that these go to, on the
+    device or the host as the others; None where they stand still."""
     rows = work.array("features", (gaussians.count, wanted.floats))
-    for start, stop, (part,) in parts(work, gaussians):
-        splats = projected.rows(start, stop)
+    others = [other for other in (moved, earlier) if other is not None]
+    for start, stop, (part, *there) in parts(work, gaussians, *others):
+        splats, means = projected.rows(start, stop), iter(there)
+        means_after, means_before = (part if other is None else next(means) for other in (moved, earlier))
         launch_items(
             device,
             device.kernels("features", LANES=1, **wanted.defines).features,
@@ -103,6 +121,8 @@ def features(
             part["means"],
             part["quaternions"],
             part["log_scales"],
+            means_after["means"],
+            means_before["means"],
             splats.splats,
             rows.rows(start, stop),
         )
@@ -113,20 +133,22 @@ def features(
 def channels(
     device: Device,
     work: Workspace,
-    wanted: Features,
+    wanted: Features | Floats,
     rows: DeviceArray,
     lists: TileLists,
     projected: Projected,
     blended: Blended,
     height: int,
     camera_array: DeviceArray | None = None,
+    held: Held | None = None,
 ) -> Channels:
     """Blend the features with the weights of `blended`, which is of the same lists. camera_array: for pixels that are
-    rays."""
+    rays; held: surfaces that hold them out."""
     plane_rows, stride = blended.stops.shape
     means = work.array("channel_means", (wanted.floats + len(DEPTHS), plane_rows, stride))
     whole = work.array("channel_whole", (len(WHOLE), plane_rows, stride), np.int32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, projected.splats, rows, blended.stops, means, whole)
-    rays = (camera_array,) if device.switched("RAYS") else ()
-    launch_tiles(device, "channels", wanted.defines, lists, stride // TILE, height, *arrays, *rays)
+    further = (*(held.arguments if held else ()), *((camera_array,) if device.switched("RAYS") else ()))
+    defines = {**wanted.defines, **({"HOLDOUT": True} if held else {})}
+    launch_tiles(device, "channels", defines, lists, stride // TILE, height, *arrays, *further)
     return Channels(means, whole)

@@ -21,6 +21,7 @@
 #define CELL_Y(cell) (((cell) * (ITEMS / 64) + ITEM / 64) * BLOCK_H + ITEM % 32 / BLOCK_W)
 #endif
 #define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
+#define LANE_IN_PLANE(lane) 0
 #define PIXELS_X(cell) ((float)CELL_X(cell))
 #define PIXELS_Y(cell) ((float)CELL_Y(cell))
 #define AT_X(cell) PIXELS_X(cell)

@@ -18,6 +18,9 @@
 // Where a cell's first pixel is in a plane.
 #define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 
+// A lane's pixel, from its cell's first one on.
+#define LANE_IN_PLANE(lane) (stride * ((lane) / CELL_W) + (lane) % CELL_W)
+
 // Coordinates of a cell's pixels in the tile, and the cell's part of a plane whose rows are `stride` apart.
 #define PIXELS_X(cell) ((floatL)(CELL_X(cell)) + LANE_X)
 #define PIXELS_Y(cell) ((floatL)(CELL_Y(cell)) + LANE_Y)

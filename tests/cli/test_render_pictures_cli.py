@@ -28,7 +28,7 @@ HALF = 2.0**-11
 FLAGS = [
     *("--colorspace", "--model-colorspace", "--ocio-config", "--overscan", "--region", "--supersample", "--filter"),
     *("--samples", "--shutter-angle", "--shutter-open", "--shutter-close", "--f-stop", "--aperture", "--focus"),
-    *("--sensor-width", "--metres", "--deep", "--deep.bins", "--deep.near", "--deep.far"),
+    *("--sensor-width", "--metres", "--deep", "--deep.bins"),
     *("--video.fps", "--video.crf", "--video.preset"),
 ]
 
@@ -199,7 +199,7 @@ def test_lens(shot: list[str], plain: np.ndarray, tmp_path: Path) -> None:
 
 
 def test_deep(shot: list[str], plain: np.ndarray, tmp_path: Path, capsys: Capture) -> None:
-    assert render(shot, tmp_path, "--deep --deep.bins 4 --deep.near 3 --deep.far 5 --frames 2") == 0
+    assert render(shot, tmp_path, "--deep --deep.bins 4 --frames 2") == 0
     image = oiio.ImageBuf(str(tmp_path / "a.0002.exr"))
     assert image.spec().deep
     data = image.deepdata()
@@ -208,7 +208,7 @@ def test_deep(shot: list[str], plain: np.ndarray, tmp_path: Path, capsys: Captur
     np.testing.assert_allclose(flat[:, :, :4], plain[:, :, :4], atol=2e-6)  # sums in float, as docs/pictures.md says
     before = (tmp_path / "a.0002.exr").stat().st_mtime_ns
     whole = (tmp_path / "a.0002.exr").read_bytes()
-    again = "--deep --deep.bins 4 --deep.near 3 --deep.far 5 --frames 2 --skip-existing"
+    again = "--deep --deep.bins 4 --frames 2 --skip-existing"
     assert render(shot, tmp_path, again) == 0
     assert (tmp_path / "a.0002.exr").stat().st_mtime_ns == before
     (tmp_path / "a.0002.exr").write_bytes(whole[:-100])
@@ -509,7 +509,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--deep --parts several", "a.#.exr", "--deep and --parts several exclude each other"),
         ("--deep", "a.#.tif", "cannot hold deep samples, expected an .exr file"),
         ("--deep --background white", "a.#.exr", "--deep and --background exclude each other"),
-        ("--deep.bins 8", "a.#.exr", "expected --deep with them"),
+        ("--deep.bins 8", "a.#.exr", "expected --deep with it"),
         ("--video.fps 25", "a.#.exr", "--video flags are of videos, expected the name of an .mp4 or .mov file"),
         ("--channels rgb,depth", "a.mp4", "an MP4 cannot hold depth"),
         ("--alpha", "a.mp4", "an MP4 cannot hold alpha"),

@@ -33,6 +33,7 @@ from clsplat.selftest.result import (
     DEEP,
     DEPTH,
     FORWARD,
+    HOLDOUT,
     LENSES,
     MASKS,
     POSES,
@@ -67,11 +68,13 @@ BROKEN = {
     "features: (rest - splat[SPLAT_SUB_X])": ("(rest + splat[SPLAT_SUB_X])", "features"),
     "channels: sums[field][cell] / by": ("sums[field][cell] * by", "channels"),
     "channels: weight > largest[cell]": ("weight < largest[cell]", "channels"),
-    "channels: MASKL(t[cell] <= 0.5f)": ("MASKL(t[cell] <= 0.25f)", "channels"),
+    "channels: MASKL(left <= 0.5f)": ("MASKL(left <= 0.25f)", "channels"),
     "channels: MASKL(count[cell] == 0)": ("MASKL(count[cell] == 1)", "channels"),
-    "deep: depth >= bounds[bin]": ("depth < bounds[bin]", "deep"),
-    "deep: before * alpha": ("before + alpha", "deep"),
-    "deep: 1.0f - value": ("value", "deep"),
+    "deep: -now - after > slack": ("now - after > slack", "deep"),
+    "deep: left * alpha": ("left + alpha", "deep"),
+    "deep: to[plane * DEEP_ALPHA] = 1.0f -": ("to[plane * DEEP_ALPHA] =", "deep"),
+    "holdout: before * alpha * through": ("before * alpha", "holdout"),
+    "holdout: depth - surface[HELD_Z]": ("surface[HELD_Z] - depth", "holdout"),
     "project_rays: l22 * t.e2[0]": ("l11 * t.e2[0]", "rays"),
     "project_rays: latitude - cap": ("latitude + cap", "rays"),
     "project_rays: -(s * around) / fx": ("(s * around) / fx", "rays"),
@@ -94,7 +97,7 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    groups = (FORWARD, CHANNELS, DEEP, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH, POSES, LENSES)
+    groups = (FORWARD, CHANNELS, DEEP, HOLDOUT, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH, POSES, LENSES)
     group = next(stages for stages in groups if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))

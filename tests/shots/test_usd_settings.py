@@ -14,7 +14,7 @@ from needs import require
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.times import shutter_times
+from clsplat.frame.times import sample_moments
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.sequence.task import RenderOptions, Task, camera_after, make_tasks, picture_camera, settings_digest
 from clsplat.shots import Shot, choose_shot, read_shot
@@ -202,7 +202,7 @@ def test_tasks_hold_the_moments_of_the_shutter(tmp_path: Path) -> None:
     assert task.sampling == SamplingConfig(samples=5, shutter_open=-0.25, shutter_close=0.25)
     sent = pickle.loads(pickle.dumps(task))  # as Dask does
     assert shot.moment is not None
-    for time in (*shutter_times(task.sampling), -0.25, 0.25, 1.8 - 2, 2.15 - 2):
+    for time in (*sample_moments(task.sampling), -0.25, 0.25, 1.8 - 2, 2.15 - 2):
         for one in (task, sent):
             np.testing.assert_array_equal(one.at(time).position, shot.moment(2 + time).position)
             assert one.at(time).fx == shot.moment(2 + time).fx

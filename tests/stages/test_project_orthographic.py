@@ -14,11 +14,10 @@ from drivers import KEPT
 from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import DeepConfig
 from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.frame.deep_exr import bin_bounds, depths_in_view, render_deep
+from clsplat.frame.deep_exr import render_deep
 from clsplat.frame.draw import on_tiles
 from clsplat.frame.window import crop
 from clsplat.reference import deep as deep_twin
@@ -226,16 +225,11 @@ def test_windows_and_little_memory_change_no_bit() -> None:
 
 def test_deep_slices(device: Device) -> None:
     gaussians, camera = orthographic(scenes.random_cloud(600, 8, 70, 50))
-    pixels, depths = pixel_from_world(camera, reference.parameters(gaussians)["means"])
-    seen = ((pixels >= 0) & (pixels <= [70, 50])).all(axis=1)
-    assert 0 < seen.sum() < len(gaussians)
-    np.testing.assert_allclose(depths_in_view(gaussians, camera), depths[seen], rtol=1e-12)
-    bounds = bin_bounds(gaussians, camera, DeepConfig(bins=5))
-    got = render_deep(Renderer(device), gaussians, camera, bounds)
+    got = render_deep(Renderer(device), gaussians, camera, 5)
     forward = reference.forward(gaussians, camera)
-    wanted = deep_twin.deep(forward.projected, camera.width, camera.height, bounds)
-    sure = forward.blended.margin > 1e-4
-    for values, of in zip(got, wanted, strict=True):
-        # As of a perspective frame (test_deep.py).
-        assert_close(values[sure][:, :4], of[sure][:, :4], absolute=2e-5)
-        assert_close(values[sure][:, 4:], of[sure][:, 4:], relative=1e-6, absolute=1e-6)
+    wanted = deep_twin.deep(forward.projected, camera.width, camera.height, 5)
+    sure = (forward.blended.margin > 1e-4) & (wanted.margin > 3e-6)
+    assert sure.mean() > 0.9
+    # As of a perspective frame (test_deep.py).
+    assert_close(got[:, sure, :4], wanted.slices[:, sure, :4], absolute=2e-5)
+    assert_close(got[:, sure, 4], wanted.slices[:, sure, 4], relative=1e-6)

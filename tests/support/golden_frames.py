@@ -61,7 +61,7 @@ def _of(run: Pipeline) -> dict[str, list[Array]]:
 
 CHANNELS = ("rgb", "alpha", "depth", "median", "first", "normals", "position", "motion", "count", "id", "deep")
 """All that a picture can be written with (`clsplat.images.frame_files`), and its slices by depth."""
-BOUNDS = np.array([2.0, 3.5, 6.0], np.float32)
+BINS = 4
 
 
 def pictures_of(device: Device) -> dict[str, dict[str, str]]:
@@ -77,7 +77,7 @@ def pictures_of(device: Device) -> dict[str, dict[str, str]]:
         renderer = Renderer(device)
         render_frame = FrameRenderer(renderer, gaussians, RenderOptions(channels=CHANNELS[:-1]))
         layers = render_frame(Task(1, "1", view, Path(), after)).planes
-        layers["deep"] = renderer.render_deep(gaussians, view, BOUNDS)
+        layers["deep"] = renderer.render_deep(gaussians, view, BINS)
         found[kind] = {name: checksum([np.ascontiguousarray(values)]) for name, values in layers.items()}
     return found
 

@@ -21,6 +21,7 @@ from clsplat.camera import NEAR, NEARS
 from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.images.colour import recorded_space
 from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd
 
 HEAD_BYTES = 1 << 16
@@ -42,7 +43,7 @@ class Format:
     loses: what the format does not keep, in a few words; floats: True if it keeps floats; sh_degree: the highest that
     it holds; describe(path): the format's part of `clsplat info`; order(gaussians): (n,), the Gaussian of each row of
     a written file, None for their own order; blocks(path): the Gaussians in the world some rows at a time, for a format
-    that need not be held whole; side_files(path): the other files of a model of this name.
+    that need not be held whole; side_files(path): the other files of a model of this name; space(path): of its colours.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Format:
     order: Callable[[Gaussians], NDArray[np.int64]] | None = None
     blocks: Callable[[Path], Iterator[Gaussians]] | None = None
     side_files: Callable[[Path], list[Path]] = lambda _: []
+    space: Callable[[Path], str] = recorded_space
 
 
 UNIT_QUATERNIONS = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
@@ -80,7 +82,7 @@ FORMATS: tuple[Format, ...] = (
            loses="positions to 24 bits fixed point, the rest to 8 or 10 bits, spherical harmonics to 6",
            describe=spz.describe),
     Format("OpenUSD", (".usda", ".usdc", ".usdz", ".usd"), usd.read, usd.write, usd.recognises,
-           loses=UNIT_QUATERNIONS, floats=True, describe=usd.describe),
+           loses=UNIT_QUATERNIONS, floats=True, describe=usd.describe, space=usd.recorded_space),
 )  # fmt: skip
 """All formats. Of two that recognise the same first bytes the earlier counts."""
 
@@ -156,6 +158,12 @@ def load(path: str | os.PathLike[str]) -> Gaussians:
     if gaussians.near == NEAR:
         gaussians.near = _near_of(gaussians)
     return gaussians
+
+
+def colour_space(path: str | os.PathLike[str]) -> str:
+    """The space of a model file's colours, sRGB where it does not say. Raises InputError."""
+    path = model_path(Path(path))
+    return format_of(path).space(path)
 
 
 def _near_of(gaussians: Gaussians) -> float:

@@ -148,6 +148,21 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
         return gaussians
 
 
+def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
+    """(n,): a property of each Gaussian that holds whole numbers. Raises InputError as `read`, and for a property that
+    is not there or holds others."""
+    with open_input(path, "a 3DGS PLY") as file:
+        header = read_header(file, path)
+        kinds = dict(header.vertex.properties)
+        if name not in kinds:
+            raise InputError(f"{path}: PLY has no property {name}, expected one of {', '.join(kinds)}")
+        columns = [np.asarray(block[name], np.float64) for block in read_vertices(file, header, "Gaussian")]
+    column = np.concatenate(columns)
+    if not (np.abs(column) < 2**31).all() or (column != np.round(column)).any():
+        raise InputError(f"{path}: the property {name} holds other values than whole numbers of 32 bits")
+    return column.astype(np.int64)
+
+
 def blocks(path: Path) -> Iterator[Gaussians]:
     """The Gaussians in the file's order, some rows at a time, in the world, each block with the file's origin; values
     that are not finite are passed on. Raises InputError as `read`."""

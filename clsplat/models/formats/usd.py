@@ -10,6 +10,9 @@ Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_g
 - Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions, SH coefficients by
   Gaussian, order and signs as ours.
 - Hints: perspective projection, sorted by depth along the camera's axis, as this renderer does.
+- Colours: of the colour space that the SH coefficients, their prim or what it is in name; sRGB, as 3DGS trains them,
+  where none does. A prim without SH has primvars:displayColor, linear where nothing else is named, and displayOpacity
+  where it lacks opacities.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -31,6 +34,7 @@ from clsplat.arrays import Float32
 from clsplat.errors import InputError, warn
 from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.images.colour import INTEROP, LINEAR, SRGB, linear_to_srgb, srgb_to_linear
 from clsplat.models.codec import axes
 from clsplat.models.codec import values as packing
 from clsplat.models.edit import merge
@@ -153,19 +157,63 @@ def read_here(path: Path) -> Gaussians:
     transforms = UsdGeom.XformCache(time)
     parts = []
     with readable(path):
-        for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-            if prim.GetTypeName() not in TYPES:
-                continue
+        prims = splats_of(path, stage)
+        space = space_of(path, prims)
+        for prim in prims:
             where = f"{path}: {prim.GetPath()}"
-            part = _gaussians(where, prim, time)
+            part = gaussians_of(where, prim, time, space)
             # USD's vectors are rows, so its matrices are the transposes of ours
             matrix = np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T
             parts.append(axes.place(part, matrix, where))
-    if not parts:
-        raise InputError(f"{path}: has no {TYPE} in it, expected at least one")
     model = merge(parts)
     packing.require_finite(path, model)
     return model
+
+
+def splats_of(path: Path, stage: Any) -> list[Any]:
+    """The prims of Gaussians, those of instances too. Raises InputError for a stage without any."""
+    from pxr import Usd
+
+    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.GetTypeName() in TYPES]
+    if not prims:
+        raise InputError(f"{path}: has no {TYPE} in it, expected at least one")
+    return prims
+
+
+def recorded_space(path: Path) -> str:
+    """The colour space of a stage's Gaussians. Raises InputError."""
+    survive(path)
+    stage = _open(path)
+    with readable(path):
+        return space_of(path, splats_of(path, stage))
+
+
+def space_of(path: Path, prims: Sequence[Any]) -> str:
+    """The colour space of the prims with SH, by our names; sRGB where none has any. Raises InputError for several."""
+    spaces: dict[str, Any] = {}
+    for prim in prims:
+        if attribute := _coefficients(prim):
+            spaces.setdefault(_space(attribute, SRGB), prim.GetPath())
+    if len(spaces) > 1:
+        found = ", ".join(f"{name} ({place})" for name, place in spaces.items())
+        raise InputError(f"{path}: has Gaussians of the colour spaces {found}, expected one: SH cannot be converted")
+    return next(iter(spaces), SRGB)
+
+
+def _coefficients(prim: Any) -> Any:
+    """The attribute of the SH coefficients, None where it has no value."""
+    attributes = (prim.GetAttribute(name) for name in (COEFFICIENTS, f"{COEFFICIENTS}h"))
+    return next((attribute for attribute in attributes if attribute and attribute.HasValue()), None)
+
+
+def _space(attribute: Any, usual: str) -> str:
+    """The colour space of an attribute by our name: that which it names itself, or the nearest prim around it."""
+    name, prim = str(attribute.GetColorSpace() if attribute.HasColorSpace() else ""), attribute.GetPrim()
+    while not name and prim and not prim.IsPseudoRoot():
+        given = prim.GetAttribute("colorSpace:name")
+        name, prim = str((given.Get() if given else None) or ""), prim.GetParent()
+    ours = {theirs: known for known, theirs in INTEROP.items()}
+    return {**ours, "srgb_rec709_display": SRGB}.get(name, name or usual)
 
 
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
@@ -184,11 +232,33 @@ def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int |
     return None
 
 
-def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
+def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussians:
+    """The Gaussians of a prim in its own coordinates; space: of colours, to which those of a prim without SH are
+    converted. Raises InputError, which begins with `where`."""
     means = _array(where, prim, "positions", time, 3, None)
     if means is None or not len(means):
         raise InputError(f"{where}: has no positions, expected at least one")
     count = len(means)
+    sh = _sh(where, prim, time, count) if _coefficients(prim) else _plain(where, prim, time, count, space)
+
+    def optional(name: str, *default: float) -> Float32:
+        array = _array(where, prim, name, time, len(default), count)
+        return np.tile(np.array(default, np.float32), (count, 1)) if array is None else array
+
+    # what the schema says where an attribute is absent: no rotation, unit scale, opaque
+    quaternions = optional("orientations", 0, 0, 0, 1)[:, [3, 0, 1, 2]]
+    log_scales = packing.log_scales(optional("scales", 1, 1, 1), where, 0).astype(np.float32)
+    shown = _array(where, prim, "opacities", time, 1, count)
+    if shown is None and not _coefficients(prim):
+        shown = _primvar(where, prim, "primvars:displayOpacity", time, 1, count)
+    opacity = np.ones(count, np.float32) if shown is None else shown[:, 0]
+    if not ((opacity >= 0) & (opacity <= 1)).all():
+        raise InputError(f"{where}: has an opacity outside [0, 1]")
+    return Gaussians(means, quaternions, log_scales, packing.logits(opacity), sh)
+
+
+def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
+    """(count, K, 3)."""
     degree = prim.GetAttribute(DEGREE).Get() if prim.GetAttribute(DEGREE) else 3
     if not isinstance(degree, int) or not 0 <= degree <= 16:
         raise InputError(f"{where}: {DEGREE} is {degree!r}, expected 0 to {MAX_SH_DEGREE}")
@@ -200,18 +270,34 @@ def _gaussians(where: str, prim: Any, time: Any) -> Gaussians:
     if degree > MAX_SH_DEGREE:
         warn(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out")
         sh = np.ascontiguousarray(sh[:, : (MAX_SH_DEGREE + 1) ** 2])
+    return sh
 
-    def optional(name: str, *default: float) -> Float32:
-        array = _array(where, prim, name, time, len(default), count)
-        return np.tile(np.array(default, np.float32), (count, 1)) if array is None else array
 
-    # what the schema says where an attribute is absent: no rotation, unit scale, opaque
-    quaternions = optional("orientations", 0, 0, 0, 1)[:, [3, 0, 1, 2]]
-    log_scales = packing.log_scales(optional("scales", 1, 1, 1), where, 0).astype(np.float32)
-    opacity = optional("opacities", 1)[:, 0]
-    if not ((opacity >= 0) & (opacity <= 1)).all():
-        raise InputError(f"{where}: has an opacity outside [0, 1]")
-    return Gaussians(means, quaternions, log_scales, packing.logits(opacity), sh)
+def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
+    """(count, 1, 3), of a prim without SH: its displayColor in the space, or grey. Raises InputError for a space that
+    colours are not converted to."""
+    colour = _primvar(where, prim, "primvars:displayColor", time, 3, count)
+    if colour is None:
+        return np.zeros((count, 1, 3), np.float32)
+    own = _space(prim.GetAttribute("primvars:displayColor"), LINEAR)
+    if own != space:
+        convert = {(LINEAR, SRGB): linear_to_srgb, (SRGB, LINEAR): srgb_to_linear}.get((own, space))
+        if convert is None:
+            raise InputError(f"{where}: has displayColor of {own}, expected {space} as the other Gaussians are of")
+        colour = convert(colour)
+    return np.asarray(packing.coefficients(colour)[:, None], np.float32)
+
+
+def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int) -> Float32 | None:
+    """(count, width): a value for each Gaussian, or one for all of them; None where there is none."""
+    attribute = prim.GetAttribute(name)
+    value = attribute.Get(time) if attribute else None
+    if value is None or not len(value):
+        return None
+    rows = np.asarray(value, np.float32).reshape(-1, width)
+    if len(rows) not in (1, count):
+        raise InputError(f"{where}: has {len(rows)} {name}, expected {count} or one")
+    return np.tile(rows, (count // len(rows), 1))
 
 
 def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_unit: float = 1.0) -> None:

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A frame's hold-out as the pictures that are drawn of it need it: windows, strips and finer ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clsplat.camera import Camera
+from clsplat.images.holdouts import Holdout, Surfaces
+
+
+class Cut:
+    """Takes the surfaces of a camera's picture out of its frame's hold-out. The last ones are kept, as the samples of
+    a shutter or a lens are of one picture."""
+
+    def __init__(self, holdout: Holdout) -> None:
+        self._holdout = holdout
+        self._key: tuple[int, ...] | None = None
+        self._last: Surfaces | None = None
+
+    def __call__(self, camera: Camera) -> Surfaces | None:
+        """The surfaces in the pixels of the picture, each those of the pixel of the hold-out that it is in, as depths
+        that the kernels have; None where there are none."""
+        window, holdout = camera.window, self._holdout
+        x, y, across, down = (
+            (window.x, window.y, window.width, window.height) if window else (0, 0, camera.width, camera.height)
+        )
+        key = (x, y, across, down, camera.width, camera.height)
+        if key != self._key:
+            columns = (x + np.arange(camera.width)) * holdout.size[0] // across - holdout.x
+            rows = (y + np.arange(camera.height)) * holdout.size[1] // down - holdout.y
+            self._key, self._last = key, holdout.surfaces.taken(columns, rows)
+        surfaces = self._last
+        assert surfaces is not None
+        if len(surfaces.rows) == 0:
+            return None
+        cosines = camera.depths_of_distances()
+        return surfaces if cosines is None else surfaces.scaled(np.float32(1) / cosines)
+
+    @property
+    def goes_on(self) -> bool:
+        """True if there are surfaces at an edge of the frame beyond which the file has no pixels."""
+        counts, (width, height) = self._holdout.surfaces.counts, self._holdout.size
+        left, top = -self._holdout.x, -self._holdout.y
+        right, bottom = left + width - counts.shape[1], top + height - counts.shape[0]
+        edges = ((left, counts[:, :1]), (top, counts[:1]), (right, counts[:, -1:]), (bottom, counts[-1:]))
+        return any(beyond == 0 and bool(edge.any()) for beyond, edge in edges)

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hold-outs: the surfaces of other elements in a frame, from a depth EXR or a deep EXR (docs/pictures.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.config.holdout import HELD
+from clsplat.errors import InputError, examples
+from clsplat.files import is_file
+from clsplat.images.reading import error_of, one_line, open_image
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Surfaces in the pixels of a picture. counts (H, W) int64: how many each pixel has; rows (S, 4) float32: HELD of
+    all of them, pixel by pixel, in each from the nearest beginning on."""
+
+    counts: NDArray[np.int64]
+    rows: Float32
+
+    @property
+    def dense(self) -> int:
+        """Surfaces of a pixel on average, in the fullest row of pixels, rounded up."""
+        return int(np.ceil(self.counts.mean(axis=1).max(initial=0)))
+
+    def taken(self, across: NDArray[np.int64], down: NDArray[np.int64]) -> Surfaces:
+        """The surfaces of a picture whose column x is column across[x] of this one, and row y row down[y]. Beyond this
+        one's edges there are none."""
+        height, width = self.counts.shape
+        if np.array_equal(across, np.arange(width)) and np.array_equal(down, np.arange(height)):
+            return self
+        inside = ((down >= 0) & (down < height))[:, None] & ((across >= 0) & (across < width))
+        source = np.clip(down, 0, height - 1)[:, None] * width + np.clip(across, 0, width - 1)
+        counts = np.where(inside, self.counts.ravel()[source], 0)
+        ends, flat = np.cumsum(self.counts), counts.ravel()
+        first = (ends[source] - self.counts.ravel()[source]).ravel() - (np.cumsum(flat) - flat)
+        return Surfaces(counts, self.rows[np.repeat(first, flat) + np.arange(flat.sum())])
+
+    def scaled(self, factors: Float32) -> Surfaces:
+        """The same with the depths of each pixel times its factor (H, W)."""
+        by = np.repeat(factors.ravel(), self.counts.ravel())[:, None]
+        return Surfaces(self.counts, (self.rows * np.concatenate([by, by, by**0, 1 / by], axis=1)).astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Holdout:
+    """The hold-out of a frame. surfaces: of the file's data window, which begins at the frame's pixel (x, y); size: of
+    the frame."""
+
+    surfaces: Surfaces
+    x: int
+    y: int
+    size: tuple[int, int]
+
+
+def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> None:
+    """Raise InputError for a file that cannot be the hold-out of a frame of that size (width, height), as its header
+    says."""
+    with _part(path, size, channel):
+        pass
+
+
+def read_holdout(path: Path, size: tuple[int, int], channel: str = "") -> Holdout:
+    """The hold-out of a frame of that size (width, height).
+
+    channel: the name of the depths, Z if empty; a deep file's samples have A and may have ZBack, a flat file may have
+    A. Depths of 0 and infinity are no surface. Raises InputError as `check_holdout`, and for values that
+    are not numbers, negative depths, and files that do not decode.
+    """
+    with _part(path, size, channel) as (source, part, places):
+        spec = source.spec()
+        shape = (spec.height, spec.width)
+        if spec.deep:
+            counts, columns = _deep(path, source, part, places)
+        else:
+            columns = [_plane(path, source, part, place) for place in places]
+            counts = np.ones(shape[0] * shape[1], np.int64)
+        origin = (spec.x - spec.full_x, spec.y - spec.full_y)
+    begin, alpha, end = columns
+    assert begin is not None, "it is looked for by its name"
+    name, end = channel or "Z", begin if end is None else end
+    alpha = np.ones(len(begin), np.float32) if alpha is None else alpha
+    for values, what in ((begin, name), (end, "ZBack"), (alpha, "A")):
+        if odd := int(np.isnan(values).sum()):
+            raise InputError(f"{path}: {odd} values of {what} are not a number, expected depths and alpha of surfaces")
+    if odd := int((begin < 0).sum()):
+        raise InputError(f"{path}: {odd} values of {name} are negative, expected depths along the camera's axis")
+    return Holdout(_surfaces(begin, end, alpha, counts, shape), *origin, size)
+
+
+def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Surfaces:
+    """Surfaces (H, W, count) of each pixel: the depths at which they begin and end, and their alpha. One at no depth,
+    0 or infinity, is none."""
+    counts = np.full(begin.shape[0] * begin.shape[1], begin.shape[2])
+    return _surfaces(begin.ravel(), end.ravel(), alpha.ravel(), counts, begin.shape[:2])
+
+
+def _surfaces(
+    begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any], counts: NDArray[np.int64], shape: tuple[int, ...]
+) -> Surfaces:
+    """Of values that are pixel by pixel, of which each has so many."""
+    alpha = np.clip(alpha, 0, 1)
+    shown = (begin > 0) & (begin < np.inf) & (alpha > 0)
+    pixels = np.repeat(np.arange(len(counts)), counts)[shown]
+    begin, end, alpha = begin[shown], end[shown], alpha[shown]
+    if counts.max(initial=0) > 1:
+        order = np.lexsort((begin, pixels))
+        begin, end, alpha = begin[order], end[order], alpha[order]
+    rows = _rows(begin, end, alpha)
+    return Surfaces(np.bincount(pixels, minlength=len(counts)).reshape(shape), rows)
+
+
+def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
+    """HELD. Of an opaque surface nothing behind its beginning is seen."""
+    rows = np.zeros((len(begin), len(HELD)), np.float32)
+    rows[:, 0], rows[:, 2] = begin, 1 - alpha
+    rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)
+    long = rows[:, 1] > rows[:, 0]
+    length = rows[long, 1].astype(np.float64) - rows[long, 0]
+    rows[long, 3] = np.log2(1 - alpha[long].astype(np.float64)) / length
+    return rows
+
+
+@contextmanager
+def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any, int, list[int | None]]]:
+    """The file's input, the part that has the depths, and where in it depths, alpha and back depths are."""
+    if not is_file(path):
+        raise InputError(f"{path}: no such hold-out, expected a depth or deep EXR for each frame that is rendered")
+    source = open_image(path)
+    try:
+        if source.format_name() != "openexr":
+            raise InputError(f"{path}: is no EXR, expected a depth or deep EXR as a hold-out")
+        name, part, seen = channel or "Z", 0, []
+        while source.seek_subimage(part, 0) and name not in (names := list(source.spec().channelnames)):
+            seen += names
+            part += 1
+        spec = source.spec()
+        if not source.seek_subimage(part, 0):
+            raise InputError(
+                f"{path}: has no channel {name}, but {examples(seen)}; name its depths with --holdout.channel"
+            )
+        if (spec.full_width, spec.full_height) != size:
+            raise InputError(
+                f"{path}: is of a frame of {spec.full_width}x{spec.full_height}, expected {size[0]}x{size[1]} as the "
+                "frame that is rendered"
+            )
+        layer = name[: name.rfind(".") + 1]
+        alpha, back = (names.index(layer + word) if layer + word in names else None for word in ("A", "ZBack"))
+        if spec.deep and alpha is None:
+            raise InputError(f"{path}: is a deep EXR without {layer}A, expected the alpha of its samples")
+        yield source, part, [names.index(name), alpha, back if spec.deep else None]
+    finally:
+        source.close()
+
+
+def _plane(path: Path, source: Any, part: int, place: int | None) -> NDArray[Any] | None:
+    if place is None:
+        return None
+    plane = source.read_image(part, 0, place, place + 1, oiio.FLOAT)
+    if plane is None:
+        raise InputError(f"{path}: does not decode: {one_line(error_of(source))}; write the hold-out again")
+    return np.asarray(plane).ravel()
+
+
+def _deep(
+    path: Path, source: Any, part: int, places: Sequence[int | None]
+) -> tuple[NDArray[np.int64], list[NDArray[Any] | None]]:
+    data = source.read_native_deep_image(part, 0)
+    if data is None:
+        raise InputError(f"{path}: does not decode: {one_line(error_of(source))}; write the hold-out again")
+    counts = np.fromiter(map(data.samples, range(data.pixels)), np.int64, data.pixels)
+    total = int(counts.sum())
+    pixels = np.repeat(np.arange(data.pixels), counts).tolist()
+    samples = (np.arange(total) - np.repeat(np.cumsum(counts) - counts, counts)).tolist()
+
+    def column(place: int | None) -> NDArray[Any] | None:
+        if place is None:
+            return None
+        return np.fromiter(map(data.deep_value, pixels, repeat(place), samples), np.float32, total)
+
+    return counts, [column(place) for place in places]

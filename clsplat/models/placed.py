@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models placed in a shot: where each is at a time, how opaque and of which colour, and all of them as one model.
+
+They are put together before they are drawn, so that they sort and blend with each other as one model's Gaussians do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.models.codec.axes import SLACK
+from clsplat.models.edit import decompose, faded, graded, merge, transform
+
+IDENTITY = tuple(np.eye(4)[:3].ravel().tolist())
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+"""Rec.709's weights, which ASC CDL's saturation takes too."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A model at a time. matrix: the first three rows of (4, 4), from the model's world to the shot's; opacity: factor
+    from 0, which hides it, to 1; colour: none, or the rows of (3, 4), a matrix and what is added to it."""
+
+    matrix: tuple[float, ...] = IDENTITY
+    opacity: float = 1.0
+    colour: tuple[float, ...] = ()
+
+    @property
+    def transform(self) -> Float64:
+        """(4, 4)."""
+        return np.vstack([np.array(self.matrix).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
+
+    def within(self, outer: Placement) -> Placement:
+        """The same model where what it is in is placed as well."""
+        matrix = self.matrix
+        if outer.matrix != IDENTITY:
+            matrix = rows_of(outer.transform @ self.transform)
+        colour = outer.colour or self.colour
+        if outer.colour and self.colour:
+            first, then = (np.array(rows).reshape(3, 4) for rows in (self.colour, outer.colour))
+            both = then[:, :3] @ first
+            both[:, 3] += then[:, 3]
+            colour = tuple(both.ravel().tolist())
+        return Placement(matrix, self.opacity * outer.opacity, colour)
+
+
+State = tuple[Placement, ...]
+"""Placements of all models of a shot at a time."""
+
+
+class Track(Protocol):
+    """The placement of a model over time."""
+
+    def at(self, frame: float) -> Placement:
+        """The placement at a frame, which need not be whole. Raises InputError for one that cannot be."""
+
+
+def rows_of(matrix: Float64) -> tuple[float, ...]:
+    """The first three rows of (4, 4), in the order of a `Placement`."""
+    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # + 0.0: no -0, which would be another state
+
+
+def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:
+    """The colour of a `Placement`: gain (3,) and offset (3,), then the saturation: ASC CDL without its
+    power; none where nothing changes."""
+    if (gain == 1).all() and (offset == 0).all() and saturation == 1:
+        return ()
+    spread = saturation * np.eye(3) + (1 - saturation) * LUMA
+    return tuple(np.column_stack([spread * gain, spread @ offset]).ravel().tolist())
+
+
+def checked(placement: Placement, where: str) -> Placement:
+    """The placement. Raises InputError, which begins with `where`, for a transform that Gaussians cannot follow."""
+    try:
+        decompose(placement.transform, SLACK)
+    except InputError as error:
+        raise InputError(f"{where}: has {error}") from None
+    return placement
+
+
+def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
+    """The model at its place. What is not changed keeps its bits. Raises InputError as `edit.transform`."""
+    moved = gaussians
+    if placement.matrix != IDENTITY:
+        moved = transform(gaussians, placement.transform, SLACK)
+    if placement.colour:
+        rows = np.array(placement.colour).reshape(3, 4)
+        moved = graded(moved, rows[:, :3], rows[:, 3])
+    return faded(moved, placement.opacity)
+
+
+def near_of(models: Sequence[Gaussians], state: State) -> float:
+    """The near plane of the models in this state, hidden ones too: the least of theirs."""
+    return min(
+        model.near if placement.matrix == IDENTITY else decompose(placement.transform, SLACK)[0] * model.near
+        for model, placement in zip(models, state, strict=True)
+    )
+
+
+class Ensemble:
+    """All models of a shot as one, of states that follow each other: what stays is made once. One thread's."""
+
+    def __init__(self, models: Sequence[Gaussians]) -> None:
+        self.models = tuple(models)
+        self._placed: list[tuple[Placement, Gaussians] | None] = [None] * len(self.models)
+        self._last: tuple[State, Gaussians] | None = None
+
+    def at(self, state: State) -> Gaussians:
+        """The models in this state, merged in their order; hidden ones are among them, so that a Gaussian keeps its
+        row. The same object for the same state twice running."""
+        if self._last is None or self._last[0] != state:
+            self._last = None  # its memory is free before the next takes some
+            self._last = state, merge([self._one(index, placement) for index, placement in enumerate(state)])
+        return self._last[1]
+
+    def moved(self, state: State, after: State) -> Gaussians | None:
+        """Gaussians with the means that those of `state` have in the state `after`; None where nothing moves."""
+        if [placement.matrix for placement in state] == [placement.matrix for placement in after]:
+            return None
+        return merge(
+            [
+                placed(replace(model, sh=model.sh[:, :1]), Placement(placement.matrix))
+                for model, placement in zip(self.models, after, strict=True)
+            ]
+        )
+
+    def _one(self, index: int, placement: Placement) -> Gaussians:
+        before = self._placed[index]
+        if before is None or before[0] != placement:
+            self._placed[index] = None
+            before = self._placed[index] = placement, placed(self.models[index], placement)
+        return before[1]

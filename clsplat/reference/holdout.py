@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A frame held out in float64: twin of kernels/holdout.cl. Equation numbers are those of docs/pictures.md."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.reference.blend import layers
+from clsplat.reference.project import Projected
+
+Surface = tuple[Float64, Float64, Float64]
+"""Depths (H, W) at which surfaces begin and end, infinite where there is none, and their alpha (H, W)."""
+
+
+def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:
+    """(75): (H, W), the share of the light that comes through the surfaces to a depth."""
+    left = np.ones(surfaces[0][0].shape)
+    for begin, end, alpha in surfaces:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            part = np.where(end > begin, np.clip((depth - begin) / (end - begin), 0, 1), 1.0)
+        part = np.where((alpha == 1) & (depth >= begin), 1.0, part)
+        left *= np.where((depth >= begin) & (begin < np.inf), (1 - alpha) ** part, 1.0)
+    return left
+
+
+def held_out(
+    projected: Projected,
+    width: int,
+    height: int,
+    surfaces: Sequence[Surface],
+    background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
+) -> tuple[Float64, Float64]:
+    """Colour (H, W, 3) and alpha (H, W) by (76) and (77)."""
+    image, seen, left = np.zeros((height, width, 3)), np.zeros((height, width)), np.ones((height, width))
+    for layer in layers(projected, width, height):
+        through = let_through(surfaces, float(np.float32(projected.depths[layer.gaussian])))[layer.box]
+        weight = np.where(layer.added, layer.before * layer.alpha, 0.0) * through
+        image[layer.box] += weight[:, :, None] * projected.colors[layer.gaussian]
+        seen[layer.box] += weight
+        left[layer.box] = layer.after
+    behind = left * let_through(surfaces, np.inf)
+    return image + behind[:, :, None] * np.asarray(background, np.float64), seen

@@ -1,0 +1,51 @@
+// A hold-out: surfaces of other elements in the pixels, which let a share of the light behind them through.
+//
+// held_starts (pixels of a plane + 1): the first surface of each pixel, the end behind it; held_surfaces (surfaces,
+// HELD_SIZE): depths at which one begins and ends, what it lets through, the binary logarithm of that over its length;
+// each pixel's from the nearest beginning on. Equations: docs/pictures.md, (75).
+#ifdef HOLDOUT
+// Of a cell: what the surfaces let through that its pixels have behind them, and the beginning of the next ones.
+typedef struct {
+  Lanes through, next;
+  uint at[LANES], end[LANES];
+} Held;
+
+static inline Held held_of(__global const uint *starts, __global const float *surfaces, size_t stride) {
+  Held held;
+  held.through.all = (floatL)(1.0f);
+  for (int lane = 0; lane < LANES; ++lane) {
+    const size_t pixel = LANE_IN_PLANE(lane);
+    held.at[lane] = starts[pixel];
+    held.end[lane] = starts[pixel + 1];
+    held.next.lane[lane] = held.at[lane] < held.end[lane] ? surfaces[HELD_SIZE * held.at[lane] + HELD_Z] : INFINITY;
+  }
+  return held;
+}
+
+// The share of the light that comes through to a depth, which is no less than that of the call before.
+static inline floatL let_through(float depth, Held *held, __global const float *surfaces) {
+  if (!ANYL(MASKL(held->next.all <= (floatL)(depth)))) return held->through.all;
+  Lanes within; // log2 of what those let through that the depth is in
+  Lanes through;
+  for (int lane = 0; lane < LANES; ++lane) {
+    uint k = held->at[lane];
+    const uint end = held->end[lane];
+    float left = held->through.lane[lane], power = 0.0f;
+    for (; k < end && surfaces[HELD_SIZE * k + HELD_BACK] <= depth; ++k) left *= surfaces[HELD_SIZE * k + HELD_KEEP];
+    held->at[lane] = k;
+    held->through.lane[lane] = left;
+    held->next.lane[lane] = k < end ? surfaces[HELD_SIZE * k + HELD_Z] : INFINITY;
+    for (; k < end && surfaces[HELD_SIZE * k + HELD_Z] <= depth; ++k) {
+      __global const float *surface = surfaces + HELD_SIZE * k;
+      if (surface[HELD_BACK] <= depth) left *= surface[HELD_KEEP];
+      else power = fma1(surface[HELD_RATE], depth - surface[HELD_Z], power);
+    }
+    through.lane[lane] = left;
+    within.lane[lane] = power > -126.0f ? power : -126.0f;
+  }
+  return through.all * exp2L(within.all);
+}
+#define HELD_PARAMETERS , __global const uint *held_starts, __global const float *held_surfaces
+#else
+#define HELD_PARAMETERS
+#endif

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files as other renderers write them: depth EXR, deep EXR, and a sphere for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+
+Samples = Sequence[Sequence[Sequence[float]]]
+"""Of each pixel its samples, of each the values of its channels."""
+
+
+def specification(size: tuple[int, int], names: Sequence[str], window: tuple[int, int, int, int] | None) -> Any:
+    """Of an EXR of a frame of that size; window: x, y, width, height of the data."""
+    x, y, width, height = window or (0, 0, *size)
+    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
+    spec.channelnames = tuple(names)
+    spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = x, y, 0, 0, *size
+    return spec
+
+
+def write_flat(
+    path: Path,
+    channels: Mapping[str, NDArray[Any]],
+    *,
+    size: tuple[int, int] | None = None,
+    window: tuple[int, int, int, int] | None = None,
+) -> Path:
+    """Channels (H, W) of the data window, which is the frame where none is given."""
+    height, width = next(iter(channels.values())).shape
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), specification(size or (width, height), list(channels), window))
+    assert output.write_image(np.ascontiguousarray(np.stack(list(channels.values()), axis=2), np.float32))
+    output.close()
+    return path
+
+
+def write_samples(path: Path, size: tuple[int, int], samples: Samples, names: Sequence[str] = ("A", "Z")) -> Path:
+    """A deep EXR of a frame of that size (width, height)."""
+    spec = specification(size, names, None)
+    spec.deep = True
+    data = oiio.DeepData()
+    data.init(size[0] * size[1], len(names), [oiio.TypeDesc("float")] * len(names), list(names))
+    for pixel, each in enumerate(samples):
+        data.set_samples(pixel, len(each))
+    for pixel, each in enumerate(samples):
+        for sample, values in enumerate(each):
+            for channel, value in enumerate(values):
+                data.set_deep_value(pixel, channel, sample, float(value))
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_deep_image(data)
+    output.close()
+    return path
+
+
+def sphere(camera: Camera, centre: Sequence[float], radius: float) -> NDArray[np.float64]:
+    """(H, W): depth along the axis of a sphere at a place in the camera's space at each pixel's middle, infinite beside
+    it."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    rays = np.stack(np.broadcast_arrays(x, y[:, None], 1.0), axis=2)
+    along, square = rays @ np.asarray(centre, np.float64), (rays**2).sum(axis=2)
+    root = along**2 - square * (np.dot(centre, centre) - radius**2)
+    return np.asarray(np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / square, np.inf))
+
+
+def sphere_samples(camera: Camera, centre: Sequence[float], radius: float, fine: int = 4) -> list[list[list[float]]]:
+    """Of each pixel one deep sample, alpha and depth: the share of fine x fine rays that hit, and their mean depth."""
+    depths = sphere(camera.resized(camera.width * fine, camera.height * fine), centre, radius)
+    blocks = depths.reshape(camera.height, fine, camera.width, fine).transpose(0, 2, 1, 3).reshape(-1, fine * fine)
+    hits = np.isfinite(blocks)
+    return [[[hit.mean(), block[hit].mean()]] if hit.any() else [] for hit, block in zip(hits, blocks, strict=True)]
