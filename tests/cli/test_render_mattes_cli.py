@@ -159,8 +159,8 @@ def test_coverage_of_a_shutter_is_the_mean(folder: Path, tmp_path: Path) -> None
 
 def test_objects_held_out_cover_what_is_seen(folder: Path, tmp_path: Path) -> None:
     """A wall in the midst of the models, of glass at the left and opaque at the right."""
-    depth, opaque = np.full((HEIGHT, WIDTH), 4.0), np.linspace(0, 1, WIDTH).repeat(HEIGHT).reshape(WIDTH, HEIGHT).T
-    opaque = np.float32(opaque).astype(np.float64)
+    depth = np.full((HEIGHT, WIDTH), 4.0)
+    opaque = np.broadcast_to(np.linspace(0, 1, WIDTH, dtype=np.float32).astype(np.float64), depth.shape)
     held = f"--holdout {write_flat(tmp_path / 'wall.exr', {'Z': depth, 'A': opaque})}"
     assert render(folder, tmp_path, f"--channels objects,alpha,depth {held}") == 0
     pixels, _ = read(tmp_path / "1.exr", "cryptoobject")
@@ -168,7 +168,7 @@ def test_objects_held_out_cover_what_is_seen(folder: Path, tmp_path: Path) -> No
     wanted, whole = by_hand(*model, [(depth, depth, opaque)]), by_hand(*model)
     for index, name in enumerate(NAMES):
         assert np.abs(coverage(pixels, name) - wanted[:, :, index]).max() < CLOSE, name
-        assert np.abs(whole - wanted)[:, :, index].max() > 0.1
+        assert np.abs(whole - wanted)[:, :, index].max() > 0.04
     alpha = oiio.ImageBuf(str(tmp_path / "1.exr")).get_pixels(oiio.FLOAT)[:, :, 0]
     assert np.abs(sum(coverage(pixels, name) for name in NAMES) - alpha).max() < CLOSE
 
