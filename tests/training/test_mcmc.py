@@ -239,7 +239,7 @@ def test_stopping_and_going_on_gives_the_same_bytes(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.6, 0.3])
+@pytest.mark.parametrize("share", [0.6, 0.5])
 def test_in_less_memory_the_same_bytes(share: float, default_device: Device, tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path / "scene", points=False))
     many = replace(CONFIG, random_points=400, density=replace(CONFIG.density, max_gaussians=2500))

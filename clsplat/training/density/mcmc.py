@@ -135,7 +135,8 @@ def wanted(config: DensityConfig, step: int, count: int) -> int:
     """Number of Gaussians after this step's growth, when there are `count` before it: it grows by the same part each
     time, so that the last growth reaches the cap."""
     left = max(last_growth(config) - step, 0) // config.every + 1
-    return max(round(count * (config.max_gaussians / count) ** (1 / left)), count)
+    factor: float = (config.max_gaussians / count) ** (1 / left)
+    return max(round(factor * count), count)
 
 
 def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
