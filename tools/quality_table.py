@@ -1,14 +1,21 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Every table of docs/quality.md, from one command that can be interrupted: finished rows are kept by commit.
+"""Every table of docs/quality.md, from one command that can be interrupted, over several days and machines.
 
     python tools/quality_table.py SCENES -o FOLDER [--only growth,antialiasing] [--rows 'fox *,bonsai mcmc*']
-        [--seeds 2] [--iterations 7000] [--resolution 0] [--list]
+        [--seeds 2] [--iterations 7000] [--resolution 0] [--kept docs/quality-rows.json] [--list]
+    python tools/quality_table.py --same-as DIGEST --why WORDS [--kept docs/quality-rows.json]
 
 SCENES has fox, banana, sceaux_castle, snowmiku, bonsai and lego_blender_400; a row whose scene is missing is left out,
-and said. Each training has a folder below FOLDER/COMMIT-ITERATIONS-RESOLUTION, in which it goes on where it stopped;
-quality.md there has all tables as far as they are done. A tree with changes that are not committed has "-dirty" in its
-name: remove that folder after a further change.
+and said. Each training has a folder below FOLDER/DIGEST-ITERATIONS-RESOLUTION, in which it goes on where it stopped;
+quality.md there has all tables as far as they are done.
+
+Finished rows go into the file --kept, to be committed, and are taken from there where the digest of the code is the
+same: of what is in kernels/ and clsplat/config, device, rendering, stages and training, without comments and
+docstrings, and without mcmc's module for rows of other growths. Whatever else has a part in a figure (scenes, their
+loading, how pictures are compared) is taken to be as it was, and rows of any device are taken. --same-as says that the
+code as it is gives the same bytes as that of DIGEST, where a change was shown to change none; WORDS say how, and are
+kept.
 """
 
 from __future__ import annotations
@@ -20,13 +27,16 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from statistics import mean
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from quality_rows import Finished, Kept, Same, code_digest, device_of  # noqa: E402
+
+from clsplat.errors import InputError  # noqa: E402
 from clsplat.files import atomic_write  # noqa: E402
 
 SCENES = ("fox", "banana", "sceaux_castle", "snowmiku", "bonsai")
@@ -44,17 +54,6 @@ class Row:
     settings: tuple[str, ...] = ()
     half_of: tuple[str, ...] = ()
     sizes: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
-class Result:
-    """A finished training: PSNR in dB and SSIM of the held-out views, Gaussians, seconds; PSNR by size."""
-
-    psnr: float
-    ssim: float
-    gaussians: int
-    seconds: float
-    sizes: tuple[float, ...] = ()
 
 
 HALVES = {
@@ -107,46 +106,46 @@ TOOLS: dict[str, tuple[str, ...]] = {
 
 
 class Book:
-    """Finished rows of a commit, in a folder."""
+    """Trainings in a folder, and the file of those that are finished."""
 
-    def __init__(self, scenes: Path, folder: Path, seeds: int, iterations: int, resolution: int) -> None:
-        self.scenes, self.folder, self.seeds, self.iterations = scenes, folder, seeds, iterations
-        self.settings = ("--iterations", str(iterations), "--resolution", str(resolution))
+    def __init__(self, scenes: Path, folder: Path, seeds: int, iterations: int, resolution: int, kept: Kept) -> None:
+        self.scenes, self.folder, self.seeds, self.kept = scenes, folder, seeds, kept
+        self.iterations, self.resolution = iterations, resolution
         folder.mkdir(parents=True, exist_ok=True)
 
-    def results(self, table: str, row: Row, rows: Sequence[Row]) -> list[Result]:
+    def results(self, table: str, row: Row, rows: Sequence[Row]) -> list[Finished]:
         """One for each seed, trained where that is not done yet."""
         most = self._most(table, row, rows)
-        return [self._result(table, row, seed, most) for seed in range(self.seeds)]
+        return [self._result(table, row, seed, most[seed]) for seed in range(self.seeds)]
 
-    def _most(self, table: str, row: Row, rows: Sequence[Row]) -> tuple[str, ...]:
+    def _most(self, table: str, row: Row, rows: Sequence[Row]) -> list[tuple[str, ...]]:
+        """Settings of each seed: half of what the better row has with the same seed, so that more seeds change none."""
         if not row.half_of:
-            return ()
+            return [()] * self.seeds
         others = [self.results(table, other, rows) for other in rows if other.name in row.half_of]
         better = max(others, key=lambda found: mean(result.psnr for result in found))
-        return ("--density.max-gaussians", str(int(mean(result.gaussians for result in better)) // 2))
+        return [("--density.max-gaussians", str(result.gaussians // 2)) for result in better]
 
-    def _result(self, table: str, row: Row, seed: int, most: Sequence[str]) -> Result:
-        run = self.folder / table / f"{row.name.replace(' ', '-')}-{seed}"
-        done = run.parent / f"{run.name}.json"
-        if done.exists():
-            return Result(**json.loads(done.read_text("utf-8")))
+    def _result(self, table: str, row: Row, seed: int, most: Sequence[str]) -> Finished:
+        settings = (*row.settings, *most)
+        code = code_digest(ROOT, mcmc="mcmc" in settings)
+        named = (table, row.name, seed, settings, self.iterations, self.resolution, code, commit())
+        if known := self.kept.find(Finished(*named, "", "", 0.0, 0.0, 0, 0.0)):
+            return known
+        run = self.folder / table / f"{row.name.replace(' ', '-')}-{seed}-{code}"
         run.parent.mkdir(exist_ok=True)
         print(f"{table}: {row.name}, seed {seed}", file=sys.stderr, flush=True)
-        given = [*self.settings, *row.settings, *most, "--seed", str(seed), "--no-report"]
+        size = ("--iterations", str(self.iterations), "--resolution", str(self.resolution))
+        given = [*size, *settings, "--seed", str(seed), "--no-report"]
         how = ["--resume"] if (run / "config.toml").exists() else []
         _clsplat("train", str(self.scenes / row.scene), "-o", str(run), *given, *how)
         found = json.loads((run / "eval.json").read_text("utf-8"))
         sizes = tuple(self._psnr_at(run, size) for size in row.sizes)
-        values: dict[str, Any] = {
-            "psnr": found["mean"]["psnr"],
-            "ssim": found["mean"]["ssim"],
-            "gaussians": found["gaussians"],
-            "seconds": found["seconds"],
-            "sizes": sizes,
-        }
-        atomic_write(done, json.dumps(values).encode())
-        return Result(**values)
+        today, psnr, ssim = datetime.now(timezone.utc).date().isoformat(), found["mean"]["psnr"], found["mean"]["ssim"]
+        ends = (psnr, ssim, found["gaussians"], round(found["seconds"], 1), sizes)
+        finished = Finished(*named, device_of(run), today, *ends)
+        self.kept.add(finished)
+        return finished
 
     def _psnr_at(self, run: Path, size: int) -> float:
         told = _clsplat("eval", str(run), "--resolution", str(size), "--json")
@@ -175,7 +174,7 @@ def _run(command: Sequence[str]) -> str:
     return done.stdout
 
 
-def line(row: Row, found: Sequence[Result]) -> str:
+def line(row: Row, found: Sequence[Finished]) -> str:
     """A row in Markdown: means of the seeds, and how far apart they are."""
     psnr = [result.psnr for result in found]
     cells = [
@@ -185,6 +184,7 @@ def line(row: Row, found: Sequence[Result]) -> str:
         f"{mean(result.ssim for result in found):.4f}",
         f"{round(mean(result.gaussians for result in found)):,}",
         f"{mean(result.seconds for result in found):.0f}",
+        " and ".join(sorted({result.device for result in found})),
         *(f"{mean(result.sizes[k] for result in found):.2f}" for k in range(len(row.sizes))),
     ]
     if row.sizes:
@@ -195,7 +195,7 @@ def line(row: Row, found: Sequence[Result]) -> str:
 def header(rows: Sequence[Row]) -> str:
     """The two first lines of a table."""
     sizes = rows[0].sizes
-    cells = ["scene", "PSNR, dB", "seeds' range", "SSIM", "Gaussians", "seconds", *map(str, sizes)]
+    cells = ["scene", "PSNR, dB", "seeds' range", "SSIM", "Gaussians", "seconds", "on", *map(str, sizes)]
     cells += ["mean"] if sizes else []
     return f"| {' | '.join(cells)} |\n{'|---' * len(cells)}|"
 
@@ -208,19 +208,47 @@ def commit() -> str:
     return described.stdout.strip() or "unknown"
 
 
+def say_same(kept: Kept, was: str, why: str) -> int:
+    """Keep the statement that a digest's rows are those of the code as it is; 2 if there are none."""
+    for mcmc in (False, True):
+        if kept.has(was, mcmc=mcmc):
+            kept.say_same(Same(code_digest(ROOT, mcmc=mcmc), was, why))
+            return 0
+    print(f"quality_table: --same-as {was}: no row of {kept.path} has this digest", file=sys.stderr)
+    return 2
+
+
 def main(arguments: list[str]) -> int:
+    """`run`, with trouble told in one line."""
+    try:
+        return run(arguments)
+    except InputError as error:
+        print(f"quality_table: {error}", file=sys.stderr)
+        return 2
+
+
+def run(arguments: list[str]) -> int:
     """Make the tables and print them; 2 for a table that is not known or scenes that are not there."""
     names = [*TRAININGS, *TOOLS]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scenes", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("scenes", type=Path, nargs="?")
+    parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--only", default=",".join(names), help=f"of {', '.join(names)}")
     parser.add_argument("--rows", default="*", help="patterns of rows' names, and what these need")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--resolution", type=int, default=0)
     parser.add_argument("--list", action="store_true", help="print the rows, and train nothing")
+    parser.add_argument("--kept", type=Path, default=ROOT / "docs" / "quality-rows.json", help="file of finished rows")
+    parser.add_argument("--same-as", metavar="DIGEST", help="state that this code gives the bytes of another")
+    parser.add_argument("--why", metavar="WORDS", help="how --same-as was found")
     given = parser.parse_args(arguments)
+    if given.same_as:
+        if not given.why:
+            parser.error("--same-as: expected --why too, how it was found that no byte changes")
+        return say_same(Kept(given.kept), given.same_as, given.why)
+    if given.scenes is None or given.output is None:
+        parser.error("expected a folder of scenes, and -o FOLDER")
     wanted = given.only.split(",")
     if unknown := [name for name in wanted if name not in names]:
         known = ", ".join(names)
@@ -232,8 +260,9 @@ def main(arguments: list[str]) -> int:
         print(f"quality_table: --rows {strange[0]}: no such row; --list prints them", file=sys.stderr)
         return 2
     text = ""
-    folder = given.output / f"{commit()}-{given.iterations}-{given.resolution or 'full'}"
-    book = None if given.list else Book(given.scenes, folder, given.seeds, given.iterations, given.resolution)
+    folder = given.output / f"{code_digest(ROOT, mcmc=True)}-{given.iterations}-{given.resolution or 'full'}"
+    size = (given.iterations, given.resolution)
+    book = None if given.list else Book(given.scenes, folder, given.seeds, *size, Kept(given.kept))
     for table in wanted:
         lines = []
         rows = TRAININGS[table]() if table in TRAININGS else []

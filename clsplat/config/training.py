@@ -118,19 +118,20 @@ class DensityConfig:
     growth: Growth = "paper"
     """paper: densify what is over the threshold; budget: the number of Gaussians rises along a parabola to
     max-gaussians at density.stop, the largest gradients first, whatever the threshold (Taming 3DGS); mcmc: Gaussians
-    under min-opacity move to where others are opaque, max-gaussians is reached by a twentieth more each time, where
-    gradients are large, and noise moves what is nearly transparent (3DGS-MCMC). With mcmc there are no clones, splits
-    and resets; max-screen-radius moves Gaussians, from the start."""
+    under min-opacity move to where gradients are largest, and noise moves what is nearly transparent (3DGS-MCMC); the
+    number rises by the same part each time to max-gaussians at density.stop. Both are by splits along the longest
+    axis, there are no clones and resets; max-screen-radius moves Gaussians, from the start."""
     long_axis: bool = False
     """Split what is densified along its longest axis, small or large, into two that lie on it (Improved-GS); there are
-    no clones then. With growth mcmc nothing is split."""
+    no clones then. Growth mcmc always does."""
     edge_views: int = 0
     """With growth budget: training views that are looked at before each densification. What is over gradient-threshold
     is then drawn at random, each as likely as what it adds to the photographs' edges there (Improved-GS); 0: the
     largest gradients go first, whatever the threshold."""
     spread: float = 1.0
-    """With growth mcmc: distance of what moves or is added from the mean of the Gaussian that it comes from, in
-    standard deviations, drawn at random; 0 puts it there, as published."""
+    """With growth mcmc, where more Gaussians have to move than there are with a gradient: distance of what moves from
+    the mean of the Gaussian that it comes to, in standard deviations, drawn at random; 0 puts it there, as
+    published."""
     noise_rate: float = 5e5
     """With growth mcmc: noise added to the means each step, in learning rates of the means, for Gaussians of size 1 in
     a scene of extent 1; 0 adds none. None is added in the cooldown."""

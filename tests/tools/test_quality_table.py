@@ -4,11 +4,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import quality_table
-from quality_table import Book, Row
+from quality_rows import Kept, Same, code_digest
+from quality_table import ROOT, Book, Row
+
+from clsplat.errors import InputError
+
+KEPT = ROOT / "docs" / "quality-rows.json"
 
 
 class FakeClsplat:
@@ -29,8 +35,12 @@ class FakeClsplat:
             self.ends -= 1
             raise SystemExit("interrupted")
         psnr = 31.0 if "short" in run.name else 30.0
-        told = {"mean": {"psnr": psnr, "ssim": 0.9}, "gaussians": 1000 if "short" in run.name else 500, "seconds": 7.0}
+        seed = int(arguments[arguments.index("--seed") + 1])
+        count = (1000 if "short" in run.name else 500) + 10 * seed
+        told = {"mean": {"psnr": psnr, "ssim": 0.9}, "gaussians": count, "seconds": 7.0}
         (run / "eval.json").write_text(json.dumps(told))
+        session = {"device": "a device", "driver": "a driver 1.0  and its parts"}
+        (run / "metrics.jsonl").write_text(json.dumps({"step": 1, "session": session}) + "\n")
         return ""
 
 
@@ -38,18 +48,98 @@ ENDS = [Row("fox default", "fox"), Row("fox short", "fox", ("--schedule", "short
 HALF = Row("fox mcmc", "fox", half_of=("fox default", "fox short"))
 
 
-def test_a_finished_row_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def book_at(folder: Path, seeds: int, work: str = "work") -> Book:
+    return Book(folder, folder / work, seeds, 40, 0, Kept(folder / "rows.json"))
+
+
+def test_a_finished_row_is_kept_for_other_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeClsplat()
     monkeypatch.setattr(quality_table, "_clsplat", fake)
-    for _ in range(2):
-        Book(tmp_path, tmp_path / "work", 2, 40, 0).results("growth", ENDS[0], ENDS)
-        assert [call[0] for call in fake.calls] == ["train", "train"]
+    found = [book_at(tmp_path, 2, work).results("growth", ENDS[0], ENDS) for work in ("work", "elsewhere")]
+    assert [call[0] for call in fake.calls] == ["train", "train"]
+    assert found[0] == found[1]
+    assert (found[0][0].psnr, found[0][0].gaussians, found[0][0].device) == (30.0, 500, "a device, a driver 1.0")
+
+
+@pytest.mark.parametrize("change", ["code", "settings", "iterations", "seed"])
+def test_rows_of_other_code_or_settings_are_made_anew(
+    change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = FakeClsplat()
+    monkeypatch.setattr(quality_table, "_clsplat", fake)
+    book_at(tmp_path, 1).results("growth", ENDS[0], ENDS)
+    book, row = book_at(tmp_path, 2 if change == "seed" else 1), ENDS[0]
+    if change == "code":
+        monkeypatch.setattr(quality_table, "code_digest", lambda root, *, mcmc: "another")
+    if change == "settings":
+        row = replace(row, settings=("--schedule", "short"))
+    if change == "iterations":
+        book.iterations = 41
+    book.results("growth", row, ENDS)
+    assert len(fake.calls) == 2
+
+
+def test_a_statement_that_bytes_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake, where = FakeClsplat(), ["--kept", str(tmp_path / "rows.json"), "--why", "compared"]
+    monkeypatch.setattr(quality_table, "_clsplat", fake)
+    for code in ("first", "second", "third"):
+        monkeypatch.setattr(quality_table, "code_digest", lambda root, *, mcmc, code=code: code)
+        if code == "second":
+            assert quality_table.main(["--same-as", "first", *where]) == 0
+        if code == "third":
+            Kept(tmp_path / "rows.json").say_same(Same("third", "second", "compared"))
+        book_at(tmp_path, 1).results("growth", ENDS[0], ENDS)
+    assert len(fake.calls) == 1
+    assert quality_table.main(["--same-as", "fourth", *where]) == 2
+    assert capsys.readouterr().err.endswith("rows.json has this digest\n")
+
+
+def test_the_digest_is_of_code_alone(tmp_path: Path) -> None:
+    def digests(python: str, kernel: str, mcmc: str = "a = 1\n") -> tuple[str, str]:
+        root = tmp_path / str(len(list(tmp_path.iterdir())))
+        for name, text in (
+            ("kernels/blend.cl", kernel),
+            ("clsplat/config/training.py", python),
+            ("clsplat/training/density/mcmc.py", mcmc),
+        ):
+            (root / name).parent.mkdir(parents=True)
+            (root / name).write_text(text)
+        return code_digest(root, mcmc=False), code_digest(root, mcmc=True)
+
+    plain, kernel = "class A:\n    rate: float = 1.0\n", "float a = 1;\n"
+    first = digests(plain, kernel)
+    words = 'class A:\n    """Words."""\n\n    rate: float = 1.0  # one\n    """A rate."""\n'
+    assert digests(words, "float a = /* 1 */\n  1; // one\n") == first
+    assert digests(plain.replace("1", "2"), kernel)[0] != first[0]
+    assert digests(plain, kernel.replace("1", "2"))[0] != first[0]
+    other = digests(plain, kernel, "a = 2\n")
+    assert other[0] == first[0]
+    assert other[1] != first[1]
+
+
+def test_rows_that_are_committed_can_be_read() -> None:
+    told = json.loads(KEPT.read_text("utf-8"))
+    assert told["rows"]
+    known = {row.name for rows in quality_table.TRAININGS.values() for row in rows()}
+    assert {row["row"] for row in told["rows"]} <= known
+    assert not Kept(KEPT).has("of no code", mcmc=True)
+
+
+def test_a_broken_file_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "rows.json").write_text('{"rows": [{"row": "fox"}], "same": []}')
+    given = ["--same-as", "first", "--why", "compared", "--kept", str(tmp_path / "rows.json")]
+    assert quality_table.main(given) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(InputError, match=r"rows\.json: .*expected rows as quality_table writes them"):
+        Kept(tmp_path / "rows.json").has("x", mcmc=False)
 
 
 def test_an_interrupted_row_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeClsplat(ends=1)
     monkeypatch.setattr(quality_table, "_clsplat", fake)
-    book = Book(tmp_path, tmp_path / "work", 1, 40, 0)
+    book = book_at(tmp_path, 1)
     with pytest.raises(SystemExit):
         book.results("growth", ENDS[0], ENDS)
     book.results("growth", ENDS[0], ENDS)
@@ -59,17 +149,17 @@ def test_an_interrupted_row_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_half_of_the_better_ones_gaussians(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeClsplat()
     monkeypatch.setattr(quality_table, "_clsplat", fake)
-    Book(tmp_path, tmp_path / "work", 1, 40, 0).results("growth", HALF, [*ENDS, HALF])
-    last = fake.calls[-1]
-    assert last[last.index("--density.max-gaussians") + 1] == "500"
+    book_at(tmp_path, 2).results("growth", HALF, [*ENDS, HALF])
+    assert [call[call.index("--density.max-gaussians") + 1] for call in fake.calls[-2:]] == ["500", "505"]
 
 
 def test_sizes_are_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality_table, "_clsplat", FakeClsplat())
     row = Row("lego", "lego", sizes=(4, 2))
-    found = Book(tmp_path, tmp_path / "work", 1, 40, 0).results("antialiasing", row, [row])
-    assert quality_table.line(row, found) == "| lego | 30.00 | 0.00 | 0.9000 | 500 | 7 | 24.00 | 22.00 | 23.00 |"
-    assert quality_table.header([row]).splitlines()[0].endswith("| seconds | 4 | 2 | mean |")
+    found = book_at(tmp_path, 1).results("antialiasing", row, [row])
+    ends = "500 | 7 | a device, a driver 1.0 | 24.00 | 22.00 | 23.00 |"
+    assert quality_table.line(row, found) == f"| lego | 30.00 | 0.00 | 0.9000 | {ends}"
+    assert quality_table.header([row]).splitlines()[0].endswith("| seconds | on | 4 | 2 | mean |")
 
 
 def test_a_table_that_is_not_known(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -89,10 +179,11 @@ def test_only_the_rows_that_are_asked_for(
     for scene in quality_table.SCENES:
         (tmp_path / scene).mkdir()
     where = [str(tmp_path), "-o", str(tmp_path / "work"), "--only", "growth", "--seeds", "1"]
+    where += ["--kept", str(tmp_path / "rows.json")]
     assert quality_table.main([*where, "--rows", "fox mcmc,bonsai mcmc ???k"]) == 0
     rows = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()[4:] if line]
     assert rows == ["| fox mcmc", "| bonsai mcmc 290k"]
-    trained = {path.stem for path in (tmp_path / "work").rglob("*.json") if path.parent.name == "growth"}
-    assert trained == {"fox-default-0", "fox-short-0", "fox-mcmc-0", "bonsai-mcmc-290k-0"}  # and what they are half of
+    trained = {row["row"] for row in json.loads((tmp_path / "rows.json").read_text())["rows"]}
+    assert trained == {"fox default", "fox short", "fox mcmc", "bonsai mcmc 290k"}  # and what they are half of
     assert quality_table.main([*where, "--rows", "fax *"]) == 2
     assert capsys.readouterr().err.endswith("--rows fax *: no such row; --list prints them\n")

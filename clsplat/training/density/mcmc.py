@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Density control as sampling (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo"): dead
-Gaussians move to live ones, the model grows to a given number, and noise explores. It grows where the picture is wrong,
-which is not as published (docs/decisions/0027-the-long-axis.md). Policy only: no device."""
+Gaussians move to live ones, the model grows to a given number, and noise explores. It grows by halving what has the
+largest gradients, which is not as published (docs/decisions/0029-mcmc-grows-by-halves.md). Policy only: no device."""
 
 from __future__ import annotations
 
@@ -18,13 +18,11 @@ from clsplat.config.exploring import Exploration, step_key
 from clsplat.config.marking import MarkRules
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
-from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
-from clsplat.training.density.adaptive import draw_offsets, is_due
+from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
+from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 
 MOST = 51
 """Gaussians that share the place of one, at most."""
-GROWTH = 1.05
-"""Factor by which the number grows each time, at least."""
 OPAQUE = 1 - 1e-7
 """Opacity that is counted as no more than this, and from which on a logit has no room left in float32."""
 DRAWN = 1 / 255
@@ -41,21 +39,19 @@ class Mcmc(Strategy):
         self.train, self.config = config, config.density
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Gradients as long as the model grows, and radii where Gaussians move for being large on the screen."""
+        """Gradients as long as the model grows or Gaussians move."""
         config = self.config
-        moves = config.max_screen_radius > 0 and step < config.stop
-        return StatisticsNeeds(gradients=moves or step <= halfway(config))
+        return StatisticsNeeds(gradients=step < config.stop, absolute=config.absolute_gradients)
 
     def is_due(self, step: int) -> bool:
         """True if Gaussians move."""
         return is_due(self.config, step)
 
     def before_step(self, model: ModelState) -> RowPlan:
-        """Move the dead to the places of live ones, then add some there. A Gaussian is dead if nearly transparent,
-        without a rotation, or too large on the screen."""
-        config, rng = self.config, model.rng
+        """Halve the Gaussians with the largest gradients; second halves take the rows of the dead, then new ones. A
+        Gaussian is dead if nearly transparent, without a rotation, or too large on the screen."""
+        config = self.config
         stored = model.parameters["opacity_logits"].get()
-        log_scales = model.parameters["log_scales"].get().astype(np.float64)
         opacities = 1 / (1 + np.exp(-stored.astype(np.float64)))
         lengths = np.square(model.parameters["quaternions"].get().astype(np.float64)).sum(axis=1)
         dead = (opacities <= config.min_opacity) | (lengths < 1e-8)
@@ -66,39 +62,51 @@ class Mcmc(Strategy):
                 f"step {model.step}: every Gaussian is under --density.min-opacity {config.min_opacity}; lower that or "
                 "--density.opacity-weight"
             )
-        count, moved = model.count, int(dead.sum())
-        more = wanted(config, model.step, count) - count
-        rows, fresh = np.arange(count + more), np.zeros(count + more, np.bool_)
-        fresh[count:] = True
-        opacities = np.concatenate([opacities, np.zeros(more)])
-        log_scales = np.concatenate([log_scales, np.zeros((more, 3))])
-        wrong = grown_from(model.marker.scores(EVERY), dead) if more else None
-        for places, weights in (
-            (np.flatnonzero(dead), np.where(dead, 0.0, opacities[:count])),
-            (np.arange(count, count + more), wrong),
-        ):
-            chances = opacities[:count] if weights is None else weights
-            parents = draw(chances, len(places), rng)
-            own, total = np.unique(parents, return_counts=True)
-            opacities[own], by = shared(opacities[own], np.minimum(total + 1, MOST), config.min_opacity)
-            log_scales[own] += by[:, None]
-            rows[places] = rows[parents]
-            opacities[places], log_scales[places] = opacities[parents], log_scales[parents]
-            fresh[places] = fresh[own] = True
-        if moved + more == 0:
+        more, places = wanted(config, model.step, model.count) - model.count, np.flatnonzero(dead)
+        if len(places) + more == 0:
             return RowPlan(new_statistics=True)
-        changed = np.flatnonzero(fresh)
-        logits = np.log(opacities[changed] / (1 - opacities[changed])).astype(np.float32)
-        values = {
-            "opacity_logits": (changed, logits),
-            "log_scales": (changed, log_scales[changed].astype(np.float32)),
-        }
-        if config.spread > 0:
-            new = np.concatenate([np.flatnonzero(dead), np.arange(count, count + more)])
-            means, turned = (model.parameters[group].get()[rows[new]] for group in ("means", "quaternions"))
-            offsets = config.spread * draw_offsets(turned, log_scales[new], rng)
-            values["means"] = (new, (means + offsets).astype(np.float32))
+        scores = model.marker.scores(EVERY)
+        scores[dead] = 0
+        split = strongest(scores, len(places) + more)
+        places, left = places[: len(split)], places[len(split) :]
+        rows = np.concatenate([np.arange(model.count), split[len(places) :]])
+        rows[places] = split[: len(places)]
+        groups = {group: model.parameters[group].get()[rows] for group in (*HALVED, "opacity_logits")}
+        halves = np.concatenate([split, places, np.arange(model.count, len(rows))])
+        for group, parts in long_halves({group: whole[split] for group, whole in groups.items()}).items():
+            groups[group][halves] = parts
+        shares = self._moved(groups, rows, left, model.rng)
+        changed, placed = np.union1d(halves, shares), np.concatenate([halves, left])
+        fresh = np.zeros(len(rows), np.bool_)
+        fresh[changed] = True
+        values = {group: (changed, groups[group][changed]) for group in ("opacity_logits", "log_scales")}
+        values["means"] = (placed, groups["means"][placed])
         return RowPlan(rows=rows.astype(np.uint32), fresh=fresh, values=values, new_statistics=True)
+
+    def _moved(
+        self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """Move those for whom nothing is left to halve to the places of others, drawn by their opacities, as published.
+        `groups` and `rows` become as they are then; the rows that change."""
+        if len(left) == 0:
+            return left
+        least, spread = self.config.min_opacity, self.config.spread
+        opacities = 1 / (1 + np.exp(-groups["opacity_logits"].astype(np.float64)))
+        log_scales = groups["log_scales"].astype(np.float64)
+        opacities[left] = 0
+        parents = draw(opacities, len(left), rng)
+        own, total = np.unique(parents, return_counts=True)
+        opacities[own], by = shared(opacities[own], np.minimum(total + 1, MOST), least)
+        log_scales[own] += by[:, None]
+        opacities[left], log_scales[left] = opacities[parents], log_scales[parents]
+        rows[left] = rows[parents]
+        changed = np.union1d(own, left)
+        parts = opacities[changed]
+        groups["opacity_logits"][changed] = np.log(parts / (1 - parts))
+        groups["log_scales"][changed] = log_scales[changed]
+        means, turned = groups["means"][parents], groups["quaternions"][parents]
+        groups["means"][left] = means + spread * draw_offsets(turned, log_scales[left], rng)
+        return changed
 
     def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration:
         """Penalties whatever the step, noise until the cooldown begins; in units in which the scene's extent is 1."""
@@ -118,24 +126,23 @@ class Mcmc(Strategy):
         return None if drawn.all() or not drawn.any() else RowPlan(rows=np.flatnonzero(drawn).astype(np.uint32))
 
 
-def halfway(config: DensityConfig) -> int:
-    """Step in the middle of growth and moves, at which the cap is reached."""
-    return (config.start + config.stop) // 2
-
-
-def grown_from(scores: Float32, dead: NDArray[np.bool_]) -> Float64 | None:
-    """Weights (n,) by which Gaussians are drawn to grow from: mean gradients on the screen, 0 for the dead; None if all
-    are 0."""
-    weights = np.where(dead, 0.0, np.maximum(scores, 0)).astype(np.float64)
-    return weights if weights.any() else None
+def last_growth(config: DensityConfig) -> int:
+    """Step of the last growth, at which the cap is reached."""
+    return (config.stop - 1) // config.every * config.every
 
 
 def wanted(config: DensityConfig, step: int, count: int) -> int:
-    """Number of Gaussians after this step's growth, when there are `count` before it: a twentieth more, or as many as
-    let the cap be reached halfway from `start` to `stop`."""
-    left = max(halfway(config) - step, 0) // config.every + 1
-    factor: float = max(GROWTH, (config.max_gaussians / count) ** (1 / left))
-    return max(min(config.max_gaussians, round(factor * count)), count)
+    """Number of Gaussians after this step's growth, when there are `count` before it: it grows by the same part each
+    time, so that the last growth reaches the cap."""
+    left = max(last_growth(config) - step, 0) // config.every + 1
+    factor: float = (config.max_gaussians / count) ** (1 / left)
+    return max(round(factor * count), count)
+
+
+def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
+    """Indices of the largest scores, in order of the rows: `count` of them, or all that are over 0."""
+    order = np.argsort(-scores, kind="stable")[:count]
+    return np.sort(order[scores[order] > 0])
 
 
 def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
