@@ -86,7 +86,7 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Move those for whom nothing is left to halve to the places of others, drawn by their opacities, as published.
+        """Move the dead that are left, as published: to the places of others, drawn by their opacities.
         `groups` and `rows` become as they are then; the rows that change."""
         if len(left) == 0:
             return left
