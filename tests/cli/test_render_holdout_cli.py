@@ -93,6 +93,7 @@ def test_a_sphere_as_depth_and_as_deep_exr(folder: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(front, alpha_in_front(folder, [(at, at, np.ceil(cover))])[0][edge], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_deep_picture_held_out_by_the_sphere(folder: Path, tmp_path: Path) -> None:
     depth = sphere(camera_of(folder, 2), CENTRE, RADIUS)
     assert render(folder, tmp_path, "--deep --frames 2") == 0
@@ -131,6 +132,7 @@ def test_channels_and_everything_else_at_once_on_a_farm(folder: Path, tmp_path: 
         assert (tmp_path / "there" / path.name).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.slow
 def test_frames_are_rendered_again_where_the_cg_changes(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     for name in ("cg", "moved"):
         (tmp_path / name).mkdir()
@@ -162,6 +164,7 @@ def test_one_file_for_all_frames_and_the_plan(folder: Path, tmp_path: Path, caps
     assert f"holdout   {folder}/z.0001.exr to {folder}/z.0003.exr" in lines
 
 
+@pytest.mark.slow
 def test_cg_that_ends_with_the_frame_is_told_with_overscan(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     flags = f"--frames 2 --overscan 4 --holdout {tmp_path}/z.exr"
     write_flat(tmp_path / "z.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})

@@ -111,6 +111,7 @@ def moved_by(frame: float) -> Float64:
     return matrix
 
 
+@pytest.mark.slow
 def test_models_over_time_are_one_model_merged_beforehand(folder: Path, tmp_path: Path) -> None:
     shot, channels = layout(folder, "moving", **MOVING), "--channels rgb,alpha,depth,id,normals"
     assert render(folder, shot, tmp_path, f"--frames 1-3 {channels}") == 0
@@ -137,6 +138,7 @@ def test_sh_turn_with_the_model() -> None:
     np.testing.assert_allclose(after, before, atol=2e-5)  # float32 of 16 terms up to 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [{"opacity": 0}, {"keys": [{"frame": 9, "visible": False}]}])
 def test_a_hidden_model_is_not_there(hidden: dict[str, Any], folder: Path, tmp_path: Path) -> None:
     assert render(folder, layout(folder, "hidden", **hidden), tmp_path, "--frames 2 --channels rgb,alpha,id") == 0
@@ -177,6 +179,7 @@ def test_a_colour_within_a_colour() -> None:
         np.testing.assert_allclose(getattr(once, name), array, atol=3e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_moving_model_blurs(folder: Path, tmp_path: Path) -> None:
     shot = layout(folder, "moving", **MOVING)
     flags = "--frames 2 --shutter-angle 180 --samples 8"
@@ -274,6 +277,7 @@ def test_transforms(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(track.at(2).transform, moved_by(2))
 
 
+@pytest.mark.slow
 def test_skip_existing_sees_the_placements(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     def rendered(shot: Path) -> list[int]:
         capsys.readouterr()

@@ -84,6 +84,7 @@ def usd_camera(camera: Any, time: float) -> Camera:
     return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, rotation, -rotation @ world[:3, 3])
 
 
+@pytest.mark.slow
 def test_shake_with_eight_samples_a_frame(model: Path, tmp_path: Path) -> None:
     """The mean, in linear light, of 64 sharp frames, by cameras of USD's own matrices."""
     rng = np.random.default_rng(4)
@@ -176,6 +177,7 @@ def test_headers(model: Path, tmp_path: Path) -> None:
     assert not {"aperture", "focus", "expTime"} & exr_attributes(file).keys()
 
 
+@pytest.mark.slow
 def test_the_data_window(model: Path, tmp_path: Path) -> None:
     plain, _, _ = picture(model, write_stage(tmp_path / "plain.usda"))
     # 0.25 to 0.75 of 48, and from the bottom 0.1 to 0.5 of 40: pixels whose centres are in it
@@ -198,6 +200,7 @@ def warnings_of(capsys: Capture, model: Path, stage: Path, flags: str = "") -> l
     return [line for line in capsys.readouterr().err.splitlines() if "not applied" in line]
 
 
+@pytest.mark.slow
 def test_one_warning_of_what_is_not_applied(model: Path, tmp_path: Path, capsys: Capture) -> None:
     window = "float4 dataWindowNDC = (-0.25, 0, 1, 1)"
     stage = write_stage(tmp_path / "shot.usda", f"float exposure = 1\n{LENS}{SHUTTER}", window)
@@ -222,6 +225,7 @@ def test_pixels_that_a_file_shows_as_squares(model: Path, tmp_path: Path, capsys
     assert line.endswith(": not applied: pixelAspectRatio (2) in .png files, which show square pixels")
 
 
+@pytest.mark.slow
 def test_the_plan_and_errors(model: Path, tmp_path: Path, capsys: Capture) -> None:
     stage = write_stage(tmp_path / "shot.usda", LENS + SHUTTER)
     words = ["render", str(model), "--cameras", str(stage), "-o", str(tmp_path / "b.####.exr"), "--samples", "7"]

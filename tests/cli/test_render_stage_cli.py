@@ -180,6 +180,7 @@ def test_prims_without_sh(stage: Usd.Stage, tmp_path: Path) -> None:
     assert_same_bits(pixels(tmp_path / "0001.exr"), image(model))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["attribute", "prim", "above"])
 def test_a_linear_stage(where: str, stage: Usd.Stage, tmp_path: Path, capsys: Capture) -> None:
     prim = stage.GetPrimAtPath("/Asset/Gaussians")

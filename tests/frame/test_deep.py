@@ -208,6 +208,7 @@ def test_strips_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert path.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_files_in_little_memory(tmp_path: Path) -> None:
     gaussians, camera = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
     limit = 14 << 20  # the slices of all of it are 23 MB

@@ -128,6 +128,7 @@ def test_a_wall_shows_the_model_cut_there(default_device: Device, depth: float) 
         assert_close(got[name][same], wanted[name][same], absolute=1e-5 if name in ("depth", "position") else 2e-6)
 
 
+@pytest.mark.slow
 def test_windows_strips_and_little_memory_change_no_bit() -> None:
     gaussians, camera = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
     names = ("rgb", "alpha", "depth")
