@@ -145,6 +145,7 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
     from clsplat.cli.convert import Convert
     from clsplat.cli.options import PageOptions
     from clsplat.cli.render import Render
+    from clsplat.cli.render_job import bits_of
     from clsplat.config.pictures import Encoding
     from clsplat.scenes.scene import load_scene
     from clsplat.viewer.server import Address
@@ -156,6 +157,7 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
     assert [default(each, "host") for each in (PageOptions, Address)] == ["127.0.0.1"] * 2
     held_out = inspect.signature(load_scene).parameters["test_every"].default
     assert [default(each, "test_every") for each in (TrainConfig, Convert)] == [held_out] * 2 == [8] * 2
-    names = {"exr": "depth", "parts": "parts", "compression": "compression", "bits": "bits", "quality": "quality"}
+    names = {"exr": "depth", "parts": "parts", "compression": "compression", "quality": "quality"}
     for flag, name in names.items():
         assert default(Render, flag) == default(Encoding, name), flag
+    assert bits_of("a.png", default(Render, "bits"), ["rgb"]) == default(Encoding, "bits")
