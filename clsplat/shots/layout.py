@@ -17,6 +17,7 @@ from clsplat.errors import InputError
 from clsplat.files import is_file, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
+from clsplat.models.mesh import Mesh, read_mesh
 from clsplat.models.placed import IDENTITY, Placement, Track, checked, grade, rows_of
 from clsplat.scenes.transforms import Keys, load_document, objects, short
 
@@ -126,16 +127,23 @@ class Within:
         return self.inner.at(frame).within(self.outer.at(frame))
 
 
+VOLUMES = ("box", "sphere", "mesh")
+"""Kinds of a volume, the properties that say it."""
+
+
 @dataclass(frozen=True)
 class Volume:
     """A part of a model that has a matte of its own, in the model's world: a box, two corners, or a sphere, its centre
-    and its radius."""
+    and its radius; or what is in a mesh."""
 
     name: str
-    numbers: tuple[float, ...]
+    numbers: tuple[float, ...] = ()
+    mesh: Mesh | None = None
 
     def holds(self, gaussians: Gaussians) -> NDArray[np.bool_]:
         """Mask (n,) of the Gaussians whose mean is in it."""
+        if self.mesh is not None:
+            return self.mesh.holds(gaussians.means + gaussians.origin)
         if len(self.numbers) == 6:
             return edit.in_box(gaussians, self.numbers[:3], self.numbers[3:])
         return edit.in_sphere(gaussians, self.numbers[:3], self.numbers[3])
@@ -192,15 +200,20 @@ def _volumes(reader: Keys) -> Iterator[Volume]:
     given = reader.frame.get("mattes")
     entries = objects(reader.frame, "mattes")
     if given is not None and not entries:
-        raise reader.wrong("mattes", "a list of at least one object with a name and a box or a sphere")
+        raise reader.wrong("mattes", "a list of at least one object with a name and a box, a sphere or a mesh")
     for index, entry in enumerate(entries):
         volume = Keys(reader.path, None, entry, {})
         volume.where = f"{reader.where}: matte {index}"
-        _known(volume.where, entry, ("name", "box", "sphere"))
+        _known(volume.where, entry, ("name", *VOLUMES))
         name = _text(volume, "name")
-        if ("box" in entry) == ("sphere" in entry):
-            raise InputError(f"{volume.where}: expected a 'box' or a 'sphere', and one of them only")
-        kind, count = ("box", 6) if "box" in entry else ("sphere", 4)
+        kinds = [kind for kind in VOLUMES if kind in entry]
+        if len(kinds) != 1:
+            raise InputError(f"{volume.where}: expected a 'box', a 'sphere' or a 'mesh', and one of them only")
+        (kind,) = kinds
+        if kind == "mesh":
+            yield Volume(name, mesh=read_mesh(reader.path.parent / _text(volume, "mesh")))
+            continue
+        count = 6 if kind == "box" else 4
         numbers = volume.vector(kind, count).tolist()
         if kind == "box" and any(low > high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
             raise volume.wrong(kind, "the least x, y and z, then the largest")

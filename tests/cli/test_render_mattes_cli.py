@@ -231,7 +231,8 @@ def test_wrong_mattes_are_one_line(
     ("mattes", "message"),
     [
         ([], "'mattes' is [], expected a list of at least one object"),
-        ([{"name": "m"}], "model 'a': matte 0: expected a 'box' or a 'sphere'"),
+        ([{"name": "m"}], "model 'a': matte 0: expected a 'box', a 'sphere' or a 'mesh'"),
+        ([{"name": "m", "mesh": "none.obj"}], "none.obj: no such file"),
         ([{"name": "m", "box": [1, 0, 0, 0, 1, 1]}], "'box' is [1, 0, 0, 0, 1, 1], expected the least x, y and z"),
         ([{"name": "m", "sphere": [0, 0, 0, -1]}], "expected x, y, z and a radius of at least 0"),
         ([{"name": "a", "sphere": [0, 0, 0, 1]}], "has the matte 'a', of a name that is there twice"),
@@ -252,3 +253,20 @@ def test_far_more_objects_than_a_matte_has(folder: Path, tmp_path: Path, capsys:
     (folder / "many.json").write_text(json.dumps(shot))
     assert render(folder, tmp_path / "none", "--channels objects", "many.json") == 2
     assert "--channels objects: has 301 objects, expected at most 256" in error_line(capsys)
+
+
+def test_a_mesh_is_a_volume(folder: Path, tmp_path: Path) -> None:
+    """A box as a mesh, from the shot's folder: the matte of the box."""
+    low, high = np.array(BOX[:3]), np.array(BOX[3:])
+    points = [np.where([index & 1, index & 2, index & 4], high, low) for index in range(8)]
+    faces = ["1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6"]
+    lines = [f"v {x} {y} {z}" for x, y, z in points] + [f"f {face}" for face in faces]
+    (folder / "box.obj").write_text("\n".join(lines))
+    found = []
+    for volume in ({"box": BOX}, {"mesh": "box.obj"}):
+        shot = {"clsplat_shot": 1, "models": [{"name": "a", "path": "a.ply", "mattes": [{"name": "left", **volume}]}]}
+        (folder / "mesh.json").write_text(json.dumps(shot))
+        assert render(folder, tmp_path, "--channels objects --overwrite", "mesh.json") == 0
+        found.append(coverage(read(tmp_path / "1.exr", "cryptoobject")[0], "left"))
+    assert found[0].max() > 0.2
+    np.testing.assert_array_equal(*found)

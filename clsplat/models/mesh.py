@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangle meshes as volumes: what of a model lies inside. Read from OBJ files and USD stages."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.errors import InputError
+from clsplat.files import open_input
+from clsplat.models.formats.usd import open_stage, readable, survive
+
+USD = (".usd", ".usda", ".usdc", ".usdz")
+MOST_TRIANGLES = 100_000
+"""Triangles of a volume: each is looked at for every Gaussian in its box."""
+_AT_ONCE = 1 << 21
+"""Pairs of a point and a triangle that are worked on at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """corners (T, 3, 3) float64: of each triangle its three points, counterclockwise from outside."""
+
+    corners: Float64
+
+    def holds(self, points: Float64) -> NDArray[np.bool_]:
+        """Mask (n,) of the points (n, 3) that are inside: around which the mesh winds more than half once, whichever
+        way its triangles look, so that small holes do not matter (Jacobson et al. 2013, generalised winding number)."""
+        inside = np.zeros(len(points), np.bool_)
+        low, high = self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
+        (near,) = np.nonzero(((points >= low) & (points <= high)).all(axis=1))
+        rows = max(_AT_ONCE // len(self.corners), 1)
+        for first in range(0, len(near), rows):
+            chosen = near[first : first + rows]
+            inside[chosen] = np.abs(self._turns(points[chosen])) > 0.5
+        return inside
+
+    def _turns(self, points: Float64) -> Float64:
+        """Winding numbers (n,): solid angles of the triangles over a full sphere's (Van Oosterom and Strackee 1983)."""
+        a, b, c = (self.corners[None, :, k] - points[:, None] for k in range(3))
+        la, lb, lc = (np.linalg.norm(side, axis=2) for side in (a, b, c))
+        triple = np.einsum("ijk,ijk->ij", a, np.cross(b, c))
+        ab, bc, ca = (np.einsum("ijk,ijk->ij", p, q) for p, q in ((a, b), (b, c), (c, a)))
+        halves = np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb)
+        return np.asarray(halves.sum(axis=1) / math.tau)
+
+
+def read_mesh(path: Path) -> Mesh:
+    """The mesh of an OBJ file, or all meshes of a USD stage at its first time, where they stand in the stage.
+
+    Polygons become fans of triangles. Raises InputError for another file, one that cannot be read, and none or too many
+    triangles.
+    """
+    extension = path.suffix.lower()
+    if extension == ".obj":
+        corners = _of_obj(path)
+    elif extension in USD:
+        survive(path, "clsplat.models.mesh:read_here")
+        corners = read_here(path)
+    else:
+        raise InputError(f"{path}: expected a mesh, an .obj file or a USD stage")
+    if not 1 <= len(corners) <= MOST_TRIANGLES:
+        raise InputError(f"{path}: has {len(corners):,} triangles, expected 1 to {MOST_TRIANGLES:,}")
+    if not np.isfinite(corners).all():
+        raise InputError(f"{path}: has points that are not finite")
+    return Mesh(corners)
+
+
+def _of_obj(path: Path) -> Float64:
+    points: list[list[float]] = []
+    polygons: list[list[int]] = []
+    with open_input(path, "a mesh") as file:
+        for number, line in enumerate(file, 1):
+            words = line.split()
+            try:
+                if words[:1] == [b"v"]:
+                    points.append([float(word) for word in words[1:4]])
+                elif words[:1] == [b"f"]:
+                    indices = [int(word.partition(b"/")[0]) for word in words[1:]]
+                    polygons.append([index - 1 if index > 0 else len(points) + index for index in indices])
+                ragged = words[:1] == [b"v"] and len(points[-1]) < 3
+            except ValueError:
+                ragged = True
+            if ragged:
+                raise InputError(f"{path}: line {number} is {line[:40]!r}, expected numbers behind its letter")
+    return _fans(path, np.array(points, np.float64).reshape(-1, 3), polygons)
+
+
+def read_here(path: Path) -> Float64:
+    """`read_mesh` of a stage that is known not to end the process, corners (T, 3, 3)."""
+    from pxr import UsdGeom, UsdUtils
+
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
+    found = [np.empty((0, 3, 3))]
+    stage = open_stage(path, path)
+    with readable(path):
+        places = UsdGeom.XformCache(stage.GetStartTimeCode())
+        for prim in stage.Traverse():
+            if prim.IsA(UsdGeom.Mesh):
+                matrix = np.array(places.GetLocalToWorldTransform(prim), np.float64)
+                found.append(_of_prim(path, UsdGeom.Mesh(prim), stage.GetStartTimeCode(), matrix))
+    delegate.TakeUncoalescedDiagnostics()
+    return np.concatenate(found)
+
+
+def _of_prim(path: Path, mesh: Any, time: float, world_from_mesh: Float64) -> Float64:
+    points = np.array(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
+    points = points @ world_from_mesh[:3, :3] + world_from_mesh[3, :3]  # USD's matrices are of rows
+    indices = list(mesh.GetFaceVertexIndicesAttr().Get(time) or [])
+    counts = list(mesh.GetFaceVertexCountsAttr().Get(time) or [])
+    ends = np.cumsum([0, *counts])
+    if ends[-1] != len(indices):
+        raise InputError(f"{path}: {mesh.GetPath()} has {len(indices):,} indices of faces, expected {ends[-1]:,}")
+    return _fans(path, points, [indices[begin:end] for begin, end in pairwise(ends)])
+
+
+def _fans(path: Path, points: Float64, polygons: list[list[int]]) -> Float64:
+    """Corners (T, 3, 3) of the polygons as fans of triangles."""
+    fans = [(own[0], one, next_one) for own in polygons for one, next_one in pairwise(own[1:])]
+    triangles = np.array(fans, np.int64).reshape(-1, 3)
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+        raise InputError(f"{path}: has faces of other points than its {len(points):,}; is it damaged?")
+    return points[triangles]
