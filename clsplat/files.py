@@ -31,6 +31,8 @@ MAX_DOCUMENT = 32 << 20
 """Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
 ABANDONED = 600.0
 """Seconds without a write after which a temporary file of another machine counts as abandoned."""
+UNWRITTEN = 20
+"""Seconds after which a claim in which nothing stands is taken over."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 PROBE = 1 << 16
 """Bytes that are written to find out whether a disk has room."""
@@ -259,11 +261,12 @@ def _claim_of(target: Path) -> Path:
 
 
 def _is_given_up(claimed: Path) -> bool:
-    if time.time() - claimed.stat().st_mtime > ABANDONED:
+    age = time.time() - claimed.stat().st_mtime
+    if age > ABANDONED:
         return True
     token = claimed.read_text(encoding="ascii", errors="replace")
-    if not token:  # it is just being written
-        return False
+    if not token:  # it is just being written, or its process was killed as it did
+        return age > UNWRITTEN
     if (
         token[:12] == f"{_machine()}{os.getpid():08x}"
     ):  # a process before this one, of the same number, as in containers

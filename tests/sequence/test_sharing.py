@@ -178,3 +178,13 @@ def test_claims_are_given_back_when_a_job_breaks_off(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="no room"):
         run_tasks(tasks_in(tmp_path, 9), [failing], OPTIONS, lambda record: None, sharing=Sharing(OPTIONS))
     assert not [path for path in tmp_path.iterdir() if path.suffix != ".exr"]
+
+
+def test_a_claim_in_which_nothing_stands(tmp_path: Path) -> None:
+    """As a process leaves it that is killed before it has written its name."""
+    target = tmp_path / "a.exr"
+    empty = tmp_path / ".a.exr.clsplat-claim"
+    empty.touch()
+    assert claim(target) is None  # it may be about to be written
+    os.utime(empty, (time.time() - 60,) * 2)
+    assert claim(target) is not None
