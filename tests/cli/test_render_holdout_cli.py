@@ -185,6 +185,7 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
         (f"{held} --holdout.channel depth.Z", "has no channel depth.Z, but Z; name its depths with --holdout.channel"),
         ("--holdout.channel Z", "--holdout.channel Z: is of hold-outs, expected --holdout with it"),
         (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
+        (f"{held} --distort", "--holdout: is of straight pictures, expected it without --stmap and --distort"),
         (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such hold-out"),
         (f"--holdout {folder}/z.{{shot}}.exr", "{shot} is not known, expected {name}"),
         (f"--holdout {tmp_path}/nan.exr", "values of Z are not a number, expected depths and alpha of surfaces"),
