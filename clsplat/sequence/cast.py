@@ -58,7 +58,8 @@ class Cast:
         placed = []
         for task in tasks:
             states = {}
-            for time in model_times(task, options) if self.tracks is not None else ():
+            times = dict.fromkeys(time for view in task.views for time in model_times(view, options))
+            for time in times if self.tracks is not None else ():
                 state = self.state(task.number + time)
                 assert state is not None
                 kept = tuple(known.setdefault(placement, placement) for placement in state)
