@@ -76,7 +76,7 @@ def read(path: Path, layer: str) -> tuple[Float32, dict[str, str]]:
 
 
 def coverage(pixels: Float32, name: str) -> Float64:
-    """What a name covers, as a program that reads a Cryptomatte adds it up."""
+    """Coverage of a name, as a program that reads a Cryptomatte adds it up."""
     pairs = pixels.reshape(HEIGHT, WIDTH, 6, 2)
     of = np.ascontiguousarray(pairs[:, :, :, 0]).view(np.uint32) == id_bits(name)
     return np.where(of, pairs[:, :, :, 1], 0).sum(axis=2, dtype=np.float64)
