@@ -114,12 +114,13 @@ def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) 
 
 def full_covariances(upper: Float64) -> Float64:
     """(N, 3, 3) of upper triangles (N, 6): xx, xy, xz, yy, yz, zz."""
-    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    full: Float64 = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    return full
 
 
 def upper_gradients(full: Float64) -> Float64:
     """Gradients (N, 6) by the upper triangle of symmetric ones (N, 3, 3): an off-diagonal number is in two places."""
-    return full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
+    return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0]), np.float64)
 
 
 def _fisheye(points: Float64) -> tuple[Float64, Float64, Float64]:
@@ -146,7 +147,7 @@ def project(means: Float64, covariances: Float64, view: View, opacities: Float64
     """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156). With opacities (N,), 0 to 1, boxes end
     where alpha is 1/255; with them compensations count."""
     rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
-    (fx, fy), (cx, cy) = view.focal, view.centre
+    fx, fy = view.focal
     points = means @ rotation.T + translation
     x, y, z = points.T
     zero = np.zeros_like(x)
@@ -187,11 +188,11 @@ def project(means: Float64, covariances: Float64, view: View, opacities: Float64
             extend = np.minimum(EXTEND, np.sqrt(np.maximum(2 * np.log(opacities / ALPHA_MIN), 0.0)))
             valid &= opacities >= ALPHA_MIN
         wide = np.ceil(extend * np.sqrt(filtered[:, 0, 0]))
-        high_ = np.ceil(extend * np.sqrt(filtered[:, 1, 1]))
+        tall = np.ceil(extend * np.sqrt(filtered[:, 1, 1]))
         valid &= (means2d[:, 0] + wide > 0) & (means2d[:, 0] - wide < view.width)
-        valid &= (means2d[:, 1] + high_ > 0) & (means2d[:, 1] - high_ < view.height)
-        valid &= (wide > view.radius_clip) | (high_ > view.radius_clip)
-        radii = np.where(valid[:, None], np.stack([wide, high_], axis=1), 0.0).astype(np.int32)
+        valid &= (means2d[:, 1] + tall > 0) & (means2d[:, 1] - tall < view.height)
+        valid &= (wide > view.radius_clip) | (tall > view.radius_clip)
+        radii = np.where(valid[:, None], np.stack([wide, tall], axis=1), 0.0).astype(np.int32)
     return Projected(radii, means2d, z.copy(), conics, compensations, points, jacobians, clamped, filtered, det0)
 
 

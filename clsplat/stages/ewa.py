@@ -32,8 +32,8 @@ _FARTHEST = float(np.finfo(np.float32).max)
 class EwaCamera:
     """A camera. viewmat (4, 4): camera from world, any numbers in its first three rows; intrinsics (3, 3): fx, fy, cx
     and cy in pixels, a skew is not looked at; width, height: pixels; near, far: world units; eps2d: px^2, added to the
-    diagonal of the projected covariance; radius_clip: pixels, up to which both radii of what is left out are; model: one
-    of MODELS."""
+    diagonal of the projected covariance; radius_clip: pixels, what has no larger radius is left out; model: one of
+    MODELS."""
 
     viewmat: Float64
     intrinsics: Float64
@@ -98,9 +98,9 @@ class EwaCamera:
 
 @dataclass(frozen=True, eq=False)
 class EwaInputs:
-    """n Gaussians. means (n, 3): world units; quaternions (n, 4), w x y z, of any length but 0, and scales (n, 3), world
-    units, or in their place covariances (n, 6), upper triangles xx, xy, xz, yy, yz, zz; opacities (n,), 0 to 1, where
-    they are to make the boxes smaller. All float32."""
+    """n Gaussians. means (n, 3): world units; quaternions (n, 4), w x y z, of any length but 0, and scales (n, 3) in
+    world units, or in their place covariances (n, 6), upper triangles xx, xy, xz, yy, yz, zz; opacities (n,), 0 to 1,
+    where they are to make the boxes smaller. All float32."""
 
     means: DeviceArray
     quaternions: DeviceArray | None = None
@@ -154,7 +154,7 @@ class EwaGradients:
         return tuple(array for array in every if array is not None)
 
 
-def ewa_array(device: Device, work: Workspace, camera: EwaCamera) -> DeviceArray:
+def ewa_array(work: Workspace, camera: EwaCamera) -> DeviceArray:
     """The camera in the workspace."""
     array = work.array("ewa_camera", (len(EWA_CAMERA),))
     array.set(camera.packed())
