@@ -18,6 +18,8 @@ from clsplat.rendering.build_flags import kernel_defines
 KEPT = frozenset(
     ("splats", "tile_counts", "first_slots", "transmittance", "stops", "ranges")
     + ("gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted")
+    + ("ewa_camera", "ewa_radii", "ewa_means2d", "ewa_depths", "ewa_conics", "ewa_compensations")
+    + ("harmonics_centre", "harmonics_colours")
 )
 """Arrays of a forward pass that its gradient reads: each pass has its own. All else is the session's, for all passes."""
 MOST_IDLE = 4

@@ -183,7 +183,7 @@ class View:
             covars = None if given.covars is None else from_host(device, given.covars)
             covers = from_host(device, given.opacities)
             self._inputs = EwaInputs(**placed, covariances=covars, opacities=covers)  # type: ignore[arg-type]
-            self._camera_array = ewa_array(device, work, camera)
+            self._camera_array = ewa_array(work, camera)
             self.projected = ewa(device, work, self._inputs, camera, self._camera_array, compensated=compensated)
             self._colours, self._harmonics = self._coloured(work)
             self.pixels = Pixels(
@@ -317,13 +317,14 @@ class View:
                     at += colours
             elif colours is not None or not gradients.coefficients or given.by_camera:
                 d_sh, add = gradients.sh(device)
-                zeros = np.zeros((given.count, 3), np.float32)
+                by_colour = from_host(device, np.zeros((given.count, 3), np.float32) if colours is None else colours)
+                device.under_way.append(by_colour)
                 by_position = harmonics_grad(
                     device,
                     self._work,
                     self._harmonics,
                     self._colours,  # type: ignore[arg-type]  # of harmonics it is on the device
-                    from_host(device, zeros if colours is None else colours),
+                    by_colour,
                     d_sh,
                     arrays.means,
                     add=add,
@@ -359,5 +360,6 @@ class View:
         if means and not added:  # only the means have something yet
             for array in arrays.arrays[1:]:
                 array.fill(0.0)
+        device.under_way.append(placed)  # memory of the host, until the device has read it
         where = (device, self._work, self._inputs, self._camera, self._camera_array, self.projected, arrays)
         return ewa_grad(*where, **placed, add=means, by_camera=cameras)
