@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clsplat.arrays import Float32
 from clsplat.device.buffers import DeviceArray, Hosted, Workspace, from_host, hosted, upload
@@ -163,8 +163,8 @@ class Pixels(ListedPixels):
 
     means2d (n, 2) in pixels, the first pixel's middle at 0.5; conics (n, 3), the inverse covariance's a, b, c;
     opacities (n,) in [0, 1]; colours (n, D), D from 1 to 512; depths (n,), by which the Gaussians are sorted, ties by
-    index; radii (n, 2) int32: one that is 0 culls; each on the session's device or, C-contiguous and float32 but for
-    the radii, on the host. The colours must not change before the last `gradient`. background (D,) float32 or None for
+    index; radii (n, 2) int32: one that is 0 culls; each on the session's device or on the host, where what is float32 and
+    C-contiguous is not copied. The colours must not change before the last `gradient`. background (D,) float32 or None for
     black; alpha_max: the cap of alpha, below 1; backward: True if there may be a `gradient`.
 
     A Gaussian takes part in a pixel where its alpha is at least 1/255, and not behind the one that would leave 1e-4 or
@@ -189,9 +189,9 @@ class Pixels(ListedPixels):
         backward: bool = True,
     ) -> None:
         device = session.device
-        arrays = (radii, means2d, conics, opacities, depths, colours)
+        arrays = (means2d, conics, opacities, depths, colours)
         with session.lock:
-            gaussians = ScreenGaussians(*(placed(device, array) for array in arrays))
+            gaussians = ScreenGaussians(placed(device, radii, np.int32), *(placed(device, array) for array in arrays))
 
             def listing(work: Workspace) -> Listed:
                 return listed_by_depth(device, work, gaussians, width, height)
@@ -199,9 +199,9 @@ class Pixels(ListedPixels):
             super().__init__(session, gaussians, listing, (width, height), background, alpha_max, backward=backward)
 
 
-def placed(device: Device, array: Array) -> DeviceArray:
-    """An array for kernels that read it: as it is on the device, or one that is on the host."""
-    return array if isinstance(array, DeviceArray) else from_host(device, array)
+def placed(device: Device, array: Array, dtype: DTypeLike = np.float32) -> DeviceArray:
+    """An array for kernels that read it: as it is on the device, or one that is on the host, in place if it can be."""
+    return array if isinstance(array, DeviceArray) else from_host(device, np.asarray(array, dtype))
 
 
 def listed_by_depth(
