@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32
+from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError
 
 Shape = tuple[int | str, ...]
@@ -40,6 +41,40 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
     array = _numbers(name, values)
     _check_shape(name, array, (shape,))
     return np.ascontiguousarray(array, np.float32)
+
+
+def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
+    """(count, side, side) float64, of one matrix or of many. Raises InputError as `floats`."""
+    floats(name, given, (count, side, side), (side, side))
+    array: Float64 = np.asarray(given, np.float64)
+    return array.reshape(-1, side, side)
+
+
+def sizes(name: str, given: Any, count: int) -> list[int]:
+    """A length in pixels for each of `count` cameras, from one for all or one for each. Raises InputError."""
+    each = [given] * count if np.ndim(given) == 0 else list(given)
+    whole = all(
+        isinstance(size, (int, np.integer)) and not isinstance(size, bool) and 0 < size < 2**24 for size in each
+    )
+    if len(each) != count or not whole:
+        raise InputError(
+            f"{name} is {given!r:.80}, expected a positive whole number, or one for each of {count} cameras"
+        )
+    return [int(size) for size in each]
+
+
+def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
+    """A number from `least` to `most`. Raises InputError."""
+    if not isinstance(given, (int, float, np.number)) or isinstance(given, bool) or not least <= given <= most:
+        bound = f"from {least:g} to {most:g}" if np.isfinite(most) else f"of at least {least:g}"
+        raise InputError(f"{name} is {given!r:.80}, expected a number {bound}")
+    return float(given)
+
+
+def choice(name: str, given: Any, choices: Sequence[str]) -> None:
+    """Raise InputError unless an argument is one of the choices."""
+    if given not in choices:
+        raise InputError(f"{name} is {given!r:.80}, expected one of {', '.join(choices)}")
 
 
 def _numbers(name: str, values: Any) -> NDArray[Any]:
