@@ -151,7 +151,7 @@ class Projection:
                 intrinsics.append(by_intrinsics)
             result = {name: np.asarray(array.get(), np.float32) for name, array in room.hosted.items()}
         if self._covariances == "full":
-            result["covars"] = _full(result["covars"])
+            result["covars"] = full_gradient(result["covars"])
         result["viewmats"] = np.array(viewmats, np.float32).reshape(-1, 4, 4)
         result["intrinsics"] = np.array(intrinsics, np.float32).reshape(-1, 3, 3)
         return result
@@ -284,7 +284,7 @@ def checked_shapes(
     return {"covariances": np.ascontiguousarray(upper, np.float32)}, "full"
 
 
-def _full(upper: Float32) -> Float32:
+def full_gradient(upper: Float32) -> Float32:
     """Gradients by the nine numbers of matrices from those by their upper triangles."""
     halves = upper * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
     return np.asarray(halves[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), np.float32)
