@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from functools import cache
 from weakref import finalize
@@ -75,7 +76,12 @@ def _session(device: Device) -> Session:
     return Session(device)
 
 
+@cache
+def _named(name: str | None, _chosen: str | None) -> Session:
+    return _session(open_device(name))
+
+
 def session_of(device: Device | str | None = None) -> Session:
-    """The session of an open device, or of the one that a text names (see `clsplat devices`); one for each device.
-    Raises DeviceError."""
-    return _session(device if isinstance(device, Device) else open_device(device))
+    """The session of an open device, or of the one that a text names (see `clsplat devices`); one for each device, and
+    one for each name, as looking for devices takes longer than a small image. Raises DeviceError."""
+    return _session(device) if isinstance(device, Device) else _named(device, os.environ.get("CLSPLAT_DEVICE"))
