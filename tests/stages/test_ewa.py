@@ -77,7 +77,7 @@ class Run:
         if into is None:
             shapes = {"covariances": 6} if self.inputs.covariances is not None else {"quaternions": 4, "scales": 3}
             into = EwaGradients(**{name: filled(device, n, width) for name, width in {"means": 3, **shapes}.items()})
-        given = {name: upload(device, values) for name, values in by.items()}
+        given: dict[str, Any] = {name: upload(device, values) for name, values in by.items()}
         where = (self.camera, self.camera_array, self.arrays, into)
         sums = ewa_grad(device, Workspace(device), self.inputs, *where, add=add, by_camera=True, **given)
         assert sums is not None
