@@ -211,12 +211,12 @@ def test_needles_and_discs(shaped_device: Device) -> None:
     assert off.max() <= 3e-5 and np.median(off) <= 1e-6  # rounding times 64, as above
 
 
-def test_flat_gaussians_and_points_have_gradients(shaped_device: Device) -> None:
+def test_flat_gaussians_and_points_have_gradients(device: Device) -> None:
     """Scales of 0: what is seen is the low-pass's, and compensations end at 0, where they have no slope."""
     subject = case(64)
     subject.scales[::2, 0] = subject.scales[1::2] = 0.0
     subject.opacities[:] = 1.0
-    run = Run.of(shaped_device, subject)
+    run = Run.of(device, subject)
     by = gradients(replace(subject.projected(), radii=run.get("radii")), *OUTPUTS)
     arrays, by_viewmat, _ = run.gradient(by)
     assert all(np.isfinite(values).all() for values in arrays.values()) and np.isfinite(by_viewmat).all()
