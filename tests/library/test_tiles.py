@@ -83,7 +83,7 @@ def test_pairs_are_those_of_gsplat() -> None:
     import torch
     from gsplat.cuda import _torch_impl as impl
 
-    of = flats(20, 2)
+    of = flats(6, 2)  # it is a loop over tensors
     arrays = (stacked(of, "means2d"), stacked(of, "radii"), stacked(of, "depths"))
     counts, ids, _ = isect_tiles(*arrays, 16, *TILES)
     wanted = impl._isect_tiles(*(torch.from_numpy(array) for array in arrays), 16, *TILES)  # its reference
