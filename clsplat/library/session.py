@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from functools import cache
 from weakref import finalize
@@ -75,7 +76,18 @@ def _session(device: Device) -> Session:
     return Session(device)
 
 
+_CHOOSE = ("CLSPLAT_DEVICE", "CLSPLAT_SHAPE", "CLSPLAT_PRETEND")
+
+
+@cache
+def _named(selector: str | None, _variables: tuple[str | None, ...]) -> Session:
+    return _session(open_device(selector))
+
+
 def session_of(device: Device | str | None = None) -> Session:
     """The session of an open device, or of the one that a text names (see `clsplat devices`); one for each device.
     Raises DeviceError."""
-    return _session(device if isinstance(device, Device) else open_device(device))
+    if isinstance(device, Device):
+        return _session(device)
+    # looking at every driver again would take as long as projecting half a million Gaussians
+    return _named(device, tuple(os.environ.get(name) for name in _CHOOSE))
