@@ -51,8 +51,8 @@ class ValuesBlended:
 
 @dataclass(frozen=True, eq=False)
 class ValueGradients:
-    """means2d (n, 2), conics (n, 3), opacities (n,), values (n, D), background (D,); absolute (n, 2): sums of the absolute
-    values of every pixel's gradient by means2d."""
+    """means2d (n, 2), conics (n, 3), opacities (n,), values (n, D), background (D,); absolute (n, 2): sums of the
+    absolute values of every pixel's gradient by means2d."""
 
     means2d: Float64
     conics: Float64
