@@ -88,9 +88,7 @@ def fully_fused_projection(
         "camera_model": camera_model,
         "device": device,
     }
-    *arrays, covers = (
-        Batches(each, leading) for each in (means, covars, quats, scales, viewmats, Ks, opacities)
-    )
+    *arrays, covers = (Batches(each, leading) for each in (means, covars, quats, scales, viewmats, Ks, opacities))
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
             library_projection(*(each[index] for each in arrays), width, height, opacities=covers[index], **settings)

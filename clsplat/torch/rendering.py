@@ -145,8 +145,7 @@ def rasterization(
     if covars is not None:
         quats = scales = None
     *arrays, behind, squares = (
-        Batches(each, batch)
-        for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
+        Batches(each, batch) for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     )
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
@@ -175,7 +174,9 @@ def _refuse_missing(**given: Any) -> None:
     for name, value in given.items():
         if value is not None and value is not False:
             found = str(value) if isinstance(value, bool) else "given"
-            raise refuse(name, found, f"{isinstance(value, bool) and 'False' or 'None'}: clsplat.torch does not have it")
+            raise refuse(
+                name, found, f"{isinstance(value, bool) and 'False' or 'None'}: clsplat.torch does not have it"
+            )
 
 
 def _check_tensors(
@@ -214,7 +215,11 @@ def _check_tensors(
             raise refuse("sh_degree", sh_degree, "0, 1, 2 or 3, or None for colours")
         check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
         if colors.shape[-2] < (sh_degree + 1) ** 2:
-            raise refuse("colors", f"of {colors.shape[-2]} coefficients", f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}")
+            raise refuse(
+                "colors",
+                f"of {colors.shape[-2]} coefficients",
+                f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}",
+            )
     if backgrounds is not None:
         check_shape("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
     return batch

@@ -85,9 +85,13 @@ def strategy(name: str) -> Any:
     Raises ImportError where gsplat is not installed, ClsplatError where it is older than 1.5.
     """
     if not _has("gsplat") or not _has("gsplat.strategy"):
-        raise ImportError(f"{name} is gsplat's own class: pip install --no-deps gsplat=={VERSION}; it needs no CUDA here")
+        raise ImportError(
+            f"{name} is gsplat's own class: pip install --no-deps gsplat=={VERSION}; it needs no CUDA here"
+        )
     if (found := _version(import_module("gsplat"))) < ONE_RADIUS:
-        raise ClsplatError(f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()")
+        raise ClsplatError(
+            f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()"
+        )
     operations = import_module("gsplat.strategy.ops")
     for ours in (quat_scale_to_covar_preci, compute_relocation):
         setattr(operations, ours.__name__, ours)

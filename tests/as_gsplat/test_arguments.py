@@ -23,7 +23,9 @@ pytestmark = pytest.mark.needs("torch")
 
 
 def given(**changes: Any) -> dict[str, Any]:
-    made = {name: value.float() if isinstance(value, torch.Tensor) else value for name, value in clouds.cloud(8).items()}
+    made = {
+        name: value.float() if isinstance(value, torch.Tensor) else value for name, value in clouds.cloud(8).items()
+    }
     return {**made, **changes}
 
 

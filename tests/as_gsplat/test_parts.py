@@ -94,7 +94,11 @@ def test_relocation_is_equation_9() -> None:
 
 def test_relocation_names_its_arguments() -> None:
     good: dict[str, Any] = {"opacities": torch.ones(2) / 2, "scales": torch.ones(2, 3), "ratios": torch.ones(2)}
-    for name, value in (("scales", torch.ones(2)), ("ratios", torch.ones(3)), ("opacities", torch.full((2,), math.nan))):
+    for name, value in (
+        ("scales", torch.ones(2)),
+        ("ratios", torch.ones(3)),
+        ("opacities", torch.full((2,), math.nan)),
+    ):
         with pytest.raises(InputError, match=name):
             compute_relocation(**{**good, name: value}, binoms=binomials(4))
     with pytest.raises(InputError, match="binoms"):
@@ -262,7 +266,16 @@ def test_tiles_of_packed_splats() -> None:
     images, gaussians = seen.nonzero(as_tuple=True)
     _, ids, numbers = isect_tiles(means2d, radii, depths, 16, 4, 3)
     per_gauss, packed_ids, packed_numbers = isect_tiles(
-        means2d[seen], radii[seen], depths[seen], 16, 4, 3, packed=True, n_images=2, image_ids=images, gaussian_ids=gaussians
+        means2d[seen],
+        radii[seen],
+        depths[seen],
+        16,
+        4,
+        3,
+        packed=True,
+        n_images=2,
+        image_ids=images,
+        gaussian_ids=gaussians,
     )
     assert torch.equal(ids, packed_ids)
     assert torch.equal(numbers.long(), (images * 20 + gaussians)[packed_numbers.long()])
@@ -299,7 +312,10 @@ def test_pixels_of_lists_are_those_of_the_whole_call(width: int, packed: bool) -
         return torch.zeros(2, 40, *values.shape[1:]).double().index_put(rows, values.double()) if packed else values
 
     exact = {name: each.detach().double().requires_grad_() for name, each in free.items()}
-    exact_colors, exact_behind = colors.detach().double().requires_grad_(), backgrounds.detach().double().requires_grad_()
+    exact_colors, exact_behind = (
+        colors.detach().double().requires_grad_(),
+        backgrounds.detach().double().requires_grad_(),
+    )
     projected = dense.Projected(
         whole(exact["means2d"]), whole(exact["conics"]), whole(meta["depths"].detach()),
         torch.ones(2, 40).double(), whole(meta["radii"]),
