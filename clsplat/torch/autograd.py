@@ -17,7 +17,6 @@ from clsplat.arrays import Int64
 from clsplat.torch.arguments import as_array, as_tensor
 from clsplat.torch.covariances import UPPER
 
-
 SPARSE = ("means", "quaternions", "scales", "covars")
 """Arguments whose gradients may be sparse."""
 
@@ -82,13 +81,13 @@ class Call:
         )
 
     def laid_out(self, array: NDArray[Any]) -> NDArray[Any]:
-        """(B, C, N, ...) as `meta` has it: (..., C, N, ...), or (nnz, ...) packed."""
+        """(B, C, N, ...) in the layout of `meta`: (..., C, N, ...), or (nnz, ...) packed."""
         if self.in_view is None:
             return array.reshape(*self.batch, *array.shape[1:])
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
 
     def whole(self, value: Tensor | None) -> Any:
-        """A gradient as `meta` has it, as (B, C, N, ...)."""
+        """A gradient in the layout of `meta`, brought to (B, C, N, ...)."""
         if value is None:
             return None
         array = as_array(value)
@@ -120,13 +119,13 @@ class Call:
         return [self.of_rows(part) if part is not None and name in SPARSE else part for name, part in pairs]
 
     def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor) -> Tensor:
-        """Gradients of splats from every batch, as `meta` has them."""
+        """Gradients of splats from every batch, in the layout of `meta`."""
         arrays = [found[name] for found in each]
         return as_tensor(self.laid_out(arrays[0][None] if len(arrays) == 1 else np.stack(arrays)), like)
 
 
 class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """From Gaussians to splats as `meta` has them."""
+    """From Gaussians to splats in the layout of `meta`."""
 
     @staticmethod
     def forward(
@@ -177,7 +176,7 @@ INPUTS = ("means", "quaternions", "scales", "covars", "opacities", "colors", "vi
 
 
 class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """From splats as `meta` has them to images and alphas."""
+    """From splats in the layout of `meta` to images and alphas."""
 
     @staticmethod
     def forward(

@@ -20,8 +20,8 @@ from clsplat.torch.covariances import quat_scale_to_covar_preci
 from clsplat.torch.harmonics import spherical_harmonics
 from clsplat.torch.pixels import rasterize_to_pixels
 from clsplat.torch.projection import fully_fused_projection
-from clsplat.torch.rendering import RollingShutterType, rasterization
 from clsplat.torch.relocation import compute_relocation
+from clsplat.torch.rendering import RollingShutterType, rasterization
 from clsplat.torch.selective_adam import SelectiveAdam
 from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 

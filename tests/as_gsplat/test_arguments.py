@@ -136,7 +136,7 @@ def test_arguments_that_are_none(changes: dict[str, Any], message: str) -> None:
 )
 def test_nan_is_refused_by_name_and_place(name: str, place: tuple[int, ...]) -> None:
     where = ", ".join(map(str, place))
-    with pytest.raises(InputError, match=rf"^{name} has 1 values that are NaN or infinite, the first at \({where},?\)"):
+    with pytest.raises(InputError, match=rf"^{name}: \[{where}\] is nan, expected finite numbers"):
         rasterization(**given(**{name: spoiled(name, place)}))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's own density control over `clsplat.torch.rasterization`: both strategies change a small model as they should."""
+"""gsplat's own density control over `clsplat.torch.rasterization`: both strategies change a small model."""
 
 from __future__ import annotations
 
