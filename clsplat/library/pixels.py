@@ -131,7 +131,8 @@ class ListedPixels:
     def gradient_on_device(
         self, d_image: NDArray[Any], d_alpha: NDArray[Any] | None = None, *, absolute: bool = False
     ) -> PixelGradients:
-        """As `gradient`, for stages that go on with it; what it is given must not change before the device is done."""
+        """The result of `gradient` where it is, for stages that go on with it; what is given must not change before the
+        device is done."""
         session, gaussians, listed = self._session, self._gaussians, self._listed
         n, depth = gaussians.count, gaussians.width
         fields = SlotFields(absolute=absolute)

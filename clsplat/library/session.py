@@ -33,7 +33,7 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """As of a workspace."""
+        """An array by its name, as of any workspace."""
         if name in KEPT:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)

@@ -2,7 +2,7 @@
 """Splats of projected Gaussians that come as arrays, and the chain rule back: float64 twin of kernels/splats.cl and
 splats_grad.cl.
 
-Equation numbers are those of docs/library.md.
+Equation numbers are those of docs/gradients.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 """Blending any number of values a Gaussian and its gradient, every Gaussian at every pixel: float64 twin of
 kernels/values.cl and values_grad.cl.
 
-Equation numbers are those of docs/library.md and, below 150, of docs/gradients.md.
+Equation numbers are those of docs/gradients.md.
 """
 
 from __future__ import annotations

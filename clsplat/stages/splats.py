@@ -61,7 +61,7 @@ def splats(
     device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int, *, listed: bool = False
 ) -> Projected:
     """Splats, and the tiles that each reaches, of an image of width x height pixels; listed: of all Gaussians, as
-    lists that were made elsewhere may have any."""
+    their lists are given, and may have any."""
     n = gaussians.count
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))
     launch_items(
