@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from clsplat.arrays import Int64
 from clsplat.torch.arguments import as_array, as_tensor
 from clsplat.torch.covariances import UPPER
+from clsplat.torch.graphs import differentiable_once
 
 SPARSE = ("means", "quaternions", "scales", "covars")
 """Arguments whose gradients may be sparse."""
@@ -150,7 +150,7 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         return (*splats, colors)
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
         """Gradients of the arguments of `forward`."""
         call: Call = ctx.call
@@ -159,14 +159,15 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
             return (None,) * (1 + len(inputs))
         names = ("means2d", "conics", "depths", "opacities")
         splats = {name: call.whole(gradient) for name, gradient in zip(names, given[:4], strict=True)}
-        splats["colors2d"] = None if given[4] is None else as_array(given[4]).reshape(*call.sizes, -1)
+        colors = given[4]
+        splats["colors2d"] = None if colors is None else as_array(colors).reshape(*call.sizes, colors.shape[-1])
         cameras = any(ctx.needs_input_grad[-2:])
         each = []
         for index, result in enumerate(call.results):
             by = {name: None if whole is None else whole[index] for name, whole in splats.items()}
             found = result.vjp_projection(**by, cameras=cameras)
             if "covars" in found:  # one half of what a number off the diagonal stands for twice
-                found["covars"] = found["covars"][:, UPPER[0], UPPER[1]] * np.float32([1, 2, 2, 1, 2, 1])
+                found["covars"] = found["covars"][:, UPPER[0], UPPER[1]] * np.array([1, 2, 2, 1, 2, 1], np.float32)
             each.append(found)
         return (None, *call.gradients(each, inputs, ctx.needs_input_grad[1:]))
 
@@ -196,7 +197,7 @@ class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no typ
         return as_tensor(call.by_camera("images"), means2d), as_tensor(call.by_camera("alphas"), means2d)
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
         """Gradients of the arguments of `forward`."""
         call: Call = ctx.call

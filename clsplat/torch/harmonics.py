@@ -7,12 +7,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from clsplat.library.harmonics import HarmonicColors
 from clsplat.library.harmonics import spherical_harmonics as library_harmonics
 from clsplat.torch.arguments import as_array, as_tensor, check_shape, refuse, renamed
-from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.graphs import differentiable_once, outside_graphs
 
 
 @outside_graphs
@@ -47,7 +46,7 @@ class _Harmonics(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         return as_tensor(result.colors, dirs)
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, d_colors: Tensor) -> tuple[None, Tensor, Tensor]:
         dirs, coeffs = ctx.saved_tensors
         found = ctx.result.vjp(as_array(d_colors))

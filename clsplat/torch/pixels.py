@@ -7,12 +7,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from clsplat.library.listed import RasterizedPixels
 from clsplat.library.listed import rasterize_to_pixels as library_pixels
 from clsplat.torch.arguments import as_array, as_tensor, check_shape, check_size, refuse
-from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.graphs import differentiable_once, outside_graphs
 
 INPUTS = ("means2d", "conics", "colors", "opacities", "backgrounds")
 
@@ -62,7 +61,10 @@ def rasterize_to_pixels(
     if backgrounds is not None:
         check_shape("backgrounds", backgrounds, (*isect_offsets.shape[:-2], colors.shape[-1]))
     result = library_pixels(
-        *(as_array(each) for each in (means2d, conics, colors, opacities)),
+        as_array(means2d),
+        as_array(conics),
+        as_array(colors),
+        as_array(opacities),
         image_width,
         image_height,
         tile_size,
@@ -88,7 +90,7 @@ class _Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no ty
         return as_tensor(result.colors, means2d), as_tensor(result.alphas, means2d)
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
         inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
         if d_images is None and d_alphas is None:

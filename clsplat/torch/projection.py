@@ -8,12 +8,11 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from clsplat.library.projection import fully_fused_projection as library_projection
 from clsplat.torch.arguments import as_tensor, check_choice, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import Batches, Call
-from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.graphs import differentiable_once, outside_graphs
 
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 INPUTS = ("means", "quaternions", "scales", "covars", "viewmats", "intrinsics")
@@ -79,7 +78,9 @@ def fully_fused_projection(
         check_shape("opacities", opacities, (*leading, count))
     if sparse_grad and (leading or not packed):
         raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
-    settings = {
+    settings: dict[str, Any] = {
+        "width": width,
+        "height": height,
         "eps2d": eps2d,
         "near_plane": near_plane,
         "far_plane": far_plane,
@@ -88,10 +89,19 @@ def fully_fused_projection(
         "camera_model": camera_model,
         "device": device,
     }
-    *arrays, covers = (Batches(each, leading) for each in (means, covars, quats, scales, viewmats, Ks, opacities))
+    tensors = {
+        "means": means,
+        "covars": covars,
+        "quaternions": quats,
+        "scales": scales,
+        "viewmats": viewmats,
+        "intrinsics": Ks,
+        "opacities": opacities,
+    }
+    arrays = {name: Batches(each, leading) for name, each in tensors.items()}
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
-            library_projection(*(each[index] for each in arrays), width, height, opacities=covers[index], **settings)
+            library_projection(**{name: each[index] for name, each in arrays.items()}, **settings)
             for index in range(math.prod(leading))
         ]
     call = Call(results, leading, packed=packed, sparse=sparse_grad)
@@ -114,7 +124,7 @@ class _Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has n
         )
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
         call: Call = ctx.call
         inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))

@@ -129,7 +129,9 @@ def rasterization(
     batch = _check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
     if sparse_grad and (batch or not packed):
         raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
-    settings = {
+    settings: dict[str, Any] = {
+        "width": width,
+        "height": height,
         "near_plane": check_number("near_plane", near_plane),
         "far_plane": check_number("far_plane", far_plane),
         "radius_clip": check_number("radius_clip", radius_clip, 0),
@@ -146,19 +148,21 @@ def rasterization(
     backgrounds = None if depth_alone else backgrounds
     if covars is not None:
         quats = scales = None
-    *arrays, behind, squares = (
-        Batches(each, batch) for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
-    )
+    tensors = {
+        "means": means,
+        "quaternions": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "intrinsics": Ks,
+        "backgrounds": backgrounds,
+        "covars": covars,
+    }
+    arrays = {name: Batches(each, batch) for name, each in tensors.items()}
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
-            rasterize(
-                *(each[index] for each in arrays),
-                width,
-                height,
-                backgrounds=behind[index],
-                covars=squares[index],
-                **settings,
-            )
+            rasterize(**{name: each[index] for name, each in arrays.items()}, **settings)
             for index in range(math.prod(batch))
         ]
     call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad)

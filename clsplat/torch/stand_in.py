@@ -99,7 +99,10 @@ def strategy(name: str) -> Any:
 
 
 def _has(module: str) -> bool:
-    return find_spec(module) is not None
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # of the package that it would be in
+        return False
 
 
 def _version(module: ModuleType) -> tuple[int, ...]:

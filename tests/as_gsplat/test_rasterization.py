@@ -168,8 +168,9 @@ def test_batches_are_calls(packed: bool) -> None:
             assert torch.equal(meta["means2d"][index, 0], about["means2d"])
 
 
-def test_no_gaussians() -> None:
-    arguments = clouds.cloud(0)
+@pytest.mark.parametrize("degree", [None, 1])
+def test_no_gaussians(degree: int | None) -> None:
+    arguments = clouds.cloud(0, degree=degree)
     given, free = leaves({**arguments, "backgrounds": torch.full((1, 3), 0.5)}, torch.float32)
     images, alphas, meta = rasterization(**given)
     assert torch.equal(images, torch.full_like(images, 0.5))
