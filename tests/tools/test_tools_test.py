@@ -60,6 +60,7 @@ def commands(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[list[str
         ("--numprocesses=3", "--numprocesses=3"),
         ("-p no:xdist", "-p no:xdist"),
         ("--pdb", "--pdb"),
+        ("--write-passed told", "-n 2 --dist loadgroup --write-passed told"),
     ],
 )
 def test_its_command_line(
@@ -95,7 +96,8 @@ def run(tool: ModuleType, folder: Path, *more: str) -> subprocess.CompletedProce
     )
     how = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(folder), *tool.distribution([])]
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV"))}
-    command = [sys.executable, "-m", "pytest", *how, *more, str(folder)]
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # the others take seconds to be imported in each process
+    command = [sys.executable, "-m", "pytest", "-p", "xdist", *how, *more, str(folder)]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=PATIENCE, check=False, cwd=folder, env=environment
     )
