@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,8 +22,6 @@ WRITE, LEAVE_OUT = "--write-passed", "--leave-out"
 PHASES = {"setup", "call", "teardown"}
 OF_ALL_DRIVERS = {"KEPT", "all_devices", "list_devices"}
 """Names in a module whose tests may depend on which drivers there are."""
-IDENTIFIER = pytest.StashKey[str]()
-"""Of a test, without the group that pytest-xdist appends."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -49,25 +46,16 @@ class Recorder:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         if report.outcome == "passed":
-            self._passed[getattr(report, "identifier", "")].add(report.when)
+            self._passed[report.nodeid].add(report.when)
 
     def pytest_sessionfinish(self) -> None:
-        passed = sorted(name for name, phases in self._passed.items() if name and phases == PHASES)
+        passed = sorted(name for name, phases in self._passed.items() if phases == PHASES)
         atomic_write(self._file, "".join(f"{name}\n" for name in passed).encode())
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item) -> Any:
-    report = yield
-    report.identifier = item.stash.get(IDENTIFIER, "")
-    return report
-
-
 def leave_out(config: pytest.Config, items: list[pytest.Item], driver_of: Callable[[pytest.Item], int | None]) -> None:
-    """Note the tests' identifiers, and take from `items` those that have passed before. driver_of(item): the index of
-    the driver that a test is for, None where it is for none."""
-    for item in items:
-        item.stash[IDENTIFIER] = item.nodeid
+    """Take from `items` those that have passed before. driver_of(item): the index of the driver that a test is for,
+    None where it is for none."""
     file = config.getoption(LEAVE_OUT)
     passed = set(file.read_text("utf-8").splitlines()) if file and file.is_file() else set()
     again = [item for item in items if item.nodeid not in passed or (driver_of(item) is None and _of_all(item))]

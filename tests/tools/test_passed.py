@@ -14,7 +14,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 HOOKS = """
 import pytest
-from passed import leave_out, pytest_addoption, pytest_runtest_makereport, record
+from groups import scheduler
+from passed import leave_out, pytest_addoption, record
+
+def pytest_xdist_make_scheduler(config, log):
+    return scheduler(config, log, {1: "driver-1.0"})
 
 def pytest_configure(config):
     record(config)
@@ -22,8 +26,6 @@ def pytest_configure(config):
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
     leave_out(config, items, lambda item: getattr(item, "callspec", None) and item.callspec.params.get("device"))
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group("driver 0"))
 """
 TESTS = """
 import os, pytest
@@ -46,7 +48,7 @@ def test_is_expected_to_fail(): assert False
 OF_DRIVERS = """
 import pytest
 KEPT = [0, 1]
-@pytest.mark.parametrize("device", [1])
+@pytest.mark.parametrize("device", [1], ids=["driver-1.0"])
 def test_of_one(device): pass
 def test_of_all(): pass
 """
@@ -56,7 +58,10 @@ SECOND = {
     "test_some.py::test_is_skipped",
     "test_drivers.py::test_of_all",
 }
-FIRST = {*(f"test_some.py::test_passes[{name}]" for name in ("a@b", "c d", "e")), "test_drivers.py::test_of_one[1]"}
+FIRST = {
+    *(f"test_some.py::test_passes[{name}]" for name in ("a@b", "c d", "e")),
+    "test_drivers.py::test_of_one[driver-1.0]",
+}
 
 
 @pytest.fixture
