@@ -62,11 +62,11 @@ def _driver_and_shape(item: pytest.Item) -> tuple[Any, Any]:
 
 @pytest.hookimpl(tryfirst=True)  # before the slow ones are left out
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """The quick run has two shapes, as building is slow."""
+    """The quick run has two shapes, or with `slow_in_groups` one, as building is slow."""
     leave_out(config, items, lambda item: _driver_and_shape(item)[0])
     for item in items:
         shape = _driver_and_shape(item)[1]
-        if shape is not None and shape not in QUICK_SHAPES:
+        if shape not in {None, *(QUICK_SHAPES[:1] if item.get_closest_marker("slow_in_groups") else QUICK_SHAPES)}:
             item.add_marker(pytest.mark.slow)
         for marker in item.iter_markers("needs"):
             if reason := missing(*marker.args):
