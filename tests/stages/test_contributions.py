@@ -55,6 +55,7 @@ def test_in_every_shape(shaped_device: Device, name: str) -> None:
     assert_as_reference(shaped_device, name)
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("size", quick([(1, 1), (17, 15), (33, 1), (64, 48)], (17, 15), (33, 1)), ids=str)
 def test_they_add_up_to_what_is_opaque(shaped_device: Device, size: tuple[int, int]) -> None:
     """Weights and what is left add up to 1 in every pixel: no pixel outside the image counts, none counts twice."""

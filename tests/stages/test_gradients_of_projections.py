@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close_gradient, assert_same_bits
-from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
+from pipeline import BACKGROUND, Pipeline, shaped, shapes_of
 from quick import quick
 from test_project_rays import all_around, fisheye, panorama, pinhole
 
@@ -110,10 +110,10 @@ def test_contributions(default_device: Device, name: str) -> None:
     assert_close_gradient(screen.contributions.get()[shown], exact.contributions[shown], 1e-4, name=name)
 
 
-@EVERY_SHAPE
-def test_the_same_bits_twice_in_every_shape(device: Device, every: bool) -> None:
+@pytest.mark.slow
+def test_the_same_bits_twice_in_every_shape(device: Device) -> None:
     scene, (d_image, _) = subject("bent fisheye", 200), wanted("bent fisheye")
-    for shape in shapes_of(device, every=every):
+    for shape in shapes_of(device):
         first, second = (Pipeline.run(shaped(device, *shape), scene).backward(d_image)[0] for _ in range(2))
         for group in GROUPS:
             assert_same_bits(getattr(first, group), getattr(second, group))

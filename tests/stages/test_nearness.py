@@ -87,6 +87,7 @@ def picture(camera: Camera) -> np.ndarray:
     return np.random.default_rng(3).random((camera.height, camera.width, 4)).astype(np.float32)
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("alpha_weight", quick([0.0, 0.3], 0.3))
 @pytest.mark.parametrize("fields", quick([NEAR, EVERY_FIELD], EVERY_FIELD))
 def test_gradients_are_the_twins(shaped_device: Device, alpha_weight: float, fields: SlotFields) -> None:
