@@ -211,6 +211,7 @@ def test_what_was_mended_gives_the_same_bytes(
     assert models[0] == models[1]
 
 
+@pytest.mark.slow
 def test_what_has_worked_is_not_tried_again(
     standing: Standing, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -239,6 +239,7 @@ def test_recorded_cells_are_those_that_contribute(device: Device, name: str) -> 
     check_record(shaped(device, 8, 1), name)
 
 
+@pytest.mark.slow
 def test_recorded_cells_with_16_lanes(default_device: Device) -> None:
     check_record(shaped(default_device, 16, 1), "overlap")
 

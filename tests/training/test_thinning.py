@@ -89,6 +89,7 @@ def gradients_of(
     return image, tiles, download_gaussians(gradients)
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("projection", ["perspective", "orthographic", "fisheye"])
 def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device, projection: str) -> None:
     """The twin's in perspective; where it draws nothing else, those of the kernels without thinning."""
