@@ -321,7 +321,7 @@ class TrainConfig:
     run's refined/ gets them. For photographs without distortion; not with batches."""
     lens_reach: float = 2.0
     """Hundredths of the focal length by which it, or the principal point, can change in a training, about."""
-    refine_gate: float = 0.5
+    refine_gate: float = 1.0
     """Decibels by which the mean PSNR of held-out views can be under its best in two measurements in a row; then
     refined cameras return to those of the best and stay. At most 8 views are measured, where refinement begins and
     every tenth of the training, with poses as given or moved as the refined ones are on average, whichever fits. 0:

@@ -18,7 +18,7 @@ from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.training.gate import CameraGate, Drift, drift, spread, steps_of
 
-CONFIG = TrainConfig(iterations=1000, refine_poses=True, density=DensityConfig(every=0))
+CONFIG = TrainConfig(iterations=1000, refine_poses=True, refine_gate=0.5, density=DensityConfig(every=0))
 EXTENT = 3.0
 
 

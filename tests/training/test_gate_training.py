@@ -27,7 +27,15 @@ from clsplat.training.poses import Poses
 from clsplat.training.trainer import Trainer
 
 FAST = OptimiserConfig(means_rate=5e-3, sh_dc_rate=0.02, scales_rate=0.02, opacities_rate=0.1)
-CONFIG = short(iterations=60, refine_poses=True, pose_reach=0.5, report=False, density={"every": 0}, optimiser=FAST)
+CONFIG = short(
+    iterations=60,
+    refine_poses=True,
+    pose_reach=0.5,
+    refine_gate=0.5,
+    report=False,
+    density={"every": 0},
+    optimiser=FAST,
+)
 """Nothing but the cameras makes a model of this worse on its way, and it follows them quickly."""
 
 
