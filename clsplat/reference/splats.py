@@ -47,8 +47,8 @@ class SplatGradients:
 
 
 def splats_grad(conics: Float64, opacities: Float64, moments: Float64) -> SplatGradients:
-    """(173) to (175): moments (n, 6) of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels, with (u, v) = W d,
-    d being from the pixel to the mean."""
+    """(173) to (175): moments (n, 6) of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels, with (u, v) = W d, d
+    from the pixel to the mean."""
     a, b, c = conics.T
     l11, l12, l22 = np.sqrt(a), b / np.sqrt(a), np.sqrt((a * c - b * b) / a)
     g, gu, gv, guu, guv, gvv = moments.T

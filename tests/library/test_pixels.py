@@ -126,3 +126,15 @@ def test_arrays_of_the_host(default_device: Device, pretend: str, monkeypatch: p
         assert_same_bits(room.get(), np.full(shape, 3, np.float32))
         room.array.fill(4.0)
         assert_same_bits(room.get(), np.full(shape, 4, np.float32))
+
+
+@pytest.mark.parametrize("depth", [3, 6])
+def test_a_pass_that_is_dropped_keeps_its_arrays_until_it_is_done(default_device: Device, depth: int) -> None:
+    flat = cloud(500, WIDTH, HEIGHT, depth)
+    for _ in range(3):
+        pixels = flat.pixels(default_device, WIDTH, HEIGHT)
+        pixels.gradient_on_device(np.ones((HEIGHT, WIDTH, depth), np.float32))
+        del pixels
+        assert default_device.under_way
+    default_device.finish()
+    assert not default_device.under_way
