@@ -20,6 +20,8 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from memory_library import library
+
 from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
 from clsplat.config.marking import MarkRules
@@ -400,6 +402,7 @@ def by_elements(source: str, lanes: int) -> str:
 PARTS = {
     "training": (training,),
     "methods": (methods,),
+    "library": (library,),
     "passes": (sorts, limits, frames, subgroups, by_two_launches, rendering, pictures, density),
 }
 """The workload in parts that take a child each, by name."""
