@@ -46,12 +46,16 @@ class Call:
         packed: bool,
         sparse: bool = False,
         absolute: bool = False,
+        expected_depth: bool = False,
     ) -> None:
         self.results, self.batch, self.packed, self.sparse, self.absolute = results, batch, packed, sparse, absolute
+        self.expected_depth = expected_depth
         radii = self.stacked("radii")
         self.sizes = (len(results), *radii.shape[1:3])
         self.in_view: Int64 | None = np.flatnonzero((radii > 0).all(-1)) if packed else None
         self.radii = self.laid_out(radii)
+        if not packed:  # the caller's own, as the gradient reads the library's
+            self.radii = self.radii.copy()
 
     def ids(self, device: Any) -> tuple[Tensor, Tensor, Tensor]:
         """Batch, camera and Gaussian of each splat in view, int64."""
@@ -87,7 +91,7 @@ class Call:
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
 
     def whole(self, value: Tensor | None) -> Any:
-        """A gradient in the layout of `meta`, brought to (B, C, N, ...)."""
+        """A gradient in the layout of `meta`, as (B, C, N, ...)."""
         if value is None:
             return None
         array = as_array(value)
@@ -192,16 +196,19 @@ class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no typ
     ) -> tuple[Tensor, Tensor]:
         """Images (..., C, H, W, X) and alphas (..., C, H, W, 1); values: (..., N, D) or (..., C, N, D), or None."""
         ctx.call = call
-        ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds)
+        images, alphas = (as_tensor(call.by_camera(name), means2d) for name in ("images", "alphas"))
+        # outputs that the gradient reads too: to change them in place is an error then
+        read = (images, alphas) if call.expected_depth else (alphas,)
+        ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds, *read)
         ctx.set_materialize_grads(False)
-        return as_tensor(call.by_camera("images"), means2d), as_tensor(call.by_camera("alphas"), means2d)
+        return images, alphas
 
     @staticmethod
     @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
         """Gradients of the arguments of `forward`."""
         call: Call = ctx.call
-        means2d, conics, depths, opacities, values, backgrounds = ctx.saved_tensors
+        means2d, conics, depths, opacities, values, backgrounds, *_ = ctx.saved_tensors
         if d_images is None and d_alphas is None:
             return (None,) * 7
         each = []

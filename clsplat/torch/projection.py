@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from clsplat.device.context import Device
 from clsplat.library.projection import fully_fused_projection as library_projection
 from clsplat.torch.arguments import as_tensor, check_choice, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import Batches, Call
@@ -40,7 +41,7 @@ def fully_fused_projection(
     camera_model: Literal["pinhole", "ortho", "fisheye", "ftheta"] = "pinhole",
     opacities: Tensor | None = None,
     *,
-    device: str | None = None,
+    device: Device | str | None = None,
 ) -> tuple[Tensor | None, ...]:
     """N Gaussians on the images of C cameras, as gsplat 1.5.3's function of this name; `...` are batches.
 
@@ -49,7 +50,7 @@ def fully_fused_projection(
     in pixels. width, height: pixels. eps2d: pixels^2, added to each variance. near_plane, far_plane: depths between
     which a Gaussian is in view. radius_clip: pixels; a splat of no larger radius is not. calc_compensations: the square
     root of the covariance's determinant without eps2d over that with it. opacities: (..., N), in [0, 1]; with them
-    radii end where alpha is 1/255. device: an OpenCL device as `clsplat devices` lists it.
+    radii end where alpha is 1/255. device: an OpenCL device, open or as `clsplat devices` lists it.
 
     Returns radii (..., C, N, 2) int32, pixels, 0 where not in view; means2d (..., C, N, 2), pixels, the first pixel's
     centre at 0.5; depths (..., C, N); conics (..., C, N, 3), the inverse covariance's xx, xy, yy; compensations (...,
