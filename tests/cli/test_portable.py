@@ -412,7 +412,7 @@ def test_a_table_and_a_warning_where_output_lacks_the_letters(encoding: str, tmp
     assert len(warned.splitlines()) == 1
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "utf-8", "UTF-8"])
+@pytest.mark.parametrize("encoding", quick(["cp1252", "utf-8", "UTF-8"], "cp1252"))
 def test_a_wrong_call_is_one_short_line_whatever_the_encoding(encoding: str, tmp_path: Path) -> None:
     """tyro frames its report by the encoding of standard output."""
     environment = {"PYTHONIOENCODING": encoding}

@@ -107,8 +107,7 @@ def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last
     "words",
     quick(
         BROKEN,
-        *("arithmetic: x / y", "duplicate: gaussian_from_visible[order[rank]]", "blend: before * alpha"),
-        *("channels: weight > largest[cell]", "project_grad: sums[field] += slot[field]"),
+        *("arithmetic: x / y", "blend: before * alpha", "project_grad: sums[field] += slot[field]"),
     ),
 )
 def test_one_wrong_operation_is_found(words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:

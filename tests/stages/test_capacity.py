@@ -87,6 +87,7 @@ def by_capacity(
     return frame, {name: int(arrived[READBACK.index(name)]) for name in NAMES}
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("name", ["cloud", "few", "hidden"])
 @pytest.mark.parametrize("spare", quick([0, 1, 3000], 1))
 def test_a_pass_with_room_is_the_exact_one(shaped_device: Device, name: str, spare: int) -> None:

@@ -88,8 +88,13 @@ def test_the_twin_by_central_differences(name: str) -> None:
 
 
 @pytest.mark.slow_in_groups
-@pytest.mark.parametrize("absolute", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", quick(CAMERAS, *QUICK))
+@pytest.mark.parametrize(
+    ("name", "absolute"),
+    [
+        *(pytest.param(name, False, marks=() if name in QUICK else pytest.mark.slow) for name in CAMERAS),
+        *(pytest.param(name, True, marks=pytest.mark.slow) for name in QUICK),
+    ],
+)
 def test_the_kernels_against_the_twin(shaped_device: Device, name: str, absolute: bool) -> None:
     (gaussians, camera), (d_image, exact) = subject(name, 200), wanted(name)
     got, screen = Pipeline.run(shaped_device, (gaussians, camera)).backward(d_image, absolute=absolute)

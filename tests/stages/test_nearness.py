@@ -146,6 +146,7 @@ def test_other_projections(default_device: Device, name: str) -> None:
         assert_close_gradient(getattr(got, group), wanted.parameters[group], 1e-4, name=group)
 
 
+@pytest.mark.slow_in_groups
 def test_colour_and_its_gradient_stay_what_they_are(shaped_device: Device) -> None:
     """Nearness beside them, with no weight, changes no bit."""
     gaussians, camera = scenes.NAMED["overlap"]()
