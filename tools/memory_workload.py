@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from numpy.typing import NDArray
-
 from memory_library import library
+from numpy.typing import NDArray
 
 from clsplat.bench.stages import _Picture
 from clsplat.camera import Camera
