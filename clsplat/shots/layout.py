@@ -84,7 +84,7 @@ class KeyedTrack:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """The reach of a `Track`: a model that is held from key to key goes on nowhere by itself."""
+        """The first and the last key of where it is; a model that is held from key to key goes on nowhere by itself."""
         if self.held:
             return -math.inf, math.inf
         moving = [channel for name in MOVING if (channel := self.channels.get(name)) and len(channel.frames) > 1]
@@ -140,7 +140,7 @@ class Within:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """The reach of a `Track`: as far as one of both says more."""
+        """The first and the last frame at which one of both says where it is."""
         ends = [reach for track in (self.inner, self.outer) if (reach := track.reach)]
         return (min(first for first, _ in ends), max(last for _, last in ends)) if ends else None
 

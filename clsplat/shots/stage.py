@@ -48,7 +48,7 @@ class StageTrack:
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """The reach of a `Track`, by the values of its transform and of those that it is in."""
+        """The first and the last time at which its transform has a value, or that of what it is in."""
         from pxr import UsdGeom
 
         times, prim = [], self.prim
