@@ -21,18 +21,20 @@ if TYPE_CHECKING:
     from clsplat.camera import Camera as Camera
     from clsplat.config.training import TrainConfig as TrainConfig
     from clsplat.gaussians import Gaussians as Gaussians
+    from clsplat.library.rasterize import rasterize as rasterize
     from clsplat.rendering.renderer import render as render
     from clsplat.scenes.scene import load_scene as load_scene
 
     __version__: str
 
-__all__ = ["Camera", "Gaussians", "TrainConfig", "__version__", "load_scene", "render", "train"]
+__all__ = ["Camera", "Gaussians", "TrainConfig", "__version__", "load_scene", "rasterize", "render", "train"]
 
 _MODULES = {
     "Camera": "clsplat.camera",
     "Gaussians": "clsplat.gaussians",
     "TrainConfig": "clsplat.config.training",
     "load_scene": "clsplat.scenes.scene",
+    "rasterize": "clsplat.library.rasterize",
     "render": "clsplat.rendering.renderer",
     "train": "clsplat.api",
 }

@@ -220,6 +220,60 @@ def shared(device: Device, values: NDArray[Any]) -> DeviceArray:
     return DeviceArray(device, buffer, values.shape, values.dtype)
 
 
+def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
+    """A C-contiguous array on the host for kernels that read it: in place where the device shares the host's memory,
+    else a copy, for which it is not waited. It must not change for as long as the result lives."""
+    if device.shares_memory and values.size:
+        return shared(device, values)
+    array = allocate(device, values.shape, values.dtype)
+    array.send(values)
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Hosted:
+    """An array that kernels write, and the host's memory that it comes to: the same, where the device shares it."""
+
+    array: DeviceArray
+    _host: NDArray[Any]
+
+    def get(self) -> NDArray[Any]:
+        """The array on the host, no copy; waits for the device. It is read before a kernel writes there again."""
+        if not self._host.size:
+            return self._host
+        if not self.array.device.shares_memory:
+            self.array.read_into(self._host)
+            return self._host
+        device, array = self.array.device, self.array
+        flags = cl.map_flags.READ
+        mapped, _ = cl.enqueue_map_buffer(
+            device.queue, array.buffer, flags, 0, array.shape, array.dtype, is_blocking=True
+        )
+        mapped.base.release(device.queue)
+        device.calls.blocking_reads += 1
+        device.under_way.clear()
+        return self._host
+
+
+_ALIGNED = 4096
+"""Bytes at multiples of which the host's memory begins, so that no driver works on a copy of it."""
+
+
+def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> Hosted:
+    """A new array that comes to the host. Raises CapacityError as `allocate`."""
+    kind = np.dtype(dtype)
+    nbytes = prod(shape) * kind.itemsize
+    if not device.shares_memory or not nbytes:
+        return Hosted(allocate(device, shape, kind), np.empty(shape, kind))
+    memory = np.empty(-(-nbytes // _ALIGNED) * _ALIGNED + _ALIGNED, np.uint8)
+    start = -memory.ctypes.data % _ALIGNED
+    if (word := _poison()) is not None:
+        memory[start : len(memory) // 4 * 4 - _ALIGNED + start].view(np.uint32)[:] = word
+    host = memory[start : start + nbytes].view(kind).reshape(shape)
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+    return Hosted(DeviceArray(device, cl.Buffer(device.context, flags, hostbuf=host), shape, kind), host)
+
+
 def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """An array on the host that a device copies to by itself. A driver may make the host wait for copies to other
     memory, asked to or not."""

@@ -39,6 +39,27 @@ CAMERA = (*_ROUNDED, "NEAR", "FAR", "HAND", "WINDOW_X", "WINDOW_Y", *_LENS, *(f"
 coefficients, and the angle and the distance from the axis that it shows; and what the rounding of them to
 float32 left, so that a mean's place on the image is good to 1e-6 pixels, and a needle's ellipse to 1e-4."""
 
+_EWA_ROUNDED = (
+    *_TRANSFORM,
+    *("XMIN", "XMAX", "YMIN", "YMAX"),
+    *(f"N{row}{column}" for row in range(3) for column in range(3)),
+)
+
+EWA_CAMERA = (
+    *_EWA_ROUNDED,
+    *("NEAR", "FAR", "WIDTH", "HEIGHT", "EPS", "RADIUS_CLIP"),
+    *(f"{name}_LOW" for name in _EWA_ROUNDED),
+)
+"""A camera of `kernels/ewa.cl`: the view matrix, which may be any, intrinsics, the limits of x/z and y/z in the
+Jacobian, the cofactors of the matrix' 3 x 3 numbers; planes, the image's size, the low-pass in px^2 and the radius that
+is too small; and what the rounding to float32 left."""
+
+EWA_GRADIENT = _TRANSFORM
+"""Numbers of a camera that `kernels/ewa_grad.cl` has gradients by."""
+
+SUM_ROWS = 64
+"""Neighbouring numbers that an item of `kernels/sums.cl` adds up."""
+
 _SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
 """The part of SPLAT and of RAY that is one thing at one place: blending reads it whichever it has."""
 
@@ -121,10 +142,10 @@ def header() -> str:
     lines = [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}", f"#define DEEP_LEVELS {DEEP_LEVELS}"]
     lines += [f"#define LOSS_ROWS {LOSS_ROWS}", f"#define LOSS_COLUMNS {LOSS_COLUMNS}"]
     lines.append(f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}")
-    lines.append(f"#define POSE_ROWS {POSE_ROWS}u")
+    lines += [f"#define POSE_ROWS {POSE_ROWS}u", f"#define SUM_ROWS {SUM_ROWS}u"]
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK}
-    layouts |= {"DEEP": DEEP, "HELD": HELD}
+    layouts |= {"DEEP": DEEP, "HELD": HELD, "EWA": EWA_CAMERA, "BY_CAMERA": EWA_GRADIENT}
     for prefix, fields in layouts.items():
         lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
         lines.append(f"#define {prefix}_SIZE {len(fields)}")

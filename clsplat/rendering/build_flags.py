@@ -12,9 +12,15 @@ from clsplat.config.rasterizer import RasterizerConfig
 _HALF_LOG2E = 0.5 * math.log2(math.e)
 
 
-def kernel_defines(config: RasterizerConfig, *, antialiased: bool = False) -> dict[str, object]:
+ALPHA_MAX = 0.99
+"""The cap of alpha unless another one is asked for."""
+
+
+def kernel_defines(
+    config: RasterizerConfig, *, antialiased: bool = False, alpha_max: float = ALPHA_MAX
+) -> dict[str, object]:
     """The defines that make the kernels do as `config` says; only for what differs from the default. antialiased: of
-    the model."""
+    the model; alpha_max: the cap of alpha, of the library's calls."""
     config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
@@ -42,6 +48,8 @@ def kernel_defines(config: RasterizerConfig, *, antialiased: bool = False) -> di
         defines.update(ALPHA_MIN=_literal(config.alpha_min), LOG2_ALPHA_MIN=_literal(math.log2(config.alpha_min)))
     if config.transmittance_min != default.transmittance_min:
         defines["TRANSMITTANCE_MIN"] = _literal(config.transmittance_min)
+    if alpha_max != ALPHA_MAX:
+        defines["ALPHA_MAX"] = _literal(alpha_max)
     return defines
 
 

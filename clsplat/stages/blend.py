@@ -64,13 +64,19 @@ def tile_items(device: Device) -> int:
 
 
 def launch_tiles(
-    device: Device, stem: str, defines: Mapping[str, object], lists: TileLists, tiles_x: int, *arguments: Any
+    device: Device,
+    stem: str,
+    defines: Mapping[str, object],
+    lists: TileLists,
+    tiles_x: int,
+    *arguments: Any,
+    kernel: str = "",
 ) -> None:
-    """Launch the kernel that is named like its file, with a group for each of the lists' tiles. The kernel's arguments
-    are the first tile, the tiles in a row of the image, and `arguments`."""
+    """Launch the kernel that is named like its file, or another one in it, with a group for each of the lists' tiles.
+    Its arguments are the first tile, the tiles in a row of the image, and `arguments`."""
     items = tile_items(device)
-    kernel = getattr(device.kernels(stem, ITEMS=items, **defines), stem)
-    launch_groups(device, kernel, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
+    built = getattr(device.kernels(stem, ITEMS=items, **defines), kernel or stem)
+    launch_groups(device, built, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
 
 
 @stage("blend")

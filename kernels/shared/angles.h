@@ -2,17 +2,27 @@
 #define HALF_TURN 3.14159265f
 #define QUARTER_TURN 1.57079633f
 
-// atan(y / x) for y, x >= 0, not both 0, to 6e-8 of it: minimax in the square of the smaller ratio.
+// atan(x) for x in [0, 1], to 6e-8 of it: x + x^3 times this polynomial in x^2, the highest coefficient first; minimax.
+#define ATAN0 2.849871991e-03f
+#define ATAN1 -1.606855914e-02f
+#define ATAN2 4.269140586e-02f
+#define ATAN3 -7.504285127e-02f
+#define ATAN4 1.064092964e-01f
+#define ATAN5 -1.420364380e-01f
+#define ATAN6 1.999261975e-01f
+#define ATAN7 -3.333307207e-01f
+
+// atan(y / x) for y, x >= 0, not both 0.
 static inline float quarter_atan(float y, float x) {
   const int steep = y > x;
   const float ratio = steep ? x / y : y / x, t = ratio * ratio;
-  float p = fma1(t, 2.849871991e-03f, -1.606855914e-02f);
-  p = fma1(t, p, 4.269140586e-02f);
-  p = fma1(t, p, -7.504285127e-02f);
-  p = fma1(t, p, 1.064092964e-01f);
-  p = fma1(t, p, -1.420364380e-01f);
-  p = fma1(t, p, 1.999261975e-01f);
-  p = fma1(t, p, -3.333307207e-01f);
+  float p = fma1(t, ATAN0, ATAN1);
+  p = fma1(t, p, ATAN2);
+  p = fma1(t, p, ATAN3);
+  p = fma1(t, p, ATAN4);
+  p = fma1(t, p, ATAN5);
+  p = fma1(t, p, ATAN6);
+  p = fma1(t, p, ATAN7);
   p = fma1(t * p, ratio, ratio);
   return steep ? QUARTER_TURN - p : p;
 }

@@ -4,7 +4,9 @@
 
 #define LOG2E 1.44269504088896341f
 #define LN2 0.693147180559945f
+#ifndef ALPHA_MAX // the library sets another one, as its callers ask for it
 #define ALPHA_MAX 0.99f
+#endif
 #ifndef ALPHA_MIN // these two can be set by RasterizerConfig
 #define ALPHA_MIN (1.0f / 255.0f)
 #define LOG2_ALPHA_MIN -7.99435344f // log2(1/255)

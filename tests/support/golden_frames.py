@@ -15,6 +15,7 @@ from pipeline import Pipeline, shaped
 from tiny import short, write_scene
 
 from clsplat.api import train
+from clsplat.config.channels import CHANNELS
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.renderer import Renderer
@@ -59,13 +60,11 @@ def _of(run: Pipeline) -> dict[str, list[Array]]:
     }
 
 
-CHANNELS = ("rgb", "alpha", "depth", "median", "first", "normals", "position", "motion", "count", "id", "deep")
-"""All that a picture can be written with (`clsplat.images.frame_files`), and its slices by depth."""
 BINS = 4
 
 
 def pictures_of(device: Device) -> dict[str, dict[str, str]]:
-    """Checksums by kind of camera and channel, in the device's own shape."""
+    """Checksums by kind of camera and channel, and of slices by depth, in the device's own shape."""
     gaussians, camera = SCENES["cloud"]()
     found = {}
     width = camera.width
@@ -73,10 +72,11 @@ def pictures_of(device: Device) -> dict[str, dict[str, str]]:
     for kind in ("perspective", *focals):
         focal = focals.get(kind)
         view = camera if focal is None else replace(camera, fx=focal, fy=focal, projection=kind)  # type: ignore[arg-type]
-        after = replace(view, translation=view.translation + np.array([-0.0625, 0.03125, 0.125]))
+        step = np.array([-0.0625, 0.03125, 0.125])
+        after, before = (replace(view, translation=view.translation + moved) for moved in (step, -step))
         renderer = Renderer(device)
-        render_frame = FrameRenderer(renderer, gaussians, RenderOptions(channels=CHANNELS[:-1]))
-        layers = render_frame(Task(1, "1", view, Path(), after)).planes
+        render_frame = FrameRenderer(renderer, gaussians, RenderOptions(channels=tuple(CHANNELS)))
+        layers = render_frame(Task(1, "1", view, Path(), after, earlier=before)).planes
         layers["deep"] = renderer.render_deep(gaussians, view, BINS)
         found[kind] = {name: checksum([np.ascontiguousarray(values)]) for name, values in layers.items()}
     return found

@@ -60,6 +60,7 @@ NEEDS = {
     "av": of_extra("av", "PyAV", "video"),
     "chromium": Need("Chromium", "apt-get install chromium, or set CLSPLAT_CHROMIUM", lambda: bool(chromium_path())),
     "distributed": of_extra("distributed", "distributed", "farm"),
+    "gsplat": Need("gsplat", "pip install --no-deps gsplat==1.5.3", lambda: find_spec("gsplat") is not None),
     "hatchling": of_extra("hatchling", "hatchling", "test"),
     "importlinter": of_extra("importlinter", "import-linter", "dev"),
     "html5lib": of_extra("html5lib", "html5lib", "test"),
@@ -73,6 +74,7 @@ NEEDS = {
     "playwright": of_extra("playwright", "Playwright", "test"),
     "pxr": of_extra("pxr", "OpenUSD", "usd"),
     "scenes": Need("real scenes", "set CLSPLAT_SCENES to their folder", SCENES.is_dir),
+    "torch": of_extra("torch", "PyTorch", "torch"),
     "viser": of_extra("viser", "viser", "view"),
 }
 

@@ -1,0 +1,365 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One camera's view of arrays of Gaussians: projection, colours and pixels, and the gradient back through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.device.buffers import DeviceArray, Hosted, from_host, hosted
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.library.inputs import floats
+from clsplat.library.pixels import Pixels
+from clsplat.library.session import Session
+from clsplat.stages.ewa import EwaCamera, EwaGradients, EwaInputs, camera_gradients, ewa, ewa_array, ewa_grad
+from clsplat.stages.harmonics import HIGHEST, Harmonics, centre_array, harmonics, harmonics_grad
+
+UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+"""Places of the six numbers of a symmetric matrix, in the order of the kernels."""
+LEAST_ALPHA = np.float32(1e-10)
+"""Divisor of an expected depth where there is next to nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """The checked arrays of a call: of `rasterize`, but that covars is (N, 6). count: Gaussians; sh: whether colors are
+    SH coefficients of sh_degree; by_camera: whether colors have a first axis of cameras."""
+
+    count: int
+    cameras: int
+    means: Float32
+    quaternions: Float32 | None
+    scales: Float32 | None
+    covars: Float32 | None
+    opacities: Float32
+    colors: Float32
+    sh_degree: int | None
+
+    @classmethod
+    def checked(
+        cls,
+        means: ArrayLike,
+        quaternions: ArrayLike | None,
+        scales: ArrayLike | None,
+        covars: ArrayLike | None,
+        opacities: ArrayLike,
+        colors: ArrayLike,
+        sh_degree: int | None,
+        cameras: int,
+    ) -> Given:
+        """Raises InputError, which names the argument."""
+        centres = floats("means", means, ("N", 3))
+        n = len(centres)
+        turns = widths = upper = None
+        if covars is not None:
+            upper = np.ascontiguousarray(floats("covars", covars, (n, 3, 3))[:, UPPER[0], UPPER[1]])
+        elif quaternions is None or scales is None:
+            name = "quaternions" if quaternions is None else "scales"
+            raise InputError(f"{name} is None, expected an array, as covars is None too")
+        else:
+            turns = floats("quaternions", quaternions, (n, 4))
+            widths = floats("scales", scales, (n, 3))
+        covers = floats("opacities", opacities, (n,))
+        if sh_degree is None:
+            values = floats("colors", colors, (n, "D"), (cameras, n, "D"))
+        else:
+            if isinstance(sh_degree, bool) or sh_degree not in range(HIGHEST + 1):
+                raise InputError(f"sh_degree is {sh_degree!r:.80}, expected 0 to {HIGHEST}, or None")
+            values = floats("colors", colors, (n, "K", 3), (cameras, n, "K", 3))
+            if values.shape[-2] < (sh_degree + 1) ** 2:
+                wanted = (sh_degree + 1) ** 2
+                raise InputError(
+                    f"colors has {values.shape[-2]} SH coefficients, expected {wanted} or more for sh_degree {sh_degree}"
+                )
+        if values.shape[-1] == 0:
+            raise InputError("colors has no channel, expected 1 to 512")
+        return cls(n, cameras, centres, turns, widths, upper, covers, values, sh_degree)
+
+    @property
+    def channels(self) -> int:
+        """D: values of a Gaussian that are blended, but for its depth."""
+        return self.colors.shape[-1]
+
+    @property
+    def by_camera(self) -> bool:
+        """True if each camera has colors of its own."""
+        return self.colors.ndim == (3 if self.sh_degree is None else 4)
+
+    def colors_of(self, camera: int) -> Float32:
+        """(N, D), or (N, K, 3)."""
+        return self.colors[camera] if self.by_camera else self.colors
+
+    def gradients(self) -> Gradients:
+        """Room for gradients by the arrays."""
+        return Gradients(self)
+
+
+class Gradients:
+    """Gradients by the arrays of a call, added up view by view."""
+
+    def __init__(self, given: Given) -> None:
+        self.given = given
+        self.views = 0
+        self.by_device: dict[str, Hosted] = {}
+        self.opacities = np.zeros(given.count, np.float32)
+        self.colors = None if given.sh_degree is not None else np.zeros_like(given.colors)
+        self.coefficients: list[Hosted] = []
+        self.viewmats: list[Float64] = []
+        self.intrinsics: list[Float64] = []
+
+    def ewa(self, device: Device) -> EwaGradients:
+        """Arrays of projection's gradient; those of the first view are not filled yet."""
+        n, given = self.given.count, self.given
+        if not self.by_device:
+            shapes = {"means": (n, 3)}
+            shapes |= {"quaternions": (n, 4), "scales": (n, 3)} if given.covars is None else {"covariances": (n, 6)}
+            self.by_device = {name: hosted(device, shape) for name, shape in shapes.items()}
+        return EwaGradients(**{name: one.array for name, one in self.by_device.items()})
+
+    def sh(self, device: Device) -> tuple[DeviceArray, bool]:
+        """The array of the gradient by a view's coefficients, and whether earlier views' are in it."""
+        given = self.given
+        add = bool(self.coefficients) and not given.by_camera
+        if not add:
+            self.coefficients.append(hosted(device, given.colors.shape[-3:]))
+        return self.coefficients[-1].array, add
+
+    def by_name(self, *, cameras: bool) -> dict[str, Any]:
+        """By the names of `rasterize`, on the host."""
+        found: dict[str, Any] = {name: one.get() for name, one in self.by_device.items()}
+        if "covariances" in found:
+            # a number of the upper triangle stands for both its places
+            halves = found.pop("covariances") * np.float32([1, 0.5, 0.5, 1, 0.5, 1])
+            whole = np.empty((self.given.count, 3, 3), np.float32)
+            whole[:, UPPER[0], UPPER[1]] = whole[:, UPPER[1], UPPER[0]] = halves
+            found["covars"] = whole
+        found["opacities"] = self.opacities
+        if self.colors is not None:
+            found["colors"] = self.colors
+        else:
+            each = [one.get() for one in self.coefficients]
+            found["colors"] = np.stack(each) if self.given.by_camera else each[0]
+        if cameras:
+            found |= {"viewmats": np.stack(self.viewmats), "intrinsics": np.stack(self.intrinsics)}
+        return found
+
+
+class View:
+    """A view of the Gaussians, with all that its gradient needs until it is dropped.
+
+    index: of its camera; background (D,); mode: one of RENDER_MODES; compensated: lower opacities by what the low-pass
+    widens; absolute: keep absolute gradients.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        given: Given,
+        camera: EwaCamera,
+        index: int,
+        background: Float32 | None,
+        alpha_max: float,
+        mode: str,
+        *,
+        compensated: bool,
+        absolute: bool,
+    ) -> None:
+        self._session, self._given, self._camera, self._index = session, given, camera, index
+        self._mode, self._absolute = mode, absolute
+        self.with_depth, self.with_colours = mode.endswith("D"), mode.startswith("RGB")
+        device = session.device
+        with session.lock:
+            work = self._work = session.workspace(self)
+            placed = {
+                name: None if array is None else from_host(device, array)
+                for name, array in (("means", given.means), ("quaternions", given.quaternions), ("scales", given.scales))
+            }
+            covars = None if given.covars is None else from_host(device, given.covars)
+            covers = from_host(device, given.opacities)
+            self._inputs = EwaInputs(**placed, covariances=covars, opacities=covers)  # type: ignore[arg-type]
+            self._camera_array = ewa_array(work, camera)
+            self.projected = ewa(device, work, self._inputs, camera, self._camera_array, compensated=compensated)
+            self._colours, self._harmonics = self._coloured(work)
+            self.pixels = Pixels(
+                session,
+                self.projected.means2d,
+                self.projected.conics,
+                covers if not compensated else self.opacities,
+                self._values(),
+                self.projected.depths,
+                self.projected.radii,
+                camera.width,
+                camera.height,
+                self._behind(background),
+                alpha_max,
+            )
+        self._has_background = background is not None
+
+    def _coloured(self, work: Any) -> tuple[Float32 | DeviceArray, Harmonics | None]:
+        """The colours (N, D), and the harmonics that they come from."""
+        given, device = self._given, self._session.device
+        colors = given.colors_of(self._index)
+        if given.sh_degree is None:
+            return colors, None
+        centre = centre_array(work, self._camera.position)
+        arrays = (self._inputs.means, from_host(device, colors))
+        by = Harmonics(*arrays, given.sh_degree, self.projected.radii, centre)
+        return harmonics(device, work, by), by
+
+    def _values(self) -> Float32 | DeviceArray:
+        """(N, X): blended values, the depth last."""
+        if not self.with_depth:
+            return self._colours
+        depths = self.depths[:, None]
+        return np.concatenate([self.colors, depths], axis=1) if self.with_colours else depths
+
+    def _behind(self, background: Float32 | None) -> Float32 | None:
+        """(X,): the background, nothing behind depths."""
+        if background is None or not self.with_colours:
+            return None
+        return np.append(background, np.float32(0)) if self.with_depth else np.ascontiguousarray(background)
+
+    @cached_property
+    def radii(self) -> NDArray[np.int32]:
+        """(N, 2) int32."""
+        return self._read(self.projected.radii)
+
+    @cached_property
+    def depths(self) -> Float32:
+        """(N,)."""
+        return self._read(self.projected.depths)
+
+    @cached_property
+    def compensations(self) -> Float32 | None:
+        """(N,), or None."""
+        return None if self.projected.compensations is None else self._read(self.projected.compensations)
+
+    @cached_property
+    def opacities(self) -> Float32:
+        """(N,): compensated."""
+        given = self._given.opacities
+        return given if self.compensations is None else given * self.compensations
+
+    @cached_property
+    def colors(self) -> Float32:
+        """(N, D): blended but for the depth."""
+        colours = self._colours
+        return self._read(colours) if isinstance(colours, DeviceArray) else colours
+
+    def _read(self, array: DeviceArray) -> NDArray[Any]:
+        with self._session.lock:
+            return array.get()
+
+    @cached_property
+    def alpha(self) -> Float32:
+        """(H, W)."""
+        return self.pixels.alpha
+
+    @cached_property
+    def image(self) -> Float32:
+        """(H, W, X)."""
+        image = self.pixels.image
+        if not self._mode.endswith("ED"):
+            return image
+        image = image.copy()
+        image[:, :, -1] /= np.maximum(self.alpha, LEAST_ALPHA)
+        return image
+
+    def pixel_gradients(self, d_image: ArrayLike, d_alpha: ArrayLike | None) -> dict[str, Float32]:
+        """As `Rasterization.vjp_pixels`, of this view."""
+        shape = (self._camera.height, self._camera.width)
+        by_image = floats("d_images", d_image, self.image.shape)
+        by_alpha = None
+        if d_alpha is not None:
+            by_alpha = floats("d_alphas", d_alpha, (*shape, 1)).reshape(shape)
+        if self._mode.endswith("ED"):
+            left = np.maximum(self.alpha, LEAST_ALPHA)
+            by_depth = by_image[:, :, -1] / left
+            by_quotient = np.where(self.alpha > LEAST_ALPHA, -by_depth * self.image[:, :, -1], np.float32(0))
+            by_image = np.concatenate([by_image[:, :, :-1], by_depth[:, :, None]], axis=2)
+            by_alpha = by_quotient if by_alpha is None else by_alpha + by_quotient
+        found = self.pixels.gradient(by_image, by_alpha, absolute=self._absolute)
+        values = found.pop("colours")
+        if self.with_depth:
+            found["depths"] = np.ascontiguousarray(values[:, -1])
+        given = self._given
+        if not self.with_colours:
+            found["colors2d"] = np.zeros((given.count, given.channels), np.float32)
+        else:
+            found["colors2d"] = np.ascontiguousarray(values[:, :-1]) if self.with_depth else values
+        behind = found.pop("background", None)
+        if self._has_background:
+            zeros = np.zeros(given.channels, np.float32)
+            found["backgrounds"] = zeros if behind is None else behind[: given.channels]
+        return found
+
+    def add_gradients(self, gradients: Gradients, by: dict[str, Float32], *, cameras: bool) -> None:
+        """Add this view's part to the gradients, from those by what is blended."""
+        session, given, device = self._session, self._given, self._session.device
+        by_opacity, by_compensation = by.get("opacities"), None
+        if by_opacity is not None:
+            gradients.opacities += by_opacity if self.compensations is None else by_opacity * self.compensations
+            if self.compensations is not None:
+                by_compensation = by_opacity * given.opacities
+        with session.lock:
+            arrays, added = gradients.ewa(device), gradients.views > 0
+            by_position = None
+            colours = by.get("colors2d")
+            if self._harmonics is None:
+                if colours is not None and gradients.colors is not None:
+                    at = gradients.colors[self._index] if given.by_camera else gradients.colors
+                    at += colours
+            elif colours is not None or not gradients.coefficients or given.by_camera:
+                d_sh, add = gradients.sh(device)
+                by_colour = from_host(device, np.zeros((given.count, 3), np.float32) if colours is None else colours)
+                device.under_way.append(by_colour)
+                by_position = harmonics_grad(
+                    device,
+                    self._work,
+                    self._harmonics,
+                    self._colours,  # type: ignore[arg-type]  # of harmonics it is on the device
+                    by_colour,
+                    d_sh,
+                    arrays.means,
+                    add=add,
+                    add_directions=added,
+                    by_centre=cameras,
+                )
+                added = True
+            sums = self._project_back(arrays, by, by_compensation, added=gradients.views > 0, means=added, cameras=cameras)
+            gradients.views += 1
+            if not cameras or sums is None:
+                return
+            viewmat, intrinsics = camera_gradients(sums.get())
+            if by_position is not None:
+                viewmat += self._camera.position_gradient(by_position.get().astype(np.float64))
+        gradients.viewmats.append(viewmat)
+        gradients.intrinsics.append(intrinsics)
+
+    def _project_back(
+        self,
+        arrays: EwaGradients,
+        by: dict[str, Float32],
+        by_compensation: Float32 | None,
+        *,
+        added: bool,
+        means: bool,
+        cameras: bool,
+    ) -> DeviceArray | None:
+        """Projection's gradient, added to what earlier views (`added`) and the colours (`means`) have in the arrays."""
+        device = self._session.device
+        placed = {name: from_host(device, by[name]) for name in ("means2d", "depths", "conics") if name in by}
+        if by_compensation is not None:
+            placed["compensations"] = from_host(device, by_compensation)
+        if means and not added:  # only the means have something yet
+            for array in arrays.arrays[1:]:
+                array.fill(0.0)
+        device.under_way.append(placed)  # memory of the host, until the device has read it
+        where = (device, self._work, self._inputs, self._camera, self._camera_array, self.projected, arrays)
+        return ewa_grad(*where, **placed, add=means, by_camera=cameras)

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""EWA projection with gsplat's conventions, and its gradient: float64 twin of kernels/ewa.cl and kernels/ewa_grad.cl.
+
+Equation numbers are those of docs/gradients.md. The view matrix may have any rows: its gradient is that of its twelve
+numbers, and not of rotations alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+
+ALPHA_MIN = 1.0 / 255.0
+EXTEND = 3.33
+"""Standard deviations that a Gaussian's box has, where its opacity does not make it smaller."""
+SLACK = 0.15
+"""Of the image's side: how far beyond an edge the Jacobian's place may be."""
+NEAR_AXIS = 1e-3
+"""Of a fisheye: (r / z)^2 up to which differences are taken by their series."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera. viewmat (4, 4): camera from world; intrinsics (3, 3), of which the skew is not looked at; model:
+    pinhole, ortho or fisheye; planes in world units, eps2d in px^2, radius_clip in pixels."""
+
+    viewmat: Float64
+    intrinsics: Float64
+    width: int
+    height: int
+    model: str = "pinhole"
+    near: float = 0.01
+    far: float = 1e10
+    eps2d: float = 0.3
+    radius_clip: float = 0.0
+
+    @property
+    def focal(self) -> Float64:
+        """(fx, fy)."""
+        return self.intrinsics[[0, 1], [0, 1]]
+
+    @property
+    def centre(self) -> Float64:
+        """(cx, cy)."""
+        return self.intrinsics[:2, 2]
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """radii (N, 2) int32, 0 where culled; means2d (N, 2) pixels; depths (N,); conics (N, 3): a, b, c; compensations
+    (N,); points (N, 3): in the camera; jacobians (N, 2, 3); clamped (N, 2); covariances (N, 2, 2) with the low-pass;
+    determinants (N,): without it. Rows of culled Gaussians are filled too."""
+
+    radii: NDArray[np.int32]
+    means2d: Float64
+    depths: Float64
+    conics: Float64
+    compensations: Float64
+    points: Float64
+    jacobians: Float64
+    clamped: NDArray[np.bool_]
+    covariances: Float64
+    determinants: Float64
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """(N,): not culled."""
+        return self.radii[:, 0] > 0
+
+
+def rotations_of(quaternions: Float64) -> Float64:
+    """(N, 3, 3) of quaternions (N, 4), w x y z, of any length but 0."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def covariances_of(quaternions: Float64, scales: Float64) -> Float64:
+    """(N, 3, 3): R S S^T R^T."""
+    m = rotations_of(quaternions) * scales[:, None, :]
+    return m @ m.transpose(0, 2, 1)
+
+
+def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) -> tuple[Float64, Float64]:
+    """Gradients by quaternions (N, 4) and scales (N, 3) from symmetric ones by covariances (N, 3, 3)."""
+    rotations = rotations_of(quaternions)
+    d_m = 2 * gradients @ (rotations * scales[:, None, :])
+    d_scales = (rotations * d_m).sum(axis=1)
+    d_r = d_m * scales[:, None, :]
+    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    unit = quaternions / length
+    w, x, y, z = unit.T
+    r = d_r.transpose(1, 2, 0)
+    d_unit = 2 * np.stack(
+        [
+            x * (r[2, 1] - r[1, 2]) + y * (r[0, 2] - r[2, 0]) + z * (r[1, 0] - r[0, 1]),
+            w * (r[2, 1] - r[1, 2]) + y * (r[0, 1] + r[1, 0]) + z * (r[0, 2] + r[2, 0]) - 2 * x * (r[1, 1] + r[2, 2]),
+            w * (r[0, 2] - r[2, 0]) + x * (r[0, 1] + r[1, 0]) + z * (r[1, 2] + r[2, 1]) - 2 * y * (r[0, 0] + r[2, 2]),
+            w * (r[1, 0] - r[0, 1]) + x * (r[0, 2] + r[2, 0]) + y * (r[1, 2] + r[2, 1]) - 2 * z * (r[0, 0] + r[1, 1]),
+        ],
+        axis=1,
+    )
+    return (d_unit - unit * (unit * d_unit).sum(axis=1, keepdims=True)) / length, d_scales
+
+
+def full_covariances(upper: Float64) -> Float64:
+    """(N, 3, 3) of upper triangles (N, 6): xx, xy, xz, yy, yz, zz."""
+    full: Float64 = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    return full
+
+
+def upper_gradients(full: Float64) -> Float64:
+    """Gradients (N, 6) by the upper triangle of symmetric ones (N, 3, 3): an off-diagonal number is in two places."""
+    return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0]), np.float64)
+
+
+def _fisheye(points: Float64) -> tuple[Float64, Float64, Float64]:
+    """(157), (158): s = theta / r, h = (ds/dr) / r and (dh/dr) / r of points (N, 3) in the camera."""
+    x, y, z = points.T
+    q = x * x + y * y
+    r, d = np.sqrt(q), q + z * z
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = q / (z * z)
+        s = np.arctan2(r, z) / r
+        h = (z / d - s) / q
+        bend = (-2 * z / (d * d) - 3 * h) / q
+        near = (t < NEAR_AXIS) & (z > 0)
+        k = np.arange(8)
+        powers = t[:, None] ** k
+        signs = (-1.0) ** k
+        s = np.where(near, (powers * signs / (2 * k + 1)).sum(axis=1) / z, s)
+        h = np.where(near, -(powers * signs * 2 * (k + 1) / (2 * k + 3)).sum(axis=1) / z**3, h)
+        bend = np.where(near, (powers * signs * 4 * (k + 2) * (k + 1) / (2 * k + 5)).sum(axis=1) / z**5, bend)
+    return s, h, bend
+
+
+def project(means: Float64, covariances: Float64, view: View, opacities: Float64 | None = None) -> Projected:
+    """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156). With opacities (N,), 0 to 1, boxes end
+    where alpha is 1/255; with them compensations count."""
+    rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
+    fx, fy = view.focal
+    points = means @ rotation.T + translation
+    x, y, z = points.T
+    zero = np.zeros_like(x)
+    clamped = np.zeros((len(means), 2), bool)
+    with np.errstate(all="ignore"):
+        if view.model == "ortho":
+            means2d = points[:, :2] * view.focal + view.centre
+            rows = [[zero + fx, zero, zero], [zero, zero + fy, zero]]
+        elif view.model == "fisheye":
+            s, h, _ = _fisheye(points)
+            d = (points * points).sum(axis=1)
+            means2d = points[:, :2] * s[:, None] * view.focal + view.centre
+            rows = [
+                [fx * (s + x * x * h), fx * x * y * h, -fx * x / d],
+                [fy * x * y * h, fy * (s + y * y * h), -fy * y / d],
+            ]
+        else:
+            ratios = points[:, :2] / z[:, None]
+            means2d = ratios * view.focal + view.centre
+            size = np.array([view.width, view.height])
+            low = -(view.centre + SLACK * size) / view.focal
+            high = ((1 + SLACK) * size - view.centre) / view.focal
+            limited = np.clip(ratios, low, high)
+            clamped = limited != ratios
+            rx, ry = limited.T
+            rows = [[fx / z, zero, -fx / z * rx], [zero, fy / z, -fy / z * ry]]
+        jacobians = np.array(rows).transpose(2, 0, 1)
+        t = jacobians @ rotation
+        raw = t @ covariances @ t.transpose(0, 2, 1)
+        det0 = raw[:, 0, 0] * raw[:, 1, 1] - raw[:, 0, 1] * raw[:, 1, 0]
+        filtered = raw + view.eps2d * np.eye(2)
+        det = filtered[:, 0, 0] * filtered[:, 1, 1] - filtered[:, 0, 1] * filtered[:, 1, 0]
+        conics = np.stack([filtered[:, 1, 1], -filtered[:, 0, 1], filtered[:, 0, 0]], axis=1) / det[:, None]
+        compensations = np.sqrt(np.maximum(det0 / det, 0.0))
+        extend: Float64 | float = EXTEND
+        valid = (z > view.near) & (z < view.far) & (det > 0)
+        if opacities is not None:
+            extend = np.minimum(EXTEND, np.sqrt(np.maximum(2 * np.log(opacities / ALPHA_MIN), 0.0)))
+            valid &= opacities >= ALPHA_MIN
+        wide = np.ceil(extend * np.sqrt(filtered[:, 0, 0]))
+        tall = np.ceil(extend * np.sqrt(filtered[:, 1, 1]))
+        valid &= (means2d[:, 0] + wide > 0) & (means2d[:, 0] - wide < view.width)
+        valid &= (means2d[:, 1] + tall > 0) & (means2d[:, 1] - tall < view.height)
+        valid &= (wide > view.radius_clip) | (tall > view.radius_clip)
+        radii = np.where(valid[:, None], np.stack([wide, tall], axis=1), 0.0).astype(np.int32)
+    return Projected(radii, means2d, z.copy(), conics, compensations, points, jacobians, clamped, filtered, det0)
+
+
+def project_grad(
+    means: Float64, covariances: Float64, view: View, projected: Projected, gradients: Mapping[str, Float64]
+) -> dict[str, Float64]:
+    """Gradients by `means` (N, 3), `covariances` (N, 3, 3), symmetric, `viewmat` (4, 4) and `intrinsics` (3, 3) from
+    those by means2d, depths, conics and compensations, of which any may be missing: equations (159) to (166). What is
+    culled has none."""
+    seen = projected.visible
+    p, j, x, y, z = projected.points[seen], projected.jacobians[seen], *projected.points[seen].T
+    count = len(p)
+
+    def given(name: str, *width: int) -> Float64:
+        return np.asarray(gradients[name], np.float64)[seen] if name in gradients else np.zeros((count, *width))
+
+    d_means2d, d_depths, d_conics = given("means2d", 2), given("depths"), given("conics", 3)
+    d_compensations = given("compensations")
+    a, b, c = projected.conics[seen].T
+    conic = np.array([[a, b], [b, c]]).transpose(2, 0, 1)
+    g = np.array([[d_conics[:, 0], d_conics[:, 1] / 2], [d_conics[:, 1] / 2, d_conics[:, 2]]]).transpose(2, 0, 1)
+    v = -conic @ g @ conic
+    if d_compensations.any():
+        half = 0.5 * d_compensations * projected.compensations[seen]
+        raw = projected.covariances[seen] - view.eps2d * np.eye(2)
+        v += half[:, None, None] * (np.linalg.inv(raw) - conic)
+    rotation = view.viewmat[:3, :3]
+    sigma = covariances[seen]
+    t = j @ rotation
+    d_t = 2 * v @ t @ sigma
+    d_j = d_t @ rotation.T
+    d_rotation = np.einsum("nai,naj->ij", j, d_t)
+
+    (fx, fy) = view.focal
+    d_intrinsics = np.zeros((3, 3))
+    d_intrinsics[:2, 2] = d_means2d.sum(axis=0)
+    d_p = np.zeros_like(p)
+    d_focal = (d_j * j).sum(axis=(0, 2)) / view.focal
+    if view.model == "ortho":
+        d_p[:, :2] = d_means2d * view.focal
+        d_focal += (p[:, :2] * d_means2d).sum(axis=0)
+    elif view.model == "fisheye":
+        s, h, bend = _fisheye(p)
+        d = (p * p).sum(axis=1)
+        g2 = d_means2d * view.focal
+        v0, v1, v2 = (fx * d_j[:, 0]).T
+        w0, w1, w2 = (fy * d_j[:, 1]).T
+        by_s = v0 + w1 + x * g2[:, 0] + y * g2[:, 1]
+        by_h = v0 * x * x + (v1 + w0) * x * y + w1 * y * y
+        by_d = (v2 * x + w2 * y) / (d * d)
+        d_p[:, 0] = s * g2[:, 0] + 2 * x * h * v0 + y * h * (v1 + w0) - v2 / d + x * (by_s * h + by_h * bend + 2 * by_d)
+        d_p[:, 1] = s * g2[:, 1] + 2 * y * h * w1 + x * h * (v1 + w0) - w2 / d + y * (by_s * h + by_h * bend + 2 * by_d)
+        d_p[:, 2] = -by_s / d + 2 * by_h / (d * d) + 2 * z * by_d
+        d_focal += (p[:, :2] * s[:, None] * d_means2d).sum(axis=0)
+    else:
+        jx, jy = j[:, 0, 0], j[:, 1, 1]
+        ratios = p[:, :2] / z[:, None]
+        limited = -np.stack([j[:, 0, 2] / jx, j[:, 1, 2] / jy], axis=1)
+        d_limited = -np.stack([jx * d_j[:, 0, 2], jy * d_j[:, 1, 2]], axis=1)
+        free = ~projected.clamped[seen]
+        d_ratios = d_means2d * view.focal + np.where(free, d_limited, 0.0)
+        d_p[:, :2] = d_ratios / z[:, None]
+        d_p[:, 2] = -(d_ratios * ratios).sum(axis=1) / z - (d_j * j).sum(axis=(1, 2)) / z
+        beyond = np.where(free, 0.0, d_limited)
+        d_focal += (ratios * d_means2d).sum(axis=0) - (beyond * limited).sum(axis=0) / view.focal
+        d_intrinsics[:2, 2] -= beyond.sum(axis=0) / view.focal
+    d_p[:, 2] += d_depths
+    d_intrinsics[[0, 1], [0, 1]] = d_focal
+    d_viewmat = np.zeros((4, 4))
+    d_viewmat[:3, :3] = d_rotation + d_p.T @ means[seen]
+    d_viewmat[:3, 3] = d_p.sum(axis=0)
+    d_means, d_covariances = np.zeros_like(means), np.zeros_like(covariances)
+    d_means[seen] = d_p @ rotation
+    d_covariances[seen] = t.transpose(0, 2, 1) @ v @ t
+    return {"means": d_means, "covariances": d_covariances, "viewmat": d_viewmat, "intrinsics": d_intrinsics}

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches harmonics.cl and harmonics_grad.cl: colours from spherical harmonics, in given directions or as a camera
+sees them, and the gradient back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.device.profile import stage
+from clsplat.errors import InputError
+from clsplat.stages.sums import padded, row_sums
+
+HIGHEST = 3
+"""The degree up to which there is a basis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """n colours to be. directions (n, 3), of any length; sh (n, K, 3), K at least (degree + 1)^2, of which the rest is
+    not looked at; mask (n,) or (n, 2), int32: what is not over 0 is left out. centre (6,): of a camera, by
+    `centre_array`; with it the directions are means, and colours have 0.5 more and a floor of 0."""
+
+    directions: DeviceArray
+    sh: DeviceArray
+    degree: int
+    mask: DeviceArray | None = None
+    centre: DeviceArray | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of colours."""
+        return self.directions.shape[0]
+
+    @property
+    def used(self) -> int:
+        """Coefficients that are looked at. Raises InputError for a degree that there is not."""
+        used = (self.degree + 1) ** 2
+        if not 0 <= self.degree <= HIGHEST:
+            raise InputError(f"sh_degree is {self.degree}: expected 0 to {HIGHEST}")
+        if used > self.sh.shape[1]:
+            raise InputError(f"sh_degree is {self.degree}: expected {used} coefficients, got {self.sh.shape[1]}")
+        return used
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """Defines of both kernels."""
+        wanted = {"CAMERA": self.centre is not None, "MASKED": self.mask is not None}
+        return {name: True for name, on in wanted.items() if on}
+
+    @property
+    def arguments(self) -> tuple[object, ...]:
+        """Arguments of both kernels from the number of coefficients on."""
+        centre = () if self.centre is None else (self.centre,)
+        mask = () if self.mask is None else (self.mask.size // max(self.count, 1), self.mask)
+        return (self.sh.shape[1], self.used, *centre, self.directions, self.sh, *mask)
+
+
+def centre_array(work: Workspace, position: Float64) -> DeviceArray:
+    """A camera's centre (3,) in the world, in the workspace, in two floats."""
+    array, high = work.array("harmonics_centre", (6,)), np.asarray(position, np.float32)
+    array.set(np.concatenate([high, (np.asarray(position, np.float64) - high).astype(np.float32)]))
+    return array
+
+
+@stage("harmonics")
+def harmonics(device: Device, work: Workspace, given: Harmonics) -> DeviceArray:
+    """Colours (n, 3), in an array of the workspace; 0 where the mask is. Equation (167) of docs/gradients.md."""
+    n = given.count
+    colours = work.array("harmonics_colours", (n, 3))
+    kernel = device.kernels("harmonics", **given.defines).harmonics
+    launch_items(device, kernel, -(-n // device.shape.lanes), n, *given.arguments, colours)
+    return colours
+
+
+@stage("harmonics_grad")
+def harmonics_grad(
+    device: Device,
+    work: Workspace,
+    given: Harmonics,
+    colours: DeviceArray,
+    d_colours: DeviceArray,
+    d_sh: DeviceArray,
+    d_directions: DeviceArray | None = None,
+    *,
+    add: bool = False,
+    add_directions: bool = False,
+    by_centre: bool = False,
+) -> DeviceArray | None:
+    """Fill d_sh (n, K, 3), and where asked for d_directions (n, 3), from d_colours (n, 3) and what `harmonics` returned.
+
+    add, add_directions: to what is there, as of the cameras before this, or of the means' other gradient; by_centre: the
+    result is the gradient (3,) by the camera's centre. Equations (38) to (40) and (168).
+    """
+    n = given.count
+    parts = work.array("harmonics_by_centre", (3, padded(n))) if by_centre else None
+    wanted = {
+        "ADDED": add,
+        "BY_DIRECTION": d_directions is not None or by_centre,
+        "ADDED_DIRECTIONS": add_directions,
+        "BY_CENTRE": by_centre,
+    }
+    if by_centre and d_directions is None:
+        d_directions = work.array("harmonics_by_direction", (n, 3))
+    launch_items(
+        device,
+        device.kernels(
+            "harmonics_grad", **given.defines, **{name: True for name, on in wanted.items() if on}
+        ).harmonics_grad,
+        -(-padded(n) // device.shape.lanes),
+        n,
+        padded(n),
+        *given.arguments,
+        d_colours,
+        *([] if given.centre is None else [colours]),
+        d_sh,
+        *([] if d_directions is None else [d_directions]),
+        *([] if parts is None else [parts]),
+    )
+    return None if parts is None else row_sums(device, work, "harmonics", parts)

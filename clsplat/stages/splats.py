@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches splats.cl and splats_grad.cl: projected Gaussians that come as arrays, and the gradient back to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.device.layout import PLAIN_SLOTS, SLOT, SPLAT, TILE, SlotFields
+from clsplat.device.profile import stage
+from clsplat.stages.project import Projected, Slots
+
+COLOURS = 3
+"""Values that a splat has, and blend.cl blends."""
+MOMENTS = SLOT.index("RED")
+"""Fields of a slot before the gradients by values."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenGaussians:
+    """Projected Gaussians as arrays: radii (n, 2) int32 in pixels, one of which is 0 where a Gaussian is culled;
+    means2d (n, 2) in pixels; conics (n, 3), the inverse covariance's a, b and c; opacities (n,) in [0, 1]; depths (n,);
+    values (n, width), of which the first three are the splat's colour."""
+
+    radii: DeviceArray
+    means2d: DeviceArray
+    conics: DeviceArray
+    opacities: DeviceArray
+    depths: DeviceArray
+    values: DeviceArray
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return self.means2d.shape[0]
+
+    @property
+    def width(self) -> int:
+        """Values of a Gaussian."""
+        return self.values.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenGradients:
+    """Gradients by the arrays of `ScreenGaussians`: means2d (n, 2), conics (n, 3), opacities (n,), values (n, width);
+    absolute (n, 2) of means2d, or None where it is not wanted."""
+
+    means2d: DeviceArray
+    conics: DeviceArray
+    opacities: DeviceArray
+    values: DeviceArray
+    absolute: DeviceArray | None = None
+
+
+@stage("splats")
+def splats(
+    device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int, *, listed: bool = False
+) -> Projected:
+    """Splats, and the tiles that each reaches, of an image of width x height pixels; listed: of all Gaussians, as their
+    lists are those of somebody else, and may have any."""
+    n = gaussians.count
+    projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))
+    launch_items(
+        device,
+        device.kernels("splats", **({"LISTED": True} if listed else {})).splats,
+        -(-n // device.shape.lanes),
+        n,
+        -(-width // TILE),
+        -(-height // TILE),
+        gaussians.width,
+        gaussians.radii,
+        gaussians.means2d,
+        gaussians.conics,
+        gaussians.opacities,
+        gaussians.depths,
+        gaussians.values,
+        projected.splats,
+        projected.tile_counts,
+    )
+    return projected
+
+
+@stage("splats_grad")
+def splats_grad(
+    device: Device,
+    projected: Projected,
+    slots: Slots,
+    gradients: ScreenGradients,
+    *,
+    kept: int = COLOURS,
+    fields: SlotFields = PLAIN_SLOTS,
+) -> None:
+    """Fill every row of the gradients from the pairs' slots, those by the first values of `kept`, which the slots
+    have. fields: of the slots, which may have absolute gradients."""
+    assert slots.first_slots is not None, "there are no bands here"
+    n, width = gradients.values.shape
+    defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **fields.defines}
+    launch_items(
+        device,
+        device.kernels("splats_grad", **defines).splats_grad,
+        n,
+        n,
+        width,
+        0,
+        projected.tile_counts,
+        slots.first_slots,
+        slots.values,
+        projected.splats,
+        gradients.means2d,
+        gradients.conics,
+        gradients.opacities,
+        gradients.values,
+        *([gradients.absolute] if fields.absolute else []),
+    )
+
+
+@stage("splats_grad")
+def add_values(
+    device: Device, projected: Projected, slots: Slots, d_values: DeviceArray, first: int, count: int
+) -> None:
+    """Fill `count` columns of d_values (n, width) from `first` on with the sums of slots (pairs, count)."""
+    n, width = d_values.shape
+    kernel = device.kernels("splats_grad", LANES=1, VALUES=count).add_values
+    counts = (projected.tile_counts, slots.first_slots)
+    launch_items(device, kernel, n, n, width, first, *counts, slots.values, d_values)

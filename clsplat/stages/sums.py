@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches sums.cl: sums along the rows of an array, with the same bits on every device."""
+
+from __future__ import annotations
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_items
+from clsplat.device.layout import SUM_ROWS
+from clsplat.device.profile import stage
+
+
+def padded(count: int) -> int:
+    """Columns of an array that `row_sums` adds up: those of `count` numbers, in whole blocks. The rest has to be
+    zero."""
+    return -(-count // SUM_ROWS) * SUM_ROWS
+
+
+@stage("sums")
+def row_sums(device: Device, work: Workspace, name: str, parts: DeviceArray) -> DeviceArray:
+    """The sum of each row of `parts` (rows, columns), float32, as (rows,), in arrays of the workspace under `name`.
+
+    columns: `padded` of a number; the sums of no columns are 0.
+    """
+    rows, columns = parts.shape
+    kernel, level = device.kernels("sums").row_sums, 0
+    if columns == 0:
+        total = work.array(f"{name}_total", (rows,))
+        total.fill(0.0)
+        return total
+    while columns > 1:
+        level += 1
+        sums = columns // SUM_ROWS
+        stride = padded(sums) if sums > 1 else 1
+        fewer = work.array(f"{name}_sums_{level}", (rows, stride))
+        launch_items(device, kernel, fewer.size, rows, columns, stride, parts, fewer)
+        parts, columns = fewer, stride
+    return parts.reshaped(rows)

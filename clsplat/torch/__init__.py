@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""gsplat's calls for PyTorch, on any OpenCL device: `from clsplat.torch import rasterization` in place of gsplat's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+try:
+    import torch as _torch  # noqa: F401
+except ImportError as error:
+    raise ImportError('clsplat.torch needs PyTorch: pip install "clsplat[torch]"') from error
+
+from clsplat.torch.covariances import quat_scale_to_covar_preci
+from clsplat.torch.harmonics import spherical_harmonics
+from clsplat.torch.pixels import rasterize_to_pixels
+from clsplat.torch.projection import fully_fused_projection
+from clsplat.torch.relocation import compute_relocation
+from clsplat.torch.rendering import RollingShutterType, rasterization
+from clsplat.torch.selective_adam import SelectiveAdam
+from clsplat.torch.stand_in import install_as_gsplat, strategy
+from clsplat.torch.tiles import isect_offset_encode, isect_tiles
+
+__all__ = [
+    "DefaultStrategy",
+    "MCMCStrategy",
+    "RollingShutterType",
+    "SelectiveAdam",
+    "compute_relocation",
+    "fully_fused_projection",
+    "install_as_gsplat",
+    "isect_offset_encode",
+    "isect_tiles",
+    "quat_scale_to_covar_preci",
+    "rasterization",
+    "rasterize_to_pixels",
+    "spherical_harmonics",
+]
+STRATEGIES = ("DefaultStrategy", "MCMCStrategy")
+"""gsplat's own classes, which are imported when they are first used."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in STRATEGIES:
+        raise AttributeError(f"module 'clsplat.torch' has no attribute {name!r}")
+    globals()[name] = value = strategy(name)
+    return value

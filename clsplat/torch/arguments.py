@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tensors that are given, checked by name; and the way from a tensor to an array and back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from clsplat.arrays import Float32
+from clsplat.errors import InputError, warn
+
+_SAID: set[str] = set()
+"""Kinds of tensors that have been warned of."""
+
+
+def refuse(name: str, found: object, expected: str) -> InputError:
+    """The error of an argument: its name, its value, and a value that would do."""
+    return InputError(f"{name} is {found}, expected {expected}")
+
+
+def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
+    """An argument is a tensor of real numbers of one of `shapes`, in which a word stands for any size, and has no NaN.
+
+    Raises InputError, which names the argument, where it is not.
+    """
+    expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
+    if not isinstance(value, Tensor):
+        raise refuse(name, f"a {type(value).__name__}", expected)
+    found = f"{str(value.dtype).removeprefix('torch.')} {_named(value.shape)}"
+    if not any(_fits(value.shape, shape) for shape in shapes):
+        raise refuse(name, found, expected)
+    if not value.dtype.is_floating_point or value.is_sparse:
+        raise refuse(name, "a sparse tensor" if value.is_sparse else found, "a dense tensor of float32")
+    # a sum is NaN where a number is, and is made in one pass without another array
+    if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
+        first = tuple(broken.nonzero()[0].tolist())
+        raise InputError(f"{name} has {int(broken.sum())} NaN, the first at {first}; expected numbers")
+
+
+def _fits(found: Sequence[int], shape: Sequence[int | str]) -> bool:
+    return len(found) == len(shape) and all(isinstance(b, str) or a == b for a, b in zip(found, shape, strict=True))
+
+
+def _named(shape: Sequence[int | str]) -> str:
+    return f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
+    """Raise InputError unless an argument is one of `choices`."""
+    if value not in choices:
+        raise refuse(name, repr(value), f"one of {', '.join(choices)}")
+
+
+def check_size(name: str, value: object) -> int:
+    """A number of pixels. Raises InputError where it is none."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise refuse(name, repr(value), "a whole number of pixels, 1 or more")
+    return int(value)
+
+
+def check_number(name: str, value: object, least: float = -math.inf, most: float = math.inf) -> float:
+    """A number in a range. Raises InputError where it is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not least <= value <= most:
+        limits = [f"{least} or more"] * (least > -math.inf) + [f"{most} or less"] * (most < math.inf)
+        raise refuse(name, repr(value), " and ".join(["a number", *limits]))
+    return float(value)
+
+
+def as_array(value: Tensor) -> Float32:
+    """The numbers of a tensor: float32, C order. Over the same memory where the tensor is float32 on the CPU and dense.
+
+    Others are copied, and a warning says so once for each kind.
+    """
+    if value.dtype != torch.float32 or value.device.type != "cpu":
+        kind = f"{str(value.dtype).removeprefix('torch.')} on {value.device.type}"
+        if kind not in _SAID:
+            _SAID.add(kind)
+            warn(f"tensors of {kind} are copied to float32 on the CPU, in which clsplat takes them, and results back")
+        value = value.detach().to("cpu", torch.float32)
+    array: Float32 = value.detach().contiguous().numpy()
+    return array
+
+
+def as_tensor(array: NDArray[Any], like: Tensor) -> Tensor:
+    """A tensor over an array's memory; on the device of another tensor, and of its kind where the numbers are real."""
+    if not array.flags.writeable or not array.flags.c_contiguous:
+        array = array.copy()
+    tensor = torch.from_numpy(array)
+    return tensor.to(like.device, like.dtype if tensor.dtype.is_floating_point else tensor.dtype)

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two functions of autograd that `rasterization` is made of: projection, and pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from clsplat.arrays import Int64
+from clsplat.library.rasterize import Rasterization
+from clsplat.torch.arguments import as_array, as_tensor
+
+
+class Batches:
+    """A tensor's array, batch by batch; None throughout where it is None."""
+
+    def __init__(self, value: Tensor | None, batch: tuple[int, ...]) -> None:
+        array = None if value is None else as_array(value)
+        self.array = None if array is None else array.reshape(math.prod(batch), *array.shape[len(batch) :])
+
+    def __getitem__(self, index: int) -> Any:
+        return None if self.array is None else self.array[index]
+
+
+class Call:
+    """Results of one call, a `Rasterization` for each batch, and which of their splats `meta` has.
+
+    Splats are numbered through batches, cameras and Gaussians, (B, C, N).
+    """
+
+    def __init__(self, results: list[Rasterization], batch: tuple[int, ...], *, packed: bool, sparse: bool, absolute: bool) -> None:
+        self.results, self.batch, self.packed, self.sparse, self.absolute = results, batch, packed, sparse, absolute
+        radii = self.stacked("radii")
+        self.sizes = (len(results), *radii.shape[1:3])
+        self.in_view: Int64 | None = np.flatnonzero((radii > 0).all(-1)) if packed else None
+        self.radii = self.laid_out(radii)
+
+    def stacked(self, name: str) -> NDArray[Any]:
+        """A result of every batch, (B, ...)."""
+        arrays = [getattr(result, name) for result in self.results]
+        return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
+
+    def by_camera(self, name: str) -> NDArray[Any]:
+        """A result of every batch, (..., C, ...)."""
+        array = self.stacked(name)
+        return array.reshape(*self.batch, *array.shape[1:])
+
+    def of_rows(self, gradient: Tensor) -> Tensor:
+        """A gradient (N, ...) as a COO tensor of the rows in view, each once."""
+        assert self.in_view is not None
+        rows = torch.from_numpy(np.unique(self.in_view % self.sizes[2])).to(gradient.device)
+        return torch.sparse_coo_tensor(
+            rows[None], gradient[rows], gradient.shape, is_coalesced=True, check_invariants=False
+        )
+
+    def laid_out(self, array: NDArray[Any]) -> NDArray[Any]:
+        """(B, C, N, ...) as `meta` has it: (..., C, N, ...), or (nnz, ...) packed."""
+        if self.in_view is None:
+            return array.reshape(*self.batch, *array.shape[1:])
+        return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
+
+    def whole(self, value: Tensor | None) -> Any:
+        """A gradient as `meta` has it, as (B, C, N, ...)."""
+        if value is None:
+            return None
+        array = as_array(value)
+        if self.in_view is None:
+            return array.reshape(*self.sizes, *array.shape[len(self.batch) + 2 :])
+        rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
+        rows[self.in_view] = array
+        return rows.reshape(*self.sizes, *array.shape[1:])
+
+    def gradient(self, each: list[dict[str, Any]], name: str, like: Tensor | None) -> Tensor | None:
+        """Gradients of an argument from every batch, in the argument's own shape and kind."""
+        if like is None or any(found.get(name) is None for found in each):
+            return None
+        arrays = [found[name] for found in each]
+        array = arrays[0] if len(arrays) == 1 else np.stack(arrays)
+        return as_tensor(np.ascontiguousarray(array).reshape(like.shape), like)
+
+    def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor) -> Tensor:
+        """Gradients of splats from every batch, as `meta` has them."""
+        arrays = [found[name] for found in each]
+        return as_tensor(self.laid_out(arrays[0][None] if len(arrays) == 1 else np.stack(arrays)), like)
+
+
+class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
+    """From Gaussians to splats as `meta` has them."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        call: Call,
+        means: Tensor,
+        quats: Tensor | None,
+        scales: Tensor | None,
+        covars: Tensor | None,
+        opacities: Tensor,
+        coefficients: Tensor | None,
+        viewmats: Tensor,
+        intrinsics: Tensor,
+    ) -> tuple[Tensor | None, ...]:
+        """means2d, conics, depths, opacities, and, with coefficients, colours (..., C, N, 3)."""
+        ctx.call = call
+        ctx.save_for_backward(means, quats, scales, covars, opacities, coefficients, viewmats, intrinsics)
+        ctx.set_materialize_grads(False)
+        names = ("means2d", "conics", "depths", "opacities")
+        splats = [as_tensor(call.laid_out(call.stacked(name)), means) for name in names]
+        colors = None if coefficients is None else as_tensor(call.by_camera("colors2d"), means)
+        return (*splats, colors)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[misc]
+    def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
+        """Gradients of the arguments of `forward`."""
+        call: Call = ctx.call
+        inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
+        if all(gradient is None for gradient in given):
+            return (None,) * (1 + len(inputs))
+        names = ("means2d", "conics", "depths", "opacities")
+        splats = {name: call.whole(gradient) for name, gradient in zip(names, given[:4], strict=True)}
+        splats["colors2d"] = None if given[4] is None else as_array(given[4]).reshape(*call.sizes, -1)
+        each = [
+            result.vjp_projection(**{name: whole if whole is None else whole[index] for name, whole in splats.items()})
+            for index, result in enumerate(call.results)
+        ]
+        wanted = [name if needed else None for name, needed in zip(INPUTS, ctx.needs_input_grad[1:], strict=True)]
+        gradients = [None if name is None else call.gradient(each, name, inputs[name]) for name in wanted]
+        if call.sparse:
+            gradients[:4] = [None if gradient is None else call.of_rows(gradient) for gradient in gradients[:4]]
+        return (None, *gradients)
+
+
+INPUTS = ("means", "quaternions", "scales", "covars", "opacities", "colors", "viewmats", "intrinsics")
+"""Names of the gradients in `Rasterization.vjp_projection`, in the order of `Projection.forward`."""
+
+
+class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
+    """From splats as `meta` has them to images and alphas."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        call: Call,
+        means2d: Tensor,
+        conics: Tensor,
+        depths: Tensor,
+        opacities: Tensor,
+        values: Tensor | None,
+        backgrounds: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Images (..., C, H, W, X) and alphas (..., C, H, W, 1); values: (..., N, D) or (..., C, N, D), or None."""
+        ctx.call = call
+        ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds)
+        ctx.set_materialize_grads(False)
+        return as_tensor(call.by_camera("images"), means2d), as_tensor(call.by_camera("alphas"), means2d)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[misc]
+    def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
+        """Gradients of the arguments of `forward`."""
+        call: Call = ctx.call
+        means2d, conics, depths, opacities, values, backgrounds = ctx.saved_tensors
+        if d_images is None and d_alphas is None:
+            return (None,) * 7
+        each = []
+        images, alphas = Batches(d_images, call.batch), Batches(d_alphas, call.batch)
+        for index, result in enumerate(call.results):
+            image = np.zeros_like(result.images) if d_images is None else images[index]
+            each.append(result.vjp_pixels(image, alphas[index]))
+        if call.absolute:
+            means2d.absgrad = call.in_layout(each, "absolute", means2d)
+        if values is not None and values.dim() == len(call.batch) + 2:  # one for all cameras
+            each = [{**found, "colors2d": found["colors2d"].sum(0)} for found in each]
+        return (
+            None,
+            call.in_layout(each, "means2d", means2d),
+            call.in_layout(each, "conics", conics),
+            call.in_layout(each, "depths", depths) if all(found.get("depths") is not None for found in each) else None,
+            call.in_layout(each, "opacities", opacities),
+            call.gradient(each, "colors2d", values),
+            call.gradient(each, "backgrounds", backgrounds),
+        )

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Functions that `torch.compile` leaves as they are: kernels are launched between its graphs."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import torch
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function, outside of what `torch.compile` traces.
+
+    `torch.compiler.disable` imports the compiler, which takes seconds; here it is called at the first call after
+    something else has imported it.
+    """
+
+    disabled: list[Callable[_P, _R]] = []
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if "torch._dynamo" not in sys.modules:
+            return function(*args, **kwargs)
+        if not disabled:
+            disabled.append(torch.compiler.disable(function))
+        return disabled[0](*args, **kwargs)
+
+    call._torchdynamo_disable = True  # type: ignore[attr-defined]  # where a compiled function calls it
+    return call

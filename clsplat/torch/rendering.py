@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rasterization`: images of Gaussians, by gsplat's call, with their gradient."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from clsplat.library.rasterize import rasterize
+from clsplat.torch.arguments import check, check_choice, check_number, check_size, refuse
+from clsplat.torch.autograd import Batches, Call, Pixels, Projection
+from clsplat.torch.covariances import UPPER
+from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.meta import Meta
+from clsplat.torch.tiles import isect_offset_encode, isect_tiles
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
+MOST_CHANNELS = 512
+
+
+class RollingShutterType(Enum):
+    """gsplat's names of shutters. clsplat has the last."""
+
+    ROLLING_TOP_TO_BOTTOM = 0
+    ROLLING_LEFT_TO_RIGHT = 1
+    ROLLING_BOTTOM_TO_TOP = 2
+    ROLLING_RIGHT_TO_LEFT = 3
+    GLOBAL = 4
+
+
+@outside_graphs
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,  # noqa: N803  # gsplat's name
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: Literal["pinhole", "ortho", "fisheye", "ftheta"] = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = RollingShutterType.GLOBAL,
+    viewmats_rs: Tensor | None = None,
+    *,
+    alpha_max: float = 0.999,
+    device: str | None = None,
+) -> tuple[Tensor, Tensor, Meta]:
+    """Images, alphas and `meta` of N Gaussians in C cameras: gsplat 1.5.3's function, argument by argument.
+
+    Leading sizes `...` are those of batches, and may be none. Tensors of float32 on the CPU share their memory with a
+    CPU's OpenCL device; others are copied there and back, which a warning says once. Everything has a gradient, `Ks` too.
+
+    means: (..., N, 3), in units of the scene. quats: (..., N, 4), w x y z, of any length. scales: (..., N, 3), standard
+    deviations, over 0. opacities: (..., N), in [0, 1]. colors: (..., N, D) or (..., C, N, D) with D from 1 to 512; with
+    `sh_degree` coefficients (..., N, K, 3) or (..., C, N, K, 3), K >= (sh_degree + 1)^2, in the order and with the signs of
+    3DGS files. viewmats: (..., C, 4, 4), camera from world, x right, y down, z forward. Ks: (..., C, 3, 3), in pixels, the
+    centre of the first pixel at 0.5; skew is ignored. width, height: pixels. near_plane, far_plane: depths between which
+    a Gaussian is drawn. radius_clip: pixels; a splat of no larger radius is not drawn. eps2d: pixels^2, added to the
+    variance of each splat. sh_degree: the degree to use, 0 to 3; None for colours. packed: `meta` has the splats in view
+    alone. tile_size: pixels, of the tile lists in `meta` alone. backgrounds: (..., C, D). render_mode: colour, depth along
+    z (D), expected depth (ED), or colour and depth, in the last channel. sparse_grad: with `packed`, without batches: the
+    gradients of means, quats and scales (or covars) are COO tensors of the rows in view. absgrad: after the backward pass
+    `meta["means2d"].absgrad` has sums over pixels of absolute gradients. rasterize_mode: "antialiased" scales opacities by
+    what eps2d added (Mip-Splatting). camera_model: pinhole, ortho or fisheye (equidistant). covars: (..., N, 3, 3) in the
+    place of quats and scales, which may be None. alpha_max: the largest alpha, under 1; gsplat's 0.999, where `clsplat
+    train` and `render` have 0.99. device: an OpenCL device as `clsplat devices` lists it; None for the first.
+    channel_chunk and segmented change no result, and are ignored.
+
+    Returns images (..., C, height, width, X), X = D, 1 or D + 1 by the mode, alphas (..., C, height, width, 1), and meta,
+    a dictionary with gsplat's names: batch_ids, camera_ids, gaussian_ids (nnz,) int64, None unless packed; radii
+    (..., C, N, 2) or (nnz, 2) int32, pixels, 0 where not in view; means2d (.., 2), pixels; depths; conics (.., 3), the
+    inverse covariance's xx, xy, yy, 1 / pixels^2; opacities, with the compensation; tiles_per_gauss, isect_ids, flatten_ids,
+    isect_offsets, made when they are first looked at; tile_width, tile_height, width, height, tile_size, n_batches,
+    n_cameras.
+
+    Raises InputError, which names the argument: other shapes, NaN, numbers out of range; and `distributed`, `with_ut`,
+    `with_eval3d`, the model ftheta, coefficients of lenses, and shutters other than GLOBAL, which clsplat does not have.
+
+    Source: gsplat 1.5.3, https://docs.gsplat.studio; Kerbl et al. 2023.
+    """
+    _refuse_missing(
+        distributed=distributed,
+        with_ut=with_ut,
+        with_eval3d=with_eval3d,
+        radial_coeffs=radial_coeffs,
+        tangential_coeffs=tangential_coeffs,
+        thin_prism_coeffs=thin_prism_coeffs,
+        ftheta_coeffs=ftheta_coeffs,
+        viewmats_rs=viewmats_rs,
+    )
+    if getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL":
+        raise refuse("rolling_shutter", rolling_shutter, "GLOBAL, the one that clsplat.torch has")
+    check_choice("camera_model", camera_model, CAMERA_MODELS)
+    check_choice("render_mode", render_mode, RENDER_MODES)
+    check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    width, height = check_size("width", width), check_size("height", height)
+    tile_size = check_size("tile_size", tile_size)
+    batch = _check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
+    if sparse_grad and (batch or not packed):
+        raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
+    settings = {
+        "near_plane": check_number("near_plane", near_plane),
+        "far_plane": check_number("far_plane", far_plane),
+        "radius_clip": check_number("radius_clip", radius_clip, 0),
+        "eps2d": check_number("eps2d", eps2d, 0),
+        "alpha_max": check_number("alpha_max", alpha_max, 1 / 255, 1),
+        "sh_degree": sh_degree,
+        "render_mode": render_mode,
+        "rasterize_mode": rasterize_mode,
+        "camera_model": camera_model,
+        "absolute_gradients": absgrad,
+        "device": device,
+    }
+    depth_alone = render_mode in {"D", "ED"}
+    backgrounds = None if depth_alone else backgrounds
+    if covars is not None:
+        covars, quats, scales = covars[..., UPPER[0], UPPER[1]], None, None
+    shared = [Batches(each, batch) for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)]
+    call = Call(
+        [
+            rasterize(*(each[index] for each in shared[:7]), width, height, backgrounds=shared[7][index], covars=shared[8][index], **settings)
+            for index in range(math.prod(batch))
+        ],
+        batch,
+        packed=packed,
+        sparse=sparse_grad,
+        absolute=absgrad,
+    )
+    coefficients = None if sh_degree is None or depth_alone else colors
+    means2d, conics, depths, opacities2d, colors2d = Projection.apply(
+        call, means, quats, scales, covars, opacities, coefficients, viewmats, Ks
+    )
+    values = None if depth_alone else colors if sh_degree is None else colors2d
+    images, alphas = Pixels.apply(call, means2d, conics, depths, opacities2d, values, backgrounds)
+    return images, alphas, _meta(call, (means2d, depths, conics, opacities2d), width, height, tile_size)
+
+
+def _refuse_missing(**given: Any) -> None:
+    for name, value in given.items():
+        if value is not None and value is not False:
+            found = str(value) if isinstance(value, bool) else "given"
+            raise refuse(name, found, f"{isinstance(value, bool) and 'False' or 'None'}: clsplat.torch does not have it")
+
+
+def _check_tensors(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,  # noqa: N803
+    backgrounds: Tensor | None,
+    covars: Tensor | None,
+    sh_degree: int | None,
+) -> tuple[int, ...]:
+    """The sizes of batches. Raises InputError for what is none of the shapes in `rasterization`, or has NaN."""
+    leading = means.shape[:-2] if isinstance(means, Tensor) and means.dim() >= 2 else ()
+    check("means", means, (*leading, "N", 3))
+    batch, count = tuple(leading), means.shape[-2]
+    if covars is None:
+        check("quats", quats, (*batch, count, 4))
+        check("scales", scales, (*batch, count, 3))
+    else:
+        check("covars", covars, (*batch, count, 3, 3))
+    check("opacities", opacities, (*batch, count))
+    check("viewmats", viewmats, (*batch, "C", 4, 4))
+    cameras = viewmats.shape[-3]
+    if cameras == 0 or 0 in batch:
+        raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "a camera or more in each batch")
+    check("Ks", Ks, (*batch, cameras, 3, 3))
+    if sh_degree is None:
+        check("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
+        if not 1 <= colors.shape[-1] <= MOST_CHANNELS:
+            raise refuse("colors", f"of {colors.shape[-1]} channels", f"1 to {MOST_CHANNELS}")
+    else:
+        if isinstance(sh_degree, bool) or sh_degree not in (0, 1, 2, 3):
+            raise refuse("sh_degree", sh_degree, "0, 1, 2 or 3, or None for colours")
+        check("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
+        if colors.shape[-2] < (sh_degree + 1) ** 2:
+            raise refuse("colors", f"of {colors.shape[-2]} coefficients", f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}")
+    if backgrounds is not None:
+        check("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
+    return batch
+
+
+def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_size: int) -> Meta:
+    """gsplat's dictionary, in its order."""
+    means2d, depths, conics, opacities = splats
+    batches, cameras, count = call.sizes
+    like, radii = means2d.detach(), torch.from_numpy(call.radii).to(means2d.device)
+    ids: dict[str, Tensor | None] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
+    image_ids = None
+    if call.in_view is not None:
+        image_ids = call.in_view // count if count else call.in_view
+        parts = (image_ids // cameras, image_ids % cameras, call.in_view % count if count else call.in_view)
+        ids = {name: torch.from_numpy(part).to(means2d.device) for name, part in zip(ids, parts, strict=True)}
+    columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
+
+    def tiles() -> dict[str, Any]:
+        per_gauss, isect_ids, flatten_ids = isect_tiles(
+            like,
+            radii,
+            depths.detach(),
+            tile_size,
+            columns,
+            rows,
+            packed=call.packed,
+            n_images=batches * cameras,
+            image_ids=None if image_ids is None else torch.from_numpy(image_ids),
+            gaussian_ids=ids["gaussian_ids"],
+        )
+        offsets = isect_offset_encode(isect_ids, batches * cameras, columns, rows)
+        return {
+            "tiles_per_gauss": per_gauss,
+            "isect_ids": isect_ids,
+            "flatten_ids": flatten_ids,
+            "isect_offsets": offsets.reshape(*call.batch, cameras, rows, columns),
+        }
+
+    meta = Meta({**ids, "radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities})
+    meta.update({"tile_width": columns, "tile_height": rows})
+    meta.later(("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets"), tiles)
+    meta.update({"width": width, "height": height, "tile_size": tile_size, "n_batches": batches, "n_cameras": cameras})
+    return meta

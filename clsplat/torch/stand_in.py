@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Programs written for gsplat, run on clsplat: its names in their place, and its own density control."""
+
+from __future__ import annotations
+
+import functools
+import re
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+from torch import Tensor
+
+from clsplat.errors import ClsplatError
+from clsplat.torch.covariances import quat_scale_to_covar_preci
+from clsplat.torch.harmonics import spherical_harmonics
+from clsplat.torch.pixels import rasterize_to_pixels
+from clsplat.torch.projection import fully_fused_projection
+from clsplat.torch.rendering import RollingShutterType, rasterization
+from clsplat.torch.relocation import compute_relocation
+from clsplat.torch.selective_adam import SelectiveAdam
+from clsplat.torch.tiles import isect_offset_encode, isect_tiles
+
+VERSION = "1.5.3"
+"""gsplat's, whose calls these are."""
+HOMES: dict[str, tuple[Any, ...]] = {
+    "gsplat.cuda._wrapper": (
+        fully_fused_projection,
+        isect_offset_encode,
+        isect_tiles,
+        quat_scale_to_covar_preci,
+        rasterize_to_pixels,
+        spherical_harmonics,
+    ),
+    "gsplat.optimizers.selective_adam": (SelectiveAdam,),
+    "gsplat.relocation": (compute_relocation,),
+    "gsplat.rendering": (rasterization,),
+}
+"""Functions and classes by the module of gsplat that defines them."""
+PACKAGES = ("gsplat", "gsplat.cuda", "gsplat.optimizers")
+ONE_RADIUS = (1, 5)
+"""The first version in which a splat has two radii."""
+CHANGED = (fully_fused_projection, isect_tiles)
+"""Functions whose results or arguments came to be as they are in that version."""
+
+
+def install_as_gsplat() -> list[str]:
+    """Let a program that imports gsplat run on clsplat; returns the names that are clsplat's from now on.
+
+    Where gsplat is installed, its functions are replaced in every module that has been imported, its own and the
+    program's; what clsplat does not have stays gsplat's. In versions before 1.5 `meta["radii"]` of `rasterization` has
+    one radius a splat, as their strategies expect. Where gsplat is not installed, a module `gsplat` with the names that
+    clsplat has takes its place; it has no strategies. A second call does nothing.
+
+    Source: gsplat 1.5.3 (Apache-2.0), https://github.com/nerfstudio-project/gsplat.
+    """
+    if not _has("gsplat"):
+        return _make_package()
+    old = _version(import_module("gsplat")) < ONE_RADIUS
+    homes = {home: [each for each in given if not (old and each in CHANGED)] for home, given in HOMES.items()}
+    replaced: dict[int, tuple[Any, Any]] = {}
+    for home, given in homes.items():
+        module = import_module(home) if _has(home) else None
+        for ours in given:
+            theirs = getattr(module, ours.__name__, None)
+            if theirs is not None and not _is_ours(theirs):
+                replaced[id(theirs)] = (theirs, _with_one_radius(ours) if old and ours is rasterization else ours)
+    names = []
+    for module_name, module in list(sys.modules.items()):
+        for name, value in list(getattr(module, "__dict__", {}).items()):
+            theirs, ours = replaced.get(id(value), (None, None))
+            if theirs is not None and theirs is value:
+                setattr(module, name, ours)
+                names.append(f"{module_name}.{name}")
+    return sorted(names)
+
+
+def strategy(name: str) -> Any:
+    """A class of `gsplat.strategy`, whose functions that need CUDA are replaced by clsplat's.
+
+    Raises ImportError where gsplat is not installed, ClsplatError where it is older than 1.5.
+    """
+    if not _has("gsplat") or not _has("gsplat.strategy"):
+        raise ImportError(f"{name} is gsplat's own class: pip install --no-deps gsplat=={VERSION}; it needs no CUDA here")
+    if (found := _version(import_module("gsplat"))) < ONE_RADIUS:
+        raise ClsplatError(f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()")
+    operations = import_module("gsplat.strategy.ops")
+    for ours in (quat_scale_to_covar_preci, compute_relocation):
+        setattr(operations, ours.__name__, ours)
+    return getattr(import_module("gsplat.strategy"), name)
+
+
+def _has(module: str) -> bool:
+    return find_spec(module) is not None
+
+
+def _version(module: ModuleType) -> tuple[int, ...]:
+    numbers = re.match(r"(\d+)\.(\d+)", str(getattr(module, "__version__", VERSION)))
+    return tuple(int(part) for part in numbers.groups()) if numbers else ONE_RADIUS
+
+
+def _is_ours(value: Any) -> bool:
+    return str(getattr(value, "__module__", "")).startswith("clsplat.torch")
+
+
+def _with_one_radius(function: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]) -> Callable[..., Any]:
+    """`rasterization` with the larger of the two radii, as before 1.5: (C, N), or (nnz,) packed."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        images, alphas, meta = function(*args, **kwargs)
+        meta["radii"] = meta["radii"].amax(-1)
+        return images, alphas, meta
+
+    return call
+
+
+def _make_package() -> list[str]:
+    """Modules `gsplat` and those in it, in `sys.modules`."""
+    names = []
+    for home in sorted({*PACKAGES, *HOMES}):
+        module = ModuleType(home, "clsplat.torch in the place of gsplat.")
+        module.__spec__ = ModuleSpec(home, None, is_package=home in PACKAGES)
+        if home in PACKAGES:
+            module.__path__ = []
+        sys.modules[home] = module
+        parent, _, last = home.rpartition(".")
+        if parent:
+            setattr(sys.modules[parent], last, module)
+    for home, given in HOMES.items():
+        for ours in given:
+            places = {home, "gsplat"} | ({home.rpartition(".")[0]} if "optimizers" in home else set())
+            if ours is compute_relocation:
+                places.discard("gsplat")  # the package itself does not have it
+            for place in places:
+                setattr(sys.modules[place], ours.__name__, ours)
+                names.append(f"{place}.{ours.__name__}")
+    for place in ("gsplat", "gsplat.cuda._wrapper"):
+        sys.modules[place].RollingShutterType = RollingShutterType  # type: ignore[attr-defined]
+    sys.modules["gsplat"].__version__ = VERSION  # type: ignore[attr-defined]
+    return sorted(names)

@@ -1,0 +1,40 @@
+// Colours from spherical harmonics, in directions that are given or from a camera's centre to the means.
+//
+// Owner: A work-item owns LANES Gaussians: their basis in vectors, the sums by turns.
+// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
+// Buffers: directions (n, 3) of any length, or with CAMERA means (n, 3) in world units and centre (6), in two floats;
+//   sh (n, coefficients, 3), of which the first `used` are looked at; with MASKED mask (n, mask_width), which is looked
+//   at where it is over 0 in the first column -> colours (n, 3), zero where the mask is; with CAMERA 0.5 more, and no
+//   less than 0. In the direction of length 0 there is the first coefficient alone.
+// Equations: docs/gradients.md, (12) and (167); the basis is in docs/conventions.md.
+#include "shared/math.h"
+#include "shared/lanes.h"
+#include "shared/sh.h"
+#include "shared/harmonics.h"
+
+__kernel void harmonics(const uint n, const int coefficients, const int used, DIRECTIONS, __global const float *sh,
+                        MASK __global float *colours) {
+  ROWS_OF_ITEM(n)
+  Direction d;
+  Lanes basis[16];
+  direction_of(row, DIRECTIONS_GIVEN, &d);
+  sh_basis(used, d.v[0], d.v[1], d.v[2], &basis[0].all);
+  for (uint lane = 0; lane < lanes_used; ++lane) {
+    const size_t i = first_row + lane;
+    if (HIDDEN(i)) {
+      for (int k = 0; k < 3; ++k) colours[3 * i + k] = 0.0f;
+      continue;
+    }
+    __global const float *f = sh + 3 * coefficients * i;
+    float4 colour = (float4)(COLOUR_OFFSET);
+    for (int k = 0; k < used; ++k, f += 3)
+      colour = sh_fma(basis[k].lane[lane], sh_channels(f, k + 1 == coefficients), colour);
+#ifdef CAMERA
+    store_colour(colour, colours + 3 * i);
+#else
+    colours[3 * i] = colour.x;
+    colours[3 * i + 1] = colour.y;
+    colours[3 * i + 2] = colour.z;
+#endif
+  }
+}

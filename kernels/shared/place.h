@@ -1,0 +1,71 @@
+// Where LANES points and turned axes are in a camera: arithmetic in two floats, of several kernels. Equation numbers
+// are those of docs/gradients.md. With ORTHOGRAPHIC the image is linear in x and y, not in x/z and y/z.
+
+// So that no sum of what they are factors of overflows: of distances in world units and of axes in pixels.
+#define FARTHEST 1e18f
+// Where `refine` is called for: longest axis over the ellipse's short one, and an axis over what is seen of it. Up to
+// there float32 is good to 3e-5.
+#define REFINE_FROM 64.0f
+#define FORESHORTENED 256.0f
+
+// The rotation of a unit quaternion, row by row.
+static inline void rotation_of(const floatL *q, floatL *r) {
+  const floatL w = q[0], x = q[1], y = q[2], z = q[3];
+  r[0] = 1.0f - 2.0f * (y * y + z * z);
+  r[1] = 2.0f * (x * y - w * z);
+  r[2] = 2.0f * (x * z + w * y);
+  r[3] = 2.0f * (x * y + w * z);
+  r[4] = 1.0f - 2.0f * (x * x + z * z);
+  r[5] = 2.0f * (y * z - w * x);
+  r[6] = 2.0f * (x * z - w * y);
+  r[7] = 2.0f * (y * z + w * x);
+  r[8] = 1.0f - 2.0f * (x * x + y * y);
+}
+
+// (57): the same in two floats, times the square of the length that is returned; `length`: the raw quaternion's.
+static inline floatL rotation2_of(const uint *row, __global const float *quaternions, floatL length, Double *r) {
+  // By a power of two, which is exact: the rest of a product must not fall among denormals.
+  const floatL size = AS_FLOATL(AS_INTL(length) & 0x7f800000);
+  const floatL w = GATHER(quaternions, 4, 0) / size, x = GATHER(quaternions, 4, 1) / size;
+  const floatL y = GATHER(quaternions, 4, 2) / size, z = GATHER(quaternions, 4, 3) / size;
+  const Double xx = product2(x, x), yy = product2(y, y), zz = product2(z, z), ww = product2(w, w);
+  const Double xy = product2(x, y), xz = product2(x, z), yz = product2(y, z);
+  const Double wx = product2(w, x), wy = product2(w, y), wz = product2(w, z);
+  const Double s = subtract2(ww, zz), d = subtract2(xx, yy);
+  r[0] = add2(s, d);
+  r[4] = subtract2(s, d);
+  r[8] = subtract2(add2(ww, zz), add2(xx, yy));
+  r[1] = twice2(subtract2(xy, wz));
+  r[3] = twice2(add2(xy, wz));
+  r[2] = twice2(add2(xz, wy));
+  r[6] = twice2(subtract2(xz, wy));
+  r[5] = twice2(subtract2(yz, wx));
+  r[7] = twice2(add2(yz, wx));
+  return length / size;
+}
+
+// A row of a camera's matrix times the mean (x, y, z), and its shift.
+static inline Double camera_row(__constant float *r, __constant float *r_low, float t, float t_low, floatL x, floatL y,
+                                floatL z) {
+  Double sum = {(floatL)(t), (floatL)(t_low)};
+  sum = multiply_add2(r[0], r_low[0], x, sum);
+  sum = multiply_add2(r[1], r_low[1], y, sum);
+  return multiply_add2(r[2], r_low[2], z, sum);
+}
+
+// The quantity that a place on the image is linear in, x/z or x, in two floats: the value, and the rest of it.
+#ifdef ORTHOGRAPHIC
+#define RATIO(x, z) (x)
+static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) { return x_low; }
+#else
+#define RATIO(x, z) ((x) / (z))
+static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) {
+  return (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
+}
+#endif
+
+// x within [low, high], and NaN as it is.
+static inline floatL clampL(floatL x, float low, float high) {
+  const floatL above = x < low ? (floatL)(low) : x;
+  return above > high ? (floatL)(high) : above;
+}

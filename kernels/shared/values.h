@@ -1,0 +1,23 @@
+// What the kernels for any number of values a Gaussian share. Needs cells.h.
+#ifndef VALUES
+#error "VALUES must be defined: values of a Gaussian that a pass has, 1 to 32"
+#endif
+
+// A lane's pixel in its cell.
+#if ITEMS == 1
+#define LANE_PIXEL_X(lane) ((lane) % CELL_W)
+#define LANE_PIXEL_Y(lane) ((lane) / CELL_W)
+#else
+#define LANE_PIXEL_X(lane) 0
+#define LANE_PIXEL_Y(lane) 0
+#endif
+
+// A short loop over the pass's values, without a loop where a lane is an item (lanes.h).
+#define FOR_VALUES(k) UNROLL for (int k = 0; k < VALUES; ++k)
+
+// Cells of the i-th pair that have a pixel which takes it, or may.
+#ifdef RECORD_CELLS // by blend
+#define CELLS_OF_PAIR(i, splat) cells_from_sorted[i]
+#else
+#define CELLS_OF_PAIR(i, splat) reach_of(splat, tile_x, tile_y)
+#endif

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arguments of `clsplat.torch.rasterization`: gsplat's names and defaults; those that are refused, by name."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from typing import Any
+
+import pytest
+from needs import require
+
+require("torch")
+
+import clouds
+import torch
+
+import clsplat.torch
+from clsplat.errors import InputError
+from clsplat.torch import arguments, rasterization
+
+pytestmark = pytest.mark.needs("torch")
+
+
+def given(**changes: Any) -> dict[str, Any]:
+    made = {name: value.float() if isinstance(value, torch.Tensor) else value for name, value in clouds.cloud(8).items()}
+    return {**made, **changes}
+
+
+def spoiled(name: str, place: tuple[int, ...]) -> torch.Tensor:
+    value: torch.Tensor = given()[name]
+    value[place] = torch.nan
+    return value
+
+
+@pytest.mark.needs("gsplat")
+@pytest.mark.parametrize(
+    ("ours", "home"),
+    [
+        ("rasterization", "gsplat.rendering"),
+        ("spherical_harmonics", "gsplat.cuda._wrapper"),
+        ("fully_fused_projection", "gsplat.cuda._wrapper"),
+        ("isect_tiles", "gsplat.cuda._wrapper"),
+        ("isect_offset_encode", "gsplat.cuda._wrapper"),
+        ("rasterize_to_pixels", "gsplat.cuda._wrapper"),
+        ("quat_scale_to_covar_preci", "gsplat.cuda._wrapper"),
+        ("compute_relocation", "gsplat.relocation"),
+        ("SelectiveAdam", "gsplat.optimizers"),
+    ],
+)
+def test_the_call_is_gsplats(ours: str, home: str) -> None:
+    module = pytest.importorskip(home)
+    expected = inspect.signature(getattr(module, ours)).parameters.values()
+    found = inspect.signature(getattr(clsplat.torch, ours)).parameters.values()
+    shared = [each for each in found if each.kind != inspect.Parameter.KEYWORD_ONLY]
+    assert [each.name for each in shared] == [each.name for each in expected]
+
+    def plain(default: Any) -> Any:
+        return getattr(default, "name", default)
+
+    assert [plain(each.default) for each in shared] == [plain(each.default) for each in expected]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"with_ut": True}, "with_ut is True, expected False"),
+        ({"with_eval3d": True}, "with_eval3d is True"),
+        ({"distributed": True}, "distributed is True"),
+        ({"camera_model": "ftheta"}, "camera_model is 'ftheta', expected one of pinhole"),
+        ({"radial_coeffs": torch.zeros(1, 6)}, "radial_coeffs is given, expected None"),
+        ({"tangential_coeffs": torch.zeros(1, 2)}, "tangential_coeffs is given"),
+        ({"thin_prism_coeffs": torch.zeros(1, 4)}, "thin_prism_coeffs is given"),
+        ({"ftheta_coeffs": object()}, "ftheta_coeffs is given"),
+        ({"rolling_shutter": clsplat.torch.RollingShutterType.ROLLING_LEFT_TO_RIGHT}, "rolling_shutter is .*LEFT"),
+        ({"viewmats_rs": torch.eye(4)[None]}, "viewmats_rs is given"),
+    ],
+)
+def test_features_that_clsplat_does_not_have_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        rasterization(**given(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"means": torch.zeros(8, 2)}, r"means is float32 \(8, 2\), expected a tensor \(N, 3\)"),
+        ({"means": [[0.0, 0, 3]] * 8}, "means is a list, expected a tensor"),
+        ({"quats": torch.zeros(7, 4)}, r"quats is float32 \(7, 4\), expected a tensor \(8, 4\)"),
+        ({"quats": None}, "quats is a NoneType"),
+        ({"scales": torch.zeros(8)}, r"scales is float32 \(8,\)"),
+        ({"opacities": torch.zeros(8, 1)}, r"opacities is float32 \(8, 1\), expected a tensor \(8,\)"),
+        ({"opacities": torch.zeros(8).int()}, r"opacities is int32 \(8,\), expected a dense tensor of float32"),
+        ({"colors": torch.zeros(8)}, r"colors is float32 \(8,\), expected a tensor \(8, D\) or \(1, 8, D\)"),
+        ({"colors": torch.zeros(8, 513)}, "colors is of 513 channels, expected 1 to 512"),
+        ({"colors": torch.zeros(8, 0)}, "colors is of 0 channels"),
+        ({"sh_degree": 1}, r"colors is float32 \(8, 3\), expected a tensor \(8, K, 3\)"),
+        ({"sh_degree": 1, "colors": torch.zeros(8, 1, 3)}, "colors is of 1 coefficients, expected 4 or more"),
+        ({"sh_degree": 4, "colors": torch.zeros(8, 25, 3)}, "sh_degree is 4, expected 0, 1, 2 or 3"),
+        ({"viewmats": torch.eye(4)}, r"viewmats is float32 \(4, 4\), expected a tensor \(C, 4, 4\)"),
+        ({"viewmats": torch.zeros(0, 4, 4)}, "viewmats is of shape .* a camera or more"),
+        ({"Ks": torch.zeros(2, 3, 3)}, r"Ks is float32 \(2, 3, 3\), expected a tensor \(1, 3, 3\)"),
+        ({"backgrounds": torch.zeros(3)}, r"backgrounds is float32 \(3,\), expected a tensor \(1, 3\)"),
+        ({"covars": torch.zeros(8, 6)}, r"covars is float32 \(8, 6\), expected a tensor \(8, 3, 3\)"),
+        ({"width": 0}, "width is 0, expected a whole number of pixels"),
+        ({"height": 2.5}, r"height is 2\.5"),
+        ({"tile_size": 0}, "tile_size is 0"),
+        ({"near_plane": "1"}, "near_plane is '1', expected a number"),
+        ({"far_plane": float("nan")}, "far_plane is nan"),
+        ({"eps2d": -1}, "eps2d is -1, expected a number and 0 or more"),
+        ({"radius_clip": -1}, "radius_clip is -1"),
+        ({"alpha_max": 1.5}, r"alpha_max is 1\.5"),
+        ({"render_mode": "depth"}, "render_mode is 'depth', expected one of RGB, D, ED"),
+        ({"rasterize_mode": "soft"}, "rasterize_mode is 'soft', expected one of classic, antialiased"),
+        ({"sparse_grad": True, "packed": False}, "sparse_grad is True, expected False"),
+    ],
+)
+def test_arguments_that_are_none(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        rasterization(**given(**changes))
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("means", (3, 1)),
+        ("quats", (0, 0)),
+        ("scales", (7, 2)),
+        ("opacities", (4,)),
+        ("colors", (2, 0)),
+        ("viewmats", (0, 3, 3)),
+        ("Ks", (0, 0, 1)),
+    ],
+)
+def test_nan_is_refused_by_name_and_place(name: str, place: tuple[int, ...]) -> None:
+    where = ", ".join(map(str, place))
+    with pytest.raises(InputError, match=rf"{name} has 1 NaN, the first at \({where},?\)"):
+        rasterization(**given(**{name: spoiled(name, place)}))
+
+
+def test_an_infinite_scale_is_no_nan() -> None:
+    """A sum of infinities may be NaN; the Gaussian is not drawn."""
+    made = given()
+    made["means"][0] = torch.tensor([torch.inf, -torch.inf, 3])
+    _, _, meta = rasterization(**made)
+    assert 0 not in meta["gaussian_ids"]
+
+
+def test_other_kinds_of_numbers_come_back_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arguments, "_SAID", set())
+    float64 = clouds.cloud(8)
+    float64["means"].requires_grad_()
+    with pytest.warns(UserWarning, match="tensors of float64 on cpu are copied to float32 on the CPU"):
+        images, alphas, meta = rasterization(**float64)
+    assert images.dtype == alphas.dtype == meta["means2d"].dtype == torch.float64
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        images, _, _ = rasterization(**float64)
+        images.sum().backward()
+    assert float64["means"].grad.dtype == torch.float64
+
+
+def test_float32_is_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    means = given()["means"]
+    assert arguments.as_array(means).ctypes.data == means.data_ptr()
+    array = arguments.as_array(means)
+    assert arguments.as_tensor(array, means).data_ptr() == array.ctypes.data
+
+
+def test_tensors_that_are_views_give_what_their_copies_give() -> None:
+    made = given()
+    turned = {**made, "means": made["means"].T.contiguous().T, "colors": made["colors"].flip(1).flip(1)}
+    turned["viewmats"] = made["viewmats"].mT.contiguous().mT
+    assert torch.equal(rasterization(**turned)[0], rasterization(**made)[0])
+
+
+def test_the_largest_alpha() -> None:
+    """0.999 is gsplat's; a Gaussian over a pixel that is opaque enough shows it."""
+    made = given(
+        means=torch.tensor([[0.0, 0, 3]]), quats=torch.tensor([[1.0, 0, 0, 0]]), scales=torch.full((1, 3), 50.0),
+        opacities=torch.ones(1), colors=torch.ones(1, 3),
+    )  # fmt: skip
+    assert rasterization(**made)[1].max().item() == pytest.approx(0.999, abs=1e-6)
+    assert rasterization(**made, alpha_max=0.99)[1].max().item() == pytest.approx(0.99, abs=1e-6)
+
+
+def test_the_device_is_named() -> None:
+    with pytest.raises(Exception, match="no such thing"):
+        rasterization(**given(), device="no such thing")

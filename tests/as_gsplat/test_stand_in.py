@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`install_as_gsplat`: with gsplat, with an older one, and without; each in a process of its own, as modules stay."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from needs import require
+
+require("torch")
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.needs("torch")
+
+RENDER = """
+import torch
+def render(rasterization, **more):
+    return rasterization(
+        torch.tensor([[0.0, 0, 3]]), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3), torch.ones(1), torch.ones(1, 3),
+        torch.eye(4)[None], torch.tensor([[[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]]), 16, 16, **more)
+"""
+
+
+def run(code: str, *paths: Path, without: str = "") -> str:
+    """Output of a program; `without` hides a package from it."""
+    hide = f"import sys; sys.modules[{without!r}] = None\n" if without else ""
+    path = os.pathsep.join([*map(str, paths), str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", hide + RENDER + code],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.needs("gsplat")
+def test_a_program_that_has_imported_gsplat_already() -> None:
+    out = run(
+        """
+import gsplat
+from gsplat import rasterization, spherical_harmonics
+from gsplat.rendering import rasterization as same
+from gsplat.relocation import compute_relocation
+from gsplat.strategy import ops
+import clsplat.torch
+names = clsplat.torch.install_as_gsplat()
+for ours in ("rasterization", "spherical_harmonics", "quat_scale_to_covar_preci", "isect_tiles", "SelectiveAdam"):
+    assert getattr(gsplat, ours) is getattr(clsplat.torch, ours), ours
+assert rasterization is same is clsplat.torch.rasterization
+assert compute_relocation is clsplat.torch.compute_relocation is ops.compute_relocation
+assert ops.quat_scale_to_covar_preci is clsplat.torch.quat_scale_to_covar_preci
+assert gsplat.rendering.isect_tiles is gsplat.cuda._wrapper.isect_tiles is clsplat.torch.isect_tiles
+assert gsplat.rasterization_2dgs.__module__ == "gsplat.rendering"
+assert "__main__.rasterization" in names and "gsplat.strategy.ops.compute_relocation" in names
+assert clsplat.torch.install_as_gsplat() == []
+images, alphas, meta = render(rasterization)
+print(tuple(images.shape), tuple(meta["radii"].shape))
+"""
+    )
+    assert out == "(1, 16, 16, 3) (1, 2)\n"
+
+
+def test_a_program_where_there_is_no_gsplat() -> None:
+    out = run(
+        """
+import importlib.util
+import clsplat.torch
+def no_gsplat(name, *rest): return None if name.startswith("gsplat") and name not in sys.modules else find(name, *rest)
+import sys
+find = importlib.util.find_spec
+import clsplat.torch.stand_in
+clsplat.torch.stand_in.find_spec = no_gsplat
+sys.path_hooks.insert(0, None) if False else None
+clsplat.torch.install_as_gsplat()
+import gsplat
+from gsplat import rasterization, RollingShutterType
+from gsplat.rendering import rasterization as same
+from gsplat.cuda._wrapper import spherical_harmonics
+from gsplat.relocation import compute_relocation
+from gsplat.optimizers import SelectiveAdam
+assert rasterization is same is clsplat.torch.rasterization
+try:
+    import gsplat.strategy
+except ModuleNotFoundError as error:
+    print(error)
+assert clsplat.torch.install_as_gsplat() == []
+print(gsplat.__version__, tuple(render(rasterization)[0].shape))
+"""
+    )
+    assert out == "No module named 'gsplat.strategy'\n1.5.3 (1, 16, 16, 3)\n"
+
+
+OLD = {
+    "__init__.py": "from .rendering import rasterization\nfrom .version import __version__\n",
+    "version.py": '__version__ = "1.4.0"\n',
+    "rendering.py": "from .cuda._wrapper import isect_tiles\ndef rasterization(): ...\n",
+    "cuda/__init__.py": "",
+    "cuda/_wrapper.py": "def isect_tiles(): ...\ndef spherical_harmonics(): ...\n",
+}
+
+
+def test_a_gsplat_that_has_one_radius_a_splat(tmp_path: Path) -> None:
+    """The layout of 1.4: `radii` (C, N), or (nnz,); functions whose results have changed since stay its own."""
+    for name, text in OLD.items():
+        path = tmp_path / "gsplat" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, "utf-8")
+    out = run(
+        """
+import gsplat
+import clsplat.torch
+clsplat.torch.install_as_gsplat()
+assert gsplat.rendering.isect_tiles is not clsplat.torch.isect_tiles
+assert gsplat.cuda._wrapper.spherical_harmonics is clsplat.torch.spherical_harmonics
+for packed in (False, True):
+    meta = render(gsplat.rasterization, packed=packed)[2]
+    print(tuple(meta["radii"].shape), tuple(meta["means2d"].shape))
+print(tuple(render(clsplat.torch.rasterization)[2]["radii"].shape))
+try:
+    clsplat.torch.DefaultStrategy
+except Exception as error:
+    print(error)
+""",
+        tmp_path,
+    )
+    assert out.splitlines()[:3] == ["(1, 1) (1, 1, 2)", "(1,) (1, 2)", "(1, 2)"]
+    assert "DefaultStrategy" in out.splitlines()[3]
+
+
+def test_without_torch_the_error_says_what_to_install() -> None:
+    out = run("", without="") or "ok"
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; sys.modules['torch'] = None; import clsplat.torch"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert out == "ok"
+    assert 'ImportError: clsplat.torch needs PyTorch: pip install "clsplat[torch]"' in done.stderr

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A few Gaussians before a few cameras, as float64 tensors for `clsplat.torch` and for the dense oracle."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+WIDTH, HEIGHT = 37, 29  # no whole number of tiles
+
+
+def cameras(count: int) -> tuple[Tensor, Tensor]:
+    """viewmats (C, 4, 4) and Ks (C, 3, 3), turned and moved a little from each other."""
+    viewmats, Ks = torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, 3, 3).double()
+    for index in range(count):
+        angle = torch.tensor(0.2 * index - 0.1).double()
+        viewmats[index, 0, 0] = viewmats[index, 2, 2] = angle.cos()
+        viewmats[index, 0, 2], viewmats[index, 2, 0] = angle.sin(), -angle.sin()
+        viewmats[index, :3, 3] = torch.tensor([0.1 * index, -0.05, 0.2 * index])
+        Ks[index] = torch.tensor([[30.0 + index, 0, 18.2], [0, 31, 14.9], [0, 0, 1]])
+    return viewmats, Ks
+
+
+def cloud(count: int, *, width: int = 3, degree: int | None = None, cams: int = 1, seed: int = 0) -> dict[str, Any]:
+    """Arguments of `rasterization`: N Gaussians at depths 2 to 6, `width` channels or SH coefficients of a degree."""
+    draw = torch.Generator().manual_seed(seed)
+
+    def uniform(least: float, most: float, *shape: int) -> Tensor:
+        return least + (most - least) * torch.rand(*shape, generator=draw, dtype=torch.float64)
+
+    depth = uniform(2, 6, count)
+    means = torch.stack([uniform(-0.6, 0.6, count) * depth, uniform(-0.5, 0.5, count) * depth, depth], -1)
+    viewmats, Ks = cameras(cams)
+    colors = uniform(0, 1, count, width)
+    if degree is not None:
+        colors = uniform(-0.4, 0.4, count, (degree + 1) ** 2, 3)
+    return {
+        "means": means,
+        "quats": torch.randn(count, 4, generator=draw, dtype=torch.float64),
+        "scales": uniform(-3.2, -1.2, count, 3).exp(),
+        "opacities": uniform(0.1, 0.95, count),
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+        "width": WIDTH,
+        "height": HEIGHT,
+        "sh_degree": degree,
+        # every number is one of float32's: the oracle and the kernels begin with the same
+    }
+
+
+def rounded(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The same with each tensor's numbers rounded to float32's, in float64."""
+    return {
+        name: value.float().double() if isinstance(value, Tensor) else value for name, value in arguments.items()
+    }
