@@ -8,14 +8,17 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from clsplat.device.context import Device
+from clsplat.errors import InputError
 from clsplat.jax.host import on_host, shape_like
-from clsplat.library.rasterize import Rasterization
+from clsplat.library.inputs import check_shape, choice
+from clsplat.library.rasterize import RENDER_MODES, Rasterization
 from clsplat.library.rasterize import rasterize as rasterize_numpy
 
 KEPT = 8
@@ -68,14 +71,15 @@ def rasterize(
     alpha_max: float = 0.99,
     absolute_gradients: bool = False,
     means2d_probe: jax.Array | None = None,
-    device: str | None = None,
+    device: Device | str | None = None,
 ) -> Rasterized:
     """`clsplat.rasterize` in a program of JAX, with the gradient of all its arrays.
 
     The arguments are those of `clsplat.rasterize`; all that are no arrays are static under `jit`, and so are shapes.
     Arrays of other dtypes become float32. means2d_probe (C, N, 2): zeros, which are not used; its gradient is that of
     the loss by `means2d` (with absolute_gradients, the sum of what pixels add to it, each without its sign), as
-    density control wants it. device: the OpenCL device by its name; JAX's own devices have no part in it.
+    density control wants it. device: of OpenCL, open or by its name; JAX's own
+    devices have no part in it.
 
     Raises InputError for wrong shapes and settings when it is called or traced. Values that are wrong are found when
     the program runs, and JAX raises an error of its own with that message.
@@ -120,18 +124,39 @@ class Call:
     settings: tuple[tuple[str, Any], ...]
 
     def run(self, arrays: dict[str, Any]) -> Rasterization:
-        """The NumPy call; the arrays by their names, None for those that are not there."""
-        given = {name: array for name, array in arrays.items() if name != "means2d_probe"}
-        missing = {name: None for name in ("quaternions", "scales") if name not in given}
-        return rasterize_numpy(**given, **missing, width=self.width, height=self.height, **dict(self.settings))
+        """The NumPy call; the arrays by their names, without those that are not there."""
+        given: dict[str, Any] = {"quaternions": None, "scales": None, **arrays, **dict(self.settings)}
+        given.pop("means2d_probe", None)
+        return rasterize_numpy(**given, width=self.width, height=self.height)
 
     def shapes(self, arrays: dict[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shapes and dtypes of the results."""
-        settings = dict(self.settings)
-        views, count = len(arrays["viewmats"]), len(arrays["means"])
-        values = 3 if settings["sh_degree"] is not None else arrays["colors"].shape[-1]
+        """Shapes and dtypes of the results. Raises InputError, which names the argument, for arrays of shapes that
+        `rasterize` does not take."""
+        settings, sizes = dict(self.settings), {name: array.shape for name, array in arrays.items()}
+        choice("render_mode", settings["render_mode"], RENDER_MODES)
+        for name, side in (("width", self.width), ("height", self.height)):
+            if np.ndim(side):
+                raise InputError(f"{name} is {side!r:.80}, expected a whole number: all cameras have one size in JAX")
+        check_shape("means", sizes["means"], ("N", 3))
+        check_shape("viewmats", sizes["viewmats"], ("C", 4, 4))
+        count, views = sizes["means"][0], sizes["viewmats"][0]
+        colors = (count, "D") if settings["sh_degree"] is None else (count, "K", 3)
+        check_shape("colors", sizes["colors"], colors, (views, *colors))
+        values = sizes["colors"][-1]
+        expected: dict[str, tuple[int, ...]] = {
+            "quaternions": (count, 4),
+            "scales": (count, 3),
+            "opacities": (count,),
+            "intrinsics": (views, 3, 3),
+            "backgrounds": (views, values),
+            "covars": (count, 3, 3),
+            "means2d_probe": (views, count, 2),
+        }
+        for name, shape in expected.items():
+            if name in sizes:
+                check_shape(name, sizes[name], shape)
         channels = {"RGB": values, "D": 1, "ED": 1}.get(settings["render_mode"], values + 1)
-        sizes = {
+        results = {
             "images": (views, self.height, self.width, channels),
             "alphas": (views, self.height, self.width, 1),
             "means2d": (views, count, 2),
@@ -142,8 +167,8 @@ class Call:
             "tile_counts": (views, count),
         }
         return {
-            name: jax.ShapeDtypeStruct(size, jnp.float32 if name in WITH_GRADIENT else jnp.int32)
-            for name, size in sizes.items()
+            name: jax.ShapeDtypeStruct(shape, jnp.float32 if name in WITH_GRADIENT else jnp.int32)
+            for name, shape in results.items()
         }
 
 
@@ -188,7 +213,8 @@ def _forward(call: Call, arrays: dict[str, Any]) -> Any:
     shapes = call.shapes(arrays)
 
     def run(arrays: dict[str, Any]) -> Any:
-        result = call.run(arrays)
+        # copies: the library reads arrays in place until the gradient, and XLA's memory is another's by then
+        result = call.run({name: np.array(array) for name, array in arrays.items()})
         return _results(result, shapes), _kept.add(result)
 
     results, number = on_host(run, (shapes, jax.ShapeDtypeStruct((), jnp.int32)), arrays)
@@ -201,12 +227,9 @@ def _backward(call: Call, residuals: Any, cotangents: dict[str, Any]) -> Any:
     def gradient(arrays: dict[str, Any], number: Any, d: dict[str, Any]) -> dict[str, Any]:
         result = _kept.pop(int(number)) or call.run(arrays)
         pixels = result.vjp_pixels(d["images"], d["alphas"])
-        projected = {name: pixels[name] + d[name] for name in PROJECTED}
-        gradients = {
-            **result.vjp_projection(**projected, colors2d=pixels["colors2d"]),
-            "backgrounds": pixels["backgrounds"],
-            "means2d_probe": pixels.get("absolute", projected["means2d"]),
-        }
+        projected = {name: d[name] + pixels.get(name, 0) for name in PROJECTED}
+        gradients = pixels | result.vjp_projection(**projected, colors2d=pixels["colors2d"])
+        gradients["means2d_probe"] = pixels.get("absolute", projected["means2d"])
         return {name: np.asarray(gradients[name], np.float32) for name in arrays}
 
     wanted = {name: cotangents[name] for name in WITH_GRADIENT}

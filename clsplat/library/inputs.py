@@ -20,8 +20,7 @@ def floats(name: str, given: Any, *shapes: Sequence[int | str]) -> Float32:
             array: Float32 = np.ascontiguousarray(given, np.float32)
     except (TypeError, ValueError):
         raise InputError(f"{name} is a {type(given).__name__}, expected an array {_named(*shapes)}") from None
-    if not any(_fits(array.shape, shape) for shape in shapes):
-        raise InputError(f"{name} has shape {_text(array.shape)}, expected {_named(*shapes)}")
+    check_shape(name, array.shape, *shapes)
     # one pass without another array; a sum of finite numbers may overflow, so it only says where to look
     with np.errstate(over="ignore", invalid="ignore"):
         suspect = not np.isfinite(array.sum())
@@ -30,6 +29,12 @@ def floats(name: str, given: Any, *shapes: Sequence[int | str]) -> Float32:
         wrong = np.size(fine) - np.count_nonzero(fine)
         raise InputError(f"{name} has {wrong:,} values that are NaN or infinite, the first at {first}; expected numbers")
     return array
+
+
+def check_shape(name: str, found: Sequence[int], *shapes: Sequence[int | str]) -> None:
+    """Raise InputError unless the shape of an argument is one of the shapes, in which a word stands for any size."""
+    if not any(_fits(found, shape) for shape in shapes):
+        raise InputError(f"{name} has shape {_text(found)}, expected {_named(*shapes)}")
 
 
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
