@@ -13,8 +13,8 @@ from clsplat.errors import InputError
 
 
 def floats(name: str, given: Any, *shapes: Sequence[int | str]) -> Float32:
-    """A C-contiguous float32 array of one of the shapes, in which a word stands for any size: `given` itself where it is
-    one. Raises InputError for another shape, for what is no array of numbers, and for what is not finite."""
+    """A C-contiguous float32 array of one of the shapes, in which a word stands for any size: `given` itself where it
+    is one. Raises InputError for another shape, for what is no array of numbers, and for what is not finite."""
     try:
         with np.errstate(over="ignore"):
             array: Float32 = np.ascontiguousarray(given, np.float32)
@@ -27,7 +27,9 @@ def floats(name: str, given: Any, *shapes: Sequence[int | str]) -> Float32:
     if suspect and not (fine := np.isfinite(array)).all():
         first = tuple(int(index) for index in np.argwhere(~fine)[0])
         wrong = np.size(fine) - np.count_nonzero(fine)
-        raise InputError(f"{name} has {wrong:,} values that are NaN or infinite, the first at {first}; expected numbers")
+        raise InputError(
+            f"{name} has {wrong:,} values that are NaN or infinite, the first at {first}; expected numbers"
+        )
     return array
 
 
@@ -47,9 +49,13 @@ def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
 def sizes(name: str, given: Any, count: int) -> list[int]:
     """A length in pixels for each of `count` cameras, from one for all or one for each. Raises InputError."""
     each = [given] * count if np.ndim(given) == 0 else list(given)
-    whole = all(isinstance(size, (int, np.integer)) and not isinstance(size, bool) and 0 < size < 2**24 for size in each)
+    whole = all(
+        isinstance(size, (int, np.integer)) and not isinstance(size, bool) and 0 < size < 2**24 for size in each
+    )
     if len(each) != count or not whole:
-        raise InputError(f"{name} is {given!r:.80}, expected a positive whole number, or one for each of {count} cameras")
+        raise InputError(
+            f"{name} is {given!r:.80}, expected a positive whole number, or one for each of {count} cameras"
+        )
     return [int(size) for size in each]
 
 

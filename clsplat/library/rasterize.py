@@ -65,7 +65,7 @@ class Rasterization:
 
     @cached_property
     def opacities(self) -> Float32:
-        """(C, N) float32: the opacities of the images; with rasterize_mode "antialiased" compensated for the low-pass."""
+        """(C, N) float32: opacities on the image; with rasterize_mode "antialiased" compensated for the low-pass."""
         return _stacked([view.opacities for view in self._views])
 
     @cached_property
@@ -102,10 +102,10 @@ class Rasterization:
         depths: ArrayLike | None = None,
         cameras: bool = True,
     ) -> dict[str, Any]:
-        """The loss's gradients by the arguments of `rasterize`, from those of `vjp_pixels`, of which any may be missing.
+        """The loss's gradients by the arguments of `rasterize`, from those of `vjp_pixels`; any may be missing.
 
-        means (N, 3), quaternions (N, 4), scales (N, 3) or in their place covars (N, 3, 3), opacities (N,), colors in the
-        given shape; and, with `cameras`, float64 viewmats (C, 4, 4) and intrinsics (C, 3, 3), all numbers of the
+        means (N, 3), quaternions (N, 4), scales (N, 3) or in their place covars (N, 3, 3), opacities (N,), colors in
+        the given shape; and, with `cameras`, float64 viewmats (C, 4, 4) and intrinsics (C, 3, 3), all numbers of the
         first three rows and fx, fy, cx, cy taken as free. Raises InputError for other shapes, and for what is not
         finite.
         """
@@ -133,8 +133,8 @@ class Rasterization:
         """`vjp_pixels` and from there `vjp_projection`: gradients by all arguments of `rasterize`, and by the
         backgrounds where they were given."""
         found = self.vjp_pixels(d_images, d_alphas)
-        others = {name: found.pop(name) for name in ("backgrounds", "absolute") if name in found}
-        return {**self.vjp_projection(**found, cameras=cameras), **others}  # type: ignore[arg-type]  # arrays by name
+        others: dict[str, Any] = {name: found.pop(name) for name in ("backgrounds", "absolute") if name in found}
+        return {**self.vjp_projection(**found, cameras=cameras), **others}
 
     def _of_pixels(self, part: Callable[[View], Float32]) -> Float32 | list[Float32]:
         arrays = [part(view) for view in self._views]
@@ -175,8 +175,8 @@ def rasterize(
 ) -> Rasterization:
     """Images of N Gaussians as C cameras see them (Kerbl et al. 2023; gsplat's conventions, docs/library.md).
 
-    means (N, 3): world units. quaternions (N, 4): w x y z, of any length but 0. scales (N, 3): standard deviations, world
-    units. opacities (N,): 0 to 1. colors: (N, D) or (C, N, D), D from 1 to 512, or with sh_degree SH coefficients
+    means (N, 3): world units. quaternions (N, 4): w x y z, of any length but 0. scales (N, 3): standard deviations,
+    world units. opacities (N,): 0 to 1. colors: (N, D) or (C, N, D), D from 1 to 512, or with sh_degree SH coefficients
     (N, K, 3) or (C, N, K, 3), of which (sh_degree + 1)^2 count. viewmats (C, 4, 4) or (4, 4): camera from world.
     intrinsics (C, 3, 3) or (3, 3): pixels. width, height: pixels, of all cameras or of each. Arrays of float32 are read
     in place where the device shares the host's memory, and must not change before the last gradient; others are
@@ -186,8 +186,8 @@ def rasterize(
     eps2d: px^2, added to both variances on the image. backgrounds (C, D) or (D,): black if None. render_mode: one of
     RENDER_MODES; depths are along the axis. rasterize_mode: "antialiased" lowers opacities by what eps2d widens.
     camera_model: pinhole, ortho or fisheye. covars (N, 3, 3): symmetric, in place of quaternions and scales. alpha_max:
-    the cap of a Gaussian's alpha. absolute_gradients: gradients by means2d have their absolute sums too. device: an open
-    one, or a name as `clsplat devices` lists them.
+    the cap of a Gaussian's alpha. absolute_gradients: gradients by means2d have their absolute sums too. device: an
+    open one, or a name as `clsplat devices` lists them.
 
     Raises InputError for an argument that is not so, and for one that is not finite; it is named. Raises DeviceError.
     """
@@ -203,11 +203,11 @@ def rasterize(
     given = Given.checked(means, quaternions, scales, covars, opacities, colors, sh_degree, count)
     if given.channels > MOST_CHANNELS:
         raise InputError(f"colors has {given.channels} channels, expected at most {MOST_CHANNELS}")
-    behind: Sequence[Float32 | None] = [None] * count
+    behind: list[Float32 | None] = [None] * count
     if backgrounds is not None:
         rows = floats("backgrounds", backgrounds, (count, given.channels), (given.channels,))
-        behind = np.broadcast_to(rows, (count, given.channels))
-    settings = {
+        behind = list(np.broadcast_to(rows, (count, given.channels)))
+    settings: dict[str, Any] = {
         "near": number("near_plane", near_plane, -np.inf),
         "far": number("far_plane", far_plane, -np.inf),
         "eps2d": number("eps2d", eps2d, 0.0),
@@ -220,7 +220,7 @@ def rasterize(
         View(
             session,
             given,
-            EwaCamera(*camera, **settings),  # type: ignore[arg-type]  # settings by name
+            EwaCamera(*camera, **settings),
             index,
             behind[index],
             cap,

@@ -16,12 +16,14 @@ from clsplat.device.context import Device, open_device
 from clsplat.rendering.build_flags import kernel_defines
 
 KEPT = frozenset(
-    ("splats", "tile_counts", "first_slots", "transmittance", "stops", "ranges")
-    + ("gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted")
-    + ("ewa_camera", "ewa_radii", "ewa_means2d", "ewa_depths", "ewa_conics", "ewa_compensations")
-    + ("harmonics_centre", "harmonics_colours")
+    (
+        *("splats", "tile_counts", "first_slots", "transmittance", "stops", "ranges"),
+        *("gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted"),
+        *("ewa_camera", "ewa_radii", "ewa_means2d", "ewa_depths", "ewa_conics", "ewa_compensations"),
+        *("harmonics_centre", "harmonics_colours"),
+    )
 )
-"""Arrays of a forward pass that its gradient reads: each pass has its own. All else is the session's, for all passes."""
+"""Arrays of a forward pass that its gradient reads: each pass has its own. All else is the session's."""
 MOST_IDLE = 4
 """Workspaces of passes that are gone, for those to come."""
 
@@ -62,7 +64,9 @@ class Session:
         return work
 
     def _take_back(self, work: PassWorkspace) -> None:
-        if len(self._idle) < MOST_IDLE:  # one append is one step of the interpreter: no lock, as it may come from anywhere
+        if (
+            len(self._idle) < MOST_IDLE
+        ):  # one append is one step of the interpreter: no lock, as it may come from anywhere
             self._idle.append(work)
 
     def capped(self, alpha_max: float) -> Device:

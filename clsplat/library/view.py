@@ -75,7 +75,8 @@ class Given:
             if values.shape[-2] < (sh_degree + 1) ** 2:
                 wanted = (sh_degree + 1) ** 2
                 raise InputError(
-                    f"colors has {values.shape[-2]} SH coefficients, expected {wanted} or more for sh_degree {sh_degree}"
+                    f"colors has {values.shape[-2]} SH coefficients, "
+                    f"expected {wanted} or more for sh_degree {sh_degree}"
                 )
         if values.shape[-1] == 0:
             raise InputError("colors has no channel, expected 1 to 512")
@@ -84,7 +85,7 @@ class Given:
     @property
     def channels(self) -> int:
         """D: values of a Gaussian that are blended, but for its depth."""
-        return self.colors.shape[-1]
+        return int(self.colors.shape[-1])
 
     @property
     def by_camera(self) -> bool:
@@ -105,7 +106,6 @@ class Gradients:
 
     def __init__(self, given: Given) -> None:
         self.given = given
-        self.views = 0
         self.by_device: dict[str, Hosted] = {}
         self.opacities = np.zeros(given.count, np.float32)
         self.colors = None if given.sh_degree is not None else np.zeros_like(given.colors)
@@ -114,12 +114,14 @@ class Gradients:
         self.intrinsics: list[Float64] = []
 
     def ewa(self, device: Device) -> EwaGradients:
-        """Arrays of projection's gradient; those of the first view are not filled yet."""
+        """Arrays of projection's gradient, to be added to."""
         n, given = self.given.count, self.given
         if not self.by_device:
             shapes = {"means": (n, 3)}
             shapes |= {"quaternions": (n, 4), "scales": (n, 3)} if given.covars is None else {"covariances": (n, 6)}
             self.by_device = {name: hosted(device, shape) for name, shape in shapes.items()}
+            for one in self.by_device.values():
+                one.array.fill(0.0)
         return EwaGradients(**{name: one.array for name, one in self.by_device.items()})
 
     def sh(self, device: Device) -> tuple[DeviceArray, bool]:
@@ -135,7 +137,7 @@ class Gradients:
         found: dict[str, Any] = {name: one.get() for name, one in self.by_device.items()}
         if "covariances" in found:
             # a number of the upper triangle stands for both its places
-            halves = found.pop("covariances") * np.float32([1, 0.5, 0.5, 1, 0.5, 1])
+            halves = found.pop("covariances") * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
             whole = np.empty((self.given.count, 3, 3), np.float32)
             whole[:, UPPER[0], UPPER[1]] = whole[:, UPPER[1], UPPER[0]] = halves
             found["covars"] = whole
@@ -178,7 +180,11 @@ class View:
             work = self._work = session.workspace(self)
             placed = {
                 name: None if array is None else from_host(device, array)
-                for name, array in (("means", given.means), ("quaternions", given.quaternions), ("scales", given.scales))
+                for name, array in (
+                    ("means", given.means),
+                    ("quaternions", given.quaternions),
+                    ("scales", given.scales),
+                )
             }
             covars = None if given.covars is None else from_host(device, given.covars)
             covers = from_host(device, given.opacities)
@@ -307,59 +313,50 @@ class View:
             gradients.opacities += by_opacity if self.compensations is None else by_opacity * self.compensations
             if self.compensations is not None:
                 by_compensation = by_opacity * given.opacities
+        if gradients.colors is not None and "colors2d" in by:
+            at = gradients.colors[self._index] if given.by_camera else gradients.colors
+            at += by["colors2d"]
         with session.lock:
-            arrays, added = gradients.ewa(device), gradients.views > 0
-            by_position = None
-            colours = by.get("colors2d")
-            if self._harmonics is None:
-                if colours is not None and gradients.colors is not None:
-                    at = gradients.colors[self._index] if given.by_camera else gradients.colors
-                    at += colours
-            elif colours is not None or not gradients.coefficients or given.by_camera:
-                d_sh, add = gradients.sh(device)
-                by_colour = from_host(device, np.zeros((given.count, 3), np.float32) if colours is None else colours)
-                device.under_way.append(by_colour)
-                by_position = harmonics_grad(
-                    device,
-                    self._work,
-                    self._harmonics,
-                    self._colours,  # type: ignore[arg-type]  # of harmonics it is on the device
-                    by_colour,
-                    d_sh,
-                    arrays.means,
-                    add=add,
-                    add_directions=added,
-                    by_centre=cameras,
-                )
-                added = True
-            sums = self._project_back(arrays, by, by_compensation, added=gradients.views > 0, means=added, cameras=cameras)
-            gradients.views += 1
-            if not cameras or sums is None:
+            arrays = gradients.ewa(device)
+            by_centre = self._colours_back(gradients, arrays.means, by.get("colors2d"), cameras=cameras)
+            names = ("means2d", "depths", "conics")
+            placed = [from_host(device, by[name]) if name in by else None for name in names]
+            placed.append(None if by_compensation is None else from_host(device, by_compensation))
+            device.under_way.append(placed)  # memory of the host, until the device has read it
+            means2d, depths, conics, compensations = placed
+            by_camera = ewa_grad(
+                device,
+                self._work,
+                self._inputs,
+                self._camera,
+                self._camera_array,
+                self.projected,
+                arrays,
+                means2d=means2d,
+                depths=depths,
+                conics=conics,
+                compensations=compensations,
+                add=True,
+                by_camera=cameras,
+            )
+            if by_camera is None:
                 return
-            viewmat, intrinsics = camera_gradients(sums.get())
-            if by_position is not None:
-                viewmat += self._camera.position_gradient(by_position.get().astype(np.float64))
+            viewmat, intrinsics = camera_gradients(by_camera.get())
+            if by_centre is not None:
+                viewmat += self._camera.position_gradient(by_centre.get().astype(np.float64))
         gradients.viewmats.append(viewmat)
         gradients.intrinsics.append(intrinsics)
 
-    def _project_back(
-        self,
-        arrays: EwaGradients,
-        by: dict[str, Float32],
-        by_compensation: Float32 | None,
-        *,
-        added: bool,
-        means: bool,
-        cameras: bool,
+    def _colours_back(
+        self, gradients: Gradients, d_means: DeviceArray, by_colour: Float32 | None, *, cameras: bool
     ) -> DeviceArray | None:
-        """Projection's gradient, added to what earlier views (`added`) and the colours (`means`) have in the arrays."""
-        device = self._session.device
-        placed = {name: from_host(device, by[name]) for name in ("means2d", "depths", "conics") if name in by}
-        if by_compensation is not None:
-            placed["compensations"] = from_host(device, by_compensation)
-        if means and not added:  # only the means have something yet
-            for array in arrays.arrays[1:]:
-                array.fill(0.0)
-        device.under_way.append(placed)  # memory of the host, until the device has read it
-        where = (device, self._work, self._inputs, self._camera, self._camera_array, self.projected, arrays)
-        return ewa_grad(*where, **placed, add=means, by_camera=cameras)
+        """Add the gradient by spherical harmonics, of the means too; returns that by the camera's centre, if asked."""
+        device, count = self._session.device, self._given.count
+        if self._harmonics is None:
+            return None
+        placed = from_host(device, np.zeros((count, 3), np.float32) if by_colour is None else by_colour)
+        device.under_way.append(placed)
+        d_sh, add = gradients.sh(device)
+        assert isinstance(self._colours, DeviceArray), "harmonics are made on the device"
+        how = {"add": add, "add_directions": True, "by_centre": cameras}
+        return harmonics_grad(device, self._work, self._harmonics, self._colours, placed, d_sh, d_means, **how)

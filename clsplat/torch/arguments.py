@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -24,11 +26,22 @@ def refuse(name: str, found: object, expected: str) -> InputError:
     return InputError(f"{name} is {found}, expected {expected}")
 
 
-def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """An argument is a tensor of real numbers of one of `shapes`, in which a word stands for any size, and has no NaN.
+@contextmanager
+def renamed(**names: str) -> Iterator[None]:
+    """Errors of the library within, with the names that arguments have here: `theirs="ours"`."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        for theirs, ours in names.items():
+            if re.match(rf"{theirs}\b", text):
+                raise InputError(text.replace(theirs, ours, 1)) from None
+        raise
 
-    Raises InputError, which names the argument, where it is not.
-    """
+
+def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
+    """Raise InputError, which names the argument, unless it is a dense tensor of real numbers of one of `shapes`, in
+    which a word stands for any size."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -37,6 +50,11 @@ def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
         raise refuse(name, found, expected)
     if not value.dtype.is_floating_point or value.is_sparse:
         raise refuse(name, "a sparse tensor" if value.is_sparse else found, "a dense tensor of float32")
+
+
+def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
+    """Raise InputError, which names the argument, where `check_shape` does, and for NaN."""
+    check_shape(name, value, *shapes)
     # a sum is NaN where a number is, and is made in one pass without another array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
         first = tuple(broken.nonzero()[0].tolist())

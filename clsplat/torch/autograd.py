@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from clsplat.arrays import Int64
-from clsplat.library.rasterize import Rasterization
 from clsplat.torch.arguments import as_array, as_tensor
+from clsplat.torch.covariances import UPPER
+
+
+SPARSE = ("means", "quaternions", "scales", "covars")
+"""Arguments whose gradients may be sparse."""
 
 
 class Batches:
@@ -29,17 +34,34 @@ class Batches:
 
 
 class Call:
-    """Results of one call, a `Rasterization` for each batch, and which of their splats `meta` has.
+    """Results of one call, of the library for each batch, and which of their splats are looked at.
 
     Splats are numbered through batches, cameras and Gaussians, (B, C, N).
     """
 
-    def __init__(self, results: list[Rasterization], batch: tuple[int, ...], *, packed: bool, sparse: bool, absolute: bool) -> None:
+    def __init__(
+        self,
+        results: Sequence[Any],
+        batch: tuple[int, ...],
+        *,
+        packed: bool,
+        sparse: bool = False,
+        absolute: bool = False,
+    ) -> None:
         self.results, self.batch, self.packed, self.sparse, self.absolute = results, batch, packed, sparse, absolute
         radii = self.stacked("radii")
         self.sizes = (len(results), *radii.shape[1:3])
         self.in_view: Int64 | None = np.flatnonzero((radii > 0).all(-1)) if packed else None
         self.radii = self.laid_out(radii)
+
+    def ids(self, device: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """Batch, camera and Gaussian of each splat in view, int64."""
+        assert self.in_view is not None
+        _, cameras, count = self.sizes
+        images, gaussians = np.divmod(self.in_view, max(count, 1))
+        batches, places = np.divmod(images, cameras)
+        first, second, third = (torch.from_numpy(each).to(device) for each in (batches, places, gaussians))
+        return first, second, third
 
     def stacked(self, name: str) -> NDArray[Any]:
         """A result of every batch, (B, ...)."""
@@ -84,6 +106,19 @@ class Call:
         array = arrays[0] if len(arrays) == 1 else np.stack(arrays)
         return as_tensor(np.ascontiguousarray(array).reshape(like.shape), like)
 
+    def gradients(
+        self, each: list[dict[str, Any]], inputs: dict[str, Tensor | None], needed: Sequence[bool]
+    ) -> list[Tensor | None]:
+        """Gradients of arguments, those that are needed; of SPARSE ones the rows in view, if they are to be sparse."""
+        found = [
+            self.gradient(each, name, like) if wanted else None
+            for (name, like), wanted in zip(inputs.items(), needed, strict=True)
+        ]
+        if not self.sparse:
+            return found
+        pairs = zip(inputs, found, strict=True)
+        return [self.of_rows(part) if part is not None and name in SPARSE else part for name, part in pairs]
+
     def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor) -> Tensor:
         """Gradients of splats from every batch, as `meta` has them."""
         arrays = [found[name] for found in each]
@@ -126,15 +161,15 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         names = ("means2d", "conics", "depths", "opacities")
         splats = {name: call.whole(gradient) for name, gradient in zip(names, given[:4], strict=True)}
         splats["colors2d"] = None if given[4] is None else as_array(given[4]).reshape(*call.sizes, -1)
-        each = [
-            result.vjp_projection(**{name: whole if whole is None else whole[index] for name, whole in splats.items()})
-            for index, result in enumerate(call.results)
-        ]
-        wanted = [name if needed else None for name, needed in zip(INPUTS, ctx.needs_input_grad[1:], strict=True)]
-        gradients = [None if name is None else call.gradient(each, name, inputs[name]) for name in wanted]
-        if call.sparse:
-            gradients[:4] = [None if gradient is None else call.of_rows(gradient) for gradient in gradients[:4]]
-        return (None, *gradients)
+        cameras = any(ctx.needs_input_grad[-2:])
+        each = []
+        for index, result in enumerate(call.results):
+            by = {name: None if whole is None else whole[index] for name, whole in splats.items()}
+            found = result.vjp_projection(**by, cameras=cameras)
+            if "covars" in found:  # one half of what a number off the diagonal stands for twice
+                found["covars"] = found["covars"][:, UPPER[0], UPPER[1]] * np.float32([1, 2, 2, 1, 2, 1])
+            each.append(found)
+        return (None, *call.gradients(each, inputs, ctx.needs_input_grad[1:]))
 
 
 INPUTS = ("means", "quaternions", "scales", "covars", "opacities", "colors", "viewmats", "intrinsics")

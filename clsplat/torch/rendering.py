@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from clsplat.library.rasterize import rasterize
-from clsplat.torch.arguments import check, check_choice, check_number, check_size, refuse
+from clsplat.torch.arguments import check_choice, check_number, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import Batches, Call, Pixels, Projection
 from clsplat.torch.covariances import UPPER
 from clsplat.torch.graphs import outside_graphs
@@ -132,7 +132,7 @@ def rasterization(
         "far_plane": check_number("far_plane", far_plane),
         "radius_clip": check_number("radius_clip", radius_clip, 0),
         "eps2d": check_number("eps2d", eps2d, 0),
-        "alpha_max": check_number("alpha_max", alpha_max, 1 / 255, 1),
+        "alpha_max": check_number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6),
         "sh_degree": sh_degree,
         "render_mode": render_mode,
         "rasterize_mode": rasterize_mode,
@@ -143,18 +143,25 @@ def rasterization(
     depth_alone = render_mode in {"D", "ED"}
     backgrounds = None if depth_alone else backgrounds
     if covars is not None:
-        covars, quats, scales = covars[..., UPPER[0], UPPER[1]], None, None
-    shared = [Batches(each, batch) for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)]
-    call = Call(
-        [
-            rasterize(*(each[index] for each in shared[:7]), width, height, backgrounds=shared[7][index], covars=shared[8][index], **settings)
-            for index in range(math.prod(batch))
-        ],
-        batch,
-        packed=packed,
-        sparse=sparse_grad,
-        absolute=absgrad,
+        quats = scales = None
+    *arrays, behind, squares = (
+        Batches(each, batch)
+        for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     )
+    with renamed(quaternions="quats", intrinsics="Ks"):
+        results = [
+            rasterize(
+                *(each[index] for each in arrays),
+                width,
+                height,
+                backgrounds=behind[index],
+                covars=squares[index],
+                **settings,
+            )
+            for index in range(math.prod(batch))
+        ]
+    call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad)
+    covars = None if covars is None else covars[..., UPPER[0], UPPER[1]]
     coefficients = None if sh_degree is None or depth_alone else colors
     means2d, conics, depths, opacities2d, colors2d = Projection.apply(
         call, means, quats, scales, covars, opacities, coefficients, viewmats, Ks
@@ -185,45 +192,41 @@ def _check_tensors(
 ) -> tuple[int, ...]:
     """The sizes of batches. Raises InputError for what is none of the shapes in `rasterization`, or has NaN."""
     leading = means.shape[:-2] if isinstance(means, Tensor) and means.dim() >= 2 else ()
-    check("means", means, (*leading, "N", 3))
+    check_shape("means", means, (*leading, "N", 3))
     batch, count = tuple(leading), means.shape[-2]
     if covars is None:
-        check("quats", quats, (*batch, count, 4))
-        check("scales", scales, (*batch, count, 3))
+        check_shape("quats", quats, (*batch, count, 4))
+        check_shape("scales", scales, (*batch, count, 3))
     else:
-        check("covars", covars, (*batch, count, 3, 3))
-    check("opacities", opacities, (*batch, count))
-    check("viewmats", viewmats, (*batch, "C", 4, 4))
+        check_shape("covars", covars, (*batch, count, 3, 3))
+    check_shape("opacities", opacities, (*batch, count))
+    check_shape("viewmats", viewmats, (*batch, "C", 4, 4))
     cameras = viewmats.shape[-3]
     if cameras == 0 or 0 in batch:
         raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "a camera or more in each batch")
-    check("Ks", Ks, (*batch, cameras, 3, 3))
+    check_shape("Ks", Ks, (*batch, cameras, 3, 3))
     if sh_degree is None:
-        check("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
+        check_shape("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
         if not 1 <= colors.shape[-1] <= MOST_CHANNELS:
             raise refuse("colors", f"of {colors.shape[-1]} channels", f"1 to {MOST_CHANNELS}")
     else:
         if isinstance(sh_degree, bool) or sh_degree not in (0, 1, 2, 3):
             raise refuse("sh_degree", sh_degree, "0, 1, 2 or 3, or None for colours")
-        check("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
+        check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
         if colors.shape[-2] < (sh_degree + 1) ** 2:
             raise refuse("colors", f"of {colors.shape[-2]} coefficients", f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}")
     if backgrounds is not None:
-        check("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
+        check_shape("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
     return batch
 
 
 def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_size: int) -> Meta:
     """gsplat's dictionary, in its order."""
     means2d, depths, conics, opacities = splats
-    batches, cameras, count = call.sizes
+    batches, cameras, _ = call.sizes
     like, radii = means2d.detach(), torch.from_numpy(call.radii).to(means2d.device)
-    ids: dict[str, Tensor | None] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
-    image_ids = None
-    if call.in_view is not None:
-        image_ids = call.in_view // count if count else call.in_view
-        parts = (image_ids // cameras, image_ids % cameras, call.in_view % count if count else call.in_view)
-        ids = {name: torch.from_numpy(part).to(means2d.device) for name, part in zip(ids, parts, strict=True)}
+    ids: tuple[Tensor | None, ...] = (None, None, None) if call.in_view is None else call.ids(means2d.device)
+    batch_ids, camera_ids, gaussian_ids = ids
     columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
 
     def tiles() -> dict[str, Any]:
@@ -236,8 +239,8 @@ def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_
             rows,
             packed=call.packed,
             n_images=batches * cameras,
-            image_ids=None if image_ids is None else torch.from_numpy(image_ids),
-            gaussian_ids=ids["gaussian_ids"],
+            image_ids=None if batch_ids is None or camera_ids is None else batch_ids * cameras + camera_ids,
+            gaussian_ids=gaussian_ids,
         )
         offsets = isect_offset_encode(isect_ids, batches * cameras, columns, rows)
         return {
@@ -247,7 +250,8 @@ def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_
             "isect_offsets": offsets.reshape(*call.batch, cameras, rows, columns),
         }
 
-    meta = Meta({**ids, "radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities})
+    meta = Meta({"batch_ids": batch_ids, "camera_ids": camera_ids, "gaussian_ids": gaussian_ids, "radii": radii})
+    meta.update({"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities})
     meta.update({"tile_width": columns, "tile_height": rows})
     meta.later(("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets"), tiles)
     meta.update({"width": width, "height": height, "tile_size": tile_size, "n_batches": batches, "n_cameras": cameras})

@@ -211,7 +211,7 @@ def rasterize(
     if sh_degree is None:
         values = colors if colors.dim() == 3 else colors.expand(len(viewmats), *colors.shape)
     else:
-        centres = -(viewmats[:, None, :3, 3] @ viewmats[:, :3, :3])
+        centres = torch.linalg.inv(viewmats)[:, None, :3, 3]
         values = (harmonics(sh_degree, means - centres, colors) + 0.5).clamp(min=0)
     depth = splats.depths[..., None]
     if render_mode != "RGB":

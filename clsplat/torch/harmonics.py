@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`spherical_harmonics`: colours from coefficients in directions, by gsplat's call, with their gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from clsplat.library.harmonics import HarmonicColors
+from clsplat.library.harmonics import spherical_harmonics as library_harmonics
+from clsplat.torch.arguments import as_array, as_tensor, check_shape, refuse, renamed
+from clsplat.torch.graphs import outside_graphs
+
+
+@outside_graphs
+def spherical_harmonics(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None, *, device: str | None = None
+) -> Tensor:
+    """Sums of real spherical harmonics in directions, (..., 3), as gsplat 1.5.3's function of this name; without the 0.5
+    and the floor that `rasterization` adds.
+
+    degrees_to_use: the highest degree, 0 to 3. dirs: (..., 3), of any length. coeffs: (..., K, 3), K at least
+    (degrees_to_use + 1)^2, in the order and with the signs of 3DGS files. masks: (...), of bool; where false the sum and
+    its gradient are 0. device: an OpenCL device as `clsplat devices` lists it.
+
+    Raises InputError, which names the argument, for other shapes and degrees and for numbers that are not finite.
+    """
+    check_shape("dirs", dirs, (*dirs.shape[:-1], 3) if isinstance(dirs, Tensor) and dirs.dim() else ("...", 3))
+    check_shape("coeffs", coeffs, (*dirs.shape[:-1], "K", 3))
+    if masks is not None and (not isinstance(masks, Tensor) or masks.shape != dirs.shape[:-1]):
+        raise refuse("masks", tuple(getattr(masks, "shape", ())), f"a tensor {tuple(dirs.shape[:-1])}")
+    shown = None if masks is None else masks.detach().cpu().numpy()
+    with renamed(directions="dirs", coefficients="coeffs", degree="degrees_to_use"):
+        result = library_harmonics(degrees_to_use, as_array(dirs), as_array(coeffs), shown, device=device)
+    colors: Tensor = _Harmonics.apply(result, dirs, coeffs)
+    return colors
+
+
+class _Harmonics(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
+    @staticmethod
+    def forward(ctx: Any, result: HarmonicColors, dirs: Tensor, coeffs: Tensor) -> Tensor:
+        ctx.result = result
+        ctx.save_for_backward(dirs, coeffs)
+        return as_tensor(result.colors, dirs)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[misc]
+    def backward(ctx: Any, d_colors: Tensor) -> tuple[None, Tensor, Tensor]:
+        dirs, coeffs = ctx.saved_tensors
+        found = ctx.result.vjp(as_array(d_colors))
+        return None, as_tensor(found["directions"], dirs), as_tensor(found["coefficients"], coeffs)

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rasterize_to_pixels`: images of splats from lists of tiles, by gsplat's call, with their gradient."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from clsplat.library.listed import RasterizedPixels
+from clsplat.library.listed import rasterize_to_pixels as library_pixels
+from clsplat.torch.arguments import as_array, as_tensor, check_shape, check_size, refuse
+from clsplat.torch.graphs import outside_graphs
+
+INPUTS = ("means2d", "conics", "colors", "opacities", "backgrounds")
+
+
+@outside_graphs
+def rasterize_to_pixels(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    image_width: int,
+    image_height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    backgrounds: Tensor | None = None,
+    masks: Tensor | None = None,
+    packed: bool = False,
+    absgrad: bool = False,
+    *,
+    alpha_max: float = 0.999,
+    device: str | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Images (..., H, W, D) and alphas (..., H, W, 1) of splats, as gsplat 1.5.3's function of this name.
+
+    means2d: (..., N, 2), pixels, the first pixel's centre at 0.5. conics: (..., N, 3), the inverse covariance's xx, xy, yy.
+    colors: (..., N, D), D from 1 to 512. opacities: (..., N), in [0, 1]. Or all of them `packed`, (nnz, ...). image_width,
+    image_height: pixels. tile_size: 16, the one that clsplat has. isect_offsets: (..., tile_height, tile_width) and
+    flatten_ids: (n_isects,), of `isect_offset_encode` and `isect_tiles`: each tile's splats, front to back. backgrounds:
+    (..., D), black if None. masks: (..., tile_height, tile_width) of bool; a tile where it is false has the background
+    alone. absgrad: after the backward pass `means2d.absgrad` has sums over pixels of absolute gradients. alpha_max: the
+    largest alpha. device: an OpenCL device as `clsplat devices` lists it.
+
+    Raises InputError, which names the argument, for other shapes, sizes of tiles and numbers that are not finite.
+    """
+    image_width, image_height = check_size("image_width", image_width), check_size("image_height", image_height)
+    leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
+    if packed and len(leading) != 1:
+        raise refuse("means2d", tuple(means2d.shape), "(nnz, 2) where packed is True")
+    check_shape("means2d", means2d, (*leading, 2))
+    check_shape("conics", conics, (*leading, 3))
+    check_shape("colors", colors, (*leading, "D"))
+    check_shape("opacities", opacities, leading)
+    for name, value in (("isect_offsets", isect_offsets), ("flatten_ids", flatten_ids)):
+        if not isinstance(value, Tensor):
+            raise refuse(name, f"a {type(value).__name__}", "a tensor of integers")
+    if backgrounds is not None:
+        check_shape("backgrounds", backgrounds, (*isect_offsets.shape[:-2], colors.shape[-1]))
+    result = library_pixels(
+        *(as_array(each) for each in (means2d, conics, colors, opacities)),
+        image_width,
+        image_height,
+        tile_size,
+        isect_offsets.cpu().numpy(),
+        flatten_ids.cpu().numpy(),
+        None if backgrounds is None else as_array(backgrounds),
+        None if masks is None else masks.cpu().numpy(),
+        alpha_max=alpha_max,
+        device=device,
+    )
+    images, alphas = _Pixels.apply(result, absgrad, means2d, conics, colors, opacities, backgrounds)
+    return images, alphas
+
+
+class _Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
+    @staticmethod
+    def forward(
+        ctx: Any, result: RasterizedPixels, absgrad: bool, means2d: Tensor, *others: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        ctx.result, ctx.absgrad = result, absgrad
+        ctx.save_for_backward(means2d, *others)
+        ctx.set_materialize_grads(False)
+        return as_tensor(result.colors, means2d), as_tensor(result.alphas, means2d)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[misc]
+    def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
+        inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
+        if d_images is None and d_alphas is None:
+            return (None,) * (2 + len(inputs))
+        given = [None if each is None else as_array(each) for each in (d_images, d_alphas)]
+        found = ctx.result.vjp(*given, absolute=ctx.absgrad)
+        if ctx.absgrad:
+            inputs["means2d"].absgrad = as_tensor(found["absolute"], inputs["means2d"])
+        gradients = [None if like is None else as_tensor(found[name], like) for name, like in inputs.items()]
+        return (None, None, *gradients)
