@@ -7,7 +7,7 @@
 //   of the inverse covariance, opacities (n) in [0, 1], depths (n), values (n, width): colour is the first three, 0
 //   where there are fewer -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With
 //   LISTED every splat is written, as others have made the lists: those that are not drawn have an alpha of nothing.
-// Equations: docs/library.md, (1) to (4); docs/gradients.md, (44) to (47).
+// Equations: docs/library.md, (170) to (172); docs/gradients.md, (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
@@ -34,7 +34,7 @@ __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const i
   const floatL a = GATHER(conics, 3, 0), b = GATHER(conics, 3, 1), c = GATHER(conics, 3, 2);
   const floatL opacity = GATHER(opacities, 1, 0);
 
-  // (1): a c - b^2 to the last bit. What rounding made singular is as thin as float32 can tell.
+  // (170): a c - b^2 to the last bit. What rounding made singular is as thin as float32 can tell.
   const floatL bb = b * b, ac = a * c;
   const floatL exact = fmaL(a, c, -bb) + fmaL(-b, b, bb), least = ROUNDING * ac;
   const floatL det = exact > least ? exact : least;
@@ -51,12 +51,12 @@ __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const i
   field[SPLAT_PIXEL_Y].all = floorL(my);
   field[SPLAT_SUB_X].all = mx - field[SPLAT_PIXEL_X].all;
   field[SPLAT_SUB_Y].all = my - field[SPLAT_PIXEL_Y].all;
-  field[SPLAT_L11].all = WHITEN * root; // (2)
+  field[SPLAT_L11].all = WHITEN * root; // (171)
   field[SPLAT_L12].all = WHITEN * (b / root);
   field[SPLAT_L22].all = WHITEN * sqrt(det / a);
   field[SPLAT_LOG2O].all = log2o;
   field[SPLAT_DEPTH].all = depth;
-  field[SPLAT_HALF_W].all = sqrt(budget * (c / det)) / WHITEN; // (3)
+  field[SPLAT_HALF_W].all = sqrt(budget * (c / det)) / WHITEN; // (172)
   field[SPLAT_HALF_H].all = sqrt(budget * (a / det)) / WHITEN;
   field[SPLAT_INVERSE_L11].all = 1.0f / field[SPLAT_L11].all;
 

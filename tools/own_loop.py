@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""A training loop written as gsplat's documentation has it, on `clsplat.torch`, beside `clsplat train` of the same scene.
+"""A training loop written as gsplat's documentation has it, on `clsplat.torch`, beside `clsplat train` of a scene.
 
 python tools/own_loop.py SCENES/fox --resolution 400 --steps 2000 --strategy default
 
-The loop is gsplat's `simple_trainer` in outline: its parameters, learning rates, schedules, loss and calls of a strategy;
-with `from gsplat import ...` in place of the import of `clsplat.torch` it is a program for CUDA. Prints the mean PSNR of
-the held-out views, the number of Gaussians and the seconds of each. Status 1 where the loop is more than --bound below.
+The loop is gsplat's `simple_trainer` in outline: its parameters, learning rates, schedules, loss and calls of a
+strategy; with `from gsplat import ...` in place of the import of `clsplat.torch` it is a program for CUDA. Prints the
+mean PSNR of the held-out views, the number of Gaussians and the seconds of each. Status 1 where the loop is more than
+--bound below.
 """
 
 from __future__ import annotations

@@ -221,12 +221,13 @@ def shared(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 
 def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """A C-contiguous array on the host for kernels that read it: in place where the device shares the host's memory,
-    else a copy, for which it is not waited. It must not change for as long as the result lives."""
-    if device.shares_memory and values.size:
-        return shared(device, values)
-    array = allocate(device, values.shape, values.dtype)
-    array.send(values)
+    """An array on the host for kernels that read it: in place where it is C-contiguous and the device shares the host's
+    memory, else a copy, for which it is not waited. It must not change for as long as the result lives."""
+    host = np.ascontiguousarray(values).reshape(values.shape)
+    if device.shares_memory and host.size:
+        return shared(device, host)
+    array = allocate(device, host.shape, host.dtype)
+    array.send(host)
     return array
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from clsplat.jax.host import on_host, shape_like
 from clsplat.library import harmonics
-from clsplat.library.inputs import check_shape
+from clsplat.library.checks import check_shape
 
 
 def spherical_harmonics(

@@ -17,7 +17,7 @@ import numpy as np
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.jax.host import on_host, shape_like
-from clsplat.library.inputs import check_shape, choice
+from clsplat.library.checks import Shape, check_shape, choice
 from clsplat.library.rasterize import RENDER_MODES, Rasterization
 from clsplat.library.rasterize import rasterize as rasterize_numpy
 
@@ -140,10 +140,10 @@ class Call:
         check_shape("means", sizes["means"], ("N", 3))
         check_shape("viewmats", sizes["viewmats"], ("C", 4, 4))
         count, views = sizes["means"][0], sizes["viewmats"][0]
-        colors = (count, "D") if settings["sh_degree"] is None else (count, "K", 3)
+        colors: Shape = (count, "D") if settings["sh_degree"] is None else (count, "K", 3)
         check_shape("colors", sizes["colors"], colors, (views, *colors))
         values = sizes["colors"][-1]
-        expected: dict[str, tuple[int, ...]] = {
+        expected: dict[str, Shape] = {
             "quaternions": (count, 4),
             "scales": (count, 3),
             "opacities": (count,),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clsplat.arrays import Float32
 from clsplat.device.buffers import DeviceArray, Hosted, Workspace, from_host, hosted, upload
@@ -23,9 +23,11 @@ from clsplat.stages.pixels import pixels_from_planes, planes_from_pixels
 from clsplat.stages.project import Projected, Slots
 from clsplat.stages.ranges import TileLists, tile_lists
 from clsplat.stages.splats import COLOURS, ScreenGaussians, ScreenGradients, splats, splats_grad
-from clsplat.stages.values import values, values_grad
+from clsplat.stages.values import ValuePass, values, values_grad
 
 Array = NDArray[Any] | DeviceArray
+MOST_CHANNELS = 512
+"""Values of a Gaussian."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +84,8 @@ class ListedPixels:
             self._image, self._alpha = hosted(device, (height, width, depth)), hosted(device, (height, width))
             pixels_from_planes(device, blended, self._image.array, self._alpha.array)
             if depth > COLOURS:
-                rows = (listed.projected.splats, gaussians.values, self._background, blended)
-                values(capped, listed.lists, *rows, self._image.array)
+                rows = (listed.projected, gaussians.values, self._background, blended)
+                values(capped, ValuePass(listed.lists, *rows), self._image.array)
 
     @property
     def image(self) -> Float32:
@@ -106,9 +108,9 @@ class ListedPixels:
     def gradient(
         self, d_image: NDArray[Any], d_alpha: NDArray[Any] | None = None, *, absolute: bool = False
     ) -> dict[str, Float32]:
-        """The vector-Jacobian product: means2d (n, 2), conics (n, 3), opacities (n,), colours (n, D), background (D,) if
-        there is one; absolute (n, 2): the sums of the absolute values of every pixel's gradient by means2d, if asked
-        for.
+        """The vector-Jacobian product: means2d (n, 2), conics (n, 3), opacities (n,), colours (n, D), background (D,)
+        if there is one; absolute (n, 2): the sums of the absolute values of every pixel's gradient by means2d, if
+        asked for.
 
         d_image (H, W, D), d_alpha (H, W): the loss's gradient by image and alpha, of which none is 0.
         """
@@ -140,7 +142,10 @@ class ListedPixels:
                 shapes["absolute"] = (n, 2)
             found = PixelGradients(**{name: hosted(device, shape) for name, shape in shapes.items()})
             gradients = ScreenGradients(
-                *(one.array for one in (found.means2d, found.conics, found.opacities, found.colours)),
+                found.means2d.array,
+                found.conics.array,
+                found.opacities.array,
+                found.colours.array,
                 found.absolute.array if found.absolute else None,
             )
             by_image = placed(device, d_image)
@@ -151,9 +156,9 @@ class ListedPixels:
                 slots = blend_grad(capped, self._work, listed.lists, *pixels, fields=fields)
                 splats_grad(device, listed.projected, Slots(slots, listed.first_slots), gradients, fields=fields)
             else:
-                rows = (listed.projected, gaussians.values, self._background, self._blended)
-                of_list = (listed.lists, listed.first_slots)
-                values_grad(capped, self._work, *of_list, *rows, by_image, by_alpha, gradients, fields=fields)
+                of_pass = ValuePass(listed.lists, listed.projected, gaussians.values, self._background, self._blended)
+                given = (by_image, by_alpha, gradients)
+                values_grad(capped, self._work, of_pass, listed.first_slots, *given, fields=fields)
             device.under_way.append((by_image, by_alpha))
         return found
 
@@ -163,9 +168,9 @@ class Pixels(ListedPixels):
 
     means2d (n, 2) in pixels, the first pixel's middle at 0.5; conics (n, 3), the inverse covariance's a, b, c;
     opacities (n,) in [0, 1]; colours (n, D), D from 1 to 512; depths (n,), by which the Gaussians are sorted, ties by
-    index; radii (n, 2) int32: one that is 0 culls; each on the session's device or, C-contiguous and float32 but for
-    the radii, on the host. The colours must not change before the last `gradient`. background (D,) float32 or None for
-    black; alpha_max: the cap of alpha, below 1; backward: True if there may be a `gradient`.
+    index; radii (n, 2) int32: one that is 0 culls; each on the session's device or on the host, where what is float32
+    and C-contiguous is not copied. The colours must not change before the last `gradient`. background (D,) float32 or
+    None for black; alpha_max: the cap of alpha, below 1; backward: True if there may be a `gradient`.
 
     A Gaussian takes part in a pixel where its alpha is at least 1/255, and not behind the one that would leave 1e-4 or
     less of the pixel's light. One whose mean is over 1e9 pixels away, or whose a or c is not from 1e-15 to 1e15, is
@@ -189,9 +194,9 @@ class Pixels(ListedPixels):
         backward: bool = True,
     ) -> None:
         device = session.device
-        arrays = (radii, means2d, conics, opacities, depths, colours)
+        arrays = (means2d, conics, opacities, depths, colours)
         with session.lock:
-            gaussians = ScreenGaussians(*(placed(device, array) for array in arrays))
+            gaussians = ScreenGaussians(placed(device, radii, np.int32), *(placed(device, array) for array in arrays))
 
             def listing(work: Workspace) -> Listed:
                 return listed_by_depth(device, work, gaussians, width, height)
@@ -199,22 +204,20 @@ class Pixels(ListedPixels):
             super().__init__(session, gaussians, listing, (width, height), background, alpha_max, backward=backward)
 
 
-def placed(device: Device, array: Array) -> DeviceArray:
-    """An array for kernels that read it: as it is on the device, or one that is on the host."""
-    return array if isinstance(array, DeviceArray) else from_host(device, array)
+def placed(device: Device, array: Array, dtype: DTypeLike = np.float32) -> DeviceArray:
+    """An array for kernels that read it: as it is on the device, or one that is on the host, in place if it can be."""
+    return array if isinstance(array, DeviceArray) else from_host(device, np.asarray(array, dtype))
 
 
-def listed_by_depth(
-    device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int
-) -> Listed:
+def listed_by_depth(device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int) -> Listed:
     """Lists of an image's tiles, each front to back. Waits for the device. Raises CapacityError."""
     projected = splats(device, work, gaussians, width, height)
     counted = count(device, work, projected)
     most = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
     if counted.pairs > most:
         raise CapacityError(
-            f"the Gaussians reach {counted.pairs:,} tiles of {TILE}x{TILE} pixels, counted for each, and {device.name} has "
-            f"room for {most:,}: use fewer or smaller Gaussians, or a smaller image"
+            f"the Gaussians reach {counted.pairs:,} tiles of {TILE}x{TILE} pixels, counted for each, and {device.name} "
+            f"has room for {most:,}: use fewer or smaller Gaussians, or a smaller image"
         )
     tiles = (-(-width // TILE), -(-height // TILE))
     band = Band(0, tiles[0] * tiles[1])

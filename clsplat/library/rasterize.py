@@ -13,24 +13,24 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.arrays import Float32
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.inputs import choice, floats, matrices, number, sizes
+from clsplat.library.checks import choice, floats, matrices, number, sizes
+from clsplat.library.pixels import MOST_CHANNELS
 from clsplat.library.session import session_of
-from clsplat.library.view import Given, View
+from clsplat.library.view import Given, Gradients, View
 from clsplat.rendering.build_flags import ALPHA_MAX
 from clsplat.stages.ewa import MODELS, EwaCamera
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 """Colour, depth, expected depth, and both: depth is the last channel."""
 RASTERIZE_MODES = ("classic", "antialiased")
-MOST_CHANNELS = 512
 
 
 class Rasterization:
     """Images of C cameras, and what belongs to them, on the host; its arrays wait for the device when they are first
     looked at. It holds device memory, for the vector-Jacobian products, until it is dropped."""
 
-    def __init__(self, views: Sequence[View], given: Given) -> None:
-        self._views, self._given = views, given
+    def __init__(self, views: Sequence[View], given: Given, device: Device) -> None:
+        self._views, self._given, self._device = views, given, device
 
     @cached_property
     def images(self) -> Float32 | list[Float32]:
@@ -46,12 +46,12 @@ class Rasterization:
     @cached_property
     def radii(self) -> NDArray[np.int32]:
         """(C, N, 2) int32: half sides in pixels of the box that a Gaussian is in, 0 where it is not seen."""
-        return _stacked([view.radii for view in self._views])
+        return _stacked([view.splats("radii") for view in self._views])
 
     @cached_property
     def means2d(self) -> Float32:
         """(C, N, 2) float32: pixels, the first pixel's middle at 0.5; 0 where not seen, as all that follows."""
-        return _stacked([view.projected.means2d.get() for view in self._views])
+        return _stacked([view.splats("means2d") for view in self._views])
 
     @cached_property
     def depths(self) -> Float32:
@@ -61,7 +61,7 @@ class Rasterization:
     @cached_property
     def conics(self) -> Float32:
         """(C, N, 3) float32: a, b, c of the inverse covariance on the image, per squared pixel."""
-        return _stacked([view.projected.conics.get() for view in self._views])
+        return _stacked([view.splats("conics") for view in self._views])
 
     @cached_property
     def opacities(self) -> Float32:
@@ -118,7 +118,7 @@ class Rasterization:
             "depths": (depths, (count, n)),
         }
         taken = {name: floats(name, array, shape) for name, (array, shape) in shapes.items() if array is not None}
-        gradients = given.gradients()
+        gradients = Gradients(given, self._device)
         for index, view in enumerate(self._views):
             view.add_gradients(gradients, {name: array[index] for name, array in taken.items()}, cameras=cameras)
         return gradients.by_name(cameras=cameras)
@@ -230,7 +230,7 @@ def rasterize(
         )
         for index, camera in enumerate(listed)
     ]
-    return Rasterization(views, given)
+    return Rasterization(views, given, session.device)
 
 
 def _stacked(arrays: list[NDArray[Any]]) -> NDArray[Any]:

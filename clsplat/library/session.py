@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from functools import cache
 from weakref import finalize
@@ -15,14 +16,8 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device, open_device
 from clsplat.rendering.build_flags import kernel_defines
 
-KEPT = frozenset(
-    (
-        *("splats", "tile_counts", "first_slots", "transmittance", "stops", "ranges"),
-        *("gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted"),
-        *("ewa_camera", "ewa_radii", "ewa_means2d", "ewa_depths", "ewa_conics", "ewa_compensations"),
-        *("harmonics_centre", "harmonics_colours"),
-    )
-)
+_PAIRS = ("ranges", "gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted")
+KEPT = frozenset(("splats", "tile_counts", "first_slots", "transmittance", "stops", *_PAIRS))
 """Arrays of a forward pass that its gradient reads: each pass has its own. All else is the session's."""
 MOST_IDLE = 4
 """Workspaces of passes that are gone, for those to come."""
@@ -81,7 +76,12 @@ def _session(device: Device) -> Session:
     return Session(device)
 
 
+@cache
+def _named(name: str | None, _chosen: str | None) -> Session:
+    return _session(open_device(name))
+
+
 def session_of(device: Device | str | None = None) -> Session:
-    """The session of an open device, or of the one that a text names (see `clsplat devices`); one for each device.
-    Raises DeviceError."""
-    return _session(device if isinstance(device, Device) else open_device(device))
+    """The session of an open device, or of the one that a text names (see `clsplat devices`); one for each device, and
+    one for each name, as looking for devices takes longer than a small image. Raises DeviceError."""
+    return _session(device) if isinstance(device, Device) else _named(device, os.environ.get("CLSPLAT_DEVICE"))

@@ -14,10 +14,11 @@ from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import DeviceArray, Hosted, from_host, hosted
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.inputs import floats
+from clsplat.library.checks import floats
 from clsplat.library.pixels import Pixels
+from clsplat.library.projection import ProjectedView, full_gradient, hosted_gradients
 from clsplat.library.session import Session
-from clsplat.stages.ewa import EwaCamera, EwaGradients, EwaInputs, camera_gradients, ewa, ewa_array, ewa_grad
+from clsplat.stages.ewa import EwaCamera, EwaInputs, camera_gradients
 from clsplat.stages.harmonics import HIGHEST, Harmonics, centre_array, harmonics, harmonics_grad
 
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
@@ -96,33 +97,19 @@ class Given:
         """(N, D), or (N, K, 3)."""
         return self.colors[camera] if self.by_camera else self.colors
 
-    def gradients(self) -> Gradients:
-        """Room for gradients by the arrays."""
-        return Gradients(self)
-
 
 class Gradients:
     """Gradients by the arrays of a call, added up view by view."""
 
-    def __init__(self, given: Given) -> None:
+    def __init__(self, given: Given, device: Device) -> None:
         self.given = given
-        self.by_device: dict[str, Hosted] = {}
+        self.views = 0
+        self.room = hosted_gradients(device, given.count, covariances=given.covars is not None)
         self.opacities = np.zeros(given.count, np.float32)
         self.colors = None if given.sh_degree is not None else np.zeros_like(given.colors)
         self.coefficients: list[Hosted] = []
         self.viewmats: list[Float64] = []
         self.intrinsics: list[Float64] = []
-
-    def ewa(self, device: Device) -> EwaGradients:
-        """Arrays of projection's gradient, to be added to."""
-        n, given = self.given.count, self.given
-        if not self.by_device:
-            shapes = {"means": (n, 3)}
-            shapes |= {"quaternions": (n, 4), "scales": (n, 3)} if given.covars is None else {"covariances": (n, 6)}
-            self.by_device = {name: hosted(device, shape) for name, shape in shapes.items()}
-            for one in self.by_device.values():
-                one.array.fill(0.0)
-        return EwaGradients(**{name: one.array for name, one in self.by_device.items()})
 
     def sh(self, device: Device) -> tuple[DeviceArray, bool]:
         """The array of the gradient by a view's coefficients, and whether earlier views' are in it."""
@@ -134,13 +121,9 @@ class Gradients:
 
     def by_name(self, *, cameras: bool) -> dict[str, Any]:
         """By the names of `rasterize`, on the host."""
-        found: dict[str, Any] = {name: one.get() for name, one in self.by_device.items()}
-        if "covariances" in found:
-            # a number of the upper triangle stands for both its places
-            halves = found.pop("covariances") * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
-            whole = np.empty((self.given.count, 3, 3), np.float32)
-            whole[:, UPPER[0], UPPER[1]] = whole[:, UPPER[1], UPPER[0]] = halves
-            found["covars"] = whole
+        found: dict[str, Any] = {name: one.get() for name, one in self.room.hosted.items()}
+        if "covars" in found:
+            found["covars"] = full_gradient(found["covars"])
         found["opacities"] = self.opacities
         if self.colors is not None:
             found["colors"] = self.colors
@@ -177,29 +160,27 @@ class View:
         self.with_depth, self.with_colours = mode.endswith("D"), mode.startswith("RGB")
         device = session.device
         with session.lock:
-            work = self._work = session.workspace(self)
-            placed = {
-                name: None if array is None else from_host(device, array)
-                for name, array in (
-                    ("means", given.means),
-                    ("quaternions", given.quaternions),
-                    ("scales", given.scales),
-                )
-            }
-            covars = None if given.covars is None else from_host(device, given.covars)
-            covers = from_host(device, given.opacities)
-            self._inputs = EwaInputs(**placed, covariances=covars, opacities=covers)  # type: ignore[arg-type]
-            self._camera_array = ewa_array(work, camera)
-            self.projected = ewa(device, work, self._inputs, camera, self._camera_array, compensated=compensated)
-            self._colours, self._harmonics = self._coloured(work)
+            means, covers = from_host(device, given.means), from_host(device, given.opacities)
+            shapes = (given.quaternions, given.scales, given.covars)
+            inputs = EwaInputs(means, *(None if one is None else from_host(device, one) for one in shapes), covers)
+            self.projected = ProjectedView(session, inputs, camera, compensated=compensated)
+            self._colours: Float32 | Hosted = given.colors_of(index)
+            self._harmonics = None
+            if given.sh_degree is not None:
+                centre = centre_array(device, camera.position)
+                arrays = (means, from_host(device, self._colours))
+                self._harmonics = Harmonics(*arrays, given.sh_degree, self.projected.arrays.radii, centre)
+                self._colours = hosted(device, (given.count, 3))
+                harmonics(device, self._harmonics, self._colours.array)
+            splats = self.projected.arrays
             self.pixels = Pixels(
                 session,
-                self.projected.means2d,
-                self.projected.conics,
-                covers if not compensated else self.opacities,
+                splats.means2d,
+                splats.conics,
+                self.opacities if compensated else covers,
                 self._values(),
-                self.projected.depths,
-                self.projected.radii,
+                splats.depths,
+                splats.radii,
                 camera.width,
                 camera.height,
                 self._behind(background),
@@ -207,21 +188,10 @@ class View:
             )
         self._has_background = background is not None
 
-    def _coloured(self, work: Any) -> tuple[Float32 | DeviceArray, Harmonics | None]:
-        """The colours (N, D), and the harmonics that they come from."""
-        given, device = self._given, self._session.device
-        colors = given.colors_of(self._index)
-        if given.sh_degree is None:
-            return colors, None
-        centre = centre_array(work, self._camera.position)
-        arrays = (self._inputs.means, from_host(device, colors))
-        by = Harmonics(*arrays, given.sh_degree, self.projected.radii, centre)
-        return harmonics(device, work, by), by
-
     def _values(self) -> Float32 | DeviceArray:
         """(N, X): blended values, the depth last."""
         if not self.with_depth:
-            return self._colours
+            return self._colours.array if isinstance(self._colours, Hosted) else self._colours
         depths = self.depths[:, None]
         return np.concatenate([self.colors, depths], axis=1) if self.with_colours else depths
 
@@ -231,20 +201,20 @@ class View:
             return None
         return np.append(background, np.float32(0)) if self.with_depth else np.ascontiguousarray(background)
 
-    @cached_property
-    def radii(self) -> NDArray[np.int32]:
-        """(N, 2) int32."""
-        return self._read(self.projected.radii)
+    def splats(self, name: str) -> NDArray[Any]:
+        """An array of the projection, by its name in `Ewa`."""
+        with self._session.lock:
+            return self.projected.get(name)
 
-    @cached_property
+    @property
     def depths(self) -> Float32:
         """(N,)."""
-        return self._read(self.projected.depths)
+        return self.splats("depths")
 
-    @cached_property
+    @property
     def compensations(self) -> Float32 | None:
         """(N,), or None."""
-        return None if self.projected.compensations is None else self._read(self.projected.compensations)
+        return None if self.projected.arrays.compensations is None else self.splats("compensations")
 
     @cached_property
     def opacities(self) -> Float32:
@@ -252,15 +222,13 @@ class View:
         given = self._given.opacities
         return given if self.compensations is None else given * self.compensations
 
-    @cached_property
+    @property
     def colors(self) -> Float32:
         """(N, D): blended but for the depth."""
-        colours = self._colours
-        return self._read(colours) if isinstance(colours, DeviceArray) else colours
-
-    def _read(self, array: DeviceArray) -> NDArray[Any]:
+        if not isinstance(self._colours, Hosted):
+            return self._colours
         with self._session.lock:
-            return array.get()
+            return self._colours.get()
 
     @cached_property
     def alpha(self) -> Float32:
@@ -308,37 +276,22 @@ class View:
     def add_gradients(self, gradients: Gradients, by: dict[str, Float32], *, cameras: bool) -> None:
         """Add this view's part to the gradients, from those by what is blended."""
         session, given, device = self._session, self._given, self._session.device
-        by_opacity, by_compensation = by.get("opacities"), None
+        by = dict(by)
+        by_opacity, by_colour, compensations = by.pop("opacities", None), by.pop("colors2d", None), self.compensations
         if by_opacity is not None:
-            gradients.opacities += by_opacity if self.compensations is None else by_opacity * self.compensations
-            if self.compensations is not None:
-                by_compensation = by_opacity * given.opacities
-        if gradients.colors is not None and "colors2d" in by:
+            gradients.opacities += by_opacity if compensations is None else by_opacity * compensations
+            if compensations is not None:
+                by["compensations"] = by_opacity * given.opacities
+        if gradients.colors is not None and by_colour is not None:
             at = gradients.colors[self._index] if given.by_camera else gradients.colors
-            at += by["colors2d"]
+            at += by_colour
         with session.lock:
-            arrays = gradients.ewa(device)
-            by_centre = self._colours_back(gradients, arrays.means, by.get("colors2d"), cameras=cameras)
-            names = ("means2d", "depths", "conics")
-            placed = [from_host(device, by[name]) if name in by else None for name in names]
-            placed.append(None if by_compensation is None else from_host(device, by_compensation))
+            placed = {name: from_host(device, array) for name, array in by.items()}
             device.under_way.append(placed)  # memory of the host, until the device has read it
-            means2d, depths, conics, compensations = placed
-            by_camera = ewa_grad(
-                device,
-                self._work,
-                self._inputs,
-                self._camera,
-                self._camera_array,
-                self.projected,
-                arrays,
-                means2d=means2d,
-                depths=depths,
-                conics=conics,
-                compensations=compensations,
-                add=True,
-                by_camera=cameras,
-            )
+            room, add = gradients.room.arrays, gradients.views > 0
+            by_camera = self.projected.gradient(room, add=add, by_camera=cameras, **placed)
+            by_centre = self._colours_back(gradients, room.means, by_colour, cameras=cameras)
+            gradients.views += 1
             if by_camera is None:
                 return
             viewmat, intrinsics = camera_gradients(by_camera.get())
@@ -351,12 +304,13 @@ class View:
         self, gradients: Gradients, d_means: DeviceArray, by_colour: Float32 | None, *, cameras: bool
     ) -> DeviceArray | None:
         """Add the gradient by spherical harmonics, of the means too; returns that by the camera's centre, if asked."""
-        device, count = self._session.device, self._given.count
+        session, count = self._session, self._given.count
         if self._harmonics is None:
             return None
-        placed = from_host(device, np.zeros((count, 3), np.float32) if by_colour is None else by_colour)
-        device.under_way.append(placed)
-        d_sh, add = gradients.sh(device)
-        assert isinstance(self._colours, DeviceArray), "harmonics are made on the device"
+        assert isinstance(self._colours, Hosted), "harmonics are made on the device"
+        placed = from_host(session.device, np.zeros((count, 3), np.float32) if by_colour is None else by_colour)
+        session.device.under_way.append(placed)
+        d_sh, add = gradients.sh(session.device)
+        arrays = (self._harmonics, self._colours.array, placed, d_sh, d_means)
         how = {"add": add, "add_directions": True, "by_centre": cameras}
-        return harmonics_grad(device, self._work, self._harmonics, self._colours, placed, d_sh, d_means, **how)
+        return harmonics_grad(session.device, session.scratch, *arrays, **how)

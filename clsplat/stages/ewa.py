@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.layout import EWA_CAMERA, EWA_GRADIENT
@@ -154,37 +154,20 @@ class EwaGradients:
         return tuple(array for array in every if array is not None)
 
 
-def ewa_array(work: Workspace, camera: EwaCamera) -> DeviceArray:
-    """The camera in the workspace."""
-    array = work.array("ewa_camera", (len(EWA_CAMERA),))
-    array.set(camera.packed())
-    return array
+def ewa_array(device: Device, camera: EwaCamera) -> DeviceArray:
+    """The camera on the device."""
+    return upload(device, camera.packed())
 
 
 @stage("ewa")
-def ewa(
-    device: Device,
-    work: Workspace,
-    gaussians: EwaInputs,
-    camera: EwaCamera,
-    camera_array: DeviceArray,
-    *,
-    compensated: bool = False,
-) -> Ewa:
-    """Project all Gaussians to a camera's image, in arrays of the workspace.
+def ewa(device: Device, gaussians: EwaInputs, camera: EwaCamera, camera_array: DeviceArray, projected: Ewa) -> None:
+    """Project all Gaussians to a camera's image: fill `projected`.
 
-    camera_array: `ewa_array` of the camera; compensated: compensations too, which then count in the boxes of what has
+    camera_array: `ewa_array` of the camera. Where compensations are asked for they count in the boxes of what has
     opacities. Equations (150) to (158) of docs/gradients.md.
     """
     n = gaussians.count
-    projected = Ewa(
-        work.array("ewa_radii", (n, 2), np.int32),
-        work.array("ewa_means2d", (n, 2)),
-        work.array("ewa_depths", (n,)),
-        work.array("ewa_conics", (n, 3)),
-        work.array("ewa_compensations", (n,)) if compensated else None,
-    )
-    defines = _defines(gaussians, camera, compensated=compensated)
+    defines = _defines(gaussians, camera, compensated=projected.compensations is not None)
     defines |= {} if gaussians.opacities is None else {"OPACITIES": True}
     launch_items(
         device,
@@ -198,7 +181,6 @@ def ewa(
         *(projected.radii, projected.means2d, projected.depths, projected.conics),
         *([] if projected.compensations is None else [projected.compensations]),
     )
-    return projected
 
 
 @stage("ewa_grad")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
@@ -61,21 +61,18 @@ class Harmonics:
         return (self.sh.shape[1], self.used, *centre, self.directions, self.sh, *mask)
 
 
-def centre_array(work: Workspace, position: Float64) -> DeviceArray:
-    """A camera's centre (3,) in the world, in the workspace, in two floats."""
-    array, high = work.array("harmonics_centre", (6,)), np.asarray(position, np.float32)
-    array.set(np.concatenate([high, (np.asarray(position, np.float64) - high).astype(np.float32)]))
-    return array
+def centre_array(device: Device, position: Float64) -> DeviceArray:
+    """A camera's centre (3,) in the world, on the device in two floats."""
+    high = np.asarray(position, np.float32)
+    return upload(device, np.concatenate([high, (np.asarray(position, np.float64) - high).astype(np.float32)]))
 
 
 @stage("harmonics")
-def harmonics(device: Device, work: Workspace, given: Harmonics) -> DeviceArray:
-    """Colours (n, 3), in an array of the workspace; 0 where the mask is. Equation (167) of docs/gradients.md."""
+def harmonics(device: Device, given: Harmonics, colours: DeviceArray) -> None:
+    """Fill colours (n, 3), with 0 where the mask is. Equation (167) of docs/gradients.md."""
     n = given.count
-    colours = work.array("harmonics_colours", (n, 3))
     kernel = device.kernels("harmonics", **given.defines).harmonics
     launch_items(device, kernel, -(-n // device.shape.lanes), n, *given.arguments, colours)
-    return colours
 
 
 @stage("harmonics_grad")
@@ -92,10 +89,10 @@ def harmonics_grad(
     add_directions: bool = False,
     by_centre: bool = False,
 ) -> DeviceArray | None:
-    """Fill d_sh (n, K, 3), and where asked for d_directions (n, 3), from d_colours (n, 3) and what `harmonics` returned.
+    """Fill d_sh (n, K, 3), and where asked for d_directions (n, 3), from d_colours (n, 3) and what `harmonics` wrote.
 
-    add, add_directions: to what is there, as of the cameras before this, or of the means' other gradient; by_centre: the
-    result is the gradient (3,) by the camera's centre. Equations (38) to (40) and (168).
+    add, add_directions: to what is there, as of the cameras before this, or of the means' other gradient; by_centre:
+    the result is the gradient (3,) by the camera's centre. Equations (38) to (40) and (168).
     """
     n = given.count
     parts = work.array("harmonics_by_centre", (3, padded(n))) if by_centre else None

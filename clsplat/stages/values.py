@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
@@ -40,68 +41,77 @@ def most_gradients(device: Device) -> int:
     return MOST if items == 1 else min(_LOCAL // items, 16)
 
 
+@dataclass(frozen=True, eq=False)
+class ValuePass:
+    """Values (n, depth) of Gaussians in an image: its lists, splats and blending, of all Gaussians; and what is behind,
+    background (depth,)."""
+
+    lists: TileLists
+    projected: Projected
+    values: DeviceArray
+    background: DeviceArray
+    blended: Blended
+
+
 @stage("values")
-def values(
-    device: Device,
-    lists: TileLists,
-    splats: DeviceArray,
-    value_rows: DeviceArray,
-    background: DeviceArray,
-    blended: Blended,
-    pixels: DeviceArray,
-    *,
-    first: int = COLOURS,
-) -> None:
-    """Blend the values from `first` on of value_rows (n, depth) over the background (depth,), with the weights of
-    `blended`, which is of the same lists, into pixels (height, width, depth)."""
+def values(device: Device, of: ValuePass, pixels: DeviceArray, *, first: int = COLOURS) -> None:
+    """Blend the values from `first` on over the background, with the weights of the image, into pixels (height, width,
+    depth)."""
     height, width, depth = pixels.shape
-    cells = blended.cells_from_sorted
-    arrays = (lists.ranges, lists.gaussian_from_sorted, splats, value_rows, background, blended.stops, pixels)
+    lists, cells = of.lists, of.blended.cells_from_sorted
+    rows = (of.projected.splats, of.values, of.background, of.blended.stops, pixels)
+    arrays = (lists.ranges, lists.gaussian_from_sorted, *rows, *([cells] if cells else []))
     for begin, count in passes(first, depth, most_values(device)):
         defines = {"VALUES": count, **({"RECORD_CELLS": True} if cells else {})}
-        of_pass = (width, height, depth, begin, *arrays, *([cells] if cells else []))
-        launch_tiles(device, "values", defines, lists, -(-width // TILE), *of_pass)
+        launch_tiles(device, "values", defines, lists, -(-width // TILE), width, height, depth, begin, *arrays)
 
 
 @stage("values_grad")
 def values_grad(
     device: Device,
     work: Workspace,
-    lists: TileLists,
+    of: ValuePass,
     first_slots: DeviceArray,
-    projected: Projected,
-    value_rows: DeviceArray,
-    background: DeviceArray,
-    blended: Blended,
     d_pixels: DeviceArray,
     d_alpha: DeviceArray | None,
     gradients: ScreenGradients,
     *,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> None:
-    """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width); fields: with
-    absolute gradients, if the gradients have room for them. background (depth,)."""
+    """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width).
+
+    first_slots (n,): where each Gaussian's pairs begin; fields: with absolute gradients, if `gradients` has room for
+    them.
+    """
     height, width, depth = d_pixels.shape
+    lists, cells, most = of.lists, of.blended.cells_from_sorted, most_gradients(device)
     tiles_x, pairs = -(-width // TILE), lists.gaussian_from_sorted.shape[0]
-    by_cell = work.array("gradient_by_cell", (lists.band.tiles, depth + 1, TILE * TILE))
-    most, cells = most_gradients(device), blended.cells_from_sorted
-    given = [] if d_alpha is None else [d_alpha]
-    recorded: dict[str, object] = {"RECORD_CELLS": True} if cells else {}
-    defines: dict[str, object] = {"VALUES": min(most, depth), **({"ALPHA_GRADIENT": True} if given else {})}
-    of_tiles = (lists, tiles_x, width, height, depth, d_pixels, background, *given, by_cell)
-    launch_tiles(device, "values_grad", defines, *of_tiles, kernel="gradient_by_cell")
+    by_cell = _gradient_by_cell(device, work, of, d_pixels, d_alpha)
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
-    planes = (projected.splats, value_rows, by_cell, blended.transmittance, blended.stops)
+    planes = (of.projected.splats, of.values, by_cell, of.blended.transmittance, of.blended.stops)
     for first, count in passes(0, depth, most):
         geometry = first == 0
         own = {"GEOMETRY": True, **fields.defines} if geometry else {}
-        floats = count + (MOMENTS + 2 * fields.absolute if geometry else 0)
-        slots = work.array("slots", (pairs, floats))
-        defines = {"VALUES": count, **recorded, **own}
+        slots = work.array("slots", (pairs, count + (MOMENTS + 2 * fields.absolute if geometry else 0)))
+        defines = {"VALUES": count, **({"RECORD_CELLS": True} if cells else {}), **own}
         arrays = (*listed, *planes, slots, *([cells] if cells else []))
         if pairs:
             launch_tiles(device, "values_grad", defines, lists, tiles_x, height, depth, first, *arrays)
         if geometry:
-            splats_grad(device, projected, Slots(slots, first_slots), gradients, kept=count, fields=fields)
+            splats_grad(device, of.projected, Slots(slots, first_slots), gradients, kept=count, fields=fields)
         else:
-            add_values(device, projected, Slots(slots, first_slots), gradients.values, first, count)
+            add_values(device, of.projected, Slots(slots, first_slots), gradients.values, first, count)
+
+
+def _gradient_by_cell(
+    device: Device, work: Workspace, of: ValuePass, d_pixels: DeviceArray, d_alpha: DeviceArray | None
+) -> DeviceArray:
+    """The image's gradient (tiles, depth + 1, pixels of a tile) in the order in which `values_grad` reads it."""
+    height, width, depth = d_pixels.shape
+    by_cell = work.array("gradient_by_cell", (of.lists.band.tiles, depth + 1, TILE * TILE))
+    given = [] if d_alpha is None else [d_alpha]
+    defines = {"VALUES": min(most_gradients(device), depth), **({"ALPHA_GRADIENT": True} if given else {})}
+    arguments = (width, height, depth, d_pixels, of.background, *given, by_cell)
+    tiles_x = -(-width // TILE)
+    launch_tiles(device, "values_grad", defines, of.lists, tiles_x, *arguments, kernel="gradient_by_cell")
+    return by_cell

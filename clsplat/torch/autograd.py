@@ -17,7 +17,6 @@ from clsplat.arrays import Int64
 from clsplat.torch.arguments import as_array, as_tensor
 from clsplat.torch.covariances import UPPER
 
-
 SPARSE = ("means", "quaternions", "scales", "covars")
 """Arguments whose gradients may be sparse."""
 

@@ -22,8 +22,8 @@ def quat_scale_to_covar_preci(
     """Covariance R S S^T R^T and precision R S^-1 S^-T R^T of each Gaussian, as gsplat 1.5.3's function of this name.
 
     quats: (..., 4), w x y z, of any length over 0. scales: (..., 3), standard deviations along the axes, in units of
-    the scene; over 0 where a precision is wanted. Returns both as (..., 3, 3), or as (..., 6), the upper triangle row by
-    row, with `triu`; None for one that is not asked for. Both can be differentiated as often as one likes.
+    the scene; over 0 where a precision is wanted. Returns both as (..., 3, 3), or as (..., 6), the upper triangle row
+    by row, with `triu`; None for one that is not asked for. Both can be differentiated as often as one likes.
 
     Raises InputError, which names the argument, for other shapes and for NaN.
     """

@@ -20,7 +20,6 @@ def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
     `torch.compiler.disable` imports the compiler, which takes seconds; here it is called at the first call after
     something else has imported it.
     """
-
     disabled: list[Callable[_P, _R]] = []
 
     @functools.wraps(function)
@@ -31,5 +30,6 @@ def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:
             disabled.append(torch.compiler.disable(function))
         return disabled[0](*args, **kwargs)
 
-    call._torchdynamo_disable = True  # type: ignore[attr-defined]  # where a compiled function calls it
+    # the mark that the compiler looks for where a compiled function calls this one
+    call._torchdynamo_disable = True  # type: ignore[attr-defined]  # noqa: SLF001
     return call

@@ -39,7 +39,7 @@ class Meta(dict[str, Any]):
 
     def get(self, name: str, default: Any = None) -> Any:
         """The entry, or `default` where there is none."""
-        return self[name] if name in self else default
+        return self[name] if name in self else default  # noqa: SIM401  # what it would be replaced with
 
     def __setitem__(self, name: str, value: Any) -> None:
         self._makers.pop(name, None)

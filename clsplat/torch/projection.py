@@ -45,17 +45,17 @@ def fully_fused_projection(
 ) -> tuple[Tensor | None, ...]:
     """N Gaussians on the images of C cameras, as gsplat 1.5.3's function of this name; `...` are batches.
 
-    means: (..., N, 3). Either covars: (..., N, 6), upper triangles xx, xy, xz, yy, yz, zz; or quats: (..., N, 4), w x y z,
-    of any length, and scales: (..., N, 3), over 0. viewmats: (..., C, 4, 4), camera from world. Ks: (..., C, 3, 3), in
-    pixels. width, height: pixels. eps2d: pixels^2, added to each variance. near_plane, far_plane: depths between which a
-    Gaussian is in view. radius_clip: pixels; a splat of no larger radius is not. calc_compensations: the square root of
-    the covariance's determinant without eps2d over that with it. opacities: (..., N), in [0, 1]; with them radii end
-    where alpha is 1/255. device: an OpenCL device as `clsplat devices` lists it.
+    means: (..., N, 3). Either covars: (..., N, 6), upper triangles xx, xy, xz, yy, yz, zz; or quats: (..., N, 4), w x y
+    z, of any length, and scales: (..., N, 3), over 0. viewmats: (..., C, 4, 4), camera from world. Ks: (..., C, 3, 3),
+    in pixels. width, height: pixels. eps2d: pixels^2, added to each variance. near_plane, far_plane: depths between
+    which a Gaussian is in view. radius_clip: pixels; a splat of no larger radius is not. calc_compensations: the square
+    root of the covariance's determinant without eps2d over that with it. opacities: (..., N), in [0, 1]; with them
+    radii end where alpha is 1/255. device: an OpenCL device as `clsplat devices` lists it.
 
     Returns radii (..., C, N, 2) int32, pixels, 0 where not in view; means2d (..., C, N, 2), pixels, the first pixel's
-    centre at 0.5; depths (..., C, N); conics (..., C, N, 3), the inverse covariance's xx, xy, yy; compensations
-    (..., C, N), or None. With `packed` batch_ids, camera_ids and gaussian_ids (nnz,) int64 come first, and the others
-    are (nnz, ...), of the splats in view. With sparse_grad too, without batches, the gradients by means, covars, quats and
+    centre at 0.5; depths (..., C, N); conics (..., C, N, 3), the inverse covariance's xx, xy, yy; compensations (...,
+    C, N), or None. With `packed` batch_ids, camera_ids and gaussian_ids (nnz,) int64 come first, and the others are
+    (nnz, ...), of the splats in view. With sparse_grad too, without batches, the gradients by means, covars, quats and
     scales are COO tensors of the rows in view.
 
     Raises InputError, which names the argument, for other shapes, numbers that are not finite, and the model ftheta.
@@ -88,9 +88,7 @@ def fully_fused_projection(
         "camera_model": camera_model,
         "device": device,
     }
-    *arrays, covers = (
-        Batches(each, leading) for each in (means, covars, quats, scales, viewmats, Ks, opacities)
-    )
+    *arrays, covers = (Batches(each, leading) for each in (means, covars, quats, scales, viewmats, Ks, opacities))
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
             library_projection(*(each[index] for each in arrays), width, height, opacities=covers[index], **settings)

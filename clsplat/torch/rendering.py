@@ -57,10 +57,10 @@ def rasterization(
     sparse_grad: bool = False,
     absgrad: bool = False,
     rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    channel_chunk: int = 32,
+    channel_chunk: int = 32,  # noqa: ARG001
     distributed: bool = False,
     camera_model: Literal["pinhole", "ortho", "fisheye", "ftheta"] = "pinhole",
-    segmented: bool = False,
+    segmented: bool = False,  # noqa: ARG001
     covars: Tensor | None = None,
     with_ut: bool = False,
     with_eval3d: bool = False,
@@ -77,33 +77,35 @@ def rasterization(
     """Images, alphas and `meta` of N Gaussians in C cameras: gsplat 1.5.3's function, argument by argument.
 
     Leading sizes `...` are those of batches, and may be none. Tensors of float32 on the CPU share their memory with a
-    CPU's OpenCL device; others are copied there and back, which a warning says once. Everything has a gradient, `Ks` too.
+    CPU's OpenCL device; others are copied there and back, which a warning says once. Everything has a gradient, `Ks`
+    too.
 
     means: (..., N, 3), in units of the scene. quats: (..., N, 4), w x y z, of any length. scales: (..., N, 3), standard
     deviations, over 0. opacities: (..., N), in [0, 1]. colors: (..., N, D) or (..., C, N, D) with D from 1 to 512; with
-    `sh_degree` coefficients (..., N, K, 3) or (..., C, N, K, 3), K >= (sh_degree + 1)^2, in the order and with the signs of
-    3DGS files. viewmats: (..., C, 4, 4), camera from world, x right, y down, z forward. Ks: (..., C, 3, 3), in pixels, the
-    centre of the first pixel at 0.5; skew is ignored. width, height: pixels. near_plane, far_plane: depths between which
-    a Gaussian is drawn. radius_clip: pixels; a splat of no larger radius is not drawn. eps2d: pixels^2, added to the
-    variance of each splat. sh_degree: the degree to use, 0 to 3; None for colours. packed: `meta` has the splats in view
-    alone. tile_size: pixels, of the tile lists in `meta` alone. backgrounds: (..., C, D). render_mode: colour, depth along
-    z (D), expected depth (ED), or colour and depth, in the last channel. sparse_grad: with `packed`, without batches: the
-    gradients of means, quats and scales (or covars) are COO tensors of the rows in view. absgrad: after the backward pass
-    `meta["means2d"].absgrad` has sums over pixels of absolute gradients. rasterize_mode: "antialiased" scales opacities by
-    what eps2d added (Mip-Splatting). camera_model: pinhole, ortho or fisheye (equidistant). covars: (..., N, 3, 3) in the
-    place of quats and scales, which may be None. alpha_max: the largest alpha, under 1; gsplat's 0.999, where `clsplat
-    train` and `render` have 0.99. device: an OpenCL device as `clsplat devices` lists it; None for the first.
-    channel_chunk and segmented change no result, and are ignored.
+    `sh_degree` coefficients (..., N, K, 3) or (..., C, N, K, 3), K >= (sh_degree + 1)^2, in the order and with the
+    signs of 3DGS files. viewmats: (..., C, 4, 4), camera from world, x right, y down, z forward. Ks: (..., C, 3, 3), in
+    pixels, the centre of the first pixel at 0.5; skew is ignored. width, height: pixels. near_plane, far_plane: depths
+    between which a Gaussian is drawn. radius_clip: pixels; a splat of no larger radius is not drawn. eps2d: pixels^2,
+    added to the variance of each splat. sh_degree: the degree to use, 0 to 3; None for colours. packed: `meta` has the
+    splats in view alone. tile_size: pixels, of the tile lists in `meta` alone. backgrounds: (..., C, D). render_mode:
+    colour, depth along z (D), expected depth (ED), or colour and depth, in the last channel. sparse_grad: with
+    `packed`, without batches: the gradients of means, quats and scales (or covars) are COO tensors of the rows in view.
+    absgrad: after the backward pass `meta["means2d"].absgrad` has sums over pixels of absolute gradients.
+    rasterize_mode: "antialiased" scales opacities by what eps2d added (Mip-Splatting). camera_model: pinhole, ortho or
+    fisheye (equidistant). covars: (..., N, 3, 3) in the place of quats and scales, which may be None. alpha_max: the
+    largest alpha, under 1; gsplat's 0.999, where `clsplat train` and `render` have 0.99. device: an OpenCL device as
+    `clsplat devices` lists it; None for the first. channel_chunk and segmented change no result, and are ignored.
 
-    Returns images (..., C, height, width, X), X = D, 1 or D + 1 by the mode, alphas (..., C, height, width, 1), and meta,
-    a dictionary with gsplat's names: batch_ids, camera_ids, gaussian_ids (nnz,) int64, None unless packed; radii
+    Returns images (..., C, height, width, X), X = D, 1 or D + 1 by the mode, alphas (..., C, height, width, 1), and
+    meta, a dictionary with gsplat's names: batch_ids, camera_ids, gaussian_ids (nnz,) int64, None unless packed; radii
     (..., C, N, 2) or (nnz, 2) int32, pixels, 0 where not in view; means2d (.., 2), pixels; depths; conics (.., 3), the
-    inverse covariance's xx, xy, yy, 1 / pixels^2; opacities, with the compensation; tiles_per_gauss, isect_ids, flatten_ids,
-    isect_offsets, made when they are first looked at; tile_width, tile_height, width, height, tile_size, n_batches,
-    n_cameras.
+    inverse covariance's xx, xy, yy, 1 / pixels^2; opacities, with the compensation; tiles_per_gauss, isect_ids,
+    flatten_ids, isect_offsets, made when they are first looked at; tile_width, tile_height, width, height, tile_size,
+    n_batches, n_cameras.
 
     Raises InputError, which names the argument: other shapes, NaN, numbers out of range; and `distributed`, `with_ut`,
-    `with_eval3d`, the model ftheta, coefficients of lenses, and shutters other than GLOBAL, which clsplat does not have.
+    `with_eval3d`, the model ftheta, coefficients of lenses, and shutters other than GLOBAL, which clsplat does not
+    have.
 
     Source: gsplat 1.5.3, https://docs.gsplat.studio; Kerbl et al. 2023.
     """
@@ -145,8 +147,7 @@ def rasterization(
     if covars is not None:
         quats = scales = None
     *arrays, behind, squares = (
-        Batches(each, batch)
-        for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
+        Batches(each, batch) for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
     )
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
@@ -175,7 +176,8 @@ def _refuse_missing(**given: Any) -> None:
     for name, value in given.items():
         if value is not None and value is not False:
             found = str(value) if isinstance(value, bool) else "given"
-            raise refuse(name, found, f"{isinstance(value, bool) and 'False' or 'None'}: clsplat.torch does not have it")
+            wanted = "False" if isinstance(value, bool) else "None"
+            raise refuse(name, found, f"{wanted}: clsplat.torch does not have it")
 
 
 def _check_tensors(
@@ -214,7 +216,11 @@ def _check_tensors(
             raise refuse("sh_degree", sh_degree, "0, 1, 2 or 3, or None for colours")
         check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
         if colors.shape[-2] < (sh_degree + 1) ** 2:
-            raise refuse("colors", f"of {colors.shape[-2]} coefficients", f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}")
+            raise refuse(
+                "colors",
+                f"of {colors.shape[-2]} coefficients",
+                f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}",
+            )
     if backgrounds is not None:
         check_shape("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
     return batch

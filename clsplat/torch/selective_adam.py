@@ -16,8 +16,8 @@ class SelectiveAdam(torch.optim.Adam):  # type: ignore[misc]  # torch has no typ
     """Adam without bias correction that leaves rows out of view as they are, their moments too; gsplat 1.5.3's class of
     this name (Mallick et al. 2024, "Taming 3DGS").
 
-    params: as for `torch.optim.Adam`, one tensor a group, with Gaussians along the first axis. eps: added to the root of
-    the second moment. betas: the decay of the first and second moment.
+    params: as for `torch.optim.Adam`, one tensor a group, with Gaussians along the first axis. eps: added to the root
+    of the second moment. betas: the decay of the first and second moment.
     """
 
     def __init__(self, params: Iterable[Any], eps: float, betas: tuple[float, float]) -> None:

@@ -20,8 +20,8 @@ from clsplat.torch.covariances import quat_scale_to_covar_preci
 from clsplat.torch.harmonics import spherical_harmonics
 from clsplat.torch.pixels import rasterize_to_pixels
 from clsplat.torch.projection import fully_fused_projection
-from clsplat.torch.rendering import RollingShutterType, rasterization
 from clsplat.torch.relocation import compute_relocation
+from clsplat.torch.rendering import RollingShutterType, rasterization
 from clsplat.torch.selective_adam import SelectiveAdam
 from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 
@@ -85,9 +85,13 @@ def strategy(name: str) -> Any:
     Raises ImportError where gsplat is not installed, ClsplatError where it is older than 1.5.
     """
     if not _has("gsplat") or not _has("gsplat.strategy"):
-        raise ImportError(f"{name} is gsplat's own class: pip install --no-deps gsplat=={VERSION}; it needs no CUDA here")
+        raise ImportError(
+            f"{name} is gsplat's own class: pip install --no-deps gsplat=={VERSION}; it needs no CUDA here"
+        )
     if (found := _version(import_module("gsplat"))) < ONE_RADIUS:
-        raise ClsplatError(f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()")
+        raise ClsplatError(
+            f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()"
+        )
     operations = import_module("gsplat.strategy.ops")
     for ours in (quat_scale_to_covar_preci, compute_relocation):
         setattr(operations, ours.__name__, ours)
@@ -95,7 +99,10 @@ def strategy(name: str) -> Any:
 
 
 def _has(module: str) -> bool:
-    return find_spec(module) is not None
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # of the package that it would be in
+        return False
 
 
 def _version(module: ModuleType) -> tuple[int, ...]:

@@ -20,21 +20,23 @@ def isect_tiles(
     tile_width: int,
     tile_height: int,
     sort: bool = True,
-    segmented: bool = False,
+    segmented: bool = False,  # noqa: ARG001
     packed: bool = False,
     n_images: int | None = None,
     image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of a tile and a splat whose box, its mean plus and minus the radii, overlaps it, as gsplat 1.5.3's function.
+    """Pairs of a tile and a splat whose box, its mean plus and minus the radii, overlaps it, as gsplat 1.5.3's
+    function.
 
-    means2d: (..., N, 2), pixels. radii: (..., N, 2), pixels; where one is 0 there is no pair. depths: (..., N). With `packed`
-    (nnz, 2), (nnz, 2), (nnz,), image_ids (nnz,) of integers below n_images, and gaussian_ids (nnz,), which change
-    nothing. tile_size: pixels. tile_width, tile_height: tiles across and down. sort: by id. segmented changes nothing.
+    means2d: (..., N, 2), pixels. radii: (..., N, 2), pixels; where one is 0 there is no pair. depths: (..., N). With
+    `packed` (nnz, 2), (nnz, 2), (nnz,), image_ids (nnz,) of integers below n_images, and gaussian_ids (nnz,), which
+    change nothing. tile_size: pixels. tile_width, tile_height: tiles across and down. sort: by id. segmented changes
+    nothing.
 
-    Returns tiles_per_gauss (..., N) or (nnz,) int32; isect_ids (n_isects,) int64, the image's number, the tile's, row by
-    row, and the depth's 32 bits, from the high bits down; flatten_ids (n_isects,) int32, the splat's number among those of
-    all images. None has a gradient. Raises InputError, which names the argument.
+    Returns tiles_per_gauss (..., N) or (nnz,) int32; isect_ids (n_isects,) int64, the image's number, the tile's, row
+    by row, and the depth's 32 bits, from the high bits down; flatten_ids (n_isects,) int32, the splat's number among
+    those of all images. None has a gradient. Raises InputError, which names the argument.
     """
     leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
     check_shape("means2d", means2d, (*leading, 2))
@@ -66,7 +68,7 @@ def isect_tiles(
 @outside_graphs
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
     """The places (n_images, tile_height, tile_width) int32 at which each tile's pairs begin in sorted `isect_ids`
-    (n_isects,) int64 of `isect_tiles`, as gsplat 1.5.3's function. Raises InputError for ids of other images or tiles."""
+    (n_isects,) int64 of `isect_tiles`, as gsplat 1.5.3's function. Raises InputError for other images or tiles."""
     if not isinstance(isect_ids, Tensor):
         raise refuse("isect_ids", f"a {type(isect_ids).__name__}", "a tensor (n_isects,) of int64")
     found = tiles.isect_offset_encode(isect_ids.cpu().numpy(), n_images, tile_width, tile_height)

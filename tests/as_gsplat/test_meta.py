@@ -80,7 +80,9 @@ def test_splats_take_losses(packed: bool) -> None:
     """Gradients of losses over entries of meta, and over images and entries together."""
     one = given()
     images, _, meta = rasterization(**one, packed=packed)
-    splats = meta["means2d"][..., 0].sum() + meta["depths"].square().sum() + meta["opacities"].sum() + meta["conics"].sum()
+    splats = (
+        meta["means2d"][..., 0].sum() + meta["depths"].square().sum() + meta["opacities"].sum() + meta["conics"].sum()
+    )
     shown = meta["radii"].prod(-1) > 0
     splats = sum(
         (meta[name][shown] * factor).sum()

@@ -94,7 +94,11 @@ def test_relocation_is_equation_9() -> None:
 
 def test_relocation_names_its_arguments() -> None:
     good: dict[str, Any] = {"opacities": torch.ones(2) / 2, "scales": torch.ones(2, 3), "ratios": torch.ones(2)}
-    for name, value in (("scales", torch.ones(2)), ("ratios", torch.ones(3)), ("opacities", torch.full((2,), math.nan))):
+    for name, value in (
+        ("scales", torch.ones(2)),
+        ("ratios", torch.ones(3)),
+        ("opacities", torch.full((2,), math.nan)),
+    ):
         with pytest.raises(InputError, match=name):
             compute_relocation(**{**good, name: value}, binoms=binomials(4))
     with pytest.raises(InputError, match="binoms"):
@@ -161,7 +165,7 @@ def test_harmonics_name_their_arguments() -> None:
     with pytest.raises(InputError, match=r"dirs is float32 \(5, 2\)"):
         spherical_harmonics(1, directions[:, :2], coefficients)
     coefficients[2, 1, 0] = math.nan
-    with pytest.raises(InputError, match="^coeffs"):
+    with pytest.raises(InputError, match=r"^coeffs: \[2, 1, 0\]"):
         spherical_harmonics(1, directions, coefficients)
 
 
@@ -192,7 +196,6 @@ def test_projection_is_gsplats(camera_model: Any, from_covariances: bool) -> Non
         exact[0], covars, exact[3], made["Ks"], *size, calc_compensations=True, camera_model=camera_model
     )
     given = [each.float().requires_grad_() for each in inputs]
-    rows, columns = torch.triu_indices(3, 3)
     upper = quat_scale_to_covar_preci(given[1], given[2], triu=True)[0] if from_covariances else None
     shape = (upper, None, None) if from_covariances else (None, given[1], given[2])
     found_radii, *found = fully_fused_projection(
@@ -262,7 +265,16 @@ def test_tiles_of_packed_splats() -> None:
     images, gaussians = seen.nonzero(as_tuple=True)
     _, ids, numbers = isect_tiles(means2d, radii, depths, 16, 4, 3)
     per_gauss, packed_ids, packed_numbers = isect_tiles(
-        means2d[seen], radii[seen], depths[seen], 16, 4, 3, packed=True, n_images=2, image_ids=images, gaussian_ids=gaussians
+        means2d[seen],
+        radii[seen],
+        depths[seen],
+        16,
+        4,
+        3,
+        packed=True,
+        n_images=2,
+        image_ids=images,
+        gaussian_ids=gaussians,
     )
     assert torch.equal(ids, packed_ids)
     assert torch.equal(numbers.long(), (images * 20 + gaussians)[packed_numbers.long()])
@@ -290,8 +302,8 @@ def test_pixels_of_lists_are_those_of_the_whole_call(width: int, packed: bool) -
     free, colors = splats_of(meta, width)
     backgrounds = torch.linspace(0, 1, 2 * width).reshape(2, width).requires_grad_()
     images, alphas = rasterize_to_pixels(
-        free["means2d"], free["conics"], colors, free["opacities"], *size, 16, meta["isect_offsets"], meta["flatten_ids"],
-        backgrounds, packed=packed, absgrad=True,
+        free["means2d"], free["conics"], colors, free["opacities"], *size, 16, meta["isect_offsets"],
+        meta["flatten_ids"], backgrounds, packed=packed, absgrad=True,
     )  # fmt: skip
     rows: Any = (meta["camera_ids"], meta["gaussian_ids"]) if packed else slice(None)
 
@@ -299,7 +311,10 @@ def test_pixels_of_lists_are_those_of_the_whole_call(width: int, packed: bool) -
         return torch.zeros(2, 40, *values.shape[1:]).double().index_put(rows, values.double()) if packed else values
 
     exact = {name: each.detach().double().requires_grad_() for name, each in free.items()}
-    exact_colors, exact_behind = colors.detach().double().requires_grad_(), backgrounds.detach().double().requires_grad_()
+    exact_colors, exact_behind = (
+        colors.detach().double().requires_grad_(),
+        backgrounds.detach().double().requires_grad_(),
+    )
     projected = dense.Projected(
         whole(exact["means2d"]), whole(exact["conics"]), whole(meta["depths"].detach()),
         torch.ones(2, 40).double(), whole(meta["radii"]),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat.torch.rasterization` against the dense float64 oracle of tests/support/dense.py: images, alphas, gradients."""
+"""`clsplat.torch.rasterization` against the dense float64 oracle of tests/support/dense.py: images and gradients."""
 
 from __future__ import annotations
 

@@ -34,13 +34,14 @@ def run(code: str, *paths: Path, without: str = "") -> str:
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
+@pytest.mark.slow  # as the next two: importing torch, each in a process of its own
 @pytest.mark.needs("gsplat")
 def test_a_program_that_has_imported_gsplat_already() -> None:
     out = run(
@@ -68,17 +69,11 @@ print(tuple(images.shape), tuple(meta["radii"].shape))
     assert out == "(1, 16, 16, 3) (1, 2)\n"
 
 
+@pytest.mark.slow
 def test_a_program_where_there_is_no_gsplat() -> None:
     out = run(
         """
-import importlib.util
 import clsplat.torch
-def no_gsplat(name, *rest): return None if name.startswith("gsplat") and name not in sys.modules else find(name, *rest)
-import sys
-find = importlib.util.find_spec
-import clsplat.torch.stand_in
-clsplat.torch.stand_in.find_spec = no_gsplat
-sys.path_hooks.insert(0, None) if False else None
 clsplat.torch.install_as_gsplat()
 import gsplat
 from gsplat import rasterization, RollingShutterType
@@ -91,11 +86,19 @@ try:
     import gsplat.strategy
 except ModuleNotFoundError as error:
     print(error)
+try:
+    clsplat.torch.MCMCStrategy
+except ImportError as error:
+    print(error)
 assert clsplat.torch.install_as_gsplat() == []
 print(gsplat.__version__, tuple(render(rasterization)[0].shape))
-"""
+""",
+        without="gsplat",
     )
-    assert out == "No module named 'gsplat.strategy'\n1.5.3 (1, 16, 16, 3)\n"
+    first, second, last = out.splitlines()
+    assert first == "No module named 'gsplat.strategy'"
+    assert "pip install --no-deps gsplat" in second
+    assert last == "1.5.3 (1, 16, 16, 3)"
 
 
 OLD = {
@@ -107,6 +110,7 @@ OLD = {
 }
 
 
+@pytest.mark.slow
 def test_a_gsplat_that_has_one_radius_a_splat(tmp_path: Path) -> None:
     """The layout of 1.4: `radii` (C, N), or (nnz,); functions whose results have changed since stay its own."""
     for name, text in OLD.items():
@@ -136,14 +140,12 @@ except Exception as error:
 
 
 def test_without_torch_the_error_says_what_to_install() -> None:
-    out = run("", without="") or "ok"
     done = subprocess.run(
         [sys.executable, "-c", "import sys; sys.modules['torch'] = None; import clsplat.torch"],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
-    assert out == "ok"
     assert 'ImportError: clsplat.torch needs PyTorch: pip install "clsplat[torch]"' in done.stderr

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's own density control over `clsplat.torch.rasterization`: both strategies change a small model as they should."""
+"""gsplat's own density control over `clsplat.torch.rasterization`: both strategies change a small model."""
 
 from __future__ import annotations
 
@@ -78,7 +78,12 @@ def run(strategy: Any, packed: bool, steps: int, **extra: Any) -> tuple[list[int
 @pytest.mark.parametrize("packed", [False, True])
 def test_the_default_strategy_clones_splits_and_prunes(packed: bool, absgrad: bool) -> None:
     strategy = DefaultStrategy(
-        refine_start_iter=5, refine_every=5, reset_every=15, grow_grad2d=1e-4, absgrad=absgrad, refine_scale2d_stop_iter=20
+        refine_start_iter=5,
+        refine_every=5,
+        reset_every=15,
+        grow_grad2d=1e-4,
+        absgrad=absgrad,
+        refine_scale2d_stop_iter=20,
     )
     counts, losses = run(strategy, packed, 24)
     assert len(set(counts)) > 2

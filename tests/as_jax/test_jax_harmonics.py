@@ -39,7 +39,7 @@ def test_colours_and_gradients_are_those_of_numpy(masks: Any) -> None:
 
 
 def test_shapes_are_refused_by_name() -> None:
-    with pytest.raises(InputError, match=r"coefficients has shape \(2, 4, 9, 3\), expected \(2, 5, K, 3\)"):
+    with pytest.raises(InputError, match=r"coefficients: got shape \(2, 4, 9, 3\), expected \(2, 5, K, 3\)"):
         clsplat.jax.spherical_harmonics(2, DIRECTIONS, COEFFICIENTS[:, :4])
-    with pytest.raises(InputError, match=r"masks has shape \(5,\), expected \(2, 5\)"):
+    with pytest.raises(InputError, match=r"masks: got shape \(5,\), expected \(2, 5\)"):
         clsplat.jax.spherical_harmonics(2, DIRECTIONS, COEFFICIENTS, MASKS[0])

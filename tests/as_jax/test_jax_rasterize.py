@@ -205,11 +205,11 @@ def test_counts(default_device: Device, count: int) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("means", np.zeros((65, 2)), r"means has shape \(65, 2\), expected \(N, 3\)"),
-        ("quaternions", np.zeros((65, 3)), r"quaternions has shape \(65, 3\), expected \(65, 4\)"),
-        ("colors", np.zeros(65), r"colors has shape \(65,\), expected \(65, D\) or \(2, 65, D\)"),
-        ("viewmats", np.eye(4), r"viewmats has shape \(4, 4\), expected \(C, 4, 4\)"),
-        ("backgrounds", np.zeros(3), r"backgrounds has shape \(3,\), expected \(2, 3\)"),
+        ("means", np.zeros((65, 2)), r"means: got shape \(65, 2\), expected \(N, 3\)"),
+        ("quaternions", np.zeros((65, 3)), r"quaternions: got shape \(65, 3\), expected \(65, 4\)"),
+        ("colors", np.zeros(65), r"colors: got shape \(65,\), expected \(65, D\) or \(2, 65, D\)"),
+        ("viewmats", np.eye(4), r"viewmats: got shape \(4, 4\), expected \(C, 4, 4\)"),
+        ("backgrounds", np.zeros(3), r"backgrounds: got shape \(3,\), expected \(2, 3\)"),
         ("render_mode", "depth", "render_mode is 'depth', expected one of RGB, D"),
         ("width", [40, 20], r"width is \[40, 20\], expected a whole number"),
     ],
@@ -222,7 +222,7 @@ def test_an_argument_that_is_wrong_is_named_before_anything_runs(name: str, valu
 def test_values_that_are_wrong_are_named_by_the_program() -> None:
     arrays = cloud()
     arrays["means"][3, 1] = np.nan
-    with pytest.raises(jax.errors.JaxRuntimeError, match="means has 1 values that are NaN or infinite"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"means: \\[3, 1\\] is nan, expected finite"):
         jax.jit(loss)(arrays).block_until_ready()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole of `clsplat.torch.rasterization` in float64 PyTorch, every Gaussian at every pixel: slow, and all of autograd.
+"""The whole of `clsplat.torch.rasterization` in float64 PyTorch, every Gaussian at every pixel: slow.
 
 It shares no code with the package, and none with gsplat.
 """

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arguments of the library's calls as arrays for the kernels: errors name the argument."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.errors import InputError
+
+Shape = tuple[int | str, ...]
+
+
+def floats(name: str, values: Any, *shapes: Shape) -> Float32:
+    """The argument `name` as a C-contiguous float32 array of one of these shapes, in which a text stands for any size.
+
+    Raises InputError, which names the argument, for another shape, for what is no array of real numbers, and for
+    numbers that are not finite.
+    """
+    array = _numbers(name, values)
+    check_shape(name, array.shape, *shapes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        result = np.ascontiguousarray(array, np.float32)
+        finite = np.isfinite(result.sum()) or bool(np.isfinite(result).all())  # a sum is quicker, and may overflow
+    if not finite:
+        at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
+        place = ", ".join(str(int(index)) for index in at)
+        raise InputError(f"{name}: [{place}] is {array[at]}, expected finite numbers within float32")
+    return result
+
+
+def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
+    """The gradient by an output as a C-contiguous float32 array of that output's shape; None where there is none.
+    Raises InputError, as `floats` does, but lets numbers pass that are not finite."""
+    if values is None:
+        return None
+    array = _numbers(name, values)
+    check_shape(name, array.shape, shape)
+    return np.ascontiguousarray(array, np.float32)
+
+
+def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
+    """(count, side, side) float64, of one matrix or of many. Raises InputError as `floats`."""
+    floats(name, given, (count, side, side), (side, side))
+    array: Float64 = np.asarray(given, np.float64)
+    return array.reshape(-1, side, side)
+
+
+def sizes(name: str, given: Any, count: int) -> list[int]:
+    """A length in pixels for each of `count` cameras, from one for all or one for each. Raises InputError."""
+    each = [given] * count if np.ndim(given) == 0 else list(given)
+    whole = all(
+        isinstance(size, (int, np.integer)) and not isinstance(size, bool) and 0 < size < 2**24 for size in each
+    )
+    if len(each) != count or not whole:
+        raise InputError(
+            f"{name} is {given!r:.80}, expected a positive whole number, or one for each of {count} cameras"
+        )
+    return [int(size) for size in each]
+
+
+def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
+    """A number from `least` to `most`. Raises InputError."""
+    if not isinstance(given, (int, float, np.number)) or isinstance(given, bool) or not least <= given <= most:
+        bound = f"from {least:g} to {most:g}" if np.isfinite(most) else f"of at least {least:g}"
+        raise InputError(f"{name} is {given!r:.80}, expected a number {bound}")
+    return float(given)
+
+
+def choice(name: str, given: Any, choices: Sequence[str]) -> None:
+    """Raise InputError unless an argument is one of the choices."""
+    if given not in choices:
+        raise InputError(f"{name} is {given!r:.80}, expected one of {', '.join(choices)}")
+
+
+def check_shape(name: str, found: Sequence[int], *shapes: Shape) -> None:
+    """Raise InputError unless the shape of an argument is one of these, in which a text stands for any size."""
+
+    def fits(shape: Shape) -> bool:
+        pairs = zip(found, shape, strict=True)
+        return len(shape) == len(found) and all(isinstance(size, str) or size == had for had, size in pairs)
+
+    if not any(fits(shape) for shape in shapes):
+        wanted = " or ".join(f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})" for shape in shapes)
+        raise InputError(f"{name}: got shape {tuple(found)}, expected {wanted}")
+
+
+def _numbers(name: str, values: Any) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{name}: got {array.dtype}, expected an array of real numbers")
+    return array

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blending any number of values a Gaussian and its gradient, every Gaussian at every pixel: float64 twin of
+kernels/values.cl and values_grad.cl.
+
+Equation numbers are those of docs/library.md and, below 150, of docs/gradients.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN
+from clsplat.reference.project import ALPHA_MIN
+
+NEAR = 0.05
+"""Where the margin is cut."""
+
+
+@dataclass(frozen=True, eq=False)
+class FlatGaussians:
+    """means2d (n, 2) in pixels; conics (n, 3): a, b, c of the inverse covariance; opacities (n,); values (n, D); depths
+    (n,); drawn (n,)."""
+
+    means2d: Float64
+    conics: Float64
+    opacities: Float64
+    values: Float64
+    depths: Float64
+    drawn: NDArray[np.bool_]
+
+    @property
+    def order(self) -> list[int]:
+        """Those that are drawn, front to back, ties by index."""
+        return [int(i) for i in np.argsort(self.depths, kind="stable") if self.drawn[i]]
+
+
+@dataclass(frozen=True, eq=False)
+class ValuesBlended:
+    """image (H, W, D) over the background; transmittance (H, W); margin (H, W): the smallest relative distance of a
+    decision to its threshold (alpha to 1/255 and to the cap, T to 1e-4), cut at NEAR."""
+
+    image: Float64
+    transmittance: Float64
+    margin: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class ValueGradients:
+    """means2d (n, 2), conics (n, 3), opacities (n,), values (n, D), background (D,); absolute (n, 2): sums of the absolute
+    values of every pixel's gradient by means2d."""
+
+    means2d: Float64
+    conics: Float64
+    opacities: Float64
+    values: Float64
+    background: Float64
+    absolute: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class _Layer:
+    """A Gaussian on all pixels, (H, W) each: offsets of its mean; alpha before the cap; alpha, 0 where it is not added;
+    transmittance in front of it."""
+
+    gaussian: int
+    dx: Float64
+    dy: Float64
+    raw: Float64
+    alpha: Float64
+    before: Float64
+    margin: Float64
+
+
+def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float) -> Iterator[_Layer]:
+    """(14) to (16): front to back."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
+    for i in gaussians.order:
+        (mx, my), (a, b, c) = gaussians.means2d[i], gaussians.conics[i]
+        dx, dy = mx - x, my - y
+        raw = gaussians.opacities[i] * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+        alpha = np.minimum(raw, alpha_max)
+        seen, after = alive & (alpha >= ALPHA_MIN), transmittance * (1 - alpha)
+        added = seen & (after > TRANSMITTANCE_MIN)
+        margin = np.minimum(np.abs(raw / ALPHA_MIN - 1), np.abs(raw / alpha_max - 1))
+        margin = np.minimum(margin, np.where(seen, np.abs(after / TRANSMITTANCE_MIN - 1), np.inf))
+        margin = np.where(alive, margin, np.inf)
+        alive &= added | ~seen
+        alpha = np.where(added, alpha, 0.0)
+        yield _Layer(i, dx, dy, raw, alpha, transmittance, margin)
+        transmittance = transmittance * (1 - alpha)
+
+
+def blend_values(
+    gaussians: FlatGaussians, width: int, height: int, background: Float64, alpha_max: float = ALPHA_MAX
+) -> ValuesBlended:
+    """(177): the picture."""
+    image = np.zeros((height, width, gaussians.values.shape[1]))
+    left, margin = np.ones((height, width)), np.full((height, width), NEAR)
+    for layer in _layers(gaussians, width, height, alpha_max):
+        image += (layer.before * layer.alpha)[:, :, None] * gaussians.values[layer.gaussian]
+        left = layer.before * (1 - layer.alpha)
+        margin = np.minimum(margin, layer.margin)
+    return ValuesBlended(image + left[:, :, None] * background, left, margin)
+
+
+def blend_values_grad(
+    gaussians: FlatGaussians,
+    width: int,
+    height: int,
+    background: Float64,
+    d_image: Float64,
+    d_alpha: Float64,
+    alpha_max: float = ALPHA_MAX,
+) -> ValueGradients:
+    """(178) to (180), back to front: d_image (H, W, D), d_alpha (H, W)."""
+    layers = list(_layers(gaussians, width, height, alpha_max))
+    n, depth = gaussians.values.shape
+    means2d, absolute, conics = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 3))
+    opacities, values = np.zeros(n), np.zeros((n, depth))
+    left = layers[-1].before * (1 - layers[-1].alpha) if layers else np.ones((height, width))
+    behind = left * (d_image @ background - d_alpha)
+    for layer in reversed(layers):
+        i, dx, dy, alpha, before = layer.gaussian, layer.dx, layer.dy, layer.alpha, layer.before
+        shade, weight = d_image @ gaussians.values[i], before * alpha
+        d = before * shade - behind / (1 - alpha)
+        g = np.where((alpha > 0) & (layer.raw < alpha_max), alpha * d, 0.0)
+        behind = behind + weight * shade
+        values[i] = (weight[:, :, None] * d_image).sum(axis=(0, 1))
+        a, b, c = gaussians.conics[i]
+        by_x, by_y = -g * (a * dx + b * dy), -g * (b * dx + c * dy)
+        means2d[i], absolute[i] = (by_x.sum(), by_y.sum()), (np.abs(by_x).sum(), np.abs(by_y).sum())
+        conics[i] = -0.5 * (g * dx * dx).sum(), -(g * dx * dy).sum(), -0.5 * (g * dy * dy).sum()
+        opacities[i] = g.sum() / gaussians.opacities[i]
+    by_background = (left[:, :, None] * d_image).sum(axis=(0, 1))
+    return ValueGradients(means2d, conics, opacities, values, by_background, absolute)
