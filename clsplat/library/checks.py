@@ -22,7 +22,7 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
     numbers that are not finite.
     """
     array = _numbers(name, values)
-    _check_shape(name, array, shapes)
+    check_shape(name, array.shape, *shapes)
     with np.errstate(over="ignore", invalid="ignore"):
         result = np.ascontiguousarray(array, np.float32)
         finite = np.isfinite(result.sum()) or bool(np.isfinite(result).all())  # a sum is quicker, and may overflow
@@ -39,7 +39,7 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
     if values is None:
         return None
     array = _numbers(name, values)
-    _check_shape(name, array, (shape,))
+    check_shape(name, array.shape, shape)
     return np.ascontiguousarray(array, np.float32)
 
 
@@ -77,18 +77,20 @@ def choice(name: str, given: Any, choices: Sequence[str]) -> None:
         raise InputError(f"{name} is {given!r:.80}, expected one of {', '.join(choices)}")
 
 
+def check_shape(name: str, found: Sequence[int], *shapes: Shape) -> None:
+    """Raise InputError unless the shape of an argument is one of these, in which a text stands for any size."""
+
+    def fits(shape: Shape) -> bool:
+        pairs = zip(found, shape, strict=True)
+        return len(shape) == len(found) and all(isinstance(size, str) or size == had for had, size in pairs)
+
+    if not any(fits(shape) for shape in shapes):
+        wanted = " or ".join(f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})" for shape in shapes)
+        raise InputError(f"{name}: got shape {tuple(found)}, expected {wanted}")
+
+
 def _numbers(name: str, values: Any) -> NDArray[Any]:
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name}: got {array.dtype}, expected an array of real numbers")
     return array
-
-
-def _check_shape(name: str, array: NDArray[Any], shapes: tuple[Shape, ...]) -> None:
-    def fits(shape: Shape) -> bool:
-        pairs = zip(array.shape, shape, strict=True)
-        return len(shape) == array.ndim and all(isinstance(size, str) or size == had for had, size in pairs)
-
-    if not any(fits(shape) for shape in shapes):
-        wanted = " or ".join(f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})" for shape in shapes)
-        raise InputError(f"{name}: got shape {array.shape}, expected {wanted}")

@@ -270,6 +270,13 @@ def render(
     device: str | None = None,
     max_device_mem: str | int | None = None,
 ) -> RenderResult:
-    """Render one view on the device that `device` names (see `clsplat devices`), with at most `max_device_mem` of its
-    memory, such as "256MiB". Raises DeviceError, and as `Renderer.render`."""
+    """Render one view.
+
+    camera: in the world; its near plane is the model's unless it has its own. background: red, green, blue, any finite
+    numbers. device: as `clsplat devices` lists it. max_device_mem: the most of its memory to use, in bytes or such as
+    "256MiB". Each call opens the device and uploads the model; `Renderer` keeps both.
+
+    Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera or a background that is none,
+    DeviceError for a device that is not there, CapacityError where a picture does not fit into its memory.
+    """
     return Renderer(open_device(device, parse_bytes(max_device_mem))).render(gaussians, camera, background)

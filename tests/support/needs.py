@@ -64,8 +64,10 @@ NEEDS = {
     "hatchling": of_extra("hatchling", "hatchling", "test"),
     "importlinter": of_extra("importlinter", "import-linter", "dev"),
     "html5lib": of_extra("html5lib", "html5lib", "test"),
+    "jax": of_extra("jax", "JAX", "jax"),
     "laspy": of_extra("laspy", "laspy", "las"),
     "matplotlib": of_extra("matplotlib", "Matplotlib", "plot"),
+    "mkdocs": of_extra("mkdocs", "MkDocs", "docs"),
     "node": Need(
         "readers from npm", "apt-get install nodejs npm && python3 tests/support/node.py", lambda: bool(node_modules())
     ),
