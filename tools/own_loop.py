@@ -35,6 +35,8 @@ from clsplat.scenes.initialise import from_scene
 from clsplat.scenes.scene import Scene, View
 from clsplat.torch import DefaultStrategy, MCMCStrategy, rasterization
 
+MAX_STEPS = 30_000
+"""Steps of gsplat's settings, over which the rate of the means falls; of clsplat's too."""
 SH_DEGREE, SH_DEGREE_EVERY, SSIM_WEIGHT = 3, 1000, 0.2
 OPACITY_WEIGHT = SCALE_WEIGHT = 0.01
 """Of gsplat's settings for MCMC, which also start from half the opacity that others do, times five."""
@@ -96,11 +98,14 @@ def own_loop(scene: Scene, given: argparse.Namespace) -> Params:
     strategy: Any = MCMCStrategy(cap_max=given.most) if mcmc else DefaultStrategy()
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state() if mcmc else strategy.initialize_state(scene_scale=scene.extent)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / given.steps))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / MAX_STEPS))
     views = scene.train_views
     photographs = [torch.from_numpy(view.load()[:, :, :3]) for view in views]
+    order: list[int] = []
     for step in range(given.steps):
-        index = int(torch.randint(len(views), ()))
+        if step % len(views) == 0:
+            order = torch.randperm(len(views)).tolist()
+        index = order[step % len(views)]
         degree = min(step // SH_DEGREE_EVERY, SH_DEGREE)
         images, _, info = picture(params, views[index], degree, packed=given.packed)
         strategy.step_pre_backward(params, optimizers, state, step, info)
