@@ -109,3 +109,30 @@ def test_the_strategies_are_gsplats_own() -> None:
     gsplat = pytest.importorskip("gsplat")
     assert DefaultStrategy is gsplat.DefaultStrategy
     assert MCMCStrategy is gsplat.MCMCStrategy
+
+
+def test_gaussians_that_are_added_share_the_picture_of_those_that_they_join() -> None:
+    """Equation (9) keeps the picture of a Gaussian, to about 0.02 of its opacity, when others come to its place."""
+    torch.manual_seed(0)
+    params, optimisers, cameras = model(30)
+
+    def picture() -> torch.Tensor:
+        with torch.no_grad():
+            return rasterization(
+                params["means"],
+                params["quats"],
+                torch.exp(params["scales"]),
+                torch.sigmoid(params["opacities"]),
+                params["colors"],
+                **cameras,
+                eps2d=0.0,
+            )[0]
+
+    before, strategy = picture(), MCMCStrategy(cap_max=45, min_opacity=0.0)
+    operations = pytest.importorskip("gsplat.strategy.ops")
+    binoms = strategy.initialize_state()["binoms"]
+    operations.sample_add(params, optimisers, {}, 15, binoms, min_opacity=0.0)
+    assert len(params["means"]) == 45
+    change = (picture() - before).abs()
+    assert change.mean() < 0.01
+    assert change.max() < 0.1
