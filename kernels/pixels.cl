@@ -6,7 +6,7 @@
 //   which there are 3 at most; alpha (height, width), 0 to 1. Back: d_pixels (height, width, depth), with
 //   ALPHA_GRADIENT d_alpha (height, width) -> image_gradient (3, rows, stride) of blend_grad.cl, 0 in planes that have
 //   no value, with ALPHA_GRADIENT a fourth: by the transmittance. Padding is left as it is.
-// Equations: docs/library.md, (177).
+// Equations: docs/gradients.md, (177).
 
 __kernel void pixels_from_planes(const int width, const int height, const int depth, const int stride,
                                  __global const float *image, __global const float *transmittance,

@@ -7,7 +7,7 @@
 //   of the inverse covariance, opacities (n) in [0, 1], depths (n), values (n, width): colour is the first three, 0
 //   where there are fewer -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With
 //   LISTED every splat is written, as others have made the lists: those that are not drawn have an alpha of nothing.
-// Equations: docs/library.md, (170) to (172); docs/gradients.md, (44) to (47).
+// Equations: docs/gradients.md, (170) to (172), with (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"

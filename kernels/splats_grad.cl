@@ -7,7 +7,7 @@
 //   d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit of each, d_values (n, width): its columns from
 //   `first` on, of which there are VALUES at most, absolute (n, 2): of means2d. Rows of Gaussians that reach no tile
 //   are zero. add_values: of slots (pairs, VALUES), d_values alone.
-// Equations: docs/library.md, (173) to (176).
+// Equations: docs/gradients.md, (173) to (176).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/splat.h"
@@ -54,7 +54,8 @@ __kernel void splats_grad(const uint n, const int width, const int first, __glob
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     by_mean[0] = -INVERSE_WHITEN2 * (l11 * sums[SLOT_GU]); // (173)
     by_mean[1] = -INVERSE_WHITEN2 * fma1(l12, sums[SLOT_GU], l22 * sums[SLOT_GV]);
-    // (174): the moments of the offsets in pixels. In a needle's that along it is by far the largest, and is added last.
+    // (174): the moments of the offsets in pixels. In a needle's that along it is by far the largest, and is added
+    // last.
     const float in_x = splat[SPLAT_INVERSE_L11], in_y = 1.0f / l22, lean = l12 * in_y;
     const float uv = fma1(-lean, sums[SLOT_GVV], sums[SLOT_GUV]);
     const float uu = fma1(-lean, sums[SLOT_GUV] + uv, sums[SLOT_GUU]);

@@ -4,7 +4,7 @@
 // Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
 // Buffers: blend's ranges, gaussian_from_sorted, splats and stops, with RECORD_CELLS its cells_from_sorted; values (n,
 //   depth), background (depth) -> pixels (height, width, depth): the values from `first` on of each pixel.
-// Equations: docs/library.md, (177); docs/gradients.md, (14) to (16).
+// Equations: docs/gradients.md, (177), with (14) to (16).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"

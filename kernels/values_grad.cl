@@ -9,7 +9,7 @@
 //   value_rows (n, depth), by_cell -> slots (pairs, FIELDS), every one of them: sums over the tile's pixels of the
 //   gradients by the values from `first` on; with GEOMETRY before them g and its moments, by all values, and with
 //   ABSOLUTE_GRADIENTS behind them those of the mean.
-// Equations: docs/library.md, (178) to (180); docs/gradients.md, (22) to (26), (48) and (49).
+// Equations: docs/gradients.md, (178) to (180), with (22) to (26), (48) and (49).
 #include "shared/math.h"
 #include "shared/splat.h"
 #include "shared/lanes.h"

@@ -25,7 +25,9 @@ from calls import train
 from drivers import KEPT, begin_session, check_some_are_kept, label
 from dying import standing, standing_device  # noqa: F401  # fixtures
 from fakes import folder, model, pipeline  # noqa: F401  # fixtures
+from groups import scheduler
 from needs import missing
+from passed import leave_out, pytest_addoption, record  # noqa: F401  # a hook
 from pipeline import QUICK_SHAPES, shaped, shapes_of
 from same_bytes import undisturbed  # noqa: F401  # a fixture
 from tiny import CONFIG, FEW, short, write_scene
@@ -41,26 +43,31 @@ os.environ.setdefault("POCL_CACHE_DIR", str(CACHE / "pocl" / "kcache"))
 os.environ.setdefault("CLSPLAT_BINARIES", str(CACHE / "clsplat" / "binaries"))
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     check_some_are_kept()
+    record(config)
 
 
-def _driver_and_shape(parameters: dict[str, Any]) -> tuple[Any, Any]:
+@pytest.hookimpl(optionalhook=True)  # of pytest-xdist
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    return scheduler(config, log, {index: label(index) for index in KEPT})
+
+
+def _driver_and_shape(item: pytest.Item) -> tuple[Any, Any]:
     """Those that a test is for; None where it is for none, or no driver is there."""
+    parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
     shaped = parameters.get("shaped_device", (parameters.get("device"), None))
     return shaped if isinstance(shaped, tuple) else (None, None)
 
 
 @pytest.hookimpl(tryfirst=True)  # before the slow ones are left out
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """With `-n 2 --dist loadgroup`: a driver's tests in one process, so that its kernels are built once, which is what
-    most of the time goes to; else a file's. The quick run has two shapes, as building is slow."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The quick run has two shapes, or with `slow_in_groups` one, as building is slow."""
+    leave_out(config, items, lambda item: _driver_and_shape(item)[0])
     for item in items:
-        parameters = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
-        driver, shape = _driver_and_shape(parameters)
-        if shape is not None and shape not in QUICK_SHAPES:
+        shape = _driver_and_shape(item)[1]
+        if shape not in {None, *(QUICK_SHAPES[:1] if item.get_closest_marker("slow_in_groups") else QUICK_SHAPES)}:
             item.add_marker(pytest.mark.slow)
-        item.add_marker(pytest.mark.xdist_group(item.path.stem if driver is None else f"driver {driver}"))
         for marker in item.iter_markers("needs"):
             if reason := missing(*marker.args):
                 item.add_marker(pytest.mark.skip(reason=reason))

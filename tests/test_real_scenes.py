@@ -53,6 +53,7 @@ def test_a_frame_of_a_trained_model(device: Device, name: str) -> None:
     assert image.std() > 0.05
 
 
+@pytest.mark.slow
 def test_a_short_training_on_photographs(default_device: Device, tmp_path: Path) -> None:
     whole = load_scene(real_file("fox"), resolution=200)
     held_out = whole.test_views[::3]  # three of them say enough

@@ -27,6 +27,8 @@ import sys
 import tempfile
 import time
 import zlib
+from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -172,11 +174,10 @@ def run_all(listed: list[Job], folder: Path) -> list[Row]:
     from tiny import write_scene
 
     scene = write_scene(folder / "scene")
-    # the one that builds longest first, so that nothing waits for it at the end
-    numbered = sorted(enumerate(listed), key=lambda pair: pair[1].driver != "Rusticl")
+    numbers = in_turn(listed)
     with ThreadPoolExecutor(max_workers=2) as pool:
-        done = pool.map(lambda pair: _in_a_process(pair[1], folder / f"{pair[0]}.npz", scene), numbered)
-        by_number = {number: row for (number, _), row in zip(numbered, done, strict=True)}
+        done = pool.map(lambda number: _in_a_process(listed[number], folder / f"{number}.npz", scene), numbers)
+        by_number = dict(zip(numbers, done, strict=True))
     rows = [by_number[number] for number in range(len(listed))]
     first = next((number for number, row in enumerate(rows) if not row.trouble), None)
     if first is not None:
@@ -185,6 +186,18 @@ def run_all(listed: list[Job], folder: Path) -> list[Row]:
             if not row.trouble:
                 row.difference = _difference(np.load(folder / f"{number}.npz"), wanted)
     return rows
+
+
+def in_turn(listed: Sequence[Job]) -> list[int]:
+    """The numbers of the jobs in the order in which they begin: Rusticl's first, which build longest, so that nothing
+    waits for them at the end; then one of each driver in turn, as rows of a driver share kernels, which two at a time
+    would both build."""
+    before: Counter[str] = Counter()
+    keys = []
+    for number, job in enumerate(listed):
+        keys.append((job.driver != "Rusticl", before[job.driver], number))
+        before[job.driver] += 1
+    return [number for _, _, number in sorted(keys)]
 
 
 def _in_a_process(job: Job, arrays: Path, scene: Path) -> Row:

@@ -93,6 +93,15 @@ class Source:
         return " ".join((self.stem, *defines))
 
     @property
+    def used(self) -> Source:
+        """The same without defines that the text does not name: two of which this is the same are the same kernels, as
+        most files are in shapes that differ in the items of a group."""
+        words = set(re.findall(r"\w+", kernel_source(self.stem)))
+        names = {each: each.removeprefix("-D").partition("=")[0].partition("(")[0] for each in self.options}
+        kept = (each for each in self.options if not each.startswith("-D") or names[each] in words)
+        return Source(self.stem, tuple(kept))
+
+    @property
     def lines(self) -> list[str]:
         """Lines of the text."""
         return kernel_source(self.stem).splitlines()

@@ -104,6 +104,10 @@ class Row:
         }
 
 
+_COMPILED: dict[tuple[Source, str], list[Built]] = {}
+"""The kernels of this process, by `Source.used` and target."""
+
+
 def sources_of(launches: Iterable[Mapping[str, Any]]) -> dict[Source, dict[str, tuple[int, int]]]:
     """The kernel files of launches, and of each kernel the items of a group and the shared memory that it is given."""
     found: dict[Source, dict[str, tuple[int, int]]] = {}
@@ -131,13 +135,15 @@ def compiled(
         nvidia("nvdisasm")
     with tempfile.TemporaryDirectory(prefix="clsplat-gpu-") as scratch, ThreadPoolExecutor(jobs) as pool:
         builtins = {target: build_builtins(target, Path(scratch)) for target in targets}
-        asked = [(source, target) for target in targets for source in sources]
-        say(f"{len(asked)} kernel files to compile")
-        built = pool.map(lambda each: compile_source(*each, builtins[each[1]]), asked)
+        asked = {(source, target): (source.used, target) for target in targets for source in sources}
+        new = {used: each for each, used in asked.items() if used not in _COMPILED}
+        say(f"{len(new)} kernel files to compile")
+        built = pool.map(lambda each: compile_source(*each, builtins[each[1]]), new.values())
+        _COMPILED.update(zip(new, built, strict=True))
         return [
             row_of(source, kernel, sources[source].get(kernel.kernel))
-            for (source, _), kernels in zip(asked, built, strict=True)
-            for kernel in kernels
+            for (source, _), used in asked.items()
+            for kernel in _COMPILED[used]
             if not sources[source] or kernel.kernel in sources[source]
         ]
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hostile_meshes import make_obj, make_usd_mesh, read_volume
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
 from clsplat.config.training import TrainConfig
@@ -509,6 +510,17 @@ _ALL += (
 )
 _ALL += (
     Reader("ksplat", make_ksplat, lambda f: read_model(f / "model.ksplat"), ("model.ksplat",), (*BYTES, *PLACES), 2),
+)
+_ALL += tuple(
+    Reader(f"mesh-{name[5:]}", make, lambda f, n=name: read_volume(f / n), (name,), (*BYTES, *LINES, *PLACES), weight)
+    for name, make, weight in (
+        ("mesh.obj", make_obj, 2),
+        *(
+            (f"mesh.{each}", partial(make_usd_mesh, name=f"mesh.{each}"), 0.5)
+            for each in ("usda", "usdc")
+            if find_spec("pxr")
+        ),
+    )
 )
 READERS = {reader.name: reader for reader in _ALL}
 

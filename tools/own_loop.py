@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""A training loop written as gsplat's documentation has it, on `clsplat.torch`, beside `clsplat train` of a scene.
+"""A training loop written as gsplat's documentation shows it, on `clsplat.torch`, beside `clsplat train` of a scene.
 
 python tools/own_loop.py SCENES/fox --resolution 400 --steps 2000 --strategy default
 

@@ -8,6 +8,8 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from clsplat.camera import Camera, Window
 from clsplat.config.pictures import ColourConfig, VideoConfig, WarpConfig
 from clsplat.config.rasterizer import RasterizerConfig
@@ -132,16 +134,20 @@ def warp_for_workers(warp: WarpConfig) -> WarpConfig:
 
 
 def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
-    """Raise InputError for a frame that the framing does not suit, a video of several sizes, deep pairs in a file."""
+    """Raise InputError for a frame that the framing does not suit, a video of several sizes, deep pairs in a file, and
+    eyes that no file can have together."""
     if options.deep is not None and tasks[0].right is not None:
         raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
     sizes = set()
     check_warps(tasks, options)
     for task in tasks:
-        camera = picture_camera(task, options)
-        if options.pictures.framing.supersample > 1:
-            finer(camera, options.pictures.framing)
-        sizes.add(f"{camera.width}x{camera.height}")
+        cameras = [picture_camera(view, options) for view in task.views]
+        for camera in cameras:
+            if options.pictures.framing.supersample > 1:
+                finer(camera, options.pictures.framing)
+            sizes.add(f"{camera.width}x{camera.height}")
+        if len(cameras) > 1:
+            _check_pair(task, *cameras)
     if tasks[0].is_video and len(sizes) > 1:
         raise InputError(
             f"{tasks[0].path}: frames are of the sizes {examples(sorted(sizes))}, expected one; give --width and "
@@ -153,12 +159,25 @@ def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
         check_size(tasks[0].path, camera.width, camera.height)
 
 
+def _check_pair(task: Task, left: Camera, right: Camera) -> None:
+    """Raise InputError for eyes whose windows or pixels have other shapes, of which an EXR has one for all parts."""
+    advice = f"{task.path} holds both eyes, expected them alike, or a file for each: {{eye}} in -o"
+    sizes = [f"{frame.width}x{frame.height}" for frame in (left.window or left, right.window or right)]
+    if sizes[0] != sizes[1]:
+        what = f"is {sizes[0]} for the left eye and {sizes[1]}"
+        raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
+    shapes = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]  # of a stage, in the header
+    if task.optics is not None and shapes[0] != shapes[1]:
+        what = f"has pixels of the aspect ratio {shapes[0]} for the left eye and {shapes[1]}"
+        raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
+
+
 def check_warps(tasks: list[Task], options: RenderOptions) -> None:
     """Raise InputError for frames that no lens bends, and a map without values for the picture. Warns where nothing is
     seen in a part of it."""
     flag = f"--stmap {options.pictures.warp.stmap}" if options.pictures.warp.stmap else "--distort"
-    empty = {}
-    for task in tasks:
+    empty: dict[int, float] = {}
+    for task in (view for whole in tasks for view in whole.views):
         if (warp := warp_of(task, options)) is None:
             continue
         if task.camera.projection == "equirectangular":
@@ -172,7 +191,7 @@ def check_warps(tasks: list[Task], options: RenderOptions) -> None:
                     f"{stmap.y} on, expected all of the picture; leave --overscan out, or write a larger data window"
                 )
         if (part := warp.empty) > 0:
-            empty[task.number] = part
+            empty[task.number] = max(part, empty.get(task.number, 0.0))
     if empty:
         number, part = max(empty.items(), key=lambda item: item[1])
         advice = "" if options.pictures.warp.stmap else "; --lenses native renders fisheyes without a straight picture"

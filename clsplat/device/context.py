@@ -21,7 +21,7 @@ from clsplat.device.child import TIMEOUT, patience
 from clsplat.device.known import tell_once
 from clsplat.device.processor import name_processor
 from clsplat.device.profile import Calls, Recorder
-from clsplat.device.program import Kernel, Kernels, build, variant_of
+from clsplat.device.program import Kernel, Kernels, build, text_of, variant_of
 from clsplat.device.quirks import compiles_by_size, no_device, subgroup_ways, title
 from clsplat.device.rehearsal import Rehearsal
 from clsplat.device.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
@@ -170,8 +170,10 @@ class Device:
         return kernels
 
     def _built(self, stem: str, defines: Mapping[str, object]) -> Kernels:
-        shape = {"LANES": self.shape.lanes, "ITEMS": self.shape.items}
-        variant = variant_of(stem, {**shape, **defines}, self._options)
+        given, text = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **defines}, text_of(stem)
+        # a driver's cache goes by the options: shapes share a file that does not name what they differ in
+        named = {name: value for name, value in given.items() if name.partition("(")[0] in text}
+        variant = variant_of(stem, named, self._options)
         program, salt = build(self.context, self.cl_device, self.rehearsal.build(variant))
         self.rehearsal.built(variant, salt)
         return Kernels(variant, program)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from clsplat.arrays import Float32
-from clsplat.device.buffers import DeviceArray, Hosted, Workspace, from_host, hosted, upload
+from clsplat.device.buffers import DeviceArray, Hosted, Workspace, from_host, hosted
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE, WIDEST_SLOTS, SlotFields
 from clsplat.errors import CapacityError
@@ -77,7 +77,7 @@ class ListedPixels:
             self._listed = listed = listing(work)
             behind = np.zeros(max(depth, COLOURS), np.float32)
             behind[:depth] = 0.0 if background is None else background
-            self._background = upload(device, behind)
+            self._background = from_host(device, behind)
             self._work, capped = work, session.capped(alpha_max)
             planes = (listed.projected.splats, self._background, width, height)
             self._blended = blended = blend(capped, work, listed.lists, *planes, record=backward or depth > COLOURS)
@@ -86,6 +86,7 @@ class ListedPixels:
             if depth > COLOURS:
                 rows = (listed.projected, gaussians.values, self._background, blended)
                 values(capped, ValuePass(listed.lists, *rows), self._image.array)
+            device.under_way.append((gaussians, self._background, self._image, self._alpha))  # until then they live
 
     @property
     def image(self) -> Float32:
@@ -131,7 +132,8 @@ class ListedPixels:
     def gradient_on_device(
         self, d_image: NDArray[Any], d_alpha: NDArray[Any] | None = None, *, absolute: bool = False
     ) -> PixelGradients:
-        """As `gradient`, for stages that go on with it; what it is given must not change before the device is done."""
+        """The result of `gradient` where it is, for stages that go on with it; what is given must not change before the
+        device is done."""
         session, gaussians, listed = self._session, self._gaussians, self._listed
         n, depth = gaussians.count, gaussians.width
         fields = SlotFields(absolute=absolute)
@@ -159,7 +161,7 @@ class ListedPixels:
                 of_pass = ValuePass(listed.lists, listed.projected, gaussians.values, self._background, self._blended)
                 given = (by_image, by_alpha, gradients)
                 values_grad(capped, self._work, of_pass, listed.first_slots, *given, fields=fields)
-            device.under_way.append((by_image, by_alpha))
+            device.under_way.append((by_image, by_alpha, gaussians, found))
         return found
 
 

@@ -179,13 +179,13 @@ def fully_fused_projection(
     """Project Gaussians to the images of C cameras, by the conventions of gsplat's function of that name.
 
     means (N, 3): world units. Either quaternions (N, 4), w x y z, of any length but 0, and scales (N, 3), which are
-    standard deviations in world units, or covars (N, 6), upper triangles xx, xy, xz, yy, yz, zz, or (N, 3, 3); the others are
-    None. viewmats (C, 4, 4): camera from world; intrinsics (C, 3, 3): pixels, a skew is not looked at; width and height:
-    pixels. eps2d: px^2, added to the diagonal of each projected covariance; near_plane, far_plane: world units;
-    radius_clip: pixels, what has no larger radius is culled; calc_compensations: also the square root of the
-    covariance's determinant without eps2d over that with it; camera_model: pinhole, ortho or fisheye (equidistant);
-    opacities (N,), 0 to 1: with them radii end where alpha is 1/255, and what is fainter is culled. Float32 arrays are
-    read in place, and must not change before the last `vjp`.
+    standard deviations in world units, or covars (N, 6), upper triangles xx, xy, xz, yy, yz, zz, or (N, 3, 3); the
+    others are None. viewmats (C, 4, 4): camera from world; intrinsics (C, 3, 3): pixels, a skew is not looked at;
+    width, height: pixels. eps2d: px^2, added to the diagonal of each projected covariance; near_plane, far_plane:
+    world units; radius_clip: pixels, what has no larger radius is culled; calc_compensations: also the square root of
+    the covariance's determinant without eps2d over that with it; camera_model: pinhole, ortho or fisheye
+    (equidistant); opacities (N,), 0 to 1: with them radii end where alpha is 1/255, and what is fainter is culled.
+    Float32 arrays are read in place, and must not change before the last `vjp`.
 
     Raises InputError, which names the argument, for wrong shapes and numbers that are not finite, DeviceError for a
     device that is not there. Zwicker et al., EWA splatting, 2002; docs/gradients.md, section 22.

@@ -33,7 +33,7 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """As of a workspace."""
+        """An array by its name, as of any workspace."""
         if name in KEPT:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)
@@ -76,12 +76,18 @@ def _session(device: Device) -> Session:
     return Session(device)
 
 
+_CHOOSE = ("CLSPLAT_DEVICE", "CLSPLAT_SHAPE", "CLSPLAT_PRETEND")
+
+
 @cache
-def _named(name: str | None, _chosen: str | None) -> Session:
-    return _session(open_device(name))
+def _named(selector: str | None, _variables: tuple[str | None, ...]) -> Session:
+    return _session(open_device(selector))
 
 
 def session_of(device: Device | str | None = None) -> Session:
-    """The session of an open device, or of the one that a text names (see `clsplat devices`); one for each device, and
-    one for each name, as looking for devices takes longer than a small image. Raises DeviceError."""
-    return _session(device) if isinstance(device, Device) else _named(device, os.environ.get("CLSPLAT_DEVICE"))
+    """The session of an open device, or of the one that a text names (see `clsplat devices`); one for each device.
+    Raises DeviceError."""
+    if isinstance(device, Device):
+        return _session(device)
+    # looking at every driver again would take as long as projecting half a million Gaussians
+    return _named(device, tuple(os.environ.get(name) for name in _CHOOSE))

@@ -162,7 +162,8 @@ class View:
         with session.lock:
             means, covers = from_host(device, given.means), from_host(device, given.opacities)
             shapes = (given.quaternions, given.scales, given.covars)
-            inputs = EwaInputs(means, *(None if one is None else from_host(device, one) for one in shapes), covers)
+            turns, widths, upper = (None if one is None else from_host(device, one) for one in shapes)
+            inputs = EwaInputs(means, turns, widths, upper, covers)
             self.projected = ProjectedView(session, inputs, camera, compensated=compensated)
             self._colours: Float32 | Hosted = given.colors_of(index)
             self._harmonics = None
@@ -246,7 +247,7 @@ class View:
         return image
 
     def pixel_gradients(self, d_image: ArrayLike, d_alpha: ArrayLike | None) -> dict[str, Float32]:
-        """As `Rasterization.vjp_pixels`, of this view."""
+        """The gradients of `Rasterization.vjp_pixels`, of this view."""
         shape = (self._camera.height, self._camera.width)
         by_image = floats("d_images", d_image, self.image.shape)
         by_alpha = None
@@ -311,6 +312,15 @@ class View:
         placed = from_host(session.device, np.zeros((count, 3), np.float32) if by_colour is None else by_colour)
         session.device.under_way.append(placed)
         d_sh, add = gradients.sh(session.device)
-        arrays = (self._harmonics, self._colours.array, placed, d_sh, d_means)
-        how = {"add": add, "add_directions": True, "by_centre": cameras}
-        return harmonics_grad(session.device, session.scratch, *arrays, **how)
+        return harmonics_grad(
+            session.device,
+            session.scratch,
+            self._harmonics,
+            self._colours.array,
+            placed,
+            d_sh,
+            d_means,
+            add=add,
+            add_directions=True,
+            by_centre=cameras,
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,10 @@ from clsplat.models.formats.usd import open_stage, readable, survive
 USD = (".usd", ".usda", ".usdc", ".usdz")
 MOST_TRIANGLES = 100_000
 """Triangles of a volume: each is looked at for every Gaussian in its box."""
+MOST_POINTS = 1_000_000
+"""Points of a file, of which triangles need not use all."""
+MOST_BYTES = 256 << 20
+_MOST_LINE = 1 << 16
 _AT_ONCE = 1 << 21
 """Pairs of a point and a triangle that are worked on at once."""
 
@@ -76,8 +81,11 @@ def read_mesh(path: Path) -> Mesh:
 def _of_obj(path: Path) -> Float64:
     points: list[list[float]] = []
     polygons: list[list[int]] = []
+    count = 0
     with open_input(path, "a mesh") as file:
-        for number, line in enumerate(file, 1):
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise InputError(f"{path}: is of {size:,} bytes, expected a mesh of at most {MOST_BYTES:,}")
+        for number, line in enumerate(iter(partial(file.readline, _MOST_LINE), b""), 1):
             words = line.split()
             try:
                 if words[:1] == [b"v"]:
@@ -85,12 +93,22 @@ def _of_obj(path: Path) -> Float64:
                 elif words[:1] == [b"f"]:
                     indices = [int(word.partition(b"/")[0]) for word in words[1:]]
                     polygons.append([index - 1 if index > 0 else len(points) + index for index in indices])
-                ragged = words[:1] == [b"v"] and len(points[-1]) < 3
+                    count += max(len(indices) - 2, 0)
+                ragged = len(line) == _MOST_LINE or (words[:1] == [b"v"] and len(points[-1]) < 3)
             except ValueError:
                 ragged = True
             if ragged:
                 raise InputError(f"{path}: line {number} is {line[:40]!r}, expected numbers behind its letter")
+            _check_counts(path, len(points), max(count, len(polygons)))
     return _fans(path, np.array(points, np.float64).reshape(-1, 3), polygons)
+
+
+def _check_counts(path: Path, points: int, triangles: int) -> None:
+    """Raise InputError for more than memory and time are meant for."""
+    if triangles > MOST_TRIANGLES:
+        raise InputError(f"{path}: has {triangles:,} triangles or more, expected 1 to {MOST_TRIANGLES:,}")
+    if points > MOST_POINTS:
+        raise InputError(f"{path}: has {points:,} points or more, expected at most {MOST_POINTS:,}")
 
 
 def read_here(path: Path) -> Float64:
@@ -111,10 +129,14 @@ def read_here(path: Path) -> Float64:
 
 
 def _of_prim(path: Path, mesh: Any, time: float, world_from_mesh: Float64) -> Float64:
-    points = np.array(mesh.GetPointsAttr().Get(time) or [], np.float64).reshape(-1, 3)
+    points, indices, counts = (
+        attribute.Get(time) or []
+        for attribute in (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetFaceVertexCountsAttr())
+    )
+    _check_counts(path, len(points), max(len(counts), len(indices) - 2 * len(counts)))
+    points = np.array(points, np.float64).reshape(-1, 3)
     points = points @ world_from_mesh[:3, :3] + world_from_mesh[3, :3]  # USD's matrices are of rows
-    indices = list(mesh.GetFaceVertexIndicesAttr().Get(time) or [])
-    counts = list(mesh.GetFaceVertexCountsAttr().Get(time) or [])
+    indices, counts = list(indices), list(counts)
     ends = np.cumsum([0, *counts])
     if ends[-1] != len(indices):
         raise InputError(f"{path}: {mesh.GetPath()} has {len(indices):,} indices of faces, expected {ends[-1]:,}")
@@ -124,7 +146,6 @@ def _of_prim(path: Path, mesh: Any, time: float, world_from_mesh: Float64) -> Fl
 def _fans(path: Path, points: Float64, polygons: list[list[int]]) -> Float64:
     """Corners (T, 3, 3) of the polygons as fans of triangles."""
     fans = [(own[0], one, next_one) for own in polygons for one, next_one in pairwise(own[1:])]
-    triangles = np.array(fans, np.int64).reshape(-1, 3)
-    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+    if fans and not 0 <= min(map(min, fans)) <= max(map(max, fans)) < len(points):
         raise InputError(f"{path}: has faces of other points than its {len(points):,}; is it damaged?")
-    return points[triangles]
+    return points[np.array(fans, np.int64).reshape(-1, 3)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import Protocol
 
 import numpy as np
@@ -61,6 +62,10 @@ class Track(Protocol):
     def at(self, frame: float) -> Placement:
         """The placement at a frame, which need not be whole. Raises InputError for one that cannot be."""
 
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """The first and the last frame at which the source says where the model is; None for one that stands still."""
+
 
 def rows_of(matrix: Float64) -> tuple[float, ...]:
     """The first three rows of (4, 4), in the order of a `Placement`."""
@@ -94,6 +99,37 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
         rows = np.array(placement.colour).reshape(3, 4)
         moved = graded(moved, rows[:, :3], rows[:, 3])
     return faded(moved, placement.opacity)
+
+
+def gone_on(track: Track, frame: float, end: float) -> Placement:
+    """The placement of a track at a frame beyond `end`, after it or before it. Where its source says no more it goes on
+    as it did up to there: for a frame its motion mirrored, which at the whole one is the same motion once more, and so
+    on from frame to frame.
+
+    So do cameras (`shots.motion`). Opacity and colour are the track's own. Raises InputError for a transform that no
+    longer can be undone.
+    """
+    if (reach := track.reach) is None or reach[0] <= frame <= reach[1]:
+        return track.at(frame)
+    way, place, now = (1 if frame > end else -1), track.at(frame), track.at(end)
+    steps = ceil(abs(frame - end)) - 1
+    matrix = _step(now, track.at(2 * end - (frame - steps * way))) @ now.transform
+    for _ in range(steps):
+        matrix = _step(now, track.at(end - way)) @ matrix
+    rows = now.matrix if np.array_equal(matrix, now.transform) else rows_of(matrix)
+    return checked(replace(place, matrix=rows), f"a model that goes on beyond frame {end:g}")
+
+
+def _step(now: Placement, before: Placement) -> Float64:
+    """The similarity (4, 4) from one placement to a later one, without what its axes are off right angles."""
+    matrix = np.eye(4)
+    if now.matrix != before.matrix:
+        (scale, turn, shift), (scale_before, turn_before, shift_before) = (
+            decompose(placement.transform, SLACK) for placement in (now, before)
+        )
+        matrix[:3, :3] = scale / scale_before * turn @ turn_before.T
+        matrix[:3, 3] = shift - matrix[:3, :3] @ shift_before
+    return matrix
 
 
 def near_of(models: Sequence[Gaussians], state: State) -> float:

@@ -2,7 +2,7 @@
 """Splats of projected Gaussians that come as arrays, and the chain rule back: float64 twin of kernels/splats.cl and
 splats_grad.cl.
 
-Equation numbers are those of docs/library.md.
+Equation numbers are those of docs/gradients.md.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class SplatGradients:
 
 
 def splats_grad(conics: Float64, opacities: Float64, moments: Float64) -> SplatGradients:
-    """(173) to (175): moments (n, 6) of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels, with (u, v) = W d and d
+    """(173) to (175): moments (n, 6) of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels, with (u, v) = W d, d
     from the pixel to the mean."""
     a, b, c = conics.T
     l11, l12, l22 = np.sqrt(a), b / np.sqrt(a), np.sqrt((a * c - b * b) / a)

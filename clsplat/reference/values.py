@@ -2,7 +2,7 @@
 """Blending any number of values a Gaussian and its gradient, every Gaussian at every pixel: float64 twin of
 kernels/values.cl and values_grad.cl.
 
-Equation numbers are those of docs/library.md and, below 150, of docs/gradients.md.
+Equation numbers are those of docs/gradients.md.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class ValuesBlended:
 
 @dataclass(frozen=True, eq=False)
 class ValueGradients:
-    """means2d (n, 2), conics (n, 3), opacities (n,), values (n, D), background (D,); absolute (n, 2): sums of the absolute
-    values of every pixel's gradient by means2d."""
+    """means2d (n, 2), conics (n, 3), opacities (n,), values (n, D), background (D,); absolute (n, 2): sums of the
+    absolute values of every pixel's gradient by means2d."""
 
     means2d: Float64
     conics: Float64

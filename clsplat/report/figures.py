@@ -107,6 +107,7 @@ def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = T
     if describe:
         _add_model(figures, model)
     _add_contributions(figures, records)
+    _add_gate(figures, records)
     iterations = run.config.iterations
     if figures.step < iterations:
         figures.notes.insert(0, f"Not finished: at step {figures.step:,} of {iterations:,}.")
@@ -264,6 +265,17 @@ def _add_contributions(figures: Figures, records: list[Record]) -> None:
         views, total, none = map(int, sums)
         histogram = {"edges": edges, "counts": list(map(int, counts)), "views": views, "of": total, "none": none}
         figures.histograms["contribution"] = histogram
+
+
+def _add_gate(figures: Figures, records: list[Record]) -> None:
+    """A note where the refinement of cameras was ended."""
+    gates = (gate for record in reversed(records) if isinstance(gate := record.get("gate"), dict))
+    gate = next(gates, {})
+    if (ended := number(gate.get("ended"))) is not None and (best := number(gate.get("best"))) is not None:
+        figures.notes.append(
+            f"Refined cameras did not suit the held-out views: refinement ended at step {ended:,.0f}, and the cameras "
+            f"are those of step {best:,.0f}."
+        )
 
 
 def _list(value: object) -> list[float]:

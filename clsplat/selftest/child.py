@@ -38,6 +38,9 @@ BUILT_WITH: dict[str, dict[str, object]] = {
     "pose": {"LANES": 1},
     "project_rays": {"LANES": 1, "RAYS": 1},
     "sampling": {"LANES": 1},
+    "splats_grad": {"LANES": 1, "VALUES": 3},
+    "values": {"VALUES": 3},
+    "values_grad": {"VALUES": 3, "GEOMETRY": True},
 }
 """Defines of the kernels that are not built without."""
 

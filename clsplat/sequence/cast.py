@@ -12,9 +12,9 @@ from clsplat.errors import InputError
 from clsplat.files import digest
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import colour_space, format_of
-from clsplat.models.placed import Ensemble, Placement, State, Track, near_of
+from clsplat.models.placed import Ensemble, Placement, State, Track, gone_on, near_of
 from clsplat.runs.run import model_file
-from clsplat.sequence.task import RenderOptions, Task, model_times
+from clsplat.sequence.task import RenderOptions, Task, end_before, model_times
 from clsplat.shots.layout import KeyedTrack, Volume, Within, is_layout, read_layout
 from clsplat.shots.read import USD
 from clsplat.shots.stage import read_stage
@@ -57,19 +57,27 @@ class Cast:
         known: dict[Placement | State, Placement | State] = {}  # what is the same is held once
         placed = []
         for task in tasks:
-            states = {}
-            times = dict.fromkeys(time for view in task.views for time in model_times(view, options))
-            for time in times if self.tracks is not None else ():
-                state = self.state(task.number + time)
-                assert state is not None
-                kept = tuple(known.setdefault(placement, placement) for placement in state)
-                states[time] = known.setdefault(kept, kept)  # type: ignore[arg-type]
-            model = self.models[0]
-            if states:
-                model = replace(model, near=near_of(self.models, next(iter(states.values()))))  # type: ignore[arg-type]
-            views = [replace(view, placed=states or None) for view in task.seen_by(model).views]  # type: ignore[arg-type]
+            views = [self._seen(view, options, known) for view in task.views]
             placed.append(replace(views[0], right=views[1] if views[1:] else None))
         return placed
+
+    def _seen(self, task: Task, options: RenderOptions, known: dict[Placement | State, Placement | State]) -> Task:
+        """A view with its placements."""
+        model, times = self.models[0], model_times(task, options)
+        if self.tracks is None:
+            return task.seen_by(model, dict.fromkeys(times, model.near))
+        states: dict[float, State] = {}
+        for time in times:
+            end, frame = end_before(task, time, options), task.number + time
+            if end is None:
+                state = [track.at(frame) for track in self.tracks]
+            else:
+                state = [gone_on(track, frame, task.number + end) for track in self.tracks]
+            kept = tuple(known.setdefault(placement, placement) for placement in state)
+            states[time] = known.setdefault(kept, kept)  # type: ignore[arg-type, assignment]
+        nears = {time: near_of(self.models, state) for time, state in states.items()}
+        seen = task.seen_by(replace(model, near=nears[times[0]]), nears)
+        return replace(seen, placed=states)
 
 
 def load_cast(path: Path, transform: KeyedTrack | None = None) -> Cast:

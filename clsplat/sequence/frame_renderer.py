@@ -86,10 +86,11 @@ class FrameRenderer:
     def check(self, tasks: Sequence[Task]) -> None:
         """Raise InputError for a frame that the file's kind cannot hold as it has to be rendered here."""
         several = self.options.encoding.parts != "one"
+        held = HELD_BYTES if self.options.holdout is not None else 0
         for task in (task for task in tasks if not task.is_video and (several or task.right)):
-            camera = picture_camera(task, self.options)
-            if self._rows(camera, HELD_BYTES if self.options.holdout is not None else 0) < camera.height:
-                check_parts(camera, self.options.encoding, views=len(task.views))
+            for camera in (picture_camera(view, self.options) for view in task.views):
+                if self._rows(camera, held) < camera.height:
+                    check_parts(camera, self.options.encoding, views=len(task.views))
 
     def __call__(self, task: Task) -> RenderedFrame:
         """The frame. Raises ClsplatError where it cannot be rendered, or, if it is written here, not be written."""
@@ -105,14 +106,14 @@ class FrameRenderer:
 
     def _pair(self, task: Task) -> RenderedFrame:
         """The frame, with that of the right eye where its file has both."""
-        left = self._frame(task)
+        left = self._frame(task, len(task.views))
         if task.right is None:
             return left
-        right = self._frame(task.right)
+        right = self._frame(task.right, len(task.views))
         blank = {"blank": left.measured["blank"] and right.measured["blank"]}
         return replace(left, right=right.planes, seconds=left.seconds + right.seconds, measured=blank)
 
-    def _frame(self, task: Task) -> RenderedFrame:
+    def _frame(self, task: Task, views: int) -> RenderedFrame:
         self._trust(task.camera)
         start, options, pipeline = time.monotonic(), self.options, self._pipeline
         camera, names, encoding = picture_camera(task, options), options.channels, options.encoding
@@ -129,6 +130,7 @@ class FrameRenderer:
         draw, finish = pipeline.draw(task.at, *around, lens_of(task, options), sampling, cut, *models)
         rows = self._rows(camera, held_bytes(cut(camera)) if cut else 0)
         if rows < camera.height and not task.is_video:
+            check_parts(camera, encoding, views)  # again: a deep hold-out takes as much as it has surfaces
             blanks: list[bool | None] = []
 
             def finished(strip: Camera, names: Collection[str]) -> Planes:

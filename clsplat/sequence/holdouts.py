@@ -19,7 +19,7 @@ from clsplat.shots.stereo import for_eye
 def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:
     """The tasks with their hold-outs, of which one without a field for the number is every frame's, and one without a
     field for the eye both eyes'. Raises InputError for a file that is missing, or none as its header says."""
-    check_pattern(pattern)
+    check_pattern(for_eye(pattern, tasks[0].eye))
 
     def held(task: Task) -> Task:
         path = path_of(for_eye(pattern, task.eye), task.number, task.name).absolute()

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.camera import Camera
+from clsplat.camera import NEAR, Camera
 from clsplat.config.channels import WRITTEN
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
@@ -91,7 +91,9 @@ class Task:
     `existing.stamp`; sampling: shutter and lens, None for those of all; optics: what a stage has of them; eye: left or
     right of a stereo pair; right: the frame of the right eye, where one file has both; lens: of the photograph that the
     picture is bent as; holdout: an absolute path, None where nothing is held out; placed: of the models, by the time in
-    frames from the frame, at all `model_times` of it; None for one that stands as it is.
+    frames from the frame, at all `model_times` of it; None for one that stands as it is; nears: the models' near plane
+    at these times, none where the camera has its own; ends: numbers of the first and the last frame of its shot, None
+    for a shot of one.
     """
 
     number: int
@@ -109,6 +111,8 @@ class Task:
     lens: Lens | None = None
     holdout: Path | None = None
     placed: Mapping[float, State] | None = None
+    nears: Mapping[float, float] = field(default_factory=dict)
+    ends: tuple[int, int] | None = None
 
     @property
     def key(self) -> str:
@@ -121,18 +125,22 @@ class Task:
         return (self,) if self.right is None else (self, self.right)
 
     def at(self, time: float) -> Camera:
-        """The camera of the whole frame at a time in frames from the frame."""
-        return self.camera if time == 0 or self.stretch is None else self.stretch.at(time)
+        """The camera of the whole frame at a time in frames from the frame, as the models want it."""
+        near = self.nears.get(time)
+        if time == 0 or self.stretch is None:
+            return self.camera if near in (None, self.camera.near) else replace(self.camera, near=near)
+        camera = self.stretch.at(time).along_rays(self.camera.by_rays)
+        return camera if near is None else camera.before(near)
 
-    def seen_by(self, gaussians: Gaussians) -> Task:
-        """The frame of a model, with its near plane, and drawn as it wants it."""
+    def seen_by(self, gaussians: Gaussians, nears: Mapping[float, float]) -> Task:
+        """The frame of a model, with its near plane, and drawn as it wants it. nears: near planes by the time."""
 
         def seen(camera: Camera) -> Camera:
             return camera.before(gaussians.near).along_rays(gaussians.by_rays)
 
         after, earlier = (other and seen(other) for other in (self.after, self.earlier))
-        right = self.right and self.right.seen_by(gaussians)
-        return replace(self, camera=seen(self.camera), after=after, earlier=earlier, right=right)
+        nears = nears if self.camera.near == NEAR else {}
+        return replace(self, camera=seen(self.camera), after=after, earlier=earlier, nears=nears)
 
     @property
     def is_video(self) -> bool:
@@ -159,8 +167,10 @@ def make_tasks(
     else:
         paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
     stretch: Callable[[int], Shot | None] = lambda number: None  # noqa: E731
-    if sampling.moves and whole.moment is None:
+    if sampling.shutter != (0.0, 0.0) and whole.moment is None:
         stretch = moving.stretches(whole, resize, *sampling.shutter, motion=motion, backward=backward)
+    numbers = [frame.number for frame in whole.frames]
+    ends = (numbers[0], numbers[-1]) if len(numbers) > 1 else None
     tasks = []
     for frame, path in zip(chosen.frames, paths, strict=True):
         camera = resize(frame.camera)
@@ -168,28 +178,32 @@ def make_tasks(
         own.check()
         if own.has_lens and camera.projection != "perspective":
             raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
-        after = earlier = None
-        if motion:
-            after = resize(moving.camera_after(whole, indices[frame.number])).resized(camera.width, camera.height)
-        if backward:
-            earlier = resize(moving.camera_before(whole, indices[frame.number])).resized(camera.width, camera.height)
+        index, after, earlier = indices[frame.number], None, None
         looked_at: Shot | Moments | None = stretch(frame.number)
-        if whole.moment is not None and own.shutter != (0.0, 0.0):
-            times = [own.middle, *own.shutter, *(sample_moments(own) if own.moves else ())]
-            looked_at = moments(whole, resize, frame.number, times)
+        if whole.moment is not None:
+            if own.shutter != (0.0, 0.0):
+                times = [own.middle, *own.shutter, *(sample_moments(own) if own.moves else ())]
+                looked_at = moments(whole, resize, frame.number, times)
             after = _beside_middle(whole, resize, frame.number, own.middle, 1) if motion else None
             earlier = _beside_middle(whole, resize, frame.number, own.middle, -1) if backward else None
+        else:
+            after = moving.camera_after(whole, index) if motion else None
+            earlier = moving.camera_before(whole, index) if backward else None
+            after, earlier = (other and resize(other) for other in (after, earlier))
+        after, earlier = (other and other.resized(camera.width, camera.height) for other in (after, earlier))
         looks = (after, earlier, looked_at, None, None if frame.optics is None else own, frame.optics)
-        tasks.append(Task(frame.number, frame.name, camera, path, *looks, lens=frame.lens))
+        tasks.append(Task(frame.number, frame.name, camera, path, *looks, lens=frame.lens, ends=ends))
     return tasks
 
 
 def _beside_middle(shot: Shot, resize: Callable[[Camera], Camera], number: int, middle: float, way: int) -> Camera:
-    """The camera a frame after the middle of the shutter (way 1) or before it (-1); beyond the shot's ends it goes on
-    as it did."""
+    """The camera a frame after the middle of the shutter (way 1) or before it (-1); beyond the shot's ends, where its
+    source says no more, it goes on as it did."""
     assert shot.moment is not None
-    time, first, last = number + middle, shot.frames[0].number, shot.frames[-1].number
-    if first <= time + way <= last or first == last:
+    time, first, last = number + middle, float(shot.frames[0].number), float(shot.frames[-1].number)
+    if shot.reach is not None:
+        first, last = min(first, shot.reach[0]), max(last, shot.reach[1])
+    if first <= time + way <= last or len(shot.frames) == 1:
         return resize(shot.moment(time + way))
     return moving.continued(resize(shot.moment(time - way)), resize(shot.moment(time)))
 
@@ -273,6 +287,20 @@ def camera_before(task: Task, options: RenderOptions) -> Camera | None:
     middle = sampling_of(task, options).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)
+
+
+def end_before(task: Task, time: float, options: RenderOptions) -> float | None:
+    """The time, in frames from the frame, from which on the camera goes on as it did at another time; None where it is
+    as its source says, and for a shot of one frame.
+
+    A stage says where its camera is as long as the shutter is open; motion goes on from the middle of that.
+    """
+    if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:
+        return None
+    if isinstance(task.stretch, Moments):
+        middle = sampling_of(task, options).middle
+        return middle if time in (middle - 1, middle + 1) else None
+    return task.ends[0] - task.number if time < 0 else task.ends[1] - task.number
 
 
 def model_times(task: Task, options: RenderOptions) -> list[float]:

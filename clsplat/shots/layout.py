@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -27,6 +28,8 @@ VECTORS = {"translate": (0.0, 0.0, 0.0), "rotate": (0.0, 0.0, 0.0), "gain": (1.0
 NUMBERS = {"scale": 1.0, "opacity": 1.0, "saturation": 1.0}
 OVER_TIME = ("matrix", *VECTORS, *NUMBERS, "visible")
 """Properties of a model that may change over time."""
+MOVING = ("matrix", "translate", "rotate", "scale")
+"""Those of them that say where it is."""
 MODEL = ("name", "path", "mattes", "keys", "matrices", "first_frame", "interpolation", *OVER_TIME)
 BOUNDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "scale": (lambda value: edit.SCALES[0] < value < edit.SCALES[1], "a number over 0"),
@@ -79,10 +82,19 @@ class KeyedTrack:
         colour = grade(value("gain", 1, 1, 1), value("offset", 0, 0, 0), float(value("saturation", 1.0)[0]))
         return Placement(self._matrix(frame, value), opacity, colour)
 
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """The first and the last key of where it is; a model that is held from key to key goes on nowhere by itself."""
+        if self.held:
+            return -math.inf, math.inf
+        moving = [channel for name in MOVING if (channel := self.channels.get(name)) and len(channel.frames) > 1]
+        frames = [float(frame) for channel in moving for frame in channel.frames[[0, -1]]]
+        return (min(frames), max(frames)) if frames else None
+
     def _matrix(self, frame: float, value: Callable[..., Float64]) -> tuple[float, ...]:
         if (channel := self.channels.get("matrix")) is not None:
             return rows_of(_between(channel, frame, held=self.held))
-        if not {"translate", "rotate", "scale"} & self.channels.keys():
+        if not set(MOVING) & self.channels.keys():
             return IDENTITY
         scale = float(value("scale", 1.0)[0])
         turned = edit.turning(value("rotate", 0, 0, 0).tolist())
@@ -125,6 +137,12 @@ class Within:
     def at(self, frame: float) -> Placement:
         """The placement of the inner in the outer."""
         return self.inner.at(frame).within(self.outer.at(frame))
+
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """The first and the last frame at which one of both says where it is."""
+        ends = [reach for track in (self.inner, self.outer) if (reach := track.reach)]
+        return (min(first for first, _ in ends), max(last for _, last in ends)) if ends else None
 
 
 VOLUMES = ("box", "sphere", "mesh")

@@ -38,7 +38,8 @@ class Frame:
 class Shot:
     """frames: numbers rise; warnings: a line each, for the user; fps: frames a second, where the source says it;
     unapplied: what the source has and no frame shows; moment: the camera at a time in frames, where the source has one
-    for each; authored: the times, rising, that it has values for; window: part of the frame that it wants, as
+    for each; authored: the times, rising, that it has values for; reach: the first and the last of those that say where
+    the camera is; window: part of the frame that it wants, as
     `usd_settings.Settings`."""
 
     frames: tuple[Frame, ...]
@@ -47,6 +48,7 @@ class Shot:
     unapplied: tuple[str, ...] = ()
     moment: Callable[[float], Camera] | None = None
     authored: tuple[float, ...] = ()
+    reach: tuple[float, float] | None = None
     window: tuple[float, float, float, float] | None = None
 
     @property

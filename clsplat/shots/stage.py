@@ -46,6 +46,18 @@ class StageTrack:
         place = Placement(rows_of(matrix), float(shown))
         return place if place.matrix == IDENTITY else checked(place, f"{self.where} at {frame:g}")
 
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """The first and the last time at which its transform has a value, or that of what it is in."""
+        from pxr import UsdGeom
+
+        times, prim = [], self.prim
+        while prim and not prim.IsPseudoRoot():
+            if prim.IsA(UsdGeom.Xformable):
+                times += UsdGeom.Xformable(prim).GetTimeSamples()
+            prim = prim.GetParent()
+        return (min(times), max(times)) if times else None
+
 
 @dataclass(frozen=True, eq=False)
 class StageModels:

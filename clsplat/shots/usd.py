@@ -85,7 +85,9 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
     # without the end of the line, where USD has the stage's address in memory
     lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
     warnings = tuple(f"{path}: USD says: {' '.join(line.split())}" for line in lines[:3])
-    return Shot(frames, warnings, rate or None, unapplied, moment, authored, settings.window)
+    moved = [time for source in _moved(camera) for time in source.GetTimeSamples()]
+    reach = (float(min(moved)), float(max(moved))) if moved else None
+    return Shot(frames, warnings, rate or None, unapplied, moment, authored, reach, settings.window)
 
 
 def _unapplied(camera: Any, codes: list[int]) -> tuple[str, ...]:

@@ -60,8 +60,8 @@ class ScreenGradients:
 def splats(
     device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int, *, listed: bool = False
 ) -> Projected:
-    """Splats, and the tiles that each reaches, of an image of width x height pixels; listed: of all Gaussians, as their
-    lists are those of somebody else, and may have any."""
+    """Splats, and the tiles that each reaches, of an image of width x height pixels; listed: of all Gaussians, as
+    their lists are given, and may have any."""
     n = gaussians.count
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))
     launch_items(

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from clsplat.arrays import Int64
 from clsplat.torch.arguments import as_array, as_tensor
 from clsplat.torch.covariances import UPPER
+from clsplat.torch.graphs import differentiable_once
 
 SPARSE = ("means", "quaternions", "scales", "covars")
 """Arguments whose gradients may be sparse."""
@@ -46,12 +46,16 @@ class Call:
         packed: bool,
         sparse: bool = False,
         absolute: bool = False,
+        expected_depth: bool = False,
     ) -> None:
         self.results, self.batch, self.packed, self.sparse, self.absolute = results, batch, packed, sparse, absolute
+        self.expected_depth = expected_depth
         radii = self.stacked("radii")
         self.sizes = (len(results), *radii.shape[1:3])
         self.in_view: Int64 | None = np.flatnonzero((radii > 0).all(-1)) if packed else None
         self.radii = self.laid_out(radii)
+        if not packed:  # the caller's own, as the gradient reads the library's
+            self.radii = self.radii.copy()
 
     def ids(self, device: Any) -> tuple[Tensor, Tensor, Tensor]:
         """Batch, camera and Gaussian of each splat in view, int64."""
@@ -81,13 +85,13 @@ class Call:
         )
 
     def laid_out(self, array: NDArray[Any]) -> NDArray[Any]:
-        """(B, C, N, ...) as `meta` has it: (..., C, N, ...), or (nnz, ...) packed."""
+        """(B, C, N, ...) in the layout of `meta`: (..., C, N, ...), or (nnz, ...) packed."""
         if self.in_view is None:
             return array.reshape(*self.batch, *array.shape[1:])
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
 
     def whole(self, value: Tensor | None) -> Any:
-        """A gradient as `meta` has it, as (B, C, N, ...)."""
+        """A gradient in the layout of `meta`, as (B, C, N, ...)."""
         if value is None:
             return None
         array = as_array(value)
@@ -119,13 +123,13 @@ class Call:
         return [self.of_rows(part) if part is not None and name in SPARSE else part for name, part in pairs]
 
     def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor) -> Tensor:
-        """Gradients of splats from every batch, as `meta` has them."""
+        """Gradients of splats from every batch, in the layout of `meta`."""
         arrays = [found[name] for found in each]
         return as_tensor(self.laid_out(arrays[0][None] if len(arrays) == 1 else np.stack(arrays)), like)
 
 
 class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """From Gaussians to splats as `meta` has them."""
+    """From Gaussians to splats in the layout of `meta`."""
 
     @staticmethod
     def forward(
@@ -150,7 +154,7 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         return (*splats, colors)
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
         """Gradients of the arguments of `forward`."""
         call: Call = ctx.call
@@ -159,14 +163,15 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
             return (None,) * (1 + len(inputs))
         names = ("means2d", "conics", "depths", "opacities")
         splats = {name: call.whole(gradient) for name, gradient in zip(names, given[:4], strict=True)}
-        splats["colors2d"] = None if given[4] is None else as_array(given[4]).reshape(*call.sizes, -1)
+        colors = given[4]
+        splats["colors2d"] = None if colors is None else as_array(colors).reshape(*call.sizes, colors.shape[-1])
         cameras = any(ctx.needs_input_grad[-2:])
         each = []
         for index, result in enumerate(call.results):
             by = {name: None if whole is None else whole[index] for name, whole in splats.items()}
             found = result.vjp_projection(**by, cameras=cameras)
             if "covars" in found:  # one half of what a number off the diagonal stands for twice
-                found["covars"] = found["covars"][:, UPPER[0], UPPER[1]] * np.float32([1, 2, 2, 1, 2, 1])
+                found["covars"] = found["covars"][:, UPPER[0], UPPER[1]] * np.array([1, 2, 2, 1, 2, 1], np.float32)
             each.append(found)
         return (None, *call.gradients(each, inputs, ctx.needs_input_grad[1:]))
 
@@ -176,7 +181,7 @@ INPUTS = ("means", "quaternions", "scales", "covars", "opacities", "colors", "vi
 
 
 class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """From splats as `meta` has them to images and alphas."""
+    """From splats in the layout of `meta` to images and alphas."""
 
     @staticmethod
     def forward(
@@ -191,16 +196,19 @@ class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no typ
     ) -> tuple[Tensor, Tensor]:
         """Images (..., C, H, W, X) and alphas (..., C, H, W, 1); values: (..., N, D) or (..., C, N, D), or None."""
         ctx.call = call
-        ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds)
+        images, alphas = (as_tensor(call.by_camera(name), means2d) for name in ("images", "alphas"))
+        # outputs that the gradient reads too: to change them in place is an error then
+        read = (images, alphas) if call.expected_depth else (alphas,)
+        ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds, *read)
         ctx.set_materialize_grads(False)
-        return as_tensor(call.by_camera("images"), means2d), as_tensor(call.by_camera("alphas"), means2d)
+        return images, alphas
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
         """Gradients of the arguments of `forward`."""
         call: Call = ctx.call
-        means2d, conics, depths, opacities, values, backgrounds = ctx.saved_tensors
+        means2d, conics, depths, opacities, values, backgrounds, *_ = ctx.saved_tensors
         if d_images is None and d_alphas is None:
             return (None,) * 7
         each = []

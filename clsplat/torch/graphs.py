@@ -9,9 +9,15 @@ from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import torch
+from torch.autograd.function import once_differentiable
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+
+
+def differentiable_once(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The `backward` of a function of autograd that has no second derivative: to ask for one is an error."""
+    return once_differentiable(function)  # type: ignore[no-any-return]
 
 
 def outside_graphs(function: Callable[_P, _R]) -> Callable[_P, _R]:

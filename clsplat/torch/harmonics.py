@@ -7,24 +7,29 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from clsplat.device.context import Device
 from clsplat.library.harmonics import HarmonicColors
 from clsplat.library.harmonics import spherical_harmonics as library_harmonics
 from clsplat.torch.arguments import as_array, as_tensor, check_shape, refuse, renamed
-from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.graphs import differentiable_once, outside_graphs
 
 
 @outside_graphs
 def spherical_harmonics(
-    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None, *, device: str | None = None
+    degrees_to_use: int,
+    dirs: Tensor,
+    coeffs: Tensor,
+    masks: Tensor | None = None,
+    *,
+    device: Device | str | None = None,
 ) -> Tensor:
     """Sums of real spherical harmonics in directions, (..., 3), as gsplat 1.5.3's function of this name; without the
     0.5 and the floor that `rasterization` adds.
 
     degrees_to_use: the highest degree, 0 to 3. dirs: (..., 3), of any length. coeffs: (..., K, 3), K at least
     (degrees_to_use + 1)^2, in the order and with the signs of 3DGS files. masks: (...), of bool; where false the sum
-    and its gradient are 0. device: an OpenCL device as `clsplat devices` lists it.
+    and its gradient are 0. device: an OpenCL device, open or as `clsplat devices` lists it.
 
     Raises InputError, which names the argument, for other shapes and degrees and for numbers that are not finite.
     """
@@ -47,7 +52,7 @@ class _Harmonics(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         return as_tensor(result.colors, dirs)
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, d_colors: Tensor) -> tuple[None, Tensor, Tensor]:
         dirs, coeffs = ctx.saved_tensors
         found = ctx.result.vjp(as_array(d_colors))

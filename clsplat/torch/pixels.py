@@ -7,12 +7,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from clsplat.device.context import Device
 from clsplat.library.listed import RasterizedPixels
 from clsplat.library.listed import rasterize_to_pixels as library_pixels
 from clsplat.torch.arguments import as_array, as_tensor, check_shape, check_size, refuse
-from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.graphs import differentiable_once, outside_graphs
 
 INPUTS = ("means2d", "conics", "colors", "opacities", "backgrounds")
 
@@ -34,7 +34,7 @@ def rasterize_to_pixels(
     absgrad: bool = False,
     *,
     alpha_max: float = 0.999,
-    device: str | None = None,
+    device: Device | str | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Images (..., H, W, D) and alphas (..., H, W, 1) of splats, as gsplat 1.5.3's function of this name.
 
@@ -44,7 +44,7 @@ def rasterize_to_pixels(
     tile_width) and flatten_ids: (n_isects,), of `isect_offset_encode` and `isect_tiles`: each tile's splats, front to
     back. backgrounds: (..., D), black if None. masks: (..., tile_height, tile_width) of bool; a tile where it is false
     has the background alone. absgrad: after the backward pass `means2d.absgrad` has sums over pixels of absolute
-    gradients. alpha_max: the largest alpha. device: an OpenCL device as `clsplat devices` lists it.
+    gradients. alpha_max: the largest alpha. device: an OpenCL device, open or as `clsplat devices` lists it.
 
     Raises InputError, which names the argument, for other shapes, sizes of tiles and numbers that are not finite.
     """
@@ -62,7 +62,10 @@ def rasterize_to_pixels(
     if backgrounds is not None:
         check_shape("backgrounds", backgrounds, (*isect_offsets.shape[:-2], colors.shape[-1]))
     result = library_pixels(
-        *(as_array(each) for each in (means2d, conics, colors, opacities)),
+        as_array(means2d),
+        as_array(conics),
+        as_array(colors),
+        as_array(opacities),
         image_width,
         image_height,
         tile_size,
@@ -83,12 +86,13 @@ class _Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no ty
         ctx: Any, result: RasterizedPixels, absgrad: bool, means2d: Tensor, *others: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         ctx.result, ctx.absgrad = result, absgrad
+        images, alphas = as_tensor(result.colors, means2d), as_tensor(result.alphas, means2d)
         ctx.save_for_backward(means2d, *others)
         ctx.set_materialize_grads(False)
-        return as_tensor(result.colors, means2d), as_tensor(result.alphas, means2d)
+        return images, alphas
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
         inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
         if d_images is None and d_alphas is None:

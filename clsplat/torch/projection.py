@@ -8,12 +8,12 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from clsplat.device.context import Device
 from clsplat.library.projection import fully_fused_projection as library_projection
 from clsplat.torch.arguments import as_tensor, check_choice, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import Batches, Call
-from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.graphs import differentiable_once, outside_graphs
 
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 INPUTS = ("means", "quaternions", "scales", "covars", "viewmats", "intrinsics")
@@ -41,7 +41,7 @@ def fully_fused_projection(
     camera_model: Literal["pinhole", "ortho", "fisheye", "ftheta"] = "pinhole",
     opacities: Tensor | None = None,
     *,
-    device: str | None = None,
+    device: Device | str | None = None,
 ) -> tuple[Tensor | None, ...]:
     """N Gaussians on the images of C cameras, as gsplat 1.5.3's function of this name; `...` are batches.
 
@@ -50,7 +50,7 @@ def fully_fused_projection(
     in pixels. width, height: pixels. eps2d: pixels^2, added to each variance. near_plane, far_plane: depths between
     which a Gaussian is in view. radius_clip: pixels; a splat of no larger radius is not. calc_compensations: the square
     root of the covariance's determinant without eps2d over that with it. opacities: (..., N), in [0, 1]; with them
-    radii end where alpha is 1/255. device: an OpenCL device as `clsplat devices` lists it.
+    radii end where alpha is 1/255. device: an OpenCL device, open or as `clsplat devices` lists it.
 
     Returns radii (..., C, N, 2) int32, pixels, 0 where not in view; means2d (..., C, N, 2), pixels, the first pixel's
     centre at 0.5; depths (..., C, N); conics (..., C, N, 3), the inverse covariance's xx, xy, yy; compensations (...,
@@ -79,7 +79,9 @@ def fully_fused_projection(
         check_shape("opacities", opacities, (*leading, count))
     if sparse_grad and (leading or not packed):
         raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
-    settings = {
+    settings: dict[str, Any] = {
+        "width": width,
+        "height": height,
         "eps2d": eps2d,
         "near_plane": near_plane,
         "far_plane": far_plane,
@@ -88,10 +90,19 @@ def fully_fused_projection(
         "camera_model": camera_model,
         "device": device,
     }
-    *arrays, covers = (Batches(each, leading) for each in (means, covars, quats, scales, viewmats, Ks, opacities))
+    tensors = {
+        "means": means,
+        "covars": covars,
+        "quaternions": quats,
+        "scales": scales,
+        "viewmats": viewmats,
+        "intrinsics": Ks,
+        "opacities": opacities,
+    }
+    arrays = {name: Batches(each, leading) for name, each in tensors.items()}
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
-            library_projection(*(each[index] for each in arrays), width, height, opacities=covers[index], **settings)
+            library_projection(**{name: each[index] for name, each in arrays.items()}, **settings)
             for index in range(math.prod(leading))
         ]
     call = Call(results, leading, packed=packed, sparse=sparse_grad)
@@ -114,7 +125,7 @@ class _Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has n
         )
 
     @staticmethod
-    @once_differentiable  # type: ignore[misc]
+    @differentiable_once
     def backward(ctx: Any, *given: Tensor | None) -> tuple[Any, ...]:
         call: Call = ctx.call
         inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))

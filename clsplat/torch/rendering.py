@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from clsplat.device.context import Device
 from clsplat.library.rasterize import rasterize
 from clsplat.torch.arguments import check_choice, check_number, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import Batches, Call, Pixels, Projection
@@ -72,7 +73,7 @@ def rasterization(
     viewmats_rs: Tensor | None = None,
     *,
     alpha_max: float = 0.999,
-    device: str | None = None,
+    device: Device | str | None = None,
 ) -> tuple[Tensor, Tensor, Meta]:
     """Images, alphas and `meta` of N Gaussians in C cameras: gsplat 1.5.3's function, argument by argument.
 
@@ -93,8 +94,8 @@ def rasterization(
     absgrad: after the backward pass `meta["means2d"].absgrad` has sums over pixels of absolute gradients.
     rasterize_mode: "antialiased" scales opacities by what eps2d added (Mip-Splatting). camera_model: pinhole, ortho or
     fisheye (equidistant). covars: (..., N, 3, 3) in the place of quats and scales, which may be None. alpha_max: the
-    largest alpha, under 1; gsplat's 0.999, where `clsplat train` and `render` have 0.99. device: an OpenCL device as
-    `clsplat devices` lists it; None for the first. channel_chunk and segmented change no result, and are ignored.
+    largest alpha, under 1; gsplat's 0.999, where `clsplat train` and `render` have 0.99. device: an OpenCL device, open
+    or as `clsplat devices` lists it; None for the first. channel_chunk and segmented change no result, and are ignored.
 
     Returns images (..., C, height, width, X), X = D, 1 or D + 1 by the mode, alphas (..., C, height, width, 1), and
     meta, a dictionary with gsplat's names: batch_ids, camera_ids, gaussian_ids (nnz,) int64, None unless packed; radii
@@ -129,7 +130,9 @@ def rasterization(
     batch = _check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
     if sparse_grad and (batch or not packed):
         raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
-    settings = {
+    settings: dict[str, Any] = {
+        "width": width,
+        "height": height,
         "near_plane": check_number("near_plane", near_plane),
         "far_plane": check_number("far_plane", far_plane),
         "radius_clip": check_number("radius_clip", radius_clip, 0),
@@ -146,22 +149,25 @@ def rasterization(
     backgrounds = None if depth_alone else backgrounds
     if covars is not None:
         quats = scales = None
-    *arrays, behind, squares = (
-        Batches(each, batch) for each in (means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
-    )
+    tensors = {
+        "means": means,
+        "quaternions": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "intrinsics": Ks,
+        "backgrounds": backgrounds,
+        "covars": covars,
+    }
+    arrays = {name: Batches(each, batch) for name, each in tensors.items()}
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
-            rasterize(
-                *(each[index] for each in arrays),
-                width,
-                height,
-                backgrounds=behind[index],
-                covars=squares[index],
-                **settings,
-            )
+            rasterize(**{name: each[index] for name, each in arrays.items()}, **settings)
             for index in range(math.prod(batch))
         ]
-    call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad)
+    expected = render_mode.endswith("ED")
+    call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
     covars = None if covars is None else covars[..., UPPER[0], UPPER[1]]
     coefficients = None if sh_degree is None or depth_alone else colors
     means2d, conics, depths, opacities2d, colors2d = Projection.apply(

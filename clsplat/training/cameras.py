@@ -22,6 +22,7 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.scenes.scene import Scene, View
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.stages.pose import LENS, POSE, lens_rows, pose_rows, sum_of, sums_of
+from clsplat.training.gate import CameraGate, Drift, drift
 from clsplat.training.lenses import RefinedLenses
 from clsplat.training.photographs import kept_pixels
 from clsplat.training.poses import Poses, descend, fallen
@@ -83,15 +84,19 @@ class CameraSums:
 
 
 class Cameras:
-    """The cameras of the training views, whose poses and lenses change where they are refined."""
+    """The cameras of the training views, whose poses and lenses change where they are refined, until their gate ends
+    that. held_out: number of views that the gate goes by."""
 
-    def __init__(self, config: TrainConfig, views: Sequence[View], extent: float) -> None:
+    def __init__(self, config: TrainConfig, views: Sequence[View], extent: float, held_out: int = 0) -> None:
         self.poses, self.lenses = Poses(config, views, extent), RefinedLenses(config, views)
-        self._views = views
+        self.gate = CameraGate(config, held_out)
+        self._views, self._extent = views, extent
 
     def sums(self, work: Workspace, count: int, view: int, step: int) -> CameraSums | None:
         """Takes the gradients by what is refined of a view in this step, of a model of `count`; None where that is
         nothing."""
+        if self.gate.ended is not None:
+            return None
         pose, lens = self.poses.moves(view, step), self.lenses.moves(step)
         return CameraSums(work, count, pose, lens) if pose or lens else None
 
@@ -106,15 +111,35 @@ class Cameras:
         """A training view's camera; the same object where lenses are not refined, and its pose stays."""
         return self.lenses.seen(self._views[view].lens, self.poses.cameras[view])
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays of a checkpoint, by name."""
+    def drift(self) -> Drift | None:
+        """The drift of the refined poses from those that were given; None where poses are not refined."""
+        given = [view.camera for view in self._views]
+        return drift(given, self.poses.cameras, self._extent) if self.poses.on else None
+
+    def refined_arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name, without the gate's."""
         return self.poses.arrays() | self.lenses.arrays()
 
-    def load(self, poses: Mapping[str, NDArray[Any]], lenses: Mapping[str, NDArray[Any]]) -> None:
+    def go_back(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Take the cameras that `refined_arrays` had. Raises ValueError where they are of other views."""
+        for part, name in ((self.poses, "poses/"), (self.lenses, "lenses/")):
+            part.load({key.removeprefix(name): array for key, array in arrays.items() if key.startswith(name)})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        return self.refined_arrays() | self.gate.arrays()
+
+    def load(
+        self,
+        poses: Mapping[str, NDArray[Any]],
+        lenses: Mapping[str, NDArray[Any]],
+        gate: Mapping[str, NDArray[Any]],
+    ) -> None:
         """Take those arrays, by name without the part before the slash. Raises ValueError where they are of other
         views."""
         self.poses.load(poses)
         self.lenses.load(lenses)
+        self.gate.load(gate, self.refined_arrays())
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,6 +45,7 @@ from clsplat.training import telemetry
 from clsplat.training.batch import Losses
 from clsplat.training.cameras import aligned
 from clsplat.training.health import RETURNS, WINDOW
+from clsplat.training.judging import judge
 from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer
 
@@ -249,7 +250,9 @@ class Session:
             space=photos_space(view.path for view in trainer.scene.views),
         )
 
-    def record(self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None) -> None:
+    def record(
+        self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, judged: bool = False
+    ) -> None:
         """Hand the report on, and write it down with what clsplat.report asks for."""
         if self.on_step is not None:
             self.on_step(report)
@@ -261,6 +264,8 @@ class Session:
         trainer = self.trainer
         if stages is not None:
             record["stages"] = stages
+        if judged:
+            record["gate"] = trainer.cameras.gate.record()
         if not self.recorded:
             record["session"] = telemetry.session(trainer.device, self.first_step)
             self.recorded = True
@@ -289,7 +294,8 @@ class Session:
 
     def reports(self, steps: range) -> bool:
         """True if the loss of these steps is read."""
-        return _reached(REPORT_EVERY, steps) or self.trainer.config.iterations in steps or self.evaluates(steps)
+        asked = self.evaluates(steps) or self.trainer.cameras.gate.is_due(steps[-1])
+        return _reached(REPORT_EVERY, steps) or self.trainer.config.iterations in steps or asked
 
     def step(self) -> None:
         """One step, or those of a batch, and what is due after it."""
@@ -307,13 +313,14 @@ class Session:
             trainer.mend(look=True)
         if self.go_back():
             return
+        judged = judge(trainer)
         if doubts.LOOK_AT in steps and trainer.step < config.iterations:
             self.doubt()
         if reports:
             evaluating = self.evaluates(steps)
             report = self.report(result)
             if report is not None:
-                self.record(report, evaluating=evaluating, stages=stages)
+                self.record(report, evaluating=evaluating, stages=stages, judged=judged)
         if config.checkpoint_every > 0 and _reached(config.checkpoint_every, steps):
             self.save()
 

@@ -57,6 +57,7 @@ from clsplat.training.cameras import MODELS, Cameras
 from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.health import Patience
+from clsplat.training.judging import Judges, judge
 from clsplat.training.monitor import Remedy, Watch
 from clsplat.training.pending import Pending
 from clsplat.training.photographs import Photographs
@@ -103,6 +104,7 @@ class Trainer:
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.rasterizer.antialias(on=config.antialiased)
         self.photographs = Photographs(self.views, device)
+        self.judges = Judges(scene, device)
         self.depths = depth.Depths(config, self.views, scene.extent)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = sizes_of(
@@ -129,7 +131,7 @@ class Trainer:
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
-        self.cameras = Cameras(self.config, self.views, self.scene.extent)
+        self.cameras = Cameras(self.config, self.views, self.scene.extent, len(self.judges.views))
         self.origin, self.near = initial.origin, self.scene.near
         asked = self.config.perspective
         self.by_rays = asked == "rays" or (asked == "auto" and any(view.camera.kind.rays for view in self.views))
@@ -216,6 +218,7 @@ class Trainer:
         if self.mark is None or self._looks_at_steps:
             self._note()
         self.mend()
+        judge(self)
         if not self.controlled:
             self._control_density()
             self.controlled = True
@@ -538,7 +541,7 @@ class Trainer:
         try:
             self.sampling.load(checkpoint.named("sampling/"), self.parameters.count)
             self.appearance.load(checkpoint.named("appearance/"))
-            self.cameras.load(checkpoint.named("poses/"), checkpoint.named("lenses/"))
+            self.cameras.load(*(checkpoint.named(f"{part}/") for part in ("poses", "lenses", "gate")))
         except ValueError as error:
             raise unusable(checkpoint, str(error)) from None
 

@@ -38,8 +38,8 @@ def wide(degree: int | None) -> tuple[dict[str, Any], tuple[Tensor, ...]]:
     ("degree", "settings"),
     [
         (None, {}),
-        (None, {"packed": False, "rasterize_mode": "antialiased"}),
-        (1, {"render_mode": "RGB+D"}),
+        pytest.param(None, {"packed": False, "rasterize_mode": "antialiased"}, marks=pytest.mark.slow),
+        pytest.param(1, {"render_mode": "RGB+D"}, marks=pytest.mark.slow),
         pytest.param(2, {"render_mode": "RGB+ED"}, marks=pytest.mark.slow),
     ],
 )

@@ -119,6 +119,21 @@ def test_parameters_that_are_changed_before_the_gradient_are_an_error() -> None:
         images.sum().backward()
 
 
+def test_results_that_are_changed_in_place() -> None:
+    """An error where the gradient reads them; the image of colours alone may be."""
+    images, alphas, _ = rasterization(**given())
+    images.mul_(2)
+    images.sum().backward()
+    images, alphas, _ = rasterization(**given())
+    alphas.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        images.sum().backward()
+    images, _, _ = rasterization(**given(), render_mode="ED")
+    images.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        images.sum().backward()
+
+
 def test_without_gradients() -> None:
     with torch.no_grad():
         images, alphas, meta = rasterization(**given())

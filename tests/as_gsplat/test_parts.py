@@ -178,12 +178,15 @@ def test_harmonics_are_gsplats(degree: int) -> None:
     assert (found - reference._spherical_harmonics(degree, directions, coefficients)).abs().max() < 1e-5
 
 
+MODELS = [("pinhole", True), ("ortho", False), ("ortho", True), ("fisheye", False), ("fisheye", True)]
 PROJECTED = ("means2d", "depths", "conics", "compensations")
 
 
 @pytest.mark.needs("gsplat")
-@pytest.mark.parametrize("from_covariances", [False, True])
-@pytest.mark.parametrize("camera_model", ["pinhole", "ortho", "fisheye"])
+@pytest.mark.parametrize(
+    ("camera_model", "from_covariances"),
+    [("pinhole", False), *(pytest.param(*each, marks=pytest.mark.slow) for each in MODELS)],
+)
 def test_projection_is_gsplats(camera_model: Any, from_covariances: bool) -> None:
     """Values within 1e-5, radii but for one in a hundred, which is next to a whole number, gradients within 1e-4."""
     reference = pytest.importorskip("gsplat.cuda._torch_impl")
@@ -292,8 +295,7 @@ def splats_of(meta: Any, width: int) -> tuple[dict[str, Tensor], Tensor]:
     return free, colors
 
 
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("width", [3, 5])
+@pytest.mark.parametrize(("width", "packed"), [(3, True), pytest.param(3, False, marks=pytest.mark.slow), (5, False)])
 def test_pixels_of_lists_are_those_of_the_whole_call(width: int, packed: bool) -> None:
     """Images within 1e-5 and gradients within 1e-4 of the dense float64 oracle, from the lists that meta has."""
     made = {name: each.float() if isinstance(each, Tensor) else each for name, each in clouds.cloud(40, cams=2).items()}

@@ -74,8 +74,13 @@ def run(strategy: Any, packed: bool, steps: int, **extra: Any) -> tuple[list[int
     return counts, losses
 
 
-@pytest.mark.parametrize("absgrad", [False, True])
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(
+    ("packed", "absgrad"),
+    [
+        (True, False),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((False, False), (False, True), (True, True))),
+    ],
+)
 def test_the_default_strategy_clones_splits_and_prunes(packed: bool, absgrad: bool) -> None:
     strategy = DefaultStrategy(
         refine_start_iter=5,
@@ -91,7 +96,7 @@ def test_the_default_strategy_clones_splits_and_prunes(packed: bool, absgrad: bo
     assert losses[10] < losses[0]
 
 
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("packed", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_mcmc_strategy_moves_and_adds(packed: bool) -> None:
     strategy = MCMCStrategy(cap_max=40, refine_start_iter=5, refine_every=5, min_opacity=0.3, noise_lr=1.0)
     counts, losses = run(strategy, packed, 40, lr=1e-3)

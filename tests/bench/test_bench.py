@@ -168,7 +168,7 @@ def test_evaluated_pairs_of_a_group_are_those_of_the_blocks(default_device: Devi
     assert contributing == counted(Pipeline.run(shaped(default_device, 8, 1), scenes.NAMED[name]()))[0]
 
 
-@pytest.mark.parametrize("name", ["overlap", "saturating", "random_cloud", "needles"])
+@pytest.mark.parametrize("name", quick(["overlap", "saturating", "random_cloud", "needles"], "random_cloud", "needles"))
 def test_evaluated_pairs_on_a_cpu_are_those_in_the_ellipse(default_device: Device, name: str) -> None:
     pipeline = Pipeline.run(shaped(default_device, 8, 1), scenes.NAMED[name]())
     _, evaluated = counted(pipeline)
@@ -229,8 +229,8 @@ MOST_LAUNCHES = 40
 
 
 @pytest.mark.parametrize(("shape", "launches"), [((1, 64), MOST_LAUNCHES), (None, MOST_LAUNCHES)], ids=str)
-@pytest.mark.parametrize("count", [300, 6000])
-@pytest.mark.parametrize("by_capacity", [False, True])
+@pytest.mark.parametrize("count", quick([300, 6000], 6000))
+@pytest.mark.parametrize("by_capacity", quick([False, True], False))
 def test_what_a_step_gives_the_queue(
     device: Device,
     monkeypatch: pytest.MonkeyPatch,

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from calls import Capture, error_line
+from quick import quick
 from tiny import short, write_scene
 
 from clsplat import process
@@ -151,7 +152,7 @@ def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
 
 
 @posix
-@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("number", quick(SIGNALS, signal.SIGINT))
 def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
     """pycolmap takes a Ctrl-C for a sign that it is not installed."""
     code = (

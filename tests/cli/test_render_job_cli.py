@@ -173,6 +173,7 @@ def test_gaps_alone_are_rendered(shot: list[str], tmp_path: Path, capsys: Captur
     assert "took" in out[-1]  # another size is not what is wanted
 
 
+@pytest.mark.slow
 def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     """By their cameras, precision or model; a frame that is broken is rendered without a word."""
     assert render(shot, tmp_path) == 0
@@ -361,7 +362,14 @@ def test_frames_that_show_nothing(shot: list[str], tmp_path: Path, capsys: Captu
     assert captured.err == ""
 
 
-@pytest.mark.parametrize("flags", ["--width 960 --max-device-mem 4MiB", "--deep", "--deep --width 960"])
+@pytest.mark.parametrize(
+    "flags",
+    quick(
+        ["--width 960 --max-device-mem 4MiB", "--deep", "--deep --width 960"],
+        "--width 960 --max-device-mem 4MiB",
+        "--deep",
+    ),
+)
 def test_frames_in_strips_and_deep_ones_that_show_nothing(
     flags: str, shot: list[str], tmp_path: Path, capsys: Capture
 ) -> None:

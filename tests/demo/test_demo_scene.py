@@ -78,6 +78,7 @@ def test_rays_meet_the_surface_where_its_texture_says(surfaces, index):
         np.testing.assert_allclose(again, points, atol=2e-2)
 
 
+@pytest.mark.slow
 def test_camera_sees_what_lies_on_its_axis(surfaces):
     marble = surfaces[2]
     rotation, translation = look_at(np.array([2.0, 0.5, 1.0]), np.array(marble.centre), np.array([0.0, 0.0, 1.0]))

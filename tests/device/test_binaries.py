@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from drivers import KEPT, label
 
-from clsplat.device import binaries
+from clsplat.device import binaries, context
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device, all_devices
 from clsplat.device.launch import launch_groups
 from clsplat.device.program import Kernels, Variant, build, variant_of
 from clsplat.device.quirks import wants_cache
+from clsplat.errors import DriverError
 
 VARIANT = variant_of("probe", {"LANES": 4, "ITEMS": 1, "FMA_BY_CONTRACTION": True}, "-cl-std=CL1.2")
 
@@ -54,6 +55,26 @@ def test_what_is_loaded_computes_the_same(fresh: Device) -> None:
         launch_groups(fresh, of.probe_fma, 1, 1, out, 1 + 2.0**-12, -(1 + 2.0**-11))
         results.append(out.get())
     np.testing.assert_array_equal(*results)
+
+
+@pytest.mark.parametrize(
+    ("stem", "shared"), [("ranges", True), ("project", True), ("sort_radix", False), ("blend", False), ("loss", False)]
+)
+def test_shapes_share_a_file_that_does_not_name_what_they_differ_in(
+    stem: str, shared: bool, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def note(_context: object, _device: object, variant: Variant) -> None:
+        asked.append(variant)
+        raise DriverError("not built")
+
+    monkeypatch.setattr(context, "build", note)
+    for shape in ("1x32", "1x64"):
+        with pytest.raises(DriverError, match="not built"):
+            default_device.with_shape(shape)._built(stem, {})
+    assert (asked[0].digest == asked[1].digest) is shared
+    assert ("-DLANES=1" in asked[0].options) == (stem in {"project", "blend", "loss"})
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "changed"])

@@ -14,6 +14,7 @@ import scenes
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
 from pipeline import EVERY_SHAPE, shaped, shapes_of
+from quick import quick
 
 from clsplat.camera import Camera, Window
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding
@@ -68,7 +69,8 @@ def over(pixels: list[NDArray[np.float64]], spec: Any) -> NDArray[np.float64]:
     return flat.reshape(spec.height, spec.width, 4)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize("name", quick(SCENES, "overlap"))
 def test_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = SCENES[name]()
     got = render_deep(Renderer(shaped_device), gaussians, camera, 5)

@@ -61,6 +61,7 @@ def in_front(gaussians: Gaussians, camera: Camera, depth: float) -> Gaussians:
     return replace(gaussians, opacity_logits=np.where(depths < depth, gaussians.opacity_logits, -20).astype(np.float32))
 
 
+@pytest.mark.slow_in_groups
 def test_against_the_twin(shaped_device: Device) -> None:
     gaussians, camera = CLOUD
     layers = layered(camera)

@@ -30,22 +30,22 @@ def test_pictures_and_gradients_against_dense_compositing(device: Device, depth:
     background, cap = rng.uniform(0, 1, depth).astype(np.float32), float(np.float32(alpha_max))
     wanted = twin.blend_values(flat.twin, WIDTH, HEIGHT, background, cap)
     sure = wanted.margin > 1e-4
-    assert 0.9 < sure.mean()
+    assert sure.mean() > 0.9
     d_image = np.where(sure[:, :, None], rng.normal(size=(HEIGHT, WIDTH, depth)), 0).astype(np.float32)
     d_alpha = np.where(sure, rng.normal(size=(HEIGHT, WIDTH)), 0).astype(np.float32)
     pixels = flat.pixels(device, WIDTH, HEIGHT, background=background, alpha_max=alpha_max)
-    # alpha is good to 2e-7 of itself in each of some tens of layers
-    assert_close(pixels.image[sure], wanted.image[sure], absolute=3e-6)
-    assert_close(pixels.alpha[sure], 1 - wanted.transmittance[sure], absolute=3e-6)
+    # alpha is good to 2e-7 of itself in each of a few layers
+    assert_close(pixels.image[sure], wanted.image[sure], absolute=1e-6)
+    assert_close(pixels.alpha[sure], 1 - wanted.transmittance[sure], absolute=1e-6)
     of = twin.blend_values_grad(flat.twin, WIDTH, HEIGHT, background, d_image, d_alpha, cap)
     # sums of up to some hundred pixels; recovered by division, a transmittance of layers at the cap loses the more
     for name, array in pixels.gradient(d_image, d_alpha, absolute=True).items():
-        assert_close_gradient(array, getattr(of, NAMES.get(name, name)), 1e-4, name=name)
+        assert_close_gradient(array, getattr(of, NAMES.get(name, name)), 5e-6, name=name)
     of = twin.blend_values_grad(flat.twin, WIDTH, HEIGHT, background, d_image, np.zeros_like(d_alpha), cap)
     plain = pixels.gradient(d_image)
     assert set(plain) == {"means2d", "conics", "opacities", "colours", "background"}
     for name, array in plain.items():
-        assert_close_gradient(array, getattr(of, NAMES.get(name, name)), 1e-4, name=name)  # as above
+        assert_close_gradient(array, getattr(of, NAMES.get(name, name)), 5e-6, name=name)  # as above
 
 
 def test_the_cap_is_asked_for(default_device: Device) -> None:
@@ -89,7 +89,7 @@ def test_passes_keep_what_their_gradients_need(default_device: Device, depth: in
 
 def test_memory_of_a_pass_that_is_gone_is_used_again(default_device: Device) -> None:
     session, flat = session_of(default_device), cloud(50, WIDTH, HEIGHT)
-    works = {id(flat.pixels(default_device, WIDTH, HEIGHT)._work) for _ in range(3)}  # noqa: SLF001  # what is tested
+    works = {id(flat.pixels(default_device, WIDTH, HEIGHT)._work) for _ in range(3)}  # what is tested
     gc.collect()
     assert len(works) == 1
     assert session is session_of(default_device)
@@ -126,3 +126,15 @@ def test_arrays_of_the_host(default_device: Device, pretend: str, monkeypatch: p
         assert_same_bits(room.get(), np.full(shape, 3, np.float32))
         room.array.fill(4.0)
         assert_same_bits(room.get(), np.full(shape, 4, np.float32))
+
+
+@pytest.mark.parametrize("depth", [3, 6])
+def test_a_pass_that_is_dropped_keeps_its_arrays_until_it_is_done(default_device: Device, depth: int) -> None:
+    flat = cloud(500, WIDTH, HEIGHT, depth)
+    for _ in range(3):
+        pixels = flat.pixels(default_device, WIDTH, HEIGHT)
+        pixels.gradient_on_device(np.ones((HEIGHT, WIDTH, depth), np.float32))
+        del pixels
+        assert default_device.under_way
+    default_device.finish()
+    assert not default_device.under_way

@@ -31,13 +31,11 @@ def three_views() -> tuple[np.ndarray, np.ndarray]:
 
 def projection(device: Device | None = None, shape: str = SHAPES[0], **settings: Any) -> Projection:
     """SUBJECT before the three cameras."""
-    covars, quaternions, scales = None, SUBJECT.quaternions, SUBJECT.scales
+    shapes: tuple[Any, ...] = (None, SUBJECT.quaternions, SUBJECT.scales)
     if shape != SHAPES[0]:
-        covars, quaternions, scales = SUBJECT.full(rounded=True), None, None
-    views = three_views()
-    return fully_fused_projection(
-        SUBJECT.means, covars, quaternions, scales, *views, 100, 70, calc_compensations=True, device=device, **settings
-    )
+        shapes = (SUBJECT.full(rounded=True), None, None)
+    given = (SUBJECT.means, *shapes, *three_views(), 100, 70)
+    return fully_fused_projection(*given, calc_compensations=True, device=device, **settings)
 
 
 def random_gradients(projected: Projection) -> dict[str, np.ndarray]:
@@ -119,7 +117,7 @@ def test_three_cameras_have_the_sum_of_their_gradients(device: Device) -> None:
 def test_one_gradient_alone_is_a_part_of_the_sum(default_device: Device) -> None:
     projected = projection(default_device)
     by = random_gradients(projected)
-    parts = [projected.vjp(**{name: values}) for name, values in by.items()]  # type: ignore[arg-type]
+    parts = [projected.vjp(**{name: values}) for name, values in by.items()]
     for name, values in projected.vjp(**by).items():
         assert relative_error(sum(part[name] for part in parts), values) <= 1e-5
     assert not any(values.any() for values in projected.vjp().values())

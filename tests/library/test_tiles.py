@@ -83,13 +83,13 @@ def test_pairs_are_those_of_gsplat() -> None:
     import torch
     from gsplat.cuda import _torch_impl as impl
 
-    of = flats(20, 2)
+    of = flats(6, 2)  # it is a loop over tensors
     arrays = (stacked(of, "means2d"), stacked(of, "radii"), stacked(of, "depths"))
     counts, ids, _ = isect_tiles(*arrays, 16, *TILES)
-    wanted = impl._isect_tiles(*(torch.from_numpy(array) for array in arrays), 16, *TILES)  # noqa: SLF001  # its reference
+    wanted = impl._isect_tiles(*(torch.from_numpy(array) for array in arrays), 16, *TILES)  # its reference
     assert_same_bits(counts, wanted[0].numpy())
     assert_same_bits(ids, wanted[1].numpy())
-    offsets = impl._isect_offset_encode(wanted[1], 2, *TILES)  # noqa: SLF001  # as above
+    offsets = impl._isect_offset_encode(wanted[1], 2, *TILES)  # as above
     assert_same_bits(isect_offset_encode(ids, 2, *TILES), offsets.numpy())
 
 
@@ -105,8 +105,8 @@ def test_pixels_of_lists_against_dense_compositing(device: Device, depth: int) -
         twin.blend_values(flat.twin, WIDTH, HEIGHT, behind) for flat, behind in zip(of, backgrounds, strict=True)
     ]
     sure = np.stack([each.margin > 1e-4 for each in blended])
-    # alpha is good to 2e-7 of itself in each of some tens of layers
-    assert_close(got.colors[sure], np.stack([each.image for each in blended])[sure], absolute=3e-6)
+    # alpha is good to 2e-7 of itself in each of a few layers
+    assert_close(got.colors[sure], np.stack([each.image for each in blended])[sure], absolute=1e-6)
     d_colors[~sure], d_alphas[~sure] = 0, 0
     found = got.vjp(d_colors, d_alphas, absolute=True)
     assert {name: array.shape for name, array in found.items()} == {
@@ -123,7 +123,7 @@ def test_pixels_of_lists_against_dense_compositing(device: Device, depth: int) -
         wanted = twin.blend_values_grad(flat.twin, WIDTH, HEIGHT, *given)
         for name, array in found.items():
             # sums of up to some hundred pixels, of transmittances that are recovered by division
-            assert_close_gradient(array[image], getattr(wanted, names.get(name, name)), 1e-4, name=name)
+            assert_close_gradient(array[image], getattr(wanted, names.get(name, name)), 5e-6, name=name)
 
 
 def test_packed_arrays_and_masks(default_device: Device) -> None:

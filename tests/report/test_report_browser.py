@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from browser import kept, watched_page
+from quick import quick
 from test_report import SCRIPT
 
 from clsplat.cli.main import main
@@ -53,7 +54,7 @@ def opened(browser: Any, pages: dict[str, Path]) -> Iterator[Any]:
         assert len([url for url in asked if url.startswith("file://")]) == 1, "the page itself"
 
 
-@pytest.mark.parametrize("kind", ["report", "compare"])
+@pytest.mark.parametrize("kind", quick(["report", "compare"], "report"))
 @pytest.mark.parametrize(("size", "scheme"), [(WIDE, "light"), (PHONE, "dark")], ids=["wide", "phone"])
 def test_it_fits_and_is_coloured_as_asked(opened: Any, kind: str, size: Any, scheme: str, tmp_path: Path) -> None:
     page = opened(kind, viewport=size, color_scheme=scheme)

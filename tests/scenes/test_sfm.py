@@ -407,6 +407,7 @@ def test_masks_that_are_asked_for_and_not_there(photos, tmp_path):
         sfm.reconstruct(photos, tmp_path / "out", masks=MaskUse("ignore"))
 
 
+@pytest.mark.slow
 def test_photos_with_masks_are_trained_by_their_folder(photos, tmp_path, monkeypatch):
     """images/ and masks/ in one folder without cameras: the masks reach sfm, are inverted once, and count after it."""
     folder = tmp_path / "capture"
@@ -428,6 +429,7 @@ def test_photos_with_masks_are_trained_by_their_folder(photos, tmp_path, monkeyp
     assert not ignored[: HEIGHT // 4 - 6, :, 4].any(), "the same features, so the same reconstruction"
 
 
+@pytest.mark.slow
 def test_alpha_that_undistortion_loses_is_kept_as_masks(pictures, tmp_path):
     folder = tmp_path / "photos"
     for index, picture in enumerate(pictures[0]):

@@ -107,8 +107,7 @@ def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last
     "words",
     quick(
         BROKEN,
-        *("arithmetic: x / y", "duplicate: gaussian_from_visible[order[rank]]", "blend: before * alpha"),
-        *("channels: weight > largest[cell]", "project_grad: sums[field] += slot[field]"),
+        *("arithmetic: x / y", "blend: before * alpha", "project_grad: sums[field] += slot[field]"),
     ),
 )
 def test_one_wrong_operation_is_found(words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:
@@ -165,7 +164,7 @@ SLOPPY = {
 """A division or a square root that is off by two or three ulp, which OpenCL allows a GPU."""
 
 
-@pytest.mark.parametrize("words", quick(SLOPPY, "arithmetic: x / y", "features: q[0] / length", "adam: sqrt(*v)"))
+@pytest.mark.parametrize("words", quick(SLOPPY, "arithmetic: x / y", "features: q[0] / length"))
 def test_rounding_otherwise_is_told_and_forgiven(
     words: str, monkeypatch: pytest.MonkeyPatch, default_device: Device
 ) -> None:
@@ -243,6 +242,7 @@ def test_every_driver_here_passes(capsys: Capture) -> None:
         assert record["build_seconds"] > 0
 
 
+@pytest.mark.slow
 def test_the_table(capsys: Capture) -> None:
     index = min(KEPT)
     assert main(["selftest", "--device", str(index)]) == 0
@@ -412,14 +412,21 @@ def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monk
     assert untrusting.exists()
 
 
-def test_training_and_rendering_ask_for_it(
-    untrusting: Path, scene: Path, trained: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+def test_training_asks_for_it(
+    untrusting: Path, scene: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(BREAK, "project_grad: sums[field] += slot[field] => sums[field] -= slot[field]")
     run_folder = tmp_path / "run"
     assert main(["train", str(scene), "-o", str(run_folder), "--iterations", "1"]) == 2
     assert "cannot be trusted: project_grad: " in capsys.readouterr().err
     assert not run_folder.exists()
+
+
+@pytest.mark.slow
+def test_rendering_and_evaluating_ask_for_what_they_need(
+    untrusting: Path, scene: Path, trained: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(BREAK, "project_grad: sums[field] += slot[field] => sums[field] -= slot[field]")
     frames = str(tmp_path / "{name}.png")
     assert main(["render", str(trained), "--cameras", str(scene), "-o", frames]) == 0, "that has no gradient"
     assert main(["eval", str(trained / "model.ply"), "--scene", str(scene)]) == 0

@@ -14,15 +14,24 @@ import OpenImageIO as oiio
 import pytest
 import scenes
 from calls import Capture, error_line
+from cg import write_flat, write_samples
 from headers import exr_attributes
 from needs import require
 
 from clsplat.camera import Camera
 from clsplat.cli.main import main
-from clsplat.config.stereo import StereoConfig
+from clsplat.cli.render_job import check_warps
+from clsplat.config.holdout import HoldoutConfig
+from clsplat.config.pictures import PictureConfig, WarpConfig
+from clsplat.config.stereo import EYES, StereoConfig
 from clsplat.errors import InputError
+from clsplat.images.stmap import write_stmap
 from clsplat.reference.cameras import pixel_from_world
+from clsplat.rendering.renderer import Renderer
+from clsplat.sequence.frame_renderer import FrameRenderer
+from clsplat.sequence.task import RenderOptions, Task
 from clsplat.shots.stereo import for_eye, pair_of_stage, seen_by
+from clsplat.stages.holdout import HELD_BYTES
 
 DISTANCE, CONVERGENCE = 0.2, 4.0
 KEY = {"world_from_cam": [1, 0, 0, 0], "fov_x": 40}
@@ -220,6 +229,91 @@ def test_a_pair_of_a_stage(shot: list[str], tmp_path: Path, capsys: Capture) -> 
     stage.write_text(STAGE.replace('"right"', '"mono"'))
     assert main([*call, "-o", f"{tmp_path}/%V.##.exr", "--stereo", "stage"]) == 2
     assert "no prim has one camera of stereoRole left and one of right" in error_line(capsys)
+
+
+RENDER = """def RenderSettings "Render"
+{
+    rel camera = </rig/one>
+    uniform int2 resolution = (64, 48)
+    uniform token aspectRatioConformPolicy = "adjustPixelAspectRatio"
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("flags", "settings", "message"),
+    [
+        ("--width 64", "", "--stereo: frame 1 is 64x48 for the left eye and 64x32 for the right; "),
+        ("--width 64 --region 0,30,8,8", "", "--region 0,30,8,8: ends at 8,38, expected at most the frame's 64,32"),
+        ("", RENDER, "--stereo: frame 1 has pixels of the aspect ratio 1.0 for the left eye and 1.5 for the right; "),
+    ],
+)
+def test_eyes_that_are_not_alike(
+    flags: str, settings: str, message: str, shot: list[str], tmp_path: Path, capsys: Capture
+) -> None:
+    """One file has one window and one shape of pixels: told before anything is rendered. Two files may have two."""
+    require("pxr")
+    stage = STAGE
+    for name, height in (("left", 15), ("right", 10)):
+        aperture = f"float horizontalAperture = 20\n        float verticalAperture = {height}"
+        stage = stage.replace(f'stereoRole = "{name}"', f'stereoRole = "{name}"\n        {aperture}')
+    if settings:
+        stage = stage.replace("endTimeCode = 2", 'endTimeCode = 2\n    renderSettingsPrimPath = "/Render"')
+    (tmp_path / "shot.usda").write_text(stage + settings)
+    call = ["render", shot[0], "--cameras", str(tmp_path / "shot.usda"), "--stereo", "stage", *flags.split()]
+    assert main([*call, "-o", str(tmp_path / "a.##.exr"), "--dry-run"]) == 2
+    assert message in error_line(capsys)
+    if "--region" not in flags:
+        assert main([*call, "-o", str(tmp_path / "{eye}.##.exr"), "--dry-run"]) == 0
+
+
+def test_each_eye_has_a_holdout(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    """A missing one, or one of another size, is told before anything is rendered, in one file as in two."""
+    whole = np.full((64, 96), 4.0)
+    for names in ("a.##.exr", "{eye}.##.exr"):
+        folder = tmp_path / names[:2].strip("{.")
+        folder.mkdir()
+        flags = f"--stereo 0.1 --frames 1 --alpha --holdout {folder}/z.{{eye}}.exr"
+        write_flat(folder / "z.left.exr", {"Z": whole})
+        assert render(shot, folder / names, flags) == 2
+        assert f"{folder}/z.right.exr: no such hold-out" in error_line(capsys)
+        write_flat(folder / "z.right.exr", {"Z": whole[:, 1:]})
+        assert render(shot, folder / names, flags) == 2
+        assert "z.right.exr: is of a frame of 95x64, expected 96x64" in error_line(capsys)
+        write_flat(folder / "z.right.exr", {"Z": np.inf * whole})
+        assert not list(folder.glob("*01.exr"))
+        assert render(shot, folder / names, flags) == 0
+        paths = [(folder / "a.01.exr", part) for part in (0, 1)]
+        if "eye" in names:
+            paths = [(folder / f"{eye}.01.exr", 0) for eye in ("left", "right")]
+        assert [bool(pixels_of(*path)[:, :, 3].max() > 0.5) for path in paths] == [False, True]
+
+
+def test_a_map_is_looked_at_for_both_eyes(tmp_path: Path) -> None:
+    write_stmap(tmp_path / "map.exr", np.full((64, 96, 2), 9.0), 96, 64)
+    options = RenderOptions(pictures=PictureConfig(warp=WarpConfig(stmap=str(tmp_path / "map.exr"))))
+    camera = scenes.tilted_camera(96, 64)
+    right = Task(1, "1", replace(camera, projection="equirectangular"), tmp_path / "a.exr", eye="right")
+    with pytest.raises(InputError, match="frame 1 is a panorama"):
+        check_warps([Task(1, "1", camera, tmp_path / "a.exr", eye="left", right=right)], options)
+
+
+def test_a_pair_in_strips_is_no_file_of_one_eye(tmp_path: Path) -> None:
+    """A deep hold-out of many surfaces asks for strips where one of a few does not, which the check goes by."""
+
+    class InStrips(FrameRenderer):
+        def _rows(self, camera: Camera, planes: int) -> int:
+            return 16 if planes > HELD_BYTES else camera.height
+
+    camera, deep = scenes.tilted_camera(64, 40), [[(1.0, z) for z in (3.0, 4.0, 5.0)]] * (64 * 40)
+    write_samples(tmp_path / "z.exr", (64, 40), deep)
+    options = RenderOptions(("rgb", "alpha"), holdout=HoldoutConfig())
+    left, right = (Task(1, "1", camera, tmp_path / "a.exr", eye=eye, holdout=tmp_path / "z.exr") for eye in EYES)
+    frames, pair = InStrips(Renderer(), scenes.one()[0], options), replace(left, right=right)
+    frames.check([pair])
+    with pytest.raises(InputError, match="a picture of 64x40 is written in strips here, expected a file for each eye"):
+        frames(pair)
+    assert not (tmp_path / "a.exr").exists()
 
 
 def test_a_panorama_says_so(tmp_path: Path) -> None:

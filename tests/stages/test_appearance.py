@@ -21,6 +21,7 @@ def padded(image: np.ndarray) -> np.ndarray:
     return planes
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (40, 15)])
 def test_gains_and_their_gradient(shaped_device: Device, width: int, height: int) -> None:
     rng = np.random.default_rng(width)

@@ -239,6 +239,7 @@ def test_recorded_cells_are_those_that_contribute(device: Device, name: str) -> 
     check_record(shaped(device, 8, 1), name)
 
 
+@pytest.mark.slow
 def test_recorded_cells_with_16_lanes(default_device: Device) -> None:
     check_record(shaped(default_device, 16, 1), "overlap")
 
@@ -264,6 +265,7 @@ def test_cells_without_a_gradient_are_left_out(device: Device, name: str) -> Non
     check_skip(shaped(device, 8, 1), name)
 
 
+@pytest.mark.slow
 def test_cells_without_a_gradient_with_16_lanes(default_device: Device) -> None:
     check_skip(shaped(default_device, 16, 1), "overlap")
 

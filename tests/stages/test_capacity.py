@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_same_bits
+from quick import quick
 
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, allocate, upload
@@ -86,8 +87,9 @@ def by_capacity(
     return frame, {name: int(arrived[READBACK.index(name)]) for name in NAMES}
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("name", ["cloud", "few", "hidden"])
-@pytest.mark.parametrize("spare", [0, 1, 3000])
+@pytest.mark.parametrize("spare", quick([0, 1, 3000], 1))
 def test_a_pass_with_room_is_the_exact_one(shaped_device: Device, name: str, spare: int) -> None:
     _, _, exact = drawn(shaped_device, name)
     rasterizer, held, _ = drawn(shaped_device, "few")  # a workspace with something else in it

@@ -11,6 +11,7 @@ import scenes
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
 from pipeline import EVERY_SHAPE, Pipeline, shaped, shapes_of
+from quick import quick
 
 from clsplat.camera import Camera
 from clsplat.device.buffers import upload
@@ -60,7 +61,7 @@ def fields(wanted: Features) -> list[tuple[str, int, int]]:
     return [(name, at, widths[name]) for name, at in wanted.offsets.items()]
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", quick(SCENES, "overlap"))
 def test_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = scene = SCENES[name]()
     got = run(shaped_device, scene)

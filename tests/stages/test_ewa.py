@@ -77,7 +77,7 @@ class Run:
         if into is None:
             shapes = {"covariances": 6} if self.inputs.covariances is not None else {"quaternions": 4, "scales": 3}
             into = EwaGradients(**{name: filled(device, n, width) for name, width in {"means": 3, **shapes}.items()})
-        given = {name: upload(device, values) for name, values in by.items()}
+        given: dict[str, Any] = {name: upload(device, values) for name, values in by.items()}
         where = (self.camera, self.camera_array, self.arrays, into)
         sums = ewa_grad(device, Workspace(device), self.inputs, *where, add=add, by_camera=True, **given)
         assert sums is not None
@@ -211,12 +211,12 @@ def test_needles_and_discs(shaped_device: Device) -> None:
     assert off.max() <= 3e-5 and np.median(off) <= 1e-6  # rounding times 64, as above
 
 
-def test_flat_gaussians_and_points_have_gradients(shaped_device: Device) -> None:
+def test_flat_gaussians_and_points_have_gradients(device: Device) -> None:
     """Scales of 0: what is seen is the low-pass's, and compensations end at 0, where they have no slope."""
     subject = case(64)
     subject.scales[::2, 0] = subject.scales[1::2] = 0.0
     subject.opacities[:] = 1.0
-    run = Run.of(shaped_device, subject)
+    run = Run.of(device, subject)
     by = gradients(replace(subject.projected(), radii=run.get("radii")), *OUTPUTS)
     arrays, by_viewmat, _ = run.gradient(by)
     assert all(np.isfinite(values).all() for values in arrays.values()) and np.isfinite(by_viewmat).all()

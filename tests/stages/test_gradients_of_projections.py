@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close_gradient, assert_same_bits
-from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
+from pipeline import BACKGROUND, Pipeline, shaped, shapes_of
+from quick import quick
 from test_project_rays import all_around, fisheye, panorama, pinhole
 
 from clsplat.camera import Camera
@@ -36,6 +37,8 @@ CAMERAS: dict[str, Camera] = {
     "antialiased fisheye": replace(fisheye(60, 50, 190), radial=BENT),
 }
 """By name; what begins with antialiased is, with Gaussians small enough that the low-pass tells."""
+QUICK = ("orthographic", "panorama", "bent fisheye", "antialiased perspective")
+"""Each kind of kernels once: these are made by projection."""
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 BAND = 3e-4
 STEP = 1e-7
@@ -65,7 +68,9 @@ def wanted(name: str) -> tuple[np.ndarray, every_pixel.Gradients]:
     return d_image, every_pixel.render_grad(gaussians, camera, d_image, BACKGROUND)
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(
+    "name", quick(CAMERAS, "orthographic", "panorama", "fisheye that folds over", "antialiased fisheye")
+)
 def test_the_twin_by_central_differences(name: str) -> None:
     gaussians, camera = subject(name, 40)
     arrays = {group: np.asarray(values, np.float64) for group, values in gaussians.arrays().items()}
@@ -82,8 +87,14 @@ def test_the_twin_by_central_differences(name: str) -> None:
         assert error <= 2e-6 * np.linalg.norm(gradients[group]), group
 
 
-@pytest.mark.parametrize("absolute", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize(
+    ("name", "absolute"),
+    [
+        *(pytest.param(name, False, marks=() if name in QUICK else pytest.mark.slow) for name in CAMERAS),
+        *(pytest.param(name, True, marks=pytest.mark.slow) for name in QUICK),
+    ],
+)
 def test_the_kernels_against_the_twin(shaped_device: Device, name: str, absolute: bool) -> None:
     (gaussians, camera), (d_image, exact) = subject(name, 200), wanted(name)
     got, screen = Pipeline.run(shaped_device, (gaussians, camera)).backward(d_image, absolute=absolute)
@@ -95,25 +106,25 @@ def test_the_kernels_against_the_twin(shaped_device: Device, name: str, absolute
     assert_close_gradient(screen[shown], on_image[shown], 1e-4, name="screen")
 
 
-def test_contributions(default_device: Device) -> None:
-    for name in ("panorama", "bent fisheye"):
-        (gaussians, camera), (d_image, exact) = subject(name, 200), wanted(name)
-        _, screen = Pipeline.run(default_device, (gaussians, camera)).screened(d_image, SlotFields(contributions=True))
-        assert screen.contributions is not None
-        shown = exact.contributions > 0
-        assert_close_gradient(screen.contributions.get()[shown], exact.contributions[shown], 1e-4, name=name)
+@pytest.mark.parametrize("name", quick(["panorama", "bent fisheye"], "bent fisheye"))
+def test_contributions(default_device: Device, name: str) -> None:
+    (gaussians, camera), (d_image, exact) = subject(name, 200), wanted(name)
+    _, screen = Pipeline.run(default_device, (gaussians, camera)).screened(d_image, SlotFields(contributions=True))
+    assert screen.contributions is not None
+    shown = exact.contributions > 0
+    assert_close_gradient(screen.contributions.get()[shown], exact.contributions[shown], 1e-4, name=name)
 
 
-@EVERY_SHAPE
-def test_the_same_bits_twice_in_every_shape(device: Device, every: bool) -> None:
+@pytest.mark.slow
+def test_the_same_bits_twice_in_every_shape(device: Device) -> None:
     scene, (d_image, _) = subject("bent fisheye", 200), wanted("bent fisheye")
-    for shape in shapes_of(device, every=every):
+    for shape in shapes_of(device):
         first, second = (Pipeline.run(shaped(device, *shape), scene).backward(d_image)[0] for _ in range(2))
         for group in GROUPS:
             assert_same_bits(getattr(first, group), getattr(second, group))
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", quick(CAMERAS, "bent fisheye"))
 def test_poisoned_memory_changes_no_bit(default_device: Device, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     scene, (d_image, _) = subject(name, 200), wanted(name)
     got = []
@@ -125,7 +136,8 @@ def test_poisoned_memory_changes_no_bit(default_device: Device, monkeypatch: pyt
         assert_same_bits(getattr(got[0][0], group), getattr(got[1][0], group))
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize("name", quick(CAMERAS, "bent fisheye"))
 def test_extreme_gaussians_have_finite_gradients(shaped_device: Device, name: str) -> None:
     """Needles, discs, specks and giants, some next to the camera, at a pole, straight behind or not numbers at all."""
     (gaussians, camera), (d_image, _) = subject(name, 200), wanted(name)

@@ -33,6 +33,7 @@ def some_image(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     return image + ((low + 0.05 + 0.9 * (level - low) - level) / (SHAPE[0] - 1))[..., None]
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (70, 15)])
 def test_a_grid_and_its_gradient(shaped_device: Device, width: int, height: int) -> None:
     rng = np.random.default_rng(width)

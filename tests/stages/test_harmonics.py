@@ -60,8 +60,9 @@ class Subject:
 def subject(count: int, degree: int = 3, *, camera: bool = True) -> Subject:
     rng = np.random.default_rng(count + degree)
     mask = np.repeat((rng.random((count, 1)) < 0.8).astype(np.int32), 2, axis=1)
-    directions, sh, by = rng.normal(size=(count, 3)), rng.normal(0, 1.0, (count, 16, 3)), rng.normal(size=(count, 3))
-    return Subject(*(a.astype(np.float32) for a in (directions, sh)), mask, by.astype(np.float32), degree, camera)
+    shapes = ((count, 3), (count, 16, 3), (count, 3))
+    directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
+    return Subject(directions, sh, mask, by, degree, camera)
 
 
 def run(device: Device, given: Subject, *, add: bool = False, start: float = -7.0) -> dict[str, NDArray[Any]]:

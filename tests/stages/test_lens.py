@@ -10,6 +10,7 @@ import pytest
 import scenes
 from compare import assert_same_bits
 from pipeline import BACKGROUND, Pipeline
+from quick import quick
 from test_gradients_of_projections import CAMERAS, direction_of_loss
 
 from clsplat.camera import Camera
@@ -48,7 +49,7 @@ def beyond(gaussians: Gaussians, camera: Camera) -> int:
     return int(((ratios < low) | (ratios > high)).any(axis=1).sum())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", quick(KINDS, "perspective", "antialiased, wide"))
 def test_the_twin_by_central_differences(kind: str) -> None:
     gaussians, camera = subject(kind, 40)
     arrays = {group: np.asarray(values, np.float64) for group, values in gaussians.arrays().items()}
@@ -67,7 +68,8 @@ def test_the_twin_by_central_differences(kind: str) -> None:
         assert np.linalg.norm(found[part] - slopes[part]) <= 1e-5 * np.linalg.norm(found[part])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize("kind", quick(KINDS, "perspective", "antialiased"))
 def test_the_kernels_against_the_twin(shaped_device: Device, kind: str) -> None:
     gaussians, camera = subject(kind, 200)
     d_image = direction_of_loss(gaussians, camera, 3e-4)

@@ -10,6 +10,7 @@ import pytest
 import scenes
 from compare import assert_close, assert_close_gradient, assert_same_bits
 from pipeline import BACKGROUND
+from quick import quick
 from test_gradients_of_projections import CAMERAS, subject
 
 from clsplat.arrays import Float64
@@ -29,6 +30,7 @@ from clsplat.stages.target import target
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 NEAR = SlotFields(nearness=True)
+EVERY_FIELD = SlotFields(absolute=True, contributions=True, nearness=True)
 
 
 def aims_of(camera: Camera, margin: Float64) -> tuple[Float64, Float64]:
@@ -85,8 +87,9 @@ def picture(camera: Camera) -> np.ndarray:
     return np.random.default_rng(3).random((camera.height, camera.width, 4)).astype(np.float32)
 
 
-@pytest.mark.parametrize("alpha_weight", [0.0, 0.3])
-@pytest.mark.parametrize("fields", [NEAR, SlotFields(absolute=True, contributions=True, nearness=True)])
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize("alpha_weight", quick([0.0, 0.3], 0.3))
+@pytest.mark.parametrize("fields", quick([NEAR, EVERY_FIELD], EVERY_FIELD))
 def test_gradients_are_the_twins(shaped_device: Device, alpha_weight: float, fields: SlotFields) -> None:
     subject = scenes.NAMED["overlap"]()
     photograph = picture(subject[1])
@@ -100,7 +103,7 @@ def test_gradients_are_the_twins(shaped_device: Device, alpha_weight: float, fie
         assert_close_gradient(getattr(got["gradients"], group), wanted.parameters[group], 1e-4)
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", quick(CAMERAS, "orthographic", "panorama", "bent fisheye"))
 def test_the_twins_slopes(name: str) -> None:
     """The twin's gradient of nearness against central differences."""
     (gaussians, camera), step = subject(name, 40), 1e-7
@@ -143,6 +146,7 @@ def test_other_projections(default_device: Device, name: str) -> None:
         assert_close_gradient(getattr(got, group), wanted.parameters[group], 1e-4, name=group)
 
 
+@pytest.mark.slow_in_groups
 def test_colour_and_its_gradient_stay_what_they_are(shaped_device: Device) -> None:
     """Nearness beside them, with no weight, changes no bit."""
     gaussians, camera = scenes.NAMED["overlap"]()

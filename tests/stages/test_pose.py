@@ -10,6 +10,7 @@ import pytest
 import scenes
 from compare import assert_same_bits
 from pipeline import BACKGROUND, Pipeline
+from quick import quick
 from scipy.spatial.transform import Rotation
 from test_gradients_of_projections import CAMERAS, direction_of_loss, subject
 
@@ -57,7 +58,9 @@ def on_device(pipeline: Pipeline, d_image: np.ndarray) -> np.ndarray:
     return sum_of(device, rasterizer.work, sums).get()[0]
 
 
-@pytest.mark.parametrize("name", ["perspective", *CAMERAS])
+@pytest.mark.parametrize(
+    "name", quick(["perspective", *CAMERAS], "perspective", "orthographic", "panorama", "bent fisheye")
+)
 def test_the_twin_by_central_differences(name: str) -> None:
     gaussians, camera = posed(name, 40)
     arrays = {group: np.asarray(values, np.float64) for group, values in gaussians.arrays().items()}
@@ -73,7 +76,10 @@ def test_the_twin_by_central_differences(name: str) -> None:
     assert np.linalg.norm(found - slopes) <= 1e-5 * np.linalg.norm(found)
 
 
-@pytest.mark.parametrize("name", ["perspective", *CAMERAS])
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize(
+    "name", quick(["perspective", *CAMERAS], "perspective", "orthographic", "panorama", "bent fisheye")
+)
 def test_the_kernels_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = posed(name, 200)
     d_image = direction_of_loss(gaussians, camera, BAND)

@@ -75,6 +75,7 @@ def test_every_sh_degree(device: Device, degree: int) -> None:
     assert_close_gradient(got.sh, reference.render_grad(*scene, d_image, (0.1, 0.2, 0.3)).parameters["sh"], 1e-4)
 
 
+@pytest.mark.slow_in_groups
 def test_absolute_screen_gradients(shaped_device: Device) -> None:
     scene = scenes.overlap()
     run = Pipeline.run(shaped_device, scene)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
-from pipeline import BACKGROUND, EVERY_SHAPE, shaped, shapes_of
+from pipeline import BACKGROUND, shaped, shapes_of
+from quick import quick
 
 from clsplat.camera import Camera, Projection, focal_length
 from clsplat.device.context import Device
@@ -94,7 +95,7 @@ def expected(name: str) -> every_pixel.Picture:
     return every_pixel.render(model_for(CAMERAS[name], 300, 5), CAMERAS[name], BACKGROUND, moved(CAMERAS[name]))
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", quick(CAMERAS, "panorama", "fisheye of 300 degrees", "perspective of 150 degrees"))
 def test_against_the_twin(device: Device, name: str) -> None:
     camera, wanted = CAMERAS[name], expected(name)
     gaussians = model_for(camera, 300, 5)
@@ -118,13 +119,13 @@ def assert_close_channels(found: ChannelResult, wanted: every_pixel.Picture) -> 
         assert_close(got / size, of / size, absolute=1e-4, name=name)
 
 
-@EVERY_SHAPE
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"])
-def test_the_same_bits_in_every_shape(device: Device, every: bool, name: str) -> None:
+def test_the_same_bits_in_every_shape(device: Device, name: str) -> None:
     camera, gaussians = CAMERAS[name], model_for(CAMERAS[name], 2000, 6)
     first, *others = (
         Renderer(shaped(device, *shape)).render_channels(gaussians, camera, FEATURES, after=moved(camera))
-        for shape in shapes_of(device, every=every)
+        for shape in shapes_of(device)
     )
     for image, found in others:
         assert_same_bits(image.image, first[0].image)
@@ -311,7 +312,9 @@ def test_what_is_too_near_or_transparent_is_left_out(device: Device) -> None:
 
 @pytest.mark.parametrize("group", ["means", "quaternions", "log_scales", "opacity_logits", "sh"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38, -3e38])
-@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"])
+@pytest.mark.parametrize(
+    "name", quick(["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"], "panorama")
+)
 def test_what_is_not_finite_is_left_out_alone(default_device: Device, name: str, value: float, group: str) -> None:
     renderer, camera = Renderer(default_device), CAMERAS[name]
     clean, broken = model_for(camera, 60, 9), model_for(camera, 60, 9)

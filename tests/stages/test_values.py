@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
 from flat import cloud
 from pipeline import EVERY_SHAPE, shaped, shapes_of
@@ -23,31 +22,31 @@ def test_passes_are_all_values_once() -> None:
     assert list(passes(0, 33, 32)) == [(0, 32), (32, 1)]
 
 
-@pytest.mark.parametrize("depth", [4, 37])
-def test_pictures_and_gradients_against_the_twin(shaped_device: Device, depth: int) -> None:
-    """37 values take two passes of the picture and of the gradient wherever a pass has 32."""
+def test_pictures_and_gradients_against_the_twin(shaped_device: Device) -> None:
+    """Of two passes of the picture, and of the gradient."""
+    depth = most_gradients(shaped_device) + 4
     flat, rng = cloud(150, WIDTH, HEIGHT, depth, seed=depth, opaque=0.3), np.random.default_rng(depth)
     background = rng.uniform(0, 1, depth).astype(np.float32)
     wanted = twin.blend_values(flat.twin, WIDTH, HEIGHT, background)
     sure = wanted.margin > 1e-4
-    assert 0.9 < sure.mean()
+    assert sure.mean() > 0.9
     d_image = np.where(sure[:, :, None], rng.normal(size=(HEIGHT, WIDTH, depth)), 0).astype(np.float32)
     d_alpha = np.where(sure, rng.normal(size=(HEIGHT, WIDTH)), 0).astype(np.float32)
     pixels = flat.pixels(shaped_device, WIDTH, HEIGHT, background=background)
-    # alpha is good to 2e-7 of itself in each of some tens of layers
-    assert_close(pixels.image[sure], wanted.image[sure], absolute=3e-6)
-    assert_close(pixels.alpha[sure], 1 - wanted.transmittance[sure], absolute=3e-6)
+    # alpha is good to 2e-7 of itself in each of a few layers
+    assert_close(pixels.image[sure], wanted.image[sure], absolute=1e-6)
+    assert_close(pixels.alpha[sure], 1 - wanted.transmittance[sure], absolute=1e-6)
     got = pixels.gradient(d_image, d_alpha, absolute=True)
     of = twin.blend_values_grad(flat.twin, WIDTH, HEIGHT, background, d_image, d_alpha)
     names = {"colours": "values"}
     for name, array in got.items():
         # sums of up to some hundred pixels, of transmittances that are recovered by division
-        assert_close_gradient(array, getattr(of, names.get(name, name)), 2e-5, name=name)
+        assert_close_gradient(array, getattr(of, names.get(name, name)), 5e-6, name=name)
 
 
 @EVERY_SHAPE
 def test_the_same_pictures_in_every_shape(device: Device, every: bool) -> None:
-    flat, pictures = cloud(400, 90, 60, 9, opaque=0.2), []
+    flat, pictures = cloud(400, 90, 60, 4, opaque=0.2), []
     for shape in shapes_of(device, (4, 1), every=every):
         pixels = flat.pixels(shaped(device, *shape), 90, 60)
         pictures.append((pixels.image.copy(), pixels.alpha.copy()))

@@ -48,7 +48,8 @@ class Case:
         plain = twin.project(means, full, self.view)
         if not opacities:
             return plain
-        return twin.project(means, full, self.view, self.opacities * (plain.compensations if compensated else 1.0))
+        seen = self.opacities.astype(np.float64) * (plain.compensations if compensated else 1.0)
+        return twin.project(means, full, self.view, seen)
 
     def at(self, **changes: object) -> Case:
         """The same Gaussians with another view."""

@@ -22,11 +22,19 @@ ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ROOT / "tools"
 sys.path.insert(0, str(TOOLS))
 import digests  # noqa: E402
-from digests import EXPECTED, Row, problems  # noqa: E402
+from digests import EXPECTED, Job, Row, in_turn, problems  # noqa: E402
 
 PICTURES = {"perspective": {"rgb": "c", "motion": "v"}, "fisheye": {"rgb": "d"}}
 GOOD = Row("A", "8x1", "f", "g8", "m8", True, 20.0, 100, pictures=PICTURES)
 ROWS = [GOOD, replace(GOOD, driver="B"), Row("A", "1x64", "f", "g1", "m1", True, 20.1, 101, 5e-7, pictures=PICTURES)]
+
+
+def test_drivers_take_turns() -> None:
+    rows = [("A", "8x1"), ("A", "1x64"), ("B", "8x1"), ("B", "1x64"), ("B", "1x32"), ("Rusticl", "1x64")]
+    listed = [Job(driver, 0, shape, train=False, environment={}) for driver, shape in rows]
+    begun = [rows[number] for number in in_turn(listed)]
+    assert begun[0] == ("Rusticl", "1x64")
+    assert begun[1:] == [("A", "8x1"), ("B", "8x1"), ("A", "1x64"), ("B", "1x64"), ("B", "1x32")]
 
 
 def test_no_problem() -> None:

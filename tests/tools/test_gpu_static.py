@@ -347,6 +347,16 @@ def test_occupancy_on_ada(registers: int, shared: int, items: int, waves: int, b
     assert occupancy(kernel, items) == waves / 48
 
 
+def test_a_file_is_compiled_once_for_shapes_that_it_does_not_tell_apart() -> None:
+    """`project` does not name ITEMS, `blend` does, in a file that it includes."""
+    for stem, options, same in (("project", "-DRAYS", True), ("blend", "-DRAYS", False)):
+        small, large = (Source(stem, (f"-DITEMS={items}", "-DLANES=1", options, "-cl-std=CL1.2")) for items in (32, 64))
+        assert small != large
+        assert (small.used == large.used) is same
+        assert small.used != Source(stem, (*small.options[:1], "-DLANES=2", *small.options[2:])).used
+        assert "-cl-std=CL1.2" in small.used.options
+
+
 def row(
     stem: str = "blend", pair: float | None = None, unknown: str = "", more: tuple[str, ...] = (), **changes: Any
 ) -> Row:

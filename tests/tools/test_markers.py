@@ -51,8 +51,10 @@ def test_words_narrow_the_drivers_down(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_no_driver_of_that_name_is_an_error() -> None:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/tools/test_markers.py"]
+    options = ["-q", "-p", "xdist", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", *options, "tests/tools/test_markers.py"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds to be imported
     environment[NARROW] = "abacus"
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == pytest.ExitCode.USAGE_ERROR

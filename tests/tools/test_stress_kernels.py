@@ -69,6 +69,7 @@ def test_ten_thousand_on_one_pixel(default_device: Device) -> None:
     assert all(off <= GRADIENT_NORM**2 * size for off, size in found.norms.values())
 
 
+@pytest.mark.slow
 def test_large_frame(default_device: Device) -> None:
     found = compare_8k(default_device, np.random.default_rng(0), count=300, crops=4)
     assert found.finite and found.image <= 2e-5
@@ -137,7 +138,14 @@ def test_command(tmp_path: Path) -> None:
     assert plot.stat().st_size > 1000
 
 
-@pytest.mark.parametrize("arguments", [["nothing"], ["kernels", "--only", "nobody"], ["kernels", "--cases", "0"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        pytest.param(["nothing"], marks=pytest.mark.slow),
+        ["kernels", "--only", "nobody"],
+        pytest.param(["kernels", "--cases", "0"], marks=pytest.mark.slow),
+    ],
+)
 def test_wrong_calls(arguments: list[str]) -> None:
     done = subprocess.run(
         [sys.executable, ROOT / "tools" / "stress", *arguments], capture_output=True, text=True, check=False

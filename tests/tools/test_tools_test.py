@@ -12,10 +12,29 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from groups import group_of
 
 ROOT = Path(__file__).resolve().parents[2]
-GROUPS = "import pytest\ndef pytest_collection_modifyitems(items):\n    for item in items:\n"
-GROUPS += "        item.add_marker(pytest.mark.xdist_group(item.path.stem))\n"
+GROUPS = """
+from groups import scheduler
+def pytest_xdist_make_scheduler(config, log): return scheduler(config, log, {0: "fast-1.0", 1: "fast-1.0-new"})
+"""
+NOTES = """
+import os, pytest
+from pathlib import Path
+
+def note(group):
+    with open(Path(__file__).parent / f"{group}.in", "a") as file:
+        file.write(os.environ["PYTEST_XDIST_WORKER"])
+
+@pytest.mark.parametrize("i", range(4))
+@pytest.mark.parametrize("driver", ["fast-1.0", "fast-1.0-new"])
+def test_of_a_driver(driver, i): note(driver)
+
+@pytest.mark.parametrize("i", range(4))
+def test_of_none(i): note(Path(__file__).stem)
+"""
+"""Tests that each write down the process that they are in."""
 PATIENCE = 120
 """Seconds for a run of a few: one that hangs never ends."""
 
@@ -60,6 +79,7 @@ def commands(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[list[str
         ("--numprocesses=3", "--numprocesses=3"),
         ("-p no:xdist", "-p no:xdist"),
         ("--pdb", "--pdb"),
+        ("--write-passed told", "-n 2 --dist loadgroup --write-passed told"),
     ],
 )
 def test_its_command_line(
@@ -95,7 +115,9 @@ def run(tool: ModuleType, folder: Path, *more: str) -> subprocess.CompletedProce
     )
     how = ["-c", str(ROOT / "pyproject.toml"), "--rootdir", str(folder), *tool.distribution([])]
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV"))}
-    command = [sys.executable, "-m", "pytest", *how, *more, str(folder)]
+    environment["PYTHONPATH"] = str(ROOT / "tests/support")
+    environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # the others take seconds to be imported in each process
+    command = [sys.executable, "-m", "pytest", "-p", "xdist", *how, *more, str(folder)]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=PATIENCE, check=False, cwd=folder, env=environment
     )
@@ -107,6 +129,30 @@ def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> 
     done = run(tool, tmp_path)
     assert done.returncode == 1, done.stdout
     assert "crashed while running 'test_aborts.py::test_it[3]'" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("identifier", "wanted"),
+    [
+        ("tests/stages/test_sort.py::test_it", "test_sort"),
+        ("tests/stages/test_sort.py::test_it[64-cloud]", "test_sort"),
+        ("tests/stages/test_fast-1.0.py::test_it[64]", "test_fast-1.0"),
+        ("tests/stages/test_sort.py::test_it[8x1-fast-1.0-cloud]", "driver 0"),
+        ("tests/stages/test_blend.py::test_it[fast-1.0-new-a/b]", "driver 1"),
+    ],
+)
+def test_a_driver_s_tests_are_a_group_and_else_a_file_s(identifier: str, wanted: str) -> None:
+    assert group_of(identifier, {0: "fast-1.0", 1: "fast-1.0-new"}) == wanted
+
+
+def test_a_group_stays_in_one_process(tool: ModuleType, tmp_path: Path) -> None:
+    for name in ("test_one.py", "test_other.py"):
+        (tmp_path / name).write_text(NOTES)
+    done = run(tool, tmp_path)
+    assert done.returncode == 0, done.stdout
+    found = {path.stem: path.read_text() for path in tmp_path.glob("*.in")}
+    tests = {"fast-1.0": 8, "fast-1.0-new": 8, "test_one": 4, "test_other": 4}
+    assert {name: text[:3] * tests[name] for name, text in found.items()} == found
 
 
 @pytest.mark.slow

@@ -93,6 +93,7 @@ def test_the_number_of_devices_changes_no_byte(scene: Scene, default_device: Dev
     assert_same_model(train(scene, config, device=halves(default_device.index)), wanted)
 
 
+@pytest.mark.slow
 def test_little_memory_changes_no_byte(scene: Scene, default_device: Device) -> None:
     """With parameters streamed on both devices."""
     config = short(batch=2, iterations=24, random_points=2000)

@@ -37,6 +37,7 @@ def scene(folder: Path) -> Scene:
     return load_scene(folder)
 
 
+@pytest.mark.slow
 def test_it_is_so_where_the_scene_has_other_lenses(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     wide = load_scene(write_lens_scene(tmp_path / "wide", "fisheye"), lenses="native")
     mixed = replace(scene, views=[*wide.views[:3], *scene.views[3:]])

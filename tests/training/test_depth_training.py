@@ -92,6 +92,7 @@ def test_the_weight_falls_and_views_count_alike(scene: Scene) -> None:
     assert Depths(TrainConfig(), views, 3.0).aims(0, camera, 1) is None
 
 
+@pytest.mark.slow
 def test_without_weight_the_model_is_that_of_today(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     """Blending's gradient has one term more, which is 0: the sums are the same."""
     plain = model_bytes(scene, short(iterations=40), default_device, tmp_path / "plain")

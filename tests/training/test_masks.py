@@ -12,6 +12,7 @@ import pytest
 import scenes
 from compare import assert_close, assert_close_gradient
 from pipeline import BACKGROUND, Pipeline
+from quick import quick
 from tiny import CONFIG, write_scene
 
 from clsplat.api import train
@@ -57,6 +58,7 @@ def masked_step(device: Device, subject: tuple[Any, Any], image: np.ndarray, wei
     return download_gaussians(gradients), screen.contributions.get(), result.read()[0]
 
 
+@pytest.mark.slow_in_groups
 @pytest.mark.parametrize("weight", [0.0, 0.4])
 def test_gradients_are_the_twins(shaped_device: Device, weight: float) -> None:
     gaussians, camera = subject = scenes.NAMED["overlap"]()
@@ -125,7 +127,7 @@ def model(folder: Path, scene: Path, config: TrainConfig, device: Device, stop: 
     return run.model_path.read_bytes()
 
 
-@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("batch", quick([1, 2], 1))
 def test_ignored_pixels_change_no_bit(default_device: Device, tmp_path: Path, batch: int) -> None:
     """At every resolution of the warm-up."""
     config = replace(CONFIG, masks="ignore", report=False, batch=batch)
@@ -135,7 +137,7 @@ def test_ignored_pixels_change_no_bit(default_device: Device, tmp_path: Path, ba
     assert plain != models[0]
 
 
-@pytest.mark.parametrize("meaning", ["ignore", "transparent"])
+@pytest.mark.parametrize("meaning", quick(["ignore", "transparent"], "ignore"))
 def test_going_on_gives_the_same_bytes(default_device: Device, tmp_path: Path, meaning: Any) -> None:
     scene, config = with_masks(tmp_path / "scene", 1), replace(CONFIG, masks=meaning, report=False)
     whole = model(tmp_path / "whole", scene, config, default_device)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from compare import assert_same_bits
 from numpy.typing import NDArray
+from quick import quick
 from tiny import short, write_scene
 
 from clsplat.bench import stages as bench_stages
@@ -112,7 +113,7 @@ def test_trouble_is_mended_and_told_as_with_exact_counts(
     assert results[1][2].pending.redone == 2
 
 
-@pytest.mark.parametrize("shape", [(1, 64), (8, 1)])
+@pytest.mark.parametrize("shape", quick([(1, 64), (8, 1)], (8, 1)))
 def test_a_step_by_capacity_waits_for_no_number(
     device: Device, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
 ) -> None:

@@ -136,10 +136,7 @@ MANY = short(
     quick(
         ["at once", "mcmc", "exposure", "grid", "masked", "depths", "in pieces", "in vectors of 1"],
         "at once",
-        "mcmc",
-        "exposure",
         "grid",
-        "masked",
         "depths",
     ),
 )

@@ -367,6 +367,7 @@ def unguarded(device: Device) -> Device:
     return device.with_switches({"UNGUARDED": True})
 
 
+@pytest.mark.slow
 def test_the_cost_of_the_checks_is_told(scene: Scene, capsys: Capture) -> None:
     folder = Path(scene.views[0].path).parents[1]
     assert bench_guards.main([str(folder), "--repeat", "2", "--json"]) == 0

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from quick import quick
 from same_bytes import check_in_less_memory, interrupted, model_bytes
 from tiny import short, write_scene
 
@@ -22,7 +23,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
-@pytest.fixture(scope="module", params=REFINED)
+@pytest.fixture(scope="module", params=quick(REFINED, "both"))
 def config(request: pytest.FixtureRequest) -> TrainConfig:
     return short(iterations=40, **dict.fromkeys(REFINED[request.param], True))
 

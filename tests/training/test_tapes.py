@@ -96,7 +96,7 @@ def assert_alike(one: Result, other: Result) -> None:
     assert one[1] == other[1]
 
 
-FAST = ("plain", "all")
+FAST = ("plain",)
 
 
 @pytest.mark.parametrize(

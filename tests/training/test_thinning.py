@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from quick import quick
 from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
 from scenes import random_cloud
 from tiny import short, write_scene
@@ -89,7 +90,8 @@ def gradients_of(
     return image, tiles, download_gaussians(gradients)
 
 
-@pytest.mark.parametrize("projection", ["perspective", "orthographic", "fisheye"])
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize("projection", quick(["perspective", "orthographic", "fisheye"], "perspective", "fisheye"))
 def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device, projection: str) -> None:
     """The twin's in perspective; where it draws nothing else, those of the kernels without thinning."""
     model, camera = cloud()

@@ -113,6 +113,7 @@ def test_the_page_shows_what_render_does(browser: Any, served: tuple[str, Path],
         page.close()
 
 
+@pytest.mark.slow
 def test_orbit_depth_and_a_path_that_is_rendered(
     browser: Any, served: tuple[str, Path], trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -203,6 +204,7 @@ def test_up_and_roll(browser: Any, served: tuple[str, Path], tmp_path: Path) -> 
         page.close()
 
 
+@pytest.mark.slow
 def test_two_pages_have_their_own_cameras(browser: Any, served: tuple[str, Path], tmp_path: Path) -> None:
     one, other = opened(browser, served[0]), opened(browser, served[0])
     try:
@@ -222,6 +224,7 @@ def test_two_pages_have_their_own_cameras(browser: Any, served: tuple[str, Path]
         other.close()
 
 
+@pytest.mark.slow
 @posix
 def test_a_training_is_watched_and_paused(browser: Any, scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
