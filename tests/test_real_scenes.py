@@ -11,6 +11,7 @@ import pytest
 import scenes
 from compare import assert_close_images
 from models import real_file
+from quick import quick
 
 from clsplat.api import train
 from clsplat.camera import Camera
@@ -40,7 +41,7 @@ def wanted(name: str) -> tuple[np.ndarray, np.ndarray]:
     return reference(model(), CAMERAS[name], BACKGROUND)
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", quick(CAMERAS, "far"))
 def test_a_frame_of_a_trained_model(device: Device, name: str) -> None:
     camera: Camera = CAMERAS[name]
     image, alpha = wanted(name)

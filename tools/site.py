@@ -64,7 +64,7 @@ def formulas(text: str, **_: object) -> str:
     def mathml(found: re.Match[str]) -> str:
         tex = html.unescape(found[2])
         tag = TAG.search(tex)
-        number = f'<span style="float: right">({tag[1]})</span>' if tag else ""
+        number = f'<span style="float: right; clear: right">({tag[1]})</span>' if tag else ""
         return number + convert(TAG.sub("", tex), display="block" if found[1] == "div" else "inline")
 
     return FORMULA.sub(mathml, text)

@@ -166,7 +166,7 @@ def _check_pair(task: Task, left: Camera, right: Camera) -> None:
     if sizes[0] != sizes[1]:
         what = f"is {sizes[0]} for the left eye and {sizes[1]}"
         raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
-    shapes = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]  # of a stage, in the header
+    shapes = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]  # the header of a stage's frames says it
     if task.optics is not None and shapes[0] != shapes[1]:
         what = f"has pixels of the aspect ratio {shapes[0]} for the left eye and {shapes[1]}"
         raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")

@@ -7,8 +7,8 @@ from typing import Any
 
 try:
     import torch as _torch  # noqa: F401
-except ImportError as error:
-    raise ImportError('clsplat.torch needs PyTorch: pip install "clsplat[torch]"') from error
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("clsplat.torch needs PyTorch: pip install 'clsplat[torch]'", name="torch") from error
 
 from clsplat.torch.covariances import quat_scale_to_covar_preci
 from clsplat.torch.harmonics import spherical_harmonics

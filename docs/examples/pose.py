@@ -18,13 +18,13 @@ lens = torch.tensor([[[90.0, 0, 48], [0, 90, 36], [0, 0, 1]]])
 
 
 def view_of(motion: torch.Tensor) -> torch.Tensor:
-    """The view matrix (1, 4, 4) of a motion (6,), a turn and a shift, from four units in front of the scene."""
+    """The view matrix (1, 4, 4) of a motion (6,), a turn about the scene and a shift, from four units before it."""
     start = torch.eye(4)
     start[2, 3] = 4.0
     x, y, z, *shift = motion
     zero = torch.zeros(())
     rows = [[zero, -z, y, shift[0]], [z, zero, -x, shift[1]], [-y, x, zero, shift[2]], [zero] * 4]
-    return (torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows])) @ start)[None]
+    return (start @ torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows])))[None]
 
 
 true = torch.tensor([0.10, -0.08, 0.05, 0.15, -0.10, 0.20])  # radians and world units

@@ -148,4 +148,4 @@ def test_without_torch_the_error_says_what_to_install() -> None:
         timeout=300,
         check=False,
     )
-    assert 'ImportError: clsplat.torch needs PyTorch: pip install "clsplat[torch]"' in done.stderr
+    assert "ModuleNotFoundError: clsplat.torch needs PyTorch: pip install 'clsplat[torch]'" in done.stderr

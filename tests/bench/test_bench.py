@@ -228,7 +228,11 @@ MOST_LAUNCHES = 40
 """Kernels of a training step, in a GPU's shape and in a CPU's."""
 
 
-@pytest.mark.parametrize(("shape", "launches"), [((1, 64), MOST_LAUNCHES), (None, MOST_LAUNCHES)], ids=str)
+@pytest.mark.parametrize(
+    ("shape", "launches"),
+    [pytest.param((1, 64), MOST_LAUNCHES, marks=pytest.mark.slow), (None, MOST_LAUNCHES)],
+    ids=str,
+)
 @pytest.mark.parametrize("count", quick([300, 6000], 6000))
 @pytest.mark.parametrize("by_capacity", quick([False, True], False))
 def test_what_a_step_gives_the_queue(

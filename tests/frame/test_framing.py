@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_same_bits
+from quick import quick
 
 from clsplat.camera import Camera, Projection, Window
 from clsplat.config.channels import CHANNELS
@@ -52,7 +53,7 @@ def assert_same(part: Planes, whole: Planes, rows: slice, columns: slice) -> Non
         assert_same_bits(values, np.ascontiguousarray(whole[name][rows, columns]))
 
 
-@pytest.mark.parametrize("projection", get_args(Projection))
+@pytest.mark.parametrize("projection", quick(get_args(Projection), "perspective", "fisheye"))
 def test_a_region_has_the_bits_of_the_frame(device: Device, projection: str) -> None:
     camera, names = camera_of(projection), EVERYTHING
     draw = drawer(device, camera)

@@ -38,7 +38,7 @@ def test_it_comes_back_as_it_was(tmp_path: Path, suffix: str) -> None:
     assert len(list(tmp_path.iterdir())) == 4
 
 
-@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usdz"])
+@pytest.mark.parametrize("suffix", quick([".usda", ".usdc", ".usdz"], ".usda", ".usdz"))
 def test_a_folder_with_brackets_and_letters_of_any_kind(tmp_path: Path, suffix: str) -> None:
     """Layers in a package are named with brackets: PACKAGE[LAYER]."""
     folder = tmp_path / "take [1] ü日"

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_same_bits
+from quick import quick
 
 from clsplat.camera import PROJECTIONS, Projection
 from clsplat.device.context import open_device
@@ -57,7 +58,7 @@ def test_the_picture_is_that_of_render() -> None:
     assert np.abs(found["motion"]).max() > 0.1
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("projection", quick(PROJECTIONS, "perspective", "fisheye"))
 def test_backward_motion_is_forward_motion_of_the_frame_before(projection: Projection) -> None:
     """Of one Gaussian all pixels have the same motion, so that it does not matter which of them a frame shows."""
     gaussians, camera = scenes.one()

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture, train
+from quick import quick
 from tiny import CONFIG, short
 
 from clsplat import files
@@ -166,7 +167,7 @@ def test_with_none_left_it_says_what_to_do(run: Run) -> None:
         run.load_latest_checkpoint()
 
 
-@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EDQUOT])
+@pytest.mark.parametrize("number", quick([errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EDQUOT], errno.ENOSPC))
 def test_a_checkpoint_that_cannot_be_written_is_named(
     number: int, scene: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture
 ) -> None:

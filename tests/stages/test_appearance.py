@@ -22,7 +22,15 @@ def padded(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow_in_groups
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (40, 15)])
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [
+        pytest.param(1, 1, marks=pytest.mark.slow),
+        (16, 16),
+        (17, 33),
+        pytest.param(40, 15, marks=pytest.mark.slow),
+    ],
+)
 def test_gains_and_their_gradient(shaped_device: Device, width: int, height: int) -> None:
     rng = np.random.default_rng(width)
     image = rng.random((height, width, 3)).astype(np.float32)

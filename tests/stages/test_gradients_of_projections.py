@@ -37,7 +37,7 @@ CAMERAS: dict[str, Camera] = {
     "antialiased fisheye": replace(fisheye(60, 50, 190), radial=BENT),
 }
 """By name; what begins with antialiased is, with Gaussians small enough that the low-pass tells."""
-QUICK = ("orthographic", "panorama", "bent fisheye", "antialiased perspective")
+QUICK = ("orthographic", "panorama", "bent fisheye")
 """Each kind of kernels once: these are made by projection."""
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 BAND = 3e-4

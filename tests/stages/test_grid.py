@@ -34,7 +34,15 @@ def some_image(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.slow_in_groups
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (70, 15)])
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [
+        pytest.param(1, 1, marks=pytest.mark.slow),
+        (16, 16),
+        (17, 33),
+        pytest.param(70, 15, marks=pytest.mark.slow),
+    ],
+)
 def test_a_grid_and_its_gradient(shaped_device: Device, width: int, height: int) -> None:
     rng = np.random.default_rng(width)
     image = some_image(rng, height, width).astype(np.float32)

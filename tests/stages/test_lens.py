@@ -69,7 +69,7 @@ def test_the_twin_by_central_differences(kind: str) -> None:
 
 
 @pytest.mark.slow_in_groups
-@pytest.mark.parametrize("kind", quick(KINDS, "perspective", "antialiased"))
+@pytest.mark.parametrize("kind", quick(KINDS, "perspective"))
 def test_the_kernels_against_the_twin(shaped_device: Device, kind: str) -> None:
     gaussians, camera = subject(kind, 200)
     d_image = direction_of_loss(gaussians, camera, 3e-4)

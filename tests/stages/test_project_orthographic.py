@@ -11,7 +11,7 @@ import pytest
 import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
 from drivers import KEPT
-from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
+from pipeline import BACKGROUND, Pipeline, shaped, shapes_of
 
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import BenchSwitches
@@ -121,10 +121,10 @@ def test_the_twin_is_the_definition_of_the_projection() -> None:
     np.testing.assert_allclose(projected.covariances, wanted, rtol=1e-9, atol=1e-9)
 
 
-@EVERY_SHAPE
-def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
+@pytest.mark.slow
+def test_the_same_bits_in_every_shape(device: Device) -> None:
     scene = orthographic(scenes.random_cloud(2000, 8, 150, 100))
-    first, *others = (drawn(shaped(device, *shape), scene) for shape in shapes_of(device, every=every))
+    first, *others = (drawn(shaped(device, *shape), scene) for shape in shapes_of(device))
     for other in others:
         assert_same_pictures(other, first)
 

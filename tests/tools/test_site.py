@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""tools/site.py: what it adds to the pages, and that it ends with an error where one of them is wrong."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+pytestmark = [pytest.mark.slow, pytest.mark.needs("mkdocs")]
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """What the site is made of, to be changed."""
+    for name in ("clsplat", "docs", ".github"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "tools").mkdir()
+    for name in ("README.md", "CHANGELOG.md", "LICENSE", "tools/site.py"):
+        shutil.copyfile(ROOT / name, tmp_path / name)
+    return tmp_path
+
+
+def build(root: Path) -> subprocess.CompletedProcess[str]:
+    """The site of a copy, in its `out`."""
+    command = [sys.executable, str(root / "tools/site.py"), str(root / "out")]
+    return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+
+
+def test_pages_have_docstrings_examples_formulas_and_decisions(copy: Path) -> None:
+    done = build(copy)
+    assert (done.returncode, done.stderr) == (0, "")
+    pages = {path.relative_to(copy / "out").as_posix(): path.read_text("utf-8") for path in copy.glob("out/**/*.html")}
+    assert 'id="clsplat.rasterize"' in pages["docs/api.html"]
+    assert pages["docs/examples.html"].count("SPDX-License-Identifier") == 5
+    assert pages["docs/cameras.html"].count("<math") > 50 and "arithmatex" not in pages["docs/cameras.html"]
+    assert pages["docs/decisions/index.html"].count('href="00') >= len(list((ROOT / "docs/decisions").glob("*.md")))
+    assert "README.md" not in pages["docs/architecture.html"]
+    assert not (copy / "docs/decisions/README.md").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("[page](nowhere.md)", "the target 'docs/nowhere.md' is not found"),
+        ("[place](render.md#nowhere)", "does not contain an anchor '#nowhere'"),
+        ("[code](../clsplat/nowhere.py)", "the target 'clsplat/nowhere.py' is not found"),
+        ("::: clsplat.nowhere", "clsplat.nowhere could not be found"),
+    ],
+)
+def test_what_leads_nowhere_is_an_error(copy: Path, line: str, message: str) -> None:
+    with (copy / "docs/examples.md").open("a", encoding="utf-8") as page:
+        page.write(f"\n{line}\n")
+    done = build(copy)
+    assert done.returncode == 1
+    assert message in done.stderr
