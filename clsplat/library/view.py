@@ -29,8 +29,8 @@ LEAST_ALPHA = np.float32(1e-10)
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """The checked arrays of a call: of `rasterize`, but that covars is (N, 6). count: Gaussians; sh: whether colors are
-    SH coefficients of sh_degree; by_camera: whether colors have a first axis of cameras."""
+    """The checked arrays of a call: of `rasterize`, but that covars is (N, 6). count: Gaussians; cameras: their
+    number."""
 
     count: int
     cameras: int

@@ -1,4 +1,4 @@
-// What the kernels for any number of values a Gaussian share. Needs cells.h.
+// Pieces that the kernels for any number of values a Gaussian share. Needs cells.h.
 #ifndef VALUES
 #error "VALUES must be defined: values of a Gaussian that a pass has, 1 to 32"
 #endif

@@ -20,7 +20,7 @@ import clsplat
 PROMPTS = re.compile(r"^```pycon\n(.*?)^```", re.MULTILINE | re.DOTALL)
 WITH_PROMPTS = [page for page in PAGES if PROMPTS.search(page.read_text("utf-8"))]
 LIMITS = {"fit_image": 30.0, "train_scene": 16.0, "pose": 0.01, "lift_features": 90.0, "depth_loss": 0.01}
-"""What the first number that each example prints has to reach: dB, dB, error of a motion of 0.30, percent, and error of
+"""Bounds of the first number that each example prints: dB, dB, error of a motion of 0.30, percent, and error of
 depths that are 0.5 off at first."""
 SMALLER = {"pose", "depth_loss"}
 """Those whose number is an error."""

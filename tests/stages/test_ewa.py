@@ -173,7 +173,7 @@ def test_every_shape_has_the_same_bits(device: Device) -> None:
 
 
 def test_gradients_of_cameras_add_up(device: Device) -> None:
-    """What is culled stays as it was."""
+    """Culled rows stay as they were."""
     subject = case(200)
     run = Run.of(device, subject, full=True)
     by = gradients(replace(subject.projected(), radii=run.get("radii")), *OUTPUTS)

@@ -66,7 +66,7 @@ def subject(count: int, degree: int = 3, *, camera: bool = True) -> Subject:
 
 
 def run(device: Device, given: Subject, *, add: bool = False, start: float = -7.0) -> dict[str, NDArray[Any]]:
-    """What the kernels make of it, the gradients in arrays that are full of `start`."""
+    """Results of the kernels, the gradients in arrays that are full of `start`."""
     inputs, work = given.on(device), Workspace(device)
     colours, d_sh, d_directions = (
         allocate(device, shape, np.float32) for shape in ((inputs.count, 3), given.sh.shape, (inputs.count, 3))

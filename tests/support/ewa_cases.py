@@ -43,7 +43,7 @@ class Case:
         return twin.covariances_of(self.quaternions.astype(np.float64), self.scales.astype(np.float64))
 
     def projected(self, *, rounded: bool = False, opacities: bool = False, compensated: bool = False) -> twin.Projected:
-        """What the twin makes of it."""
+        """Results of the twin."""
         means, full = self.means.astype(np.float64), self.full(rounded=rounded)
         plain = twin.project(means, full, self.view)
         if not opacities:

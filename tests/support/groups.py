@@ -34,5 +34,5 @@ class ByDriver(LoadScopeScheduling):  # type: ignore[misc]  # it has no types
 
 
 def scheduler(config: pytest.Config, log: Any, drivers: Mapping[int, str]) -> ByDriver | None:
-    """What pytest-xdist is to distribute the tests by; None where it is not asked for groups."""
+    """The scheduler that pytest-xdist distributes the tests by; None where it is not asked for groups."""
     return ByDriver(config, log, drivers) if config.getvalue("dist") == "loadgroup" else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has passed in a run of the tests, and a second run without it."""
+"""Tests that have passed in a run, and a second run without it."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.needs("mkdocs")]
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """What the site is made of, to be changed."""
+    """Sources of the site, to be changed."""
     for name in ("clsplat", "docs", ".github"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "tools").mkdir()
