@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two runs of the tests of one checkout, of which the second leaves out what has passed in the first.
 
-pytest --write-passed FILE    the identifiers of what passed, one a line
-pytest --leave-out FILE       without those; without the file every test runs
+pytest --write-passed=FILE    the identifiers of what passed, one a line
+pytest --leave-out=FILE       without those; without the file every test runs
 
+With the `=`: pytest takes a word of its own for where the tests are if such a file is there, and finds no conftest.py.
 A test for one driver has the driver's name and version in its identifier. One that looks at the list of drivers runs
 again, as the second run may have others.
 """

@@ -53,32 +53,35 @@ def test_of_one(device): pass
 def test_of_all(): pass
 """
 SECOND = {
-    "test_some.py::test_fails",
-    "test_some.py::test_is_torn_down",
-    "test_some.py::test_is_skipped",
-    "test_drivers.py::test_of_all",
+    "tests/test_some.py::test_fails",
+    "tests/test_some.py::test_is_torn_down",
+    "tests/test_some.py::test_is_skipped",
+    "tests/test_drivers.py::test_of_all",
 }
 FIRST = {
-    *(f"test_some.py::test_passes[{name}]" for name in ("a@b", "c d", "e")),
-    "test_drivers.py::test_of_one[driver-1.0]",
+    *(f"tests/test_some.py::test_passes[{name}]" for name in ("a@b", "c d", "e")),
+    "tests/test_drivers.py::test_of_one[driver-1.0]",
 }
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Callable[..., set[str]]:
-    """Run those tests in a folder; gives what passed."""
-    (tmp_path / "conftest.py").write_text(HOOKS)
-    (tmp_path / "test_some.py").write_text(TESTS)
-    (tmp_path / "test_drivers.py").write_text(OF_DRIVERS)
+    """Run those tests in a checkout, whose hooks lie in `tests` as the project's; gives what passed."""
+    house = tmp_path / "house"
+    (house / "tests").mkdir(parents=True)
+    (house / "pytest.ini").write_text("[pytest]\ntestpaths = tests\n")
+    (house / "tests/conftest.py").write_text(HOOKS)
+    (house / "tests/test_some.py").write_text(TESTS)
+    (house / "tests/test_drivers.py").write_text(OF_DRIVERS)
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV"))}
     kept["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(ROOT / "tests/support")])
     kept["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
 
     def started(*arguments: str, **more: str) -> set[str]:
         file = tmp_path / "told"
-        command = [sys.executable, "-m", "pytest", "-p", "xdist", "--rootdir", ".", "--write-passed", str(file)]
+        command = [sys.executable, "-m", "pytest", "-p", "xdist", f"--write-passed={file}"]
         done = subprocess.run(
-            [*command, *arguments], capture_output=True, text=True, check=False, cwd=tmp_path, env={**kept, **more}
+            [*command, *arguments], capture_output=True, text=True, check=False, cwd=house, env={**kept, **more}
         )
         assert done.returncode in {0, 1}, done.stdout + done.stderr
         return set(file.read_text("utf-8").splitlines())
@@ -88,10 +91,10 @@ def run(tmp_path: Path) -> Callable[..., set[str]]:
 
 def test_what_passed_is_left_out_and_nothing_else(run: Callable[..., set[str]], tmp_path: Path) -> None:
     first = run("-n", "2", "--dist", "loadgroup")
-    assert first == FIRST | {"test_drivers.py::test_of_all"}
+    assert first == FIRST | {"tests/test_drivers.py::test_of_all"}
     (tmp_path / "first").write_text("".join(f"{name}\n" for name in first))
-    assert run("--leave-out", "first", "-n", "2", "--dist", "loadgroup", AGAIN="yes") == SECOND
+    assert run(f"--leave-out={tmp_path / 'first'}", "-n", "2", "--dist", "loadgroup", AGAIN="yes") == SECOND
 
 
-def test_without_the_file_every_test_runs(run: Callable[..., set[str]]) -> None:
-    assert run("--leave-out", "nowhere", AGAIN="yes") == FIRST | SECOND
+def test_without_the_file_every_test_runs(run: Callable[..., set[str]], tmp_path: Path) -> None:
+    assert run(f"--leave-out={tmp_path / 'nowhere'}", AGAIN="yes") == FIRST | SECOND

@@ -79,7 +79,7 @@ def commands(tool: ModuleType, monkeypatch: pytest.MonkeyPatch) -> list[list[str
         ("--numprocesses=3", "--numprocesses=3"),
         ("-p no:xdist", "-p no:xdist"),
         ("--pdb", "--pdb"),
-        ("--write-passed told", "-n 2 --dist loadgroup --write-passed told"),
+        ("--write-passed=told", "-n 2 --dist loadgroup --write-passed=told"),
     ],
 )
 def test_its_command_line(
