@@ -149,12 +149,13 @@ class Call:
             "opacities": (count,),
             "intrinsics": (views, 3, 3),
             "backgrounds": (views, values),
-            "covars": (count, 3, 3),
             "means2d_probe": (views, count, 2),
         }
         for name, shape in expected.items():
             if name in sizes:
                 check_shape(name, sizes[name], shape)
+        if "covars" in sizes:
+            check_shape("covars", sizes["covars"], (count, 3, 3), (count, 6))
         channels = {"RGB": values, "D": 1, "ED": 1}.get(settings["render_mode"], values + 1)
         results = {
             "images": (views, self.height, self.width, channels),

@@ -56,7 +56,7 @@ def spherical_harmonics(
 ) -> HarmonicColors:
     """Sum up real spherical harmonics in directions, by the conventions of gsplat's function of that name.
 
-    degree: the highest that is looked at, 0 to 3; directions (..., 3), of any length; in the direction of length 0
+    degree: the highest that is looked at, 0 to 4; directions (..., 3), of any length; in the direction of length 0
     degree 0 counts alone. coefficients (..., K, 3), K at least (degree + 1)^2; masks (...): what is false has the
     colour 0 and no gradient. The signs and the order of the basis are in docs/conventions.md; there is no 0.5 more.
     Float32 arrays are read in place, and must not change before the last `vjp`.

@@ -14,7 +14,7 @@ from clsplat.arrays import Float32
 from clsplat.device.buffers import DeviceArray, Hosted, from_host, hosted
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.checks import floats, gradient
+from clsplat.library.checks import choice, floats, gradient, matrices, number, sizes
 from clsplat.library.session import Session, session_of
 from clsplat.stages.ewa import (
     MODELS,
@@ -180,11 +180,12 @@ def fully_fused_projection(
 
     means (N, 3): world units. Either quaternions (N, 4), w x y z, of any length but 0, and scales (N, 3), which are
     standard deviations in world units, or covars (N, 6), upper triangles xx, xy, xz, yy, yz, zz, or (N, 3, 3); the
-    others are None. viewmats (C, 4, 4): camera from world; intrinsics (C, 3, 3): pixels, a skew is not looked at;
-    width, height: pixels. eps2d: px^2, added to the diagonal of each projected covariance; near_plane, far_plane:
-    world units; radius_clip: pixels, what has no larger radius is culled; calc_compensations: also the square root of
-    the covariance's determinant without eps2d over that with it; camera_model: pinhole, ortho or fisheye
-    (equidistant); opacities (N,), 0 to 1: with them radii end where alpha is 1/255, and what is fainter is culled.
+    others are None. viewmats (C, 4, 4) or (4, 4): camera from world; intrinsics (C, 3, 3) or (3, 3): pixels, a skew
+    is not looked at; width, height: pixels. eps2d: px^2, added to the diagonal of each projected covariance;
+    near_plane, far_plane: world units; radius_clip: pixels, what has no larger radius is culled; calc_compensations:
+    also the square root of the covariance's determinant without eps2d over that with it; camera_model: pinhole, ortho
+    or fisheye (equidistant); opacities (N,), 0 to 1: with them radii end where alpha is 1/255, and what is fainter is
+    culled.
     Float32 arrays are read in place, and must not change before the last `vjp`.
 
     Raises InputError, which names the argument, for wrong shapes and numbers that are not finite, DeviceError for a
@@ -195,7 +196,8 @@ def fully_fused_projection(
     cameras = checked_cameras(
         viewmats,
         intrinsics,
-        [(width, height)],
+        width,
+        height,
         near_plane=near_plane,
         far_plane=far_plane,
         eps2d=eps2d,
@@ -212,7 +214,8 @@ def fully_fused_projection(
         views = [ProjectedView(session, inputs, camera, compensated=calc_compensations) for camera in cameras]
 
         def of_all(name: str, *width: int) -> NDArray[Any]:
-            return _stacked([view.get(name) for view in views], (count, *width), name)
+            kind = np.int32 if name == "radii" else np.float32
+            return stacked([view.get(name) for view in views], np.empty((count, *width), kind))
 
         return Projection(
             of_all("radii", 2),
@@ -229,7 +232,8 @@ def fully_fused_projection(
 def checked_cameras(
     viewmats: ArrayLike,
     intrinsics: ArrayLike,
-    sizes: Sequence[tuple[int, int]],
+    width: int | Sequence[int],
+    height: int | Sequence[int],
     *,
     near_plane: float,
     far_plane: float,
@@ -237,28 +241,22 @@ def checked_cameras(
     radius_clip: float,
     camera_model: str,
 ) -> list[EwaCamera]:
-    """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), with one size (width, height) for all, or C of them.
-    Raises InputError, which names the argument."""
-    if camera_model not in MODELS:
-        raise InputError(f"camera_model is {camera_model!r}: expected one of {', '.join(MODELS)}")
-    poses = floats("viewmats", viewmats, ("C", 4, 4))
-    lenses = floats("intrinsics", intrinsics, (len(poses), 3, 3))
-    for name, value in {"eps2d": eps2d, "radius_clip": radius_clip}.items():
-        if not 0 <= value < np.inf:
-            raise InputError(f"{name} is {value}: expected a number from 0 on")
-    if not near_plane < far_plane:
-        raise InputError(f"near_plane is {near_plane} and far_plane {far_plane}: expected the second to be larger")
+    """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or of one of each, (4, 4) and (3, 3); width, height:
+    pixels of all cameras or of each. Raises InputError, which names the argument."""
+    choice("camera_model", camera_model, tuple(MODELS))
+    poses = matrices("viewmats", viewmats, 4, "C")
+    count = len(poses)
+    lenses = matrices("intrinsics", intrinsics, 3, count)
+    if len(lenses) != count:
+        raise InputError(f"intrinsics has {len(lenses)} matrices, expected {count}, one for each of viewmats")
     if not (lenses[:, [0, 1], [0, 1]] != 0).all():
         raise InputError("intrinsics: a focal length is 0, expected those of a camera")
-    exact = [np.asarray(values, np.float64) for values in (viewmats, intrinsics)]  # where they are given in float64
-    cameras = []
-    for index, (pose, lens) in enumerate(zip(*exact, strict=True)):
-        width, height = sizes[index] if len(sizes) > 1 else sizes[0]
-        if width < 1 or height < 1:
-            raise InputError(f"width and height are {width} and {height}: expected at least 1 pixel")
-        planes = (float(near_plane), float(far_plane), float(eps2d), float(radius_clip))
-        cameras.append(EwaCamera(pose, lens, int(width), int(height), *planes, camera_model))
-    return cameras
+    near, far = number("near_plane", near_plane, -np.inf), number("far_plane", far_plane, -np.inf)
+    if not near < far:
+        raise InputError(f"near_plane is {near_plane} and far_plane {far_plane}, expected the second to be larger")
+    planes = (near, far, number("eps2d", eps2d, 0.0), number("radius_clip", radius_clip, 0.0))
+    listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
+    return [EwaCamera(*camera, *planes, camera_model) for camera in listed]
 
 
 def checked_shapes(
@@ -269,7 +267,7 @@ def checked_shapes(
     if covars is None:
         if quaternions is None or scales is None:
             missing = "quaternions" if quaternions is None else "scales"
-            raise InputError(f"{missing}: expected an array where covars are not given")
+            raise InputError(f"{missing} is None, expected an array, as covars is None too")
         return {
             "quaternions": floats("quaternions", quaternions, (count, 4)),
             "scales": floats("scales", scales, (count, 3)),
@@ -290,9 +288,9 @@ def full_gradient(upper: Float32) -> Float32:
     return np.asarray(halves[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), np.float32)
 
 
-def _stacked(arrays: list[NDArray[Any]], shape: tuple[int, ...], name: str) -> NDArray[Any]:
-    """One array of those of all cameras; of one camera its own memory."""
+def stacked(arrays: list[NDArray[Any]], each: NDArray[Any] | None = None) -> NDArray[Any]:
+    """One array of those of all cameras, of one camera its own memory; `each` is one like them where there may be no
+    camera."""
     if len(arrays) == 1:
         return arrays[0][None]
-    kind = np.int32 if name == "radii" else np.float32
-    return np.stack(arrays) if arrays else np.zeros((0, *shape), kind)
+    return np.stack(arrays) if arrays or each is None else np.zeros((0, *each.shape), each.dtype)

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.arrays import Float32
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.checks import choice, floats, matrices, number, sizes
+from clsplat.library.checks import choice, floats, gradient, number
 from clsplat.library.pixels import MOST_CHANNELS
+from clsplat.library.projection import checked_cameras, stacked
 from clsplat.library.session import session_of
 from clsplat.library.view import Given, Gradients, View
 from clsplat.rendering.build_flags import ALPHA_MAX
-from clsplat.stages.ewa import MODELS, EwaCamera
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 """Colour, depth, expected depth, and both: depth is the last channel."""
@@ -46,37 +46,37 @@ class Rasterization:
     @cached_property
     def radii(self) -> NDArray[np.int32]:
         """(C, N, 2) int32: half sides in pixels of the box that a Gaussian is in, 0 where it is not seen."""
-        return _stacked([view.splats("radii") for view in self._views])
+        return stacked([view.splats("radii") for view in self._views])
 
     @cached_property
     def means2d(self) -> Float32:
         """(C, N, 2) float32: pixels, the first pixel's middle at 0.5; 0 where not seen, as all that follows."""
-        return _stacked([view.splats("means2d") for view in self._views])
+        return stacked([view.splats("means2d") for view in self._views])
 
     @cached_property
     def depths(self) -> Float32:
         """(C, N) float32: world units along the camera's axis."""
-        return _stacked([view.depths for view in self._views])
+        return stacked([view.depths for view in self._views])
 
     @cached_property
     def conics(self) -> Float32:
         """(C, N, 3) float32: a, b, c of the inverse covariance on the image, per squared pixel."""
-        return _stacked([view.splats("conics") for view in self._views])
+        return stacked([view.splats("conics") for view in self._views])
 
     @cached_property
     def opacities(self) -> Float32:
         """(C, N) float32: opacities on the image; with rasterize_mode "antialiased" compensated for the low-pass."""
-        return _stacked([view.opacities for view in self._views])
+        return stacked([view.opacities for view in self._views])
 
     @cached_property
     def colors2d(self) -> Float32:
         """(C, N, D) float32: the values that are blended, but for the depth."""
-        return _stacked([view.colors for view in self._views])
+        return stacked([view.colors for view in self._views])
 
     @cached_property
     def tile_counts(self) -> NDArray[np.int32]:
         """(C, N) int32: tiles of 16 x 16 pixels that a Gaussian's ellipse reaches."""
-        return _stacked([view.pixels.tile_counts for view in self._views])
+        return stacked([view.pixels.tile_counts for view in self._views])
 
     def vjp_pixels(
         self, d_images: ArrayLike | Sequence[ArrayLike], d_alphas: ArrayLike | Sequence[ArrayLike] | None = None
@@ -86,11 +86,11 @@ class Rasterization:
         means2d (C, N, 2), conics (C, N, 3), of b as one number; opacities (C, N), the compensated ones; colors2d
         (C, N, D); depths (C, N) where images have depth; backgrounds (C, D) where they were given; absolute (C, N, 2)
         where absolute_gradients was: sums over pixels of absolute gradients by means2d (AbsGS, Ye et al. 2024).
-        Raises InputError for other shapes, and for what is not finite.
+        Numbers that are not finite pass, to what they have a part in. Raises InputError for other shapes.
         """
         pairs = zip(self._views, self._each("d_images", d_images), self._each("d_alphas", d_alphas), strict=True)
         each = [view.pixel_gradients(d_image, d_alpha) for view, d_image, d_alpha in pairs]
-        return {name: _stacked([found[name] for found in each]) for name in each[0]}
+        return {name: stacked([found[name] for found in each]) for name in each[0]}
 
     def vjp_projection(
         self,
@@ -104,10 +104,9 @@ class Rasterization:
     ) -> dict[str, Any]:
         """The loss's gradients by the arguments of `rasterize`, from those of `vjp_pixels`; any may be missing.
 
-        means (N, 3), quaternions (N, 4), scales (N, 3) or in their place covars (N, 3, 3), opacities (N,), colors in
+        means (N, 3), quaternions (N, 4), scales (N, 3) or in their place covars as given, opacities (N,), colors in
         the given shape; and, with `cameras`, float64 viewmats (C, 4, 4) and intrinsics (C, 3, 3), all numbers of the
-        first three rows and fx, fy, cx, cy taken as free. Raises InputError for other shapes, and for what is not
-        finite.
+        first three rows and fx, fy, cx, cy taken as free. Raises InputError for other shapes.
         """
         given, count, n = self._given, len(self._views), self._given.count
         shapes: dict[str, tuple[Any, tuple[int, ...]]] = {
@@ -117,7 +116,8 @@ class Rasterization:
             "colors2d": (colors2d, (count, n, given.channels)),
             "depths": (depths, (count, n)),
         }
-        taken = {name: floats(name, array, shape) for name, (array, shape) in shapes.items() if array is not None}
+        each = {name: gradient(name, array, shape) for name, (array, shape) in shapes.items()}
+        taken = {name: array for name, array in each.items() if array is not None}
         gradients = Gradients(given, self._device)
         for index, view in enumerate(self._views):
             view.add_gradients(gradients, {name: array[index] for name, array in taken.items()}, cameras=cameras)
@@ -138,7 +138,7 @@ class Rasterization:
 
     def _of_pixels(self, part: Callable[[View], Float32]) -> Float32 | list[Float32]:
         arrays = [part(view) for view in self._views]
-        return _stacked(arrays) if len({array.shape for array in arrays}) == 1 else arrays
+        return stacked(arrays) if len({array.shape for array in arrays}) == 1 else arrays
 
     def _each(self, name: str, given: Any) -> list[Any]:
         if given is None:
@@ -185,7 +185,8 @@ def rasterize(
     near_plane, far_plane: world units. radius_clip: pixels, up to which a Gaussian's radii are too small to be seen.
     eps2d: px^2, added to both variances on the image. backgrounds (C, D) or (D,): black if None. render_mode: one of
     RENDER_MODES; depths are along the axis. rasterize_mode: "antialiased" lowers opacities by what eps2d widens.
-    camera_model: pinhole, ortho or fisheye. covars (N, 3, 3): symmetric, in place of quaternions and scales. alpha_max:
+    camera_model: pinhole, ortho or fisheye. covars (N, 3, 3), symmetric, or (N, 6), xx, xy, xz, yy, yz, zz: in place of
+    quaternions and scales, which are None then. alpha_max:
     the cap of a Gaussian's alpha. absolute_gradients: gradients by means2d have their absolute sums too. device: an
     open one, or a name as `clsplat devices` lists them.
 
@@ -193,13 +194,19 @@ def rasterize(
     """
     choice("render_mode", render_mode, RENDER_MODES)
     choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
-    choice("camera_model", camera_model, tuple(MODELS))
     cap = number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6)
-    poses = matrices("viewmats", viewmats, 4, "C")
-    count = len(poses)
-    lenses = matrices("intrinsics", intrinsics, 3, count)
-    if len(lenses) != count:
-        raise InputError(f"intrinsics has {len(lenses)} matrices, expected {count}, one for each of viewmats")
+    cameras = checked_cameras(
+        viewmats,
+        intrinsics,
+        width,
+        height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        eps2d=eps2d,
+        radius_clip=radius_clip,
+        camera_model=camera_model,
+    )
+    count = len(cameras)
     given = Given.checked(means, quaternions, scales, covars, opacities, colors, sh_degree, count)
     if given.channels > MOST_CHANNELS:
         raise InputError(f"colors has {given.channels} channels, expected at most {MOST_CHANNELS}")
@@ -207,20 +214,12 @@ def rasterize(
     if backgrounds is not None:
         rows = floats("backgrounds", backgrounds, (count, given.channels), (given.channels,))
         behind = list(np.broadcast_to(rows, (count, given.channels)))
-    settings: dict[str, Any] = {
-        "near": number("near_plane", near_plane, -np.inf),
-        "far": number("far_plane", far_plane, -np.inf),
-        "eps2d": number("eps2d", eps2d, 0.0),
-        "radius_clip": number("radius_clip", radius_clip, 0.0),
-        "model": camera_model,
-    }
     session = session_of(device)
-    listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
     views = [
         View(
             session,
             given,
-            EwaCamera(*camera, **settings),
+            camera,
             index,
             behind[index],
             cap,
@@ -228,11 +227,6 @@ def rasterize(
             compensated=rasterize_mode == "antialiased",
             absolute=absolute_gradients,
         )
-        for index, camera in enumerate(listed)
+        for index, camera in enumerate(cameras)
     ]
     return Rasterization(views, given, session.device)
-
-
-def _stacked(arrays: list[NDArray[Any]]) -> NDArray[Any]:
-    """The arrays of all cameras; of one without a copy."""
-    return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)

@@ -14,30 +14,27 @@ from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import DeviceArray, Hosted, from_host, hosted
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.checks import floats
+from clsplat.library.checks import floats, gradient
 from clsplat.library.pixels import Pixels
-from clsplat.library.projection import ProjectedView, full_gradient, hosted_gradients
+from clsplat.library.projection import ProjectedView, checked_shapes, full_gradient, hosted_gradients
 from clsplat.library.session import Session
 from clsplat.stages.ewa import EwaCamera, EwaInputs, camera_gradients
 from clsplat.stages.harmonics import HIGHEST, Harmonics, centre_array, harmonics, harmonics_grad
 
-UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-"""Places of the six numbers of a symmetric matrix, in the order of the kernels."""
 LEAST_ALPHA = np.float32(1e-10)
 """Divisor of an expected depth where there is next to nothing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """The checked arrays of a call: of `rasterize`, but that covars is (N, 6). count: Gaussians; cameras: their
-    number."""
+    """The checked arrays of a call of `rasterize`. count: Gaussians; cameras: their number; shapes: the arrays of
+    `EwaInputs`, quaternions and scales or covariances; covariances: as of `checked_shapes`."""
 
     count: int
     cameras: int
     means: Float32
-    quaternions: Float32 | None
-    scales: Float32 | None
-    covars: Float32 | None
+    shapes: dict[str, Float32]
+    covariances: str
     opacities: Float32
     colors: Float32
     sh_degree: int | None
@@ -57,15 +54,7 @@ class Given:
         """Raises InputError, which names the argument."""
         centres = floats("means", means, ("N", 3))
         n = len(centres)
-        turns = widths = upper = None
-        if covars is not None:
-            upper = np.ascontiguousarray(floats("covars", covars, (n, 3, 3))[:, UPPER[0], UPPER[1]])
-        elif quaternions is None or scales is None:
-            name = "quaternions" if quaternions is None else "scales"
-            raise InputError(f"{name} is None, expected an array, as covars is None too")
-        else:
-            turns = floats("quaternions", quaternions, (n, 4))
-            widths = floats("scales", scales, (n, 3))
+        shapes, covariances = checked_shapes(n, covars, quaternions, scales)
         covers = floats("opacities", opacities, (n,))
         if sh_degree is None:
             values = floats("colors", colors, (n, "D"), (cameras, n, "D"))
@@ -81,7 +70,7 @@ class Given:
                 )
         if values.shape[-1] == 0:
             raise InputError("colors has no channel, expected 1 to 512")
-        return cls(n, cameras, centres, turns, widths, upper, covers, values, sh_degree)
+        return cls(n, cameras, centres, shapes, covariances, covers, values, sh_degree)
 
     @property
     def channels(self) -> int:
@@ -104,7 +93,7 @@ class Gradients:
     def __init__(self, given: Given, device: Device) -> None:
         self.given = given
         self.views = 0
-        self.room = hosted_gradients(device, given.count, covariances=given.covars is not None)
+        self.room = hosted_gradients(device, given.count, covariances=bool(given.covariances))
         self.opacities = np.zeros(given.count, np.float32)
         self.colors = None if given.sh_degree is not None else np.zeros_like(given.colors)
         self.coefficients: list[Hosted] = []
@@ -122,7 +111,7 @@ class Gradients:
     def by_name(self, *, cameras: bool) -> dict[str, Any]:
         """By the names of `rasterize`, on the host."""
         found: dict[str, Any] = {name: one.get() for name, one in self.room.hosted.items()}
-        if "covars" in found:
+        if self.given.covariances == "full":
             found["covars"] = full_gradient(found["covars"])
         found["opacities"] = self.opacities
         if self.colors is not None:
@@ -161,9 +150,8 @@ class View:
         device = session.device
         with session.lock:
             means, covers = from_host(device, given.means), from_host(device, given.opacities)
-            shapes = (given.quaternions, given.scales, given.covars)
-            turns, widths, upper = (None if one is None else from_host(device, one) for one in shapes)
-            inputs = EwaInputs(means, turns, widths, upper, covers)
+            shapes = {name: from_host(device, array) for name, array in given.shapes.items()}
+            inputs = EwaInputs(means, **shapes, opacities=covers)
             self.projected = ProjectedView(session, inputs, camera, compensated=compensated)
             self._colours: Float32 | Hosted = given.colors_of(index)
             self._harmonics = None
@@ -249,10 +237,10 @@ class View:
     def pixel_gradients(self, d_image: ArrayLike, d_alpha: ArrayLike | None) -> dict[str, Float32]:
         """The gradients of `Rasterization.vjp_pixels`, of this view."""
         shape = (self._camera.height, self._camera.width)
-        by_image = floats("d_images", d_image, self.image.shape)
-        by_alpha = None
-        if d_alpha is not None:
-            by_alpha = floats("d_alphas", d_alpha, (*shape, 1)).reshape(shape)
+        by_image = gradient("d_images", d_image, self.image.shape)
+        assert by_image is not None, "`Rasterization.vjp_pixels` asks for one of each camera"
+        by_alpha = gradient("d_alphas", d_alpha, (*shape, 1))
+        by_alpha = None if by_alpha is None else by_alpha.reshape(shape)
         if self._mode.endswith("ED"):
             left = np.maximum(self.alpha, LEAST_ALPHA)
             by_depth = by_image[:, :, -1] / left

@@ -78,3 +78,15 @@ def test_compiled_code_may_call_it() -> None:
         found.backward()
         assert torch.equal(found, plain)
         assert torch.equal(made["means"].grad, expected)
+
+
+def test_a_scaled_loss_that_overflows_is_a_step_left_out() -> None:
+    made, tensors = wide(None)
+    leaves = [tensor.detach().clone().requires_grad_() for tensor in tensors]
+    optimizer, scaler = torch.optim.SGD(leaves, lr=1.0), torch.amp.GradScaler("cpu", init_scale=3e38)
+    images, *_ = rasterization(**dict(zip(NAMES, leaves, strict=True)), **made)
+    scaler.scale(1e3 * images.sum()).backward()
+    scaler.step(optimizer)
+    scaler.update()
+    assert scaler.get_scale() < 3e38
+    assert all(torch.equal(leaf, tensor) for leaf, tensor in zip(leaves, tensors, strict=True))

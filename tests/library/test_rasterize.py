@@ -137,6 +137,24 @@ def test_covariances_in_place_of_quaternions_and_scales(default_device: Device) 
     units = turned / arguments["scales"][:, None, :]
     chained = 2 * np.einsum("nji,njk,nki->ni", units, by_covars.astype(np.float64), units) * arguments["scales"]
     assert np.linalg.norm(chained - by_scales) <= 1e-4 * np.linalg.norm(by_scales)
+    upper = covars[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    same = call({**arguments, "quaternions": None, "scales": None, "covars": upper}, default_device)
+    np.testing.assert_array_equal(same.images, result.images)
+    both = by_covars[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] * np.float32([1, 2, 2, 1, 2, 1])
+    np.testing.assert_array_equal(same.vjp(d_images)["covars"], both)
+
+
+def test_gradients_that_are_not_finite_pass_to_what_they_have_a_part_in(default_device: Device) -> None:
+    result = call(with_lenses(scene()), default_device)
+    d_images = np.random.default_rng(3).normal(size=result.images.shape).astype(np.float32)
+    d_images[0, 12, 20] = 0
+    wanted = result.vjp(d_images)
+    d_images[0, 12, 20] = np.inf
+    found = result.vjp(d_images)
+    reached = ~np.isfinite(found["opacities"])
+    assert 0 < reached.sum() < len(reached)
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
+        np.testing.assert_array_equal(found[name][~reached], wanted[name][~reached])
 
 
 def test_a_background_shows_through(default_device: Device) -> None:
@@ -222,6 +240,7 @@ def test_absolute_gradients(default_device: Device) -> None:
         ({"means": np.full((12, 3), np.nan)}, "means: [0, 0] is nan, expected finite numbers within float32"),
         ({"quaternions": np.zeros((11, 4))}, "quaternions: got shape (11, 4), expected (12, 4)"),
         ({"quaternions": None}, "quaternions is None, expected an array, as covars is None too"),
+        ({"covars": np.zeros((12, 6))}, "covars: expected either these, or quaternions and scales"),
         ({"scales": "wide"}, "scales: got <U4, expected an array of real numbers"),
         ({"opacities": np.full(12, np.inf)}, "opacities: [0] is inf, expected finite numbers within float32"),
         ({"colors": np.zeros((3, 12, 3))}, "colors: got shape (3, 12, 3), expected (12, D) or (2, 12, D)"),
@@ -231,8 +250,10 @@ def test_absolute_gradients(default_device: Device) -> None:
             {"colors": np.zeros((12, 4, 3)), "sh_degree": 2},
             "colors has 4 SH coefficients, expected 9 or more for sh_degree 2",
         ),
-        ({"sh_degree": 4}, "sh_degree is 4, expected 0 to 3, or None"),
+        ({"sh_degree": 5}, "sh_degree is 5, expected 0 to 4, or None"),
         ({"viewmats": np.zeros((2, 3, 4))}, "viewmats: got shape (2, 3, 4), expected (C, 4, 4) or (4, 4)"),
+        ({"intrinsics": np.zeros((2, 3, 3))}, "intrinsics: a focal length is 0, expected those of a camera"),
+        ({"near_plane": 2, "far_plane": 1}, "near_plane is 2 and far_plane 1, expected the second to be larger"),
         ({"intrinsics": np.eye(3)}, "intrinsics has 1 matrices, expected 2, one for each of viewmats"),
         ({"width": 0}, "width is 0, expected a positive whole number, or one for each of 2 cameras"),
         ({"height": [24]}, "height is [24], expected a positive whole number, or one for each of 2 cameras"),
