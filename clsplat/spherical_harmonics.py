@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real spherical harmonics up to degree 3, with the constants and signs of 3D Gaussian Splatting files."""
+"""Real spherical harmonics up to degree 4, with the constants and signs of 3D Gaussian Splatting files, which end at 3;
+beyond it with gsplat's."""
 
 from __future__ import annotations
 
@@ -18,6 +19,17 @@ C3 = (
     -0.4570457994644658,
     1.445305721320277,
     -0.5900435899266435,
+)
+C4 = (
+    2.5033429417967046,
+    -1.7701307697799304,
+    0.9461746957575601,
+    -0.6690465435572892,
+    0.10578554691520431,
+    -0.6690465435572892,
+    0.47308734787878004,
+    -1.7701307697799304,
+    0.6258357354491761,
 )
 
 
@@ -44,5 +56,18 @@ def sh_basis(directions: Float64, degree: int) -> Float64:
             C3[4] * x * (4 * z * z - x * x - y * y),
             C3[5] * z * (x * x - y * y),
             C3[6] * x * (x * x - 3 * y * y),
+        ]
+    if degree >= 4:
+        xx, yy, zz = x * x, y * y, z * z
+        columns += [
+            C4[0] * x * y * (xx - yy),
+            C4[1] * y * z * (3 * xx - yy),
+            C4[2] * x * y * (6 * zz - xx - yy),
+            C4[3] * y * z * (4 * zz - 3 * xx - 3 * yy),
+            C4[4] * (8 * zz * zz - 24 * zz * (xx + yy) + 3 * (xx + yy) ** 2),
+            C4[5] * x * z * (4 * zz - 3 * xx - 3 * yy),
+            C4[6] * (xx - yy) * (6 * zz - xx - yy),
+            C4[7] * x * z * (xx - 3 * yy),
+            C4[8] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ]
     return np.stack(columns, axis=1)

@@ -3,9 +3,9 @@
 // Owner: A work-item owns LANES Gaussians: their basis in vectors, the sums by turns.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
 // Buffers: directions (n, 3) of any length, or with CAMERA means (n, 3) in world units and centre (6), in two floats;
-//   sh (n, coefficients, 3), of which the first `used` are looked at; with MASKED mask (n, mask_width), which is looked
-//   at where it is over 0 in the first column -> colours (n, 3), zero where the mask is; with CAMERA 0.5 more, and no
-//   less than 0. In the direction of length 0 there is the first coefficient alone.
+//   sh (n, coefficients, 3), of which the first `used` are looked at, 25 with DEGREE_4; with MASKED mask (n,
+//   mask_width), which is looked at where it is over 0 in the first column -> colours (n, 3), zero where the mask is;
+//   with CAMERA 0.5 more, and no less than 0. In the direction of length 0 there is the first coefficient alone.
 // Equations: docs/gradients.md, (12) and (167); the basis is in docs/conventions.md.
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -16,9 +16,12 @@ __kernel void harmonics(const uint n, const int coefficients, const int used, DI
                         MASK __global float *colours) {
   ROWS_OF_ITEM(n)
   Direction d;
-  Lanes basis[16];
+  Lanes basis[MOST_COEFFICIENTS];
   direction_of(row, DIRECTIONS_GIVEN, &d);
   sh_basis(used, d.v[0], d.v[1], d.v[2], &basis[0].all);
+#ifdef DEGREE_4
+  band_4(d.v[0], d.v[1], d.v[2], &basis[0].all);
+#endif
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const size_t i = first_row + lane;
     if (HIDDEN(i)) {

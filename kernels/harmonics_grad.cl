@@ -2,9 +2,8 @@
 //
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
-// Buffers: what harmonics.cl reads; d_colours (n, 3); with CAMERA colours (n, 3), as harmonics.cl wrote them, as what
-// is
-//   0 there has no gradient -> d_sh (n, coefficients, 3), zero from `used` on, with ADDED to what is there; with
+// Buffers: what harmonics.cl reads; d_colours (n, 3); with CAMERA colours (n, 3), as harmonics.cl wrote them: what is 0
+//   there has no gradient -> d_sh (n, coefficients, 3), zero from `used` on, with ADDED to what is there; with
 //   BY_DIRECTION d_directions (n, 3), by a mean where there is a camera, with ADDED_DIRECTIONS to what is there. What
 //   the mask hides is zero, or stays as it was. With BY_CENTRE by_centre (3, padded): what each says of the camera's
 //   centre, zero from n on.
@@ -45,12 +44,15 @@ __kernel void harmonics_grad(const uint n, const uint padded, const int coeffici
   uint row[LANES];
   for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < n ? first_row + lane : n - 1;
   Direction d;
-  Lanes basis[16], weight[16];
+  Lanes basis[MOST_COEFFICIENTS], weight[MOST_COEFFICIENTS];
   IntLanes shown;
   shown.all = (intL)(0);
   direction_of(row, DIRECTIONS_GIVEN, &d);
   sh_basis(used, d.v[0], d.v[1], d.v[2], &basis[0].all);
-  for (int k = 0; k < 16; ++k) weight[k].all = (floatL)(0.0f);
+#ifdef DEGREE_4
+  band_4(d.v[0], d.v[1], d.v[2], &basis[0].all);
+#endif
+  for (int k = 0; k < MOST_COEFFICIENTS; ++k) weight[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {
     const size_t i = first_row + lane;
     if (i >= n) break;
@@ -86,6 +88,9 @@ __kernel void harmonics_grad(const uint n, const uint padded, const int coeffici
   floatL by_unit[3];
   Lanes by[3];
   sh_direction_gradient(used, d.v[0], d.v[1], d.v[2], &weight[0].all, by_unit);
+#ifdef DEGREE_4
+  add_band_4_gradient(d.v[0], d.v[1], d.v[2], &weight[0].all, by_unit);
+#endif
   const floatL along = fmaL(by_unit[0], d.v[0], fmaL(by_unit[1], d.v[1], by_unit[2] * d.v[2]));
   FOR_AXES(k) by[k].all = shown.all ? d.scale * fmaL(-along, d.v[k], by_unit[k]) : (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {

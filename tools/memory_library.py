@@ -25,7 +25,7 @@ def library(device: Device) -> None:
     poses[:, 2, 3] = 3.0, 2.5
     lenses = np.stack([np.array([[20.0, 0, 10], [0, 20, 5], [0, 0, 1]])] * 2)
     colours, features = rng.random((COUNT, 3)), rng.random((COUNT, 18))
-    sh = rng.normal(0, 0.2, (COUNT, 16, 3))
+    sh, wide = (rng.normal(0, 0.2, (COUNT, number, 3)) for number in (16, 25))
     plain = (means, quaternions, scales, opacities)
     calls = (
         (plain, colours, {"backgrounds": [0.1, 0.2, 0.3], "absolute_gradients": True}),
@@ -39,8 +39,9 @@ def library(device: Device) -> None:
         result = rasterize(*gaussians, values, *views, device=device, **settings)
         gradients = result.vjp(np.ones_like(result.images), np.ones_like(result.alphas))
         check(result.images, *gradients.values())
-    directions = spherical_harmonics(2, means, sh, np.arange(COUNT) % 3 > 0, device=device)
-    check(directions.colors, *directions.vjp(np.ones((COUNT, 3))).values())
+    for degree, coefficients in ((2, sh), (4, wide)):
+        directions = spherical_harmonics(degree, means, coefficients, np.arange(COUNT) % 3 > 0, device=device)
+        check(directions.colors, *directions.vjp(np.ones((COUNT, 3))).values())
     result = rasterize(*plain, colours, poses[:1], lenses[:1], WIDTH, HEIGHT, device=device)
     tiles = tuple(-(-size // 16) for size in (WIDTH, HEIGHT))
     _, ids, gaussians_listed = isect_tiles(result.means2d, result.radii, result.depths, 16, *tiles)

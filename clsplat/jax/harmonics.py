@@ -19,7 +19,7 @@ def spherical_harmonics(
 ) -> jax.Array:
     """`clsplat.library.harmonics.spherical_harmonics` with its gradient by directions and coefficients.
 
-    degree: 0 to 3, the bands that are used; directions (..., 3), of any length; coefficients (..., K, 3), K at least
+    degree: 0 to 4, the bands that are used; directions (..., 3), of any length; coefficients (..., K, 3), K at least
     (degree + 1)^2; masks (...) bool: False where the result is 0. Returns float32 (..., 3), without 0.5 added. Inputs
     of other dtypes become float32. Raises InputError for wrong shapes; other errors are those of `rasterize`.
 

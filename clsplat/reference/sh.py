@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real spherical harmonics up to degree 3, with the constants and signs of 3D Gaussian Splatting files."""
+"""The derivative of real spherical harmonics up to degree 4."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.spherical_harmonics import C1, C2, C3
+from clsplat.spherical_harmonics import C1, C2, C3, C4
 
 
 def sh_basis_grad(directions: Float64, degree: int) -> Float64:
@@ -38,5 +38,22 @@ def sh_basis_grad(directions: Float64, degree: int) -> Float64:
             (C3[4] * (4 * z * z - 3 * x * x - y * y), -2 * C3[4] * x * y, 8 * C3[4] * x * z),
             (2 * C3[5] * x * z, -2 * C3[5] * y * z, C3[5] * (x * x - y * y)),
             (3 * C3[6] * (x * x - y * y), -6 * C3[6] * x * y, zero),
+        ]
+    if degree >= 4:
+        xx, yy, zz = x * x, y * y, z * z
+        rows += [
+            (C4[0] * y * (3 * xx - yy), C4[0] * x * (xx - 3 * yy), zero),
+            (6 * C4[1] * x * y * z, 3 * C4[1] * z * (xx - yy), C4[1] * y * (3 * xx - yy)),
+            (C4[2] * y * (6 * zz - 3 * xx - yy), C4[2] * x * (6 * zz - xx - 3 * yy), 12 * C4[2] * x * y * z),
+            (-6 * C4[3] * x * y * z, C4[3] * z * (4 * zz - 3 * xx - 9 * yy), C4[3] * y * (12 * zz - 3 * xx - 3 * yy)),
+            (
+                C4[4] * x * (12 * (xx + yy) - 48 * zz),
+                C4[4] * y * (12 * (xx + yy) - 48 * zz),
+                C4[4] * z * (32 * zz - 48 * (xx + yy)),
+            ),
+            (C4[5] * z * (4 * zz - 9 * xx - 3 * yy), -6 * C4[5] * x * y * z, C4[5] * x * (12 * zz - 3 * xx - 3 * yy)),
+            (4 * C4[6] * x * (3 * zz - xx), -4 * C4[6] * y * (3 * zz - yy), 12 * C4[6] * z * (xx - yy)),
+            (3 * C4[7] * z * (xx - yy), -6 * C4[7] * x * y * z, C4[7] * x * (xx - 3 * yy)),
+            (4 * C4[8] * x * (xx - 3 * yy), 4 * C4[8] * y * (yy - 3 * xx), zero),
         ]
     return np.stack([np.stack(row, axis=1) for row in rows], axis=1)

@@ -16,7 +16,7 @@ from clsplat.device.profile import stage
 from clsplat.errors import InputError
 from clsplat.stages.sums import padded, row_sums
 
-HIGHEST = 3
+HIGHEST = 4
 """The degree up to which there is a basis."""
 
 
@@ -50,7 +50,11 @@ class Harmonics:
     @property
     def defines(self) -> dict[str, object]:
         """Defines of both kernels."""
-        wanted = {"CAMERA": self.centre is not None, "MASKED": self.mask is not None}
+        wanted = {
+            "CAMERA": self.centre is not None,
+            "MASKED": self.mask is not None,
+            "DEGREE_4": self.degree == HIGHEST,
+        }
         return {name: True for name, on in wanted.items() if on}
 
     @property

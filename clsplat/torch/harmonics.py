@@ -27,7 +27,7 @@ def spherical_harmonics(
     """Sums of real spherical harmonics in directions, (..., 3), as gsplat 1.5.3's function of this name; without the
     0.5 and the floor that `rasterization` adds.
 
-    degrees_to_use: the highest degree, 0 to 3. dirs: (..., 3), of any length. coeffs: (..., K, 3), K at least
+    degrees_to_use: the highest degree, 0 to 4. dirs: (..., 3), of any length. coeffs: (..., K, 3), K at least
     (degrees_to_use + 1)^2, in the order and with the signs of 3DGS files. masks: (...), of bool; where false the sum
     and its gradient are 0. device: an OpenCL device, open or as `clsplat devices` lists it.
 

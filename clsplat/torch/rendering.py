@@ -12,6 +12,7 @@ from torch import Tensor
 
 from clsplat.device.context import Device
 from clsplat.library.rasterize import rasterize
+from clsplat.stages.harmonics import HIGHEST
 from clsplat.torch.arguments import check_choice, check_number, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import Batches, Call, Pixels, Projection
 from clsplat.torch.covariances import UPPER
@@ -87,7 +88,7 @@ def rasterization(
     signs of 3DGS files. viewmats: (..., C, 4, 4), camera from world, x right, y down, z forward. Ks: (..., C, 3, 3), in
     pixels, the centre of the first pixel at 0.5; skew is ignored. width, height: pixels. near_plane, far_plane: depths
     between which a Gaussian is drawn. radius_clip: pixels; a splat of no larger radius is not drawn. eps2d: pixels^2,
-    added to the variance of each splat. sh_degree: the degree to use, 0 to 3; None for colours. packed: `meta` has the
+    added to the variance of each splat. sh_degree: the degree to use, 0 to 4; None for colours. packed: `meta` has the
     splats in view alone. tile_size: pixels, of the tile lists in `meta` alone. backgrounds: (..., C, D). render_mode:
     colour, depth along z (D), expected depth (ED), or colour and depth, in the last channel. sparse_grad: with
     `packed`, without batches: the gradients of means, quats and scales (or covars) are COO tensors of the rows in view.
@@ -218,8 +219,8 @@ def _check_tensors(
         if not 1 <= colors.shape[-1] <= MOST_CHANNELS:
             raise refuse("colors", f"of {colors.shape[-1]} channels", f"1 to {MOST_CHANNELS}")
     else:
-        if isinstance(sh_degree, bool) or sh_degree not in (0, 1, 2, 3):
-            raise refuse("sh_degree", sh_degree, "0, 1, 2 or 3, or None for colours")
+        if isinstance(sh_degree, bool) or sh_degree not in range(HIGHEST + 1):
+            raise refuse("sh_degree", sh_degree, f"0 to {HIGHEST}, or None for colours")
         check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
         if colors.shape[-2] < (sh_degree + 1) ** 2:
             raise refuse(

@@ -1,5 +1,10 @@
 // The direction in which a colour of spherical harmonics is looked at, and which ones are looked at at all: arguments
-// that harmonics.cl and its gradient share.
+// that harmonics.cl and its gradient share; and with DEGREE_4 the band that models do not have, as in sh.h.
+#ifdef DEGREE_4
+#define MOST_COEFFICIENTS 25
+#else
+#define MOST_COEFFICIENTS 16
+#endif
 #ifdef CAMERA
 #define DIRECTIONS __constant float *centre, __global const float *means
 #define DIRECTIONS_GIVEN centre, means
@@ -36,3 +41,40 @@ static inline void direction_of(const uint *row, DIRECTIONS, Direction *d) {
   d->scale = length > 0.0f ? 1.0f / length : (floatL)(0.0f);
   FOR_AXES(k) d->v[k] = length > 0.0f ? d->v[k] / length : (floatL)(0.0f);
 }
+
+#ifdef DEGREE_4
+static inline void band_4(floatL x, floatL y, floatL z, floatL *basis) {
+  const floatL xx = x * x, yy = y * y, zz = z * z, disc = xx + yy;
+  basis[16] = 2.5033429417967046f * x * y * (xx - yy);
+  basis[17] = -1.7701307697799304f * y * z * (3.0f * xx - yy);
+  basis[18] = 0.9461746957575601f * x * y * (6.0f * zz - disc);
+  basis[19] = -0.6690465435572892f * y * z * (4.0f * zz - 3.0f * disc);
+  basis[20] = 0.10578554691520431f * (8.0f * zz * zz - 24.0f * zz * disc + 3.0f * disc * disc);
+  basis[21] = -0.6690465435572892f * x * z * (4.0f * zz - 3.0f * disc);
+  basis[22] = 0.47308734787878004f * (xx - yy) * (6.0f * zz - disc);
+  basis[23] = -1.7701307697799304f * x * z * (xx - 3.0f * yy);
+  basis[24] = 0.6258357354491761f * (xx * (xx - 3.0f * yy) - yy * (3.0f * xx - yy));
+}
+
+// To d[3]: sum over k of weight[k] times the gradient of basis[k] by (x, y, z), of this band.
+static inline void add_band_4_gradient(floatL x, floatL y, floatL z, const floatL *weight, floatL *d) {
+  const float c0 = 2.5033429417967046f, c1 = 1.7701307697799304f, c2 = 0.9461746957575601f, c3 = 0.6690465435572892f;
+  const float c4 = 0.10578554691520431f, c6 = 0.47308734787878004f, c8 = 0.6258357354491761f;
+  const floatL xx = x * x, yy = y * y, zz = z * z, disc = xx + yy, xyz = x * y * z;
+  d[0] += c0 * y * (3.0f * xx - yy) * weight[16] - 6.0f * c1 * xyz * weight[17] +
+          c2 * y * (6.0f * zz - 3.0f * xx - yy) * weight[18] + 6.0f * c3 * xyz * weight[19] +
+          c4 * x * (12.0f * disc - 48.0f * zz) * weight[20] -
+          c3 * z * (4.0f * zz - 9.0f * xx - 3.0f * yy) * weight[21] + 4.0f * c6 * x * (3.0f * zz - xx) * weight[22] -
+          3.0f * c1 * z * (xx - yy) * weight[23] + 4.0f * c8 * x * (xx - 3.0f * yy) * weight[24];
+  d[1] += c0 * x * (xx - 3.0f * yy) * weight[16] - 3.0f * c1 * z * (xx - yy) * weight[17] +
+          c2 * x * (6.0f * zz - xx - 3.0f * yy) * weight[18] -
+          c3 * z * (4.0f * zz - 3.0f * xx - 9.0f * yy) * weight[19] +
+          c4 * y * (12.0f * disc - 48.0f * zz) * weight[20] + 6.0f * c3 * xyz * weight[21] -
+          4.0f * c6 * y * (3.0f * zz - yy) * weight[22] + 6.0f * c1 * xyz * weight[23] +
+          4.0f * c8 * y * (yy - 3.0f * xx) * weight[24];
+  d[2] += -c1 * y * (3.0f * xx - yy) * weight[17] + 12.0f * c2 * xyz * weight[18] -
+          c3 * y * (12.0f * zz - 3.0f * disc) * weight[19] + c4 * z * (32.0f * zz - 48.0f * disc) * weight[20] -
+          c3 * x * (12.0f * zz - 3.0f * disc) * weight[21] + 12.0f * c6 * z * (xx - yy) * weight[22] -
+          c1 * x * (xx - 3.0f * yy) * weight[23];
+}
+#endif

@@ -98,7 +98,7 @@ def test_features_that_clsplat_does_not_have_are_refused(changes: dict[str, Any]
         ({"colors": torch.zeros(8, 0)}, "colors is of 0 channels"),
         ({"sh_degree": 1}, r"colors is float32 \(8, 3\), expected a tensor \(8, K, 3\)"),
         ({"sh_degree": 1, "colors": torch.zeros(8, 1, 3)}, "colors is of 1 coefficients, expected 4 or more"),
-        ({"sh_degree": 4, "colors": torch.zeros(8, 25, 3)}, "sh_degree is 4, expected 0, 1, 2 or 3"),
+        ({"sh_degree": 5, "colors": torch.zeros(8, 36, 3)}, "sh_degree is 5, expected 0 to 4, or None"),
         ({"viewmats": torch.eye(4)}, r"viewmats is float32 \(4, 4\), expected a tensor \(C, 4, 4\)"),
         ({"viewmats": torch.zeros(0, 4, 4)}, "viewmats is of shape .* a camera or more"),
         ({"Ks": torch.zeros(2, 3, 3)}, r"Ks is float32 \(2, 3, 3\), expected a tensor \(1, 3, 3\)"),

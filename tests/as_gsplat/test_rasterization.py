@@ -83,7 +83,7 @@ LOW_PASSES = ("classic", "antialiased")
 
 @pytest.mark.parametrize(
     ("degree", "cams", "rasterize_mode"),
-    every((0, 1, 2, 3), (1, 3), LOW_PASSES, quick={(0, 1, "classic"), (1, 1, "antialiased"), (3, 3, "classic")}),
+    every((0, 1, 2, 3, 4), (1, 3), LOW_PASSES, quick={(0, 1, "classic"), (1, 1, "antialiased"), (3, 3, "classic")}),
 )
 def test_degrees(degree: int, cams: int, rasterize_mode: str) -> None:
     arguments = clouds.rounded(clouds.cloud(40, degree=degree, cams=cams))

@@ -14,13 +14,13 @@ from clsplat.errors import InputError
 from clsplat.library.harmonics import spherical_harmonics
 
 RNG = np.random.default_rng(5)
-DIRECTIONS, COEFFICIENTS = RNG.normal(size=(3, 70, 3)), RNG.normal(size=(3, 70, 16, 3))
+DIRECTIONS, COEFFICIENTS = RNG.normal(size=(3, 70, 3)), RNG.normal(size=(3, 70, 25, 3))
 BY = RNG.normal(size=(3, 70, 3))
 
 
 @pytest.mark.needs("gsplat")
 @pytest.mark.needs("torch")
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", range(5))
 def test_gsplat_s_reference_has_the_same(degree: int) -> None:
     torch = pytest.importorskip("torch")
     reference = pytest.importorskip("gsplat.cuda._torch_impl")
@@ -54,16 +54,16 @@ def test_no_directions_and_a_single_one(default_device: Device) -> None:
     assert none.vjp(np.zeros((0, 3)))["coefficients"].shape == (0, 4, 3)
     one = spherical_harmonics(3, DIRECTIONS[0, 0], COEFFICIENTS[0, 0], device=default_device)
     assert one.colors.shape == (3,)
-    assert one.vjp(BY[0, 0])["coefficients"].shape == (16, 3)
+    assert one.vjp(BY[0, 0])["coefficients"].shape == (25, 3)
 
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ((4, DIRECTIONS, COEFFICIENTS), "degree is 4: expected 0 to 3"),
-        ((1.5, DIRECTIONS, COEFFICIENTS), "degree is 1.5: expected 0 to 3"),
+        ((5, DIRECTIONS, COEFFICIENTS), "degree is 5: expected 0 to 4"),
+        ((1.5, DIRECTIONS, COEFFICIENTS), "degree is 1.5: expected 0 to 4"),
         ((2, DIRECTIONS, COEFFICIENTS[:, :, :4]), "coefficients: got 4 of them, expected 9 or more for degree 2"),
-        ((1, DIRECTIONS[:2], COEFFICIENTS), r"coefficients: got shape \(3, 70, 16, 3\), expected \(2, 70, K, 3\)"),
+        ((1, DIRECTIONS[:2], COEFFICIENTS), r"coefficients: got shape \(3, 70, 25, 3\), expected \(2, 70, K, 3\)"),
         ((1, DIRECTIONS[..., :2], COEFFICIENTS), r"directions: got shape \(3, 70, 2\), expected \(3, 70, 3\)"),
         ((1, np.full((1, 3), np.inf), np.zeros((1, 4, 3))), r"directions: \[0, 0\] is inf, expected finite numbers"),
         ((1, DIRECTIONS, COEFFICIENTS, np.ones(70)), r"masks: got shape \(70,\), expected \(3, 70\)"),

@@ -18,7 +18,7 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.reference.sh import sh_basis_grad
 from clsplat.spherical_harmonics import sh_basis
-from clsplat.stages.harmonics import Harmonics, centre_array, harmonics, harmonics_grad
+from clsplat.stages.harmonics import HIGHEST, Harmonics, centre_array, harmonics, harmonics_grad
 
 CENTRE = np.array([0.1, 0.2, 3.3])
 """Of a camera; not one of float32's numbers."""
@@ -26,7 +26,7 @@ CENTRE = np.array([0.1, 0.2, 3.3])
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """directions (n, 3), sh (n, 16, 3), mask (n, 2), d_colours (n, 3), and whether a camera looks."""
+    """directions (n, 3), sh (n, K, 3), mask (n, 2), d_colours (n, 3), and whether a camera looks."""
 
     directions: Float32
     sh: Float32
@@ -60,7 +60,7 @@ class Subject:
 def subject(count: int, degree: int = 3, *, camera: bool = True) -> Subject:
     rng = np.random.default_rng(count + degree)
     mask = np.repeat((rng.random((count, 1)) < 0.8).astype(np.int32), 2, axis=1)
-    shapes = ((count, 3), (count, 16, 3), (count, 3))
+    shapes = ((count, 3), (count, 25 if degree == HIGHEST else 16, 3), (count, 3))
     directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
     return Subject(directions, sh, mask, by, degree, camera)
 
@@ -81,11 +81,11 @@ def run(device: Device, given: Subject, *, add: bool = False, start: float = -7.
 
 
 @pytest.mark.parametrize("camera", quick([False, True], True))
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", range(HIGHEST + 1))
 def test_the_kernels_against_float64(shaped_device: Device, degree: int, camera: bool) -> None:
     given = subject(300, degree, camera=camera)
     found, wanted = run(shaped_device, given), given.wanted()
-    # sums of up to 16 products of size 1, each off by 1e-7
+    # sums of up to 25 products of size 1, each off by 1e-7
     np.testing.assert_allclose(found["colours"], wanted["colours"], atol=4e-6)
     for name in ("sh", *(["directions", *(["centre"] if camera else [])] if degree else [])):
         assert_close_gradient(found[name], wanted[name], 2e-6, name=name)
@@ -131,7 +131,7 @@ def test_what_is_hidden_may_be_no_number(shaped_device: Device) -> None:
     assert found["centre"].any()
 
 
-@pytest.mark.parametrize("degree", quick(range(4), 3))
+@pytest.mark.parametrize("degree", quick(range(HIGHEST + 1), 3))
 def test_no_direction_has_the_first_coefficient_alone(device: Device, degree: int) -> None:
     given = replace(subject(64, degree, camera=False), directions=np.zeros((64, 3), np.float32))
     found = run(device, given)
@@ -142,7 +142,7 @@ def test_no_direction_has_the_first_coefficient_alone(device: Device, degree: in
 
 def test_degrees_that_there_are_not(default_device: Device) -> None:
     given = subject(1)
-    with pytest.raises(InputError, match="sh_degree is 4: expected 0 to 3"):
-        _ = replace(given, degree=4).on(default_device).used
+    with pytest.raises(InputError, match="sh_degree is 5: expected 0 to 4"):
+        _ = replace(given, degree=5).on(default_device).used
     with pytest.raises(InputError, match="sh_degree is 2: expected 9 coefficients, got 4"):
         _ = replace(given, degree=2, sh=np.ascontiguousarray(given.sh[:, :4])).on(default_device).used

@@ -6,6 +6,7 @@ It shares no code with the package, and none with gsplat.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -70,6 +71,17 @@ def harmonics(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
         basis += [C3[0] * y * (3 * x * x - y * y), C3[1] * x * y * z, C3[2] * y * (4 * z * z - x * x - y * y)]
         basis += [C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), C3[4] * x * (4 * z * z - x * x - y * y)]
         basis += [C3[5] * z * (x * x - y * y), C3[6] * x * (x * x - 3 * y * y)]
+    if degree > 3:  # by Legendre's functions of z, times the sines and cosines of m times the azimuth
+        square = z * z
+        sines, cosines = [y, 2 * x * y], [x, x * x - y * y]
+        for _ in range(2):
+            sines, cosines = [*sines, x * sines[-1] + y * cosines[-1]], [*cosines, x * cosines[-1] - y * sines[-1]]
+        of_z = [z * (7 * square - 3), 7 * square - 1, z, torch.ones_like(z)]
+        sizes = [-3 / 4 * (5 / (2 * math.pi)) ** 0.5, 3 / 8 * (5 / math.pi) ** 0.5]
+        sizes += [-3 / 4 * (35 / (2 * math.pi)) ** 0.5, 3 / 16 * (35 / math.pi) ** 0.5]
+        basis += [size * value * sine for size, value, sine in zip(sizes[::-1], of_z[::-1], sines[::-1], strict=True)]
+        basis += [3 / 16 / math.pi**0.5 * (35 * square * square - 30 * square + 3)]
+        basis += [size * value * cosine for size, value, cosine in zip(sizes, of_z, cosines, strict=True)]
     return (torch.stack(basis, -1)[..., None] * coefficients[..., : len(basis), :]).sum(-2)
 
 
