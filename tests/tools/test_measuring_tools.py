@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import bench_growth
+import bench_library
 import bench_sort
 import compare_peer
 import numpy as np
@@ -45,6 +46,29 @@ def test_sort(tmp_path: Path, capsys: Capture) -> None:
     assert result["repeat"] == 1
     assert "ns a key" in plot.read_text()
     assert any("10,000" in line for line in bench_sort.table(result))
+
+
+def test_library(capsys: Capture) -> None:
+    assert bench_library.main(["--gaussians", "300", "--size", "40x30", "--repeat", "1", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    rows = {row["call"]: row for row in result["rows"]}
+    assert {"Renderer.render", "rasterize", "Rasterizer.backward", "rasterize, vjp"} <= rows.keys()
+    assert rows["rasterize"]["ratio"] == pytest.approx(rows["rasterize"]["ms"] / rows["Renderer.render"]["ms"])
+    assert rows["Rasterizer.backward"]["ratio"] == 1
+    assert (result["gaussians"], result["width"], result["height"]) == (300, 40, 30)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--gaussians 0", "--gaussians 0: expected at least 1"),
+        ("--size 0x30", "--size 0x30: expected at least 1x1"),
+        ("--repeat 0", "--repeat 0: expected at least 1"),
+    ],
+)
+def test_wrong_calls_of_bench_library(flags: str, message: str, capsys: Capture) -> None:
+    assert bench_library.main(flags.split()) == 2
+    assert message in one_error(capsys, "bench_library")
 
 
 def test_deviation_from_linear_growth() -> None:
