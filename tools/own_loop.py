@@ -3,6 +3,7 @@
 """A training loop written as gsplat's documentation shows it, on `clsplat.torch`, beside `clsplat train` of a scene.
 
 python tools/own_loop.py SCENES/fox --resolution 400 --steps 2000 --strategy default
+python tools/own_loop.py SCENES/fox --resolution 400 --steps 2000 --strategy mcmc --steps-scaler 0.0667
 
 The loop is gsplat's `simple_trainer` in outline: its parameters, learning rates, schedules, loss and calls of a
 strategy; with `from gsplat import ...` in place of the import of `clsplat.torch` it is a program for CUDA. Prints the
@@ -51,6 +52,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--strategy", choices=("default", "mcmc"), default="default")
     parser.add_argument("--most", type=int, default=50_000, help="Gaussians that mcmc grows to")
+    parser.add_argument("--steps-scaler", type=float, default=1.0, help="of all of gsplat's settings that are steps")
     parser.add_argument("--packed", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bound", type=float, default=0.3, help="dB")
@@ -95,10 +97,10 @@ def own_loop(scene: Scene, given: argparse.Namespace) -> Params:
     params = initial(scene, given)
     optimizers = optimizers_of(params, scene.extent)
     mcmc = given.strategy == "mcmc"
-    strategy: Any = MCMCStrategy(cap_max=given.most) if mcmc else DefaultStrategy()
+    strategy = strategy_of(given)
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state() if mcmc else strategy.initialize_state(scene_scale=scene.extent)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / MAX_STEPS))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizers["means"], gamma=0.01 ** (1 / scaled(MAX_STEPS, given)))
     views = scene.train_views
     photographs = [torch.from_numpy(view.load()[:, :, :3]) for view in views]
     order: list[int] = []
@@ -106,7 +108,7 @@ def own_loop(scene: Scene, given: argparse.Namespace) -> Params:
         if step % len(views) == 0:
             order = torch.randperm(len(views)).tolist()
         index = order[step % len(views)]
-        degree = min(step // SH_DEGREE_EVERY, SH_DEGREE)
+        degree = min(step // scaled(SH_DEGREE_EVERY, given), SH_DEGREE)
         images, _, info = picture(params, views[index], degree, packed=given.packed)
         strategy.step_pre_backward(params, optimizers, state, step, info)
         target = photographs[index]
@@ -127,6 +129,20 @@ def own_loop(scene: Scene, given: argparse.Namespace) -> Params:
         if step % 100 == 0:
             print(f"step {step}: loss {loss.item():.4f}, {len(params['means']):,} Gaussians", flush=True)
     return params
+
+
+def scaled(steps: int, given: argparse.Namespace) -> int:
+    """A setting of gsplat's that is a number of steps, in this training."""
+    return max(1, int(steps * given.steps_scaler))
+
+
+def strategy_of(given: argparse.Namespace) -> Any:
+    """gsplat's strategy, with its settings."""
+    strategy: Any = MCMCStrategy(cap_max=given.most) if given.strategy == "mcmc" else DefaultStrategy()
+    for name in ("refine_start_iter", "refine_stop_iter", "refine_every", "reset_every"):
+        if hasattr(strategy, name):
+            setattr(strategy, name, scaled(getattr(strategy, name), given))
+    return strategy
 
 
 def initial(scene: Scene, given: argparse.Namespace) -> Params:
