@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -50,14 +51,18 @@ class Call:
     ) -> None:
         self.results, self.batch, self.packed, self.sparse, self.absolute = results, batch, packed, sparse, absolute
         self.expected_depth = expected_depth
+        self._handed_on: dict[str, tuple[Tensor, int, NDArray[Any]]] = {}
         radii = self.stacked("radii")
         self.sizes = (len(results), *radii.shape[1:3])
         self.in_view: Int64 | None = None
         if packed:  # a column at a time: numpy takes ten times as long for an axis of two
             self.in_view = np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
-        self.radii = self.laid_out(radii)
-        if not packed:  # the caller's own, as the gradient reads the library's
-            self.radii = self.radii.copy()
+
+    @cached_property
+    def radii(self) -> NDArray[np.int32]:
+        """In the layout of `meta`; the caller's own, as the gradient reads the library's."""
+        radii = self.laid_out(self.stacked("radii"))
+        return radii if self.packed else radii.copy()
 
     def ids(self, device: Any) -> tuple[Tensor, Tensor, Tensor]:
         """Batch, camera and Gaussian of each splat in view, int64."""
@@ -95,19 +100,22 @@ class Call:
             return array.reshape(*self.batch, *array.shape[1:])
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
 
-    def whole(self, value: Tensor | None) -> Any:
-        """A gradient in the layout of `meta`, as (B, C, N, ...)."""
+    def whole(self, name: str, value: Tensor | None) -> Any:
+        """A gradient in the layout of `meta`, as (B, C, N, ...). What `in_layout` has packed is not spread again, if by
+        PyTorch's count of versions it is as it was."""
+        packed, version, array = self._handed_on.pop(name, (None, 0, None))
         if value is None:
             return None
+        if packed is not None and value.data_ptr() == packed.data_ptr() and value._version == version:  # noqa: SLF001
+            return array
         array = as_array(value)
         if self.in_view is None:
             return array.reshape(*self.sizes, *array.shape[len(self.batch) + 2 :])
         rows = array
         if len(array) < math.prod(self.sizes):
             rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
-            one = np.dtype(
-                (np.void, array.itemsize * math.prod(array.shape[1:]))
-            )  # a row as one item, in half the time
+            # a row as one item, in half the time
+            one = np.dtype((np.void, array.itemsize * math.prod(array.shape[1:])))
             rows.reshape(-1).view(one)[self.in_view] = array.reshape(-1).view(one)
         return rows.reshape(*self.sizes, *array.shape[1:])
 
@@ -132,10 +140,14 @@ class Call:
         pairs = zip(inputs, found, strict=True)
         return [self.of_rows(part) if part is not None and name in SPARSE else part for name, part in pairs]
 
-    def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor) -> Tensor:
-        """Gradients of splats from every batch, in the layout of `meta`."""
+    def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor, *, hand_on: bool = True) -> Tensor:
+        """Gradients of splats from every batch, in the layout of `meta`; hand_on: `whole` will be asked for them."""
         arrays = [found[name] for found in each]
-        return as_tensor(self.laid_out(arrays[0][None] if len(arrays) == 1 else np.stack(arrays)), like)
+        array = arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
+        tensor = as_tensor(self.laid_out(array), like)
+        if self.packed and hand_on:
+            self._handed_on[name] = (tensor, tensor._version, array)  # noqa: SLF001
+        return tensor
 
 
 class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
@@ -172,7 +184,7 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         if all(gradient is None for gradient in given):
             return (None,) * (1 + len(inputs))
         names = ("means2d", "conics", "depths", "opacities")
-        splats = {name: call.whole(gradient) for name, gradient in zip(names, given[:4], strict=True)}
+        splats = {name: call.whole(name, gradient) for name, gradient in zip(names, given[:4], strict=True)}
         colors = given[4]
         splats["colors2d"] = None if colors is None else as_array(colors).reshape(*call.sizes, colors.shape[-1])
         cameras = any(ctx.needs_input_grad[-2:])
@@ -227,7 +239,7 @@ class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no typ
             image = np.zeros_like(result.images) if d_images is None else images[index]
             each.append(result.vjp_pixels(image, alphas[index]))
         if call.absolute:
-            means2d.absgrad = call.in_layout(each, "absolute", means2d)
+            means2d.absgrad = call.in_layout(each, "absolute", means2d, hand_on=False)
         if values is not None and values.dim() == len(call.batch) + 2:  # one for all cameras
             each = [{**found, "colors2d": found["colors2d"].sum(0)} for found in each]
         return (

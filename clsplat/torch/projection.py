@@ -131,7 +131,7 @@ class _Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has n
         inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
         if all(gradient is None for gradient in given):
             return (None,) * (1 + len(inputs))
-        splats = {name: call.whole(gradient) for name, gradient in zip(OUTPUTS, given, strict=True)}
+        splats = {name: call.whole(name, gradient) for name, gradient in zip(OUTPUTS, given, strict=True)}
         each = [
             result.vjp(**{name: None if whole is None else whole[index] for name, whole in splats.items()})
             for index, result in enumerate(call.results)

@@ -24,6 +24,8 @@ RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
 MOST_CHANNELS = 512
+IDS = ("batch_ids", "camera_ids", "gaussian_ids")
+"""Names of a splat's own in `meta`."""
 
 
 class RollingShutterType(Enum):
@@ -144,6 +146,7 @@ def rasterization(
         "rasterize_mode": rasterize_mode,
         "camera_model": camera_model,
         "absolute_gradients": absgrad,
+        "differentiable": torch.is_grad_enabled(),
         "device": device,
     }
     depth_alone = render_mode in {"D", "ED"}
@@ -161,6 +164,7 @@ def rasterization(
         "backgrounds": backgrounds,
         "covars": covars,
     }
+    settings["differentiable"] &= any(each is not None and each.requires_grad for each in tensors.values())
     arrays = {name: Batches(each, batch) for name, each in tensors.items()}
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
@@ -237,15 +241,20 @@ def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_
     """gsplat's dictionary, in its order."""
     means2d, depths, conics, opacities = splats
     batches, cameras, _ = call.sizes
-    like, radii = means2d.detach(), torch.from_numpy(call.radii).to(means2d.device)
-    ids: tuple[Tensor | None, ...] = (None, None, None) if call.in_view is None else call.ids(means2d.device)
-    batch_ids, camera_ids, gaussian_ids = ids
+    like = means2d.detach()
     columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
 
+    def ids() -> dict[str, Any]:
+        return dict(zip(IDS, call.ids(like.device), strict=True))
+
+    def radii() -> dict[str, Any]:
+        return {"radii": torch.from_numpy(call.radii).to(like.device)}
+
     def tiles() -> dict[str, Any]:
+        batch_ids, camera_ids, gaussian_ids = (meta[name] for name in IDS)
         per_gauss, isect_ids, flatten_ids = isect_tiles(
             like,
-            radii,
+            meta["radii"],
             depths.detach(),
             tile_size,
             columns,
@@ -263,7 +272,10 @@ def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_
             "isect_offsets": offsets.reshape(*call.batch, cameras, rows, columns),
         }
 
-    meta = Meta({"batch_ids": batch_ids, "camera_ids": camera_ids, "gaussian_ids": gaussian_ids, "radii": radii})
+    meta = Meta(dict.fromkeys(IDS))
+    if call.in_view is not None:
+        meta.later(IDS, ids)
+    meta.later(("radii",), radii)
     meta.update({"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities})
     meta.update({"tile_width": columns, "tile_height": rows})
     meta.later(("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets"), tiles)

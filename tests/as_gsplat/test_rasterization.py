@@ -115,6 +115,34 @@ def test_modes(render_mode: str, rasterize_mode: str, cams: int, packed: bool) -
     )
 
 
+def test_packed_gradients_are_those_that_are_not() -> None:
+    """To the bit: as they are handed on, changed in place by a hook, in place of others, and with others added."""
+    arguments = clouds.rounded(clouds.cloud(40, degree=1, cams=2))
+    weights = torch.randn(2, arguments["height"], arguments["width"], 3, generator=torch.Generator().manual_seed(1))
+
+    def doubled(gradient: Tensor) -> Tensor:
+        return 2 * gradient
+
+    def in_place(gradient: Tensor) -> None:
+        gradient.mul_(2)
+
+    def gradients(packed: bool, hook: Any, depths: bool) -> dict[str, Tensor]:
+        given, tensors = leaves(arguments, torch.float32)
+        images, _, meta = rasterization(**given, packed=packed)
+        if hook is not None:
+            meta["means2d"].register_hook(hook)
+        loss = (images * weights).sum()
+        (loss + meta["depths"].square().sum() if depths else loss).backward()
+        return {name: tensor.grad for name, tensor in tensors.items()}
+
+    plain = gradients(packed=True, hook=None, depths=False)
+    for hook, depths in ((None, False), (doubled, False), (in_place, False), (None, True)):
+        found, wanted = (gradients(packed, hook, depths) for packed in (True, False))
+        for name, tensor in found.items():
+            assert torch.equal(tensor, wanted[name]), name
+        assert torch.equal(found["means"], plain["means"]) == (hook is None and not depths)
+
+
 def test_every_driver(device: Device) -> None:
     """The image of each is the oracle's, and so is the gradient."""
     compare(clouds.rounded(clouds.cloud(40, degree=1)), device=device)
