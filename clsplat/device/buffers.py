@@ -21,6 +21,7 @@ import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
 from clsplat.device.context import Device
+from clsplat.device.host_memory import host_bytes
 from clsplat.device.tape import CHECK, Tape, asked
 from clsplat.errors import CapacityError, InputError, amount
 
@@ -256,21 +257,16 @@ class Hosted:
         return self._host
 
 
-_ALIGNED = 4096
-"""Bytes at multiples of which the host's memory begins, so that no driver works on a copy of it."""
-
-
 def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> Hosted:
     """A new array that comes to the host. Raises CapacityError as `allocate`."""
     kind = np.dtype(dtype)
     nbytes = prod(shape) * kind.itemsize
     if not device.shares_memory or not nbytes:
         return Hosted(allocate(device, shape, kind), np.empty(shape, kind))
-    memory = np.empty(-(-nbytes // _ALIGNED) * _ALIGNED + _ALIGNED, np.uint8)
-    start = -memory.ctypes.data % _ALIGNED
+    memory = host_bytes(-(-nbytes // 4) * 4)
     if (word := _poison()) is not None:
-        memory[start : len(memory) // 4 * 4 - _ALIGNED + start].view(np.uint32)[:] = word
-    host = memory[start : start + nbytes].view(kind).reshape(shape)
+        memory.view(np.uint32)[:] = word
+    host = memory[:nbytes].view(kind).reshape(shape)
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
     return Hosted(DeviceArray(device, cl.Buffer(device.context, flags, hostbuf=host), shape, kind), host)
 
