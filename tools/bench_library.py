@@ -5,8 +5,10 @@
     python tools/bench_library.py [--gaussians 1e5] [--size 640x480] [--repeat 25] [--device DEVICE] [--json]
 
 The scene is the one that `clsplat bench` makes up, SH of degree 3. All calls take their turn before one has its next;
-after medians in ms come the medians of the ratios, in a turn, to `Renderer.render` and to `Rasterizer.backward`. Of a
-call the gradient by the view matrix is left out, as the trainer has none. Without PyTorch its rows are left out.
+after medians in ms come the medians of the ratios in a turn: of images alone to `Renderer.render`, of images with what
+a gradient needs to a trainer's `Rasterizer.forward`, whose image stays on the device, and of gradients to
+`Rasterizer.backward`. Of a call the gradient by the view matrix is left out, as the trainer has none. Without PyTorch
+its rows are left out.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -68,8 +71,8 @@ def lens_of(camera: Camera) -> Any:
     return np.array([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], np.float32)
 
 
-def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call]:
-    """`Renderer.render`, and the trainer's gradient from a gradient by the image that is on the device."""
+def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
+    """`Renderer.render`, a trainer's frame, and its gradient from a gradient by the image that is on the device."""
     renderer, rasterizer, camera = Renderer(device), Rasterizer(device), subject.camera
     gaussians = upload_gaussians(device, subject.gaussians)
     gradients = allocate_gaussians(device, gaussians.count, gaussians.coefficients, zero=True)
@@ -89,27 +92,35 @@ def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call]:
 
         return work
 
-    return ("Renderer.render", forward), ("Rasterizer.backward", backward)
+    def frame() -> Callable[[], object]:
+        def work() -> None:
+            rasterizer.forward(gaussians, camera, black, backward=True)
+            device.finish()
+
+        return work
+
+    return ("Renderer.render", forward), ("Rasterizer.forward", frame), ("Rasterizer.backward", backward)
 
 
-def of_numpy(device: Device, subject: Subject) -> tuple[Call, Call]:
-    """`clsplat.rasterize`, and its vector-Jacobian product."""
+def of_numpy(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
+    """`clsplat.rasterize` without and with what a gradient needs, and its vector-Jacobian product."""
     arrays, gradient = arrays_of(subject), gradient_of(subject.camera)[None]
 
-    def call() -> Any:
-        width, height = subject.camera.width, subject.camera.height
-        found = rasterize(**arrays, width=width, height=height, sh_degree=DEGREE, device=device)
+    def call(*, differentiable: bool = True) -> Any:
+        size = {"width": subject.camera.width, "height": subject.camera.height}
+        found = rasterize(**arrays, **size, sh_degree=DEGREE, differentiable=differentiable, device=device)
         return found, found.images, found.alphas
 
     def backward() -> Callable[[], object]:
         found = call()[0]
         return lambda: found.vjp(gradient, cameras=False)
 
-    return ("rasterize", lambda: call), ("rasterize, vjp", backward)
+    alone = partial(call, differentiable=False)
+    return ("rasterize, differentiable=False", lambda: alone), ("rasterize", lambda: call), ("rasterize, vjp", backward)
 
 
-def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, Call]:
-    """`clsplat.torch.rasterization`, and the backward pass."""
+def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, Call, Call]:
+    """`clsplat.torch.rasterization` without and with what a gradient needs, and the backward pass."""
     import torch
 
     from clsplat.torch import rasterization
@@ -129,8 +140,12 @@ def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, C
         images = call()[0]
         return lambda: images.backward(gradient)
 
+    def without() -> Any:
+        with torch.no_grad():
+            return call()
+
     title = f"torch.rasterization, packed={packed}"
-    return (title, lambda: call), (f"{title}, backward", backward)
+    return (f"{title}, no_grad", lambda: without), (title, lambda: call), (f"{title}, backward", backward)
 
 
 def gradient_of(camera: Camera) -> Any:
@@ -138,12 +153,12 @@ def gradient_of(camera: Camera) -> Any:
     return np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
 
 
-def measure(pairs: list[tuple[Call, Call]], repeat: int) -> list[Result]:
-    """The rows: the first pair is what the others are compared to."""
-    times: dict[str, list[float]] = {name: [] for pair in pairs for name, _ in pair}
+def measure(groups: list[tuple[Call, Call, Call]], repeat: int) -> list[Result]:
+    """The rows: the first group is what the others are compared to."""
+    times: dict[str, list[float]] = {name: [] for group in groups for name, _ in group}
     for turn in range(repeat + 2):  # kernels are built in the first, and the memory has grown after it
-        for pair in pairs:
-            for name, prepare in pair:
+        for group in groups:
+            for name, prepare in group:
                 work = prepare()
                 began = time.perf_counter()
                 kept = work()
@@ -151,10 +166,10 @@ def measure(pairs: list[tuple[Call, Call]], repeat: int) -> list[Result]:
                     times[name].append(1e3 * (time.perf_counter() - began))
                 del kept, work
     rows = []
-    for place in range(2):
-        base = times[pairs[0][place][0]]
-        for pair in pairs:
-            name = pair[place][0]
+    for place in range(3):
+        base = times[groups[0][place][0]]
+        for group in groups:
+            name = group[place][0]
             ratios = [ms / other for ms, other in zip(times[name], base, strict=True)]
             rows.append({"call": name, "ms": statistics.median(times[name]), "ratio": statistics.median(ratios)})
     return rows
@@ -175,12 +190,12 @@ def run(arguments: list[str]) -> int:
     require(min(options.size) >= 1, f"--size {options.size[0]}x{options.size[1]}: expected at least 1x1")
     require(options.repeat >= 1, f"--repeat {options.repeat}: expected at least 1")
     device, subject = open_device(options.device), synthetic(options.gaussians, *options.size)
-    pairs = [of_the_renderer(device, subject), of_numpy(device, subject)]
+    groups = [of_the_renderer(device, subject), of_numpy(device, subject)]
     try:
-        pairs += [of_torch(device, subject, packed=packed) for packed in (False, True)]
+        groups += [of_torch(device, subject, packed=packed) for packed in (False, True)]
     except ModuleNotFoundError as error:
         print(f"bench_library: {error}: without the rows of torch", file=sys.stderr)
-    rows = measure(pairs, options.repeat)
+    rows = measure(groups, options.repeat)
     result = {
         **machine(device, options.repeat),
         "gaussians": options.gaussians,

@@ -25,7 +25,8 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
     check_shape(name, array.shape, *shapes)
     with np.errstate(over="ignore", invalid="ignore"):
         result = np.ascontiguousarray(array, np.float32)
-        finite = np.isfinite(result.sum()) or bool(np.isfinite(result).all())  # a sum is quicker, and may overflow
+        flat = result.reshape(-1)
+        finite = np.isfinite(flat @ flat) or bool(np.isfinite(flat).all())  # a product is quicker, and may overflow
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)

@@ -172,7 +172,8 @@ class Pixels(ListedPixels):
     opacities (n,) in [0, 1]; colours (n, D), D from 1 to 512; depths (n,), by which the Gaussians are sorted, ties by
     index; radii (n, 2) int32: one that is 0 culls; each on the session's device or on the host, where what is float32
     and C-contiguous is not copied. The colours must not change before the last `gradient`. background (D,) float32 or
-    None for black; alpha_max: the cap of alpha, below 1; backward: True if there may be a `gradient`.
+    None for black; alpha_max: the cap of alpha, below 1; backward: True if there is likely to be a `gradient`,
+    which is quicker then.
 
     A Gaussian takes part in a pixel where its alpha is at least 1/255, and not behind the one that would leave 1e-4 or
     less of the pixel's light. One whose mean is over 1e9 pixels away, or whose a or c is not from 1e-15 to 1e15, is

@@ -171,6 +171,7 @@ def rasterize(
     covars: ArrayLike | None = None,
     alpha_max: float = ALPHA_MAX,
     absolute_gradients: bool = False,
+    differentiable: bool = True,
     device: Device | str | None = None,
 ) -> Rasterization:
     """Images of N Gaussians as C cameras see them (Kerbl et al. 2023; gsplat's conventions, docs/library.md).
@@ -186,9 +187,9 @@ def rasterize(
     eps2d: px^2, added to both variances on the image. backgrounds (C, D) or (D,): black if None. render_mode: one of
     RENDER_MODES; depths are along the axis. rasterize_mode: "antialiased" lowers opacities by what eps2d widens.
     camera_model: pinhole, ortho or fisheye. covars (N, 3, 3), symmetric, or (N, 6), xx, xy, xz, yy, yz, zz: in place of
-    quaternions and scales, which are None then. alpha_max:
-    the cap of a Gaussian's alpha. absolute_gradients: gradients by means2d have their absolute sums too. device: an
-    open one, or a name as `clsplat devices` lists them.
+    quaternions and scales, which are None then. alpha_max: the cap of a Gaussian's alpha. absolute_gradients:
+    gradients by means2d have their absolute sums too. differentiable: False for images alone, which takes less; their
+    gradient, of the same bits, is slower then. device: an open one, or a name as `clsplat devices` lists them.
 
     Raises InputError for an argument that is not so, and for one that is not finite; it is named. Raises DeviceError.
     """
@@ -226,6 +227,7 @@ def rasterize(
             render_mode,
             compensated=rasterize_mode == "antialiased",
             absolute=absolute_gradients,
+            differentiable=differentiable,
         )
         for index, camera in enumerate(cameras)
     ]

@@ -128,7 +128,7 @@ class View:
     """A view of the Gaussians, with all that its gradient needs until it is dropped.
 
     index: of its camera; background (D,); mode: one of RENDER_MODES; compensated: lower opacities by what the low-pass
-    widens; absolute: keep absolute gradients.
+    widens; absolute: keep absolute gradients; differentiable: prepare the gradient.
     """
 
     def __init__(
@@ -143,6 +143,7 @@ class View:
         *,
         compensated: bool,
         absolute: bool,
+        differentiable: bool,
     ) -> None:
         self._session, self._given, self._camera, self._index = session, given, camera, index
         self._mode, self._absolute = mode, absolute
@@ -174,6 +175,7 @@ class View:
                 camera.height,
                 self._behind(background),
                 alpha_max,
+                backward=differentiable,
             )
         self._has_background = background is not None
 

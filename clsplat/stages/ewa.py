@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.buffers import DeviceArray, Workspace, from_host
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.layout import EWA_CAMERA, EWA_GRADIENT
@@ -156,7 +156,7 @@ class EwaGradients:
 
 def ewa_array(device: Device, camera: EwaCamera) -> DeviceArray:
     """The camera on the device."""
-    return upload(device, camera.packed())
+    return from_host(device, camera.packed())
 
 
 @stage("ewa")

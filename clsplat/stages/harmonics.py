@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.buffers import DeviceArray, Workspace, from_host
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
@@ -68,7 +68,7 @@ class Harmonics:
 def centre_array(device: Device, position: Float64) -> DeviceArray:
     """A camera's centre (3,) in the world, on the device in two floats."""
     high = np.asarray(position, np.float32)
-    return upload(device, np.concatenate([high, (np.asarray(position, np.float64) - high).astype(np.float32)]))
+    return from_host(device, np.concatenate([high, (np.asarray(position, np.float64) - high).astype(np.float32)]))
 
 
 @stage("harmonics")

@@ -144,6 +144,17 @@ def test_covariances_in_place_of_quaternions_and_scales(default_device: Device) 
     np.testing.assert_array_equal(same.vjp(d_images)["covars"], both)
 
 
+@pytest.mark.parametrize("channels", [3, 5])
+def test_images_alone_have_the_same_bits_and_so_have_gradients_after_all(channels: int, device: Device) -> None:
+    arguments = {**with_lenses(scene()), "colors": np.random.default_rng(1).random((12, channels), np.float32)}
+    wanted, alone = call(arguments, device), call(arguments, device, differentiable=False)
+    np.testing.assert_array_equal(alone.images, wanted.images)
+    by = np.random.default_rng(2).normal(size=wanted.images.shape)
+    expected = wanted.vjp(by)
+    for name, array in alone.vjp(by).items():
+        np.testing.assert_array_equal(array, expected[name])
+
+
 def test_gradients_that_are_not_finite_pass_to_what_they_have_a_part_in(default_device: Device) -> None:
     result = call(with_lenses(scene()), default_device)
     d_images = np.random.default_rng(3).normal(size=result.images.shape).astype(np.float32)
