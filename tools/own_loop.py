@@ -40,7 +40,7 @@ MAX_STEPS = 30_000
 """Steps of gsplat's settings, over which the rate of the means falls; of clsplat's too."""
 SH_DEGREE, SH_DEGREE_EVERY, SSIM_WEIGHT = 3, 1000, 0.2
 OPACITY_WEIGHT = SCALE_WEIGHT = 0.01
-"""Of gsplat's settings for MCMC, which also start from half the opacity that others do, times five."""
+"""Of gsplat's settings for MCMC, which also start from other sizes and opacities."""
 Params = torch.nn.ParameterDict
 
 
@@ -53,11 +53,15 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--strategy", choices=("default", "mcmc"), default="default")
     parser.add_argument("--most", type=int, default=50_000, help="Gaussians that mcmc grows to")
     parser.add_argument("--steps-scaler", type=float, default=1.0, help="of all of gsplat's settings that are steps")
+    parser.add_argument("--init-scale", type=float, help="of a point's distance to its neighbours; mcmc: 0.1, else 1")
+    parser.add_argument("--init-opacity", type=float, help="mcmc: 0.5, else 0.1")
     parser.add_argument("--packed", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bound", type=float, default=0.3, help="dB")
     parser.add_argument("--alone", action="store_true", help="no `clsplat train` to compare with")
     given = parser.parse_args(arguments)
+    preset = (0.1, 0.5) if given.strategy == "mcmc" else (1.0, 0.1)
+    given.init_scale, given.init_opacity = given.init_scale or preset[0], given.init_opacity or preset[1]
     scene = load_scene(given.scene, resolution=given.resolution)
     began = time.perf_counter()
     params = own_loop(scene, given)
@@ -148,13 +152,12 @@ def strategy_of(given: argparse.Namespace) -> Any:
 def initial(scene: Scene, given: argparse.Namespace) -> Params:
     """gsplat's parameters at the scene's points: scales as logarithms, opacities as logits, SH in two parts."""
     model = from_scene(scene, TrainConfig.random_points, np.random.default_rng(given.seed))
-    mcmc = given.strategy == "mcmc"
     count = len(model.means)
     values = {
         "means": torch.from_numpy(model.means + np.asarray(scene.origin, np.float32)),
-        "scales": torch.from_numpy(model.log_scales) + (math.log(0.1) if mcmc else 0.0),
+        "scales": torch.from_numpy(model.log_scales) + math.log(given.init_scale),
         "quats": torch.rand(count, 4),
-        "opacities": torch.logit(torch.full((count,), 0.5 if mcmc else 0.1)),
+        "opacities": torch.logit(torch.full((count,), given.init_opacity)),
         "sh0": torch.from_numpy(model.sh[:, :1]),
         "shN": torch.zeros(count, (SH_DEGREE + 1) ** 2 - 1, 3),
     }
