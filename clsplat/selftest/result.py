@@ -27,8 +27,13 @@ POSES = ("pose",)
 """Stages of poses, which training needs where they are refined."""
 LENSES = ("lens",)
 """The same of lenses."""
+LIBRARY = ("ewa", "harmonics", "splats", "values")
+"""Stages of the library's calls, beside a frame's."""
 TRAINING = (*FORWARD, *BACKWARD)
-STAGES = (*FORWARD, *CHANNELS, *DEEP, *HOLDOUT, *RAYS, *MASKS, *BACKWARD, "appearance", "grid", *DEPTH, *POSES, *LENSES)
+STAGES = (
+    *(*FORWARD, *CHANNELS, *DEEP, *HOLDOUT, *RAYS, *MASKS, *BACKWARD),
+    *("appearance", "grid", *DEPTH, *POSES, *LENSES, *LIBRARY),
+)
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Stages by whose counts and lists the next ones find their way."""
 
@@ -55,6 +60,10 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "depth": (1024, "as blend_grad"),
     "pose": (1024, "as appearance; terms of either sign are added up"),
     "lens": (1024, "19 found; as pose"),
+    "ewa": (1024, "95 found, by quaternions, whose terms cancel; quotients and roots as in project_grad"),
+    "harmonics": (64, "10 found; one root and one division"),
+    "splats": (64, "2 found; a root and two quotients"),
+    "values": (1024, "71 found; as blend_grad"),
 }
 """Ulp that a stage may be off, and why. Each bound is the error found where every operation is rounded as in IEEE 754,
 with room for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""

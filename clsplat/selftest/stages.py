@@ -29,6 +29,7 @@ from clsplat.selftest.appearance_stage import of_appearance
 from clsplat.selftest.depth_stage import of_depth
 from clsplat.selftest.grid_stage import of_grid
 from clsplat.selftest.harness import WHITEN, Array, Bench, Outcome, cropped, joined
+from clsplat.selftest.library_stages import LIBRARY
 from clsplat.selftest.made_up import COLOUR, MadeUpSlots, slot_sums
 from clsplat.selftest.mask_stages import MASKS
 from clsplat.selftest.picture_stages import PICTURES
@@ -426,4 +427,5 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "depth": of_depth,
     "pose": of_pose,
     "lens": of_lens,
+    **LIBRARY,
 }

@@ -35,6 +35,7 @@ from clsplat.selftest.result import (
     FORWARD,
     HOLDOUT,
     LENSES,
+    LIBRARY,
     MASKS,
     POSES,
     RAYS,
@@ -90,6 +91,13 @@ BROKEN = {
     "project_grad: lens[2].all = d_mx": ("lens[2].all = d_my", "lens"),
     "grid: risen[k] = b - a": ("risen[k] = a - b", "grid"),
     "grid: h * (level - (float)l)": ("h * level", "grid"),
+    "ewa: field[4].all = -p.sxy / p.det": ("field[4].all = p.sxy / p.det", "ewa"),
+    "ewa_grad: uv = -2.0f * (l22 * g_v)": ("uv = 2.0f * (l22 * g_v)", "ewa"),
+    "sums: four.lo + four.hi": ("four.lo - four.hi", "ewa"),
+    "harmonics_grad: fmaL(-along, d.v[k]": ("fmaL(along, d.v[k]", "harmonics"),
+    "splats: sqrt(det / a)": ("sqrt(det * a)", "splats"),
+    "values: fmaL(weight, (floatL)(own[k]), sums[k])": ("fmaL(alpha, (floatL)(own[k]), sums[k])", "values"),
+    "values_grad: fmaL(weight, shade, p->behind)": ("fmaL(weight, shade, -p->behind)", "values"),
 }
 """What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
 
@@ -97,7 +105,20 @@ BROKEN = {
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK, change)
-    groups = (FORWARD, CHANNELS, DEEP, HOLDOUT, RAYS, MASKS, BACKWARD, *APPEARANCE.values(), DEPTH, POSES, LENSES)
+    groups = (
+        FORWARD,
+        CHANNELS,
+        DEEP,
+        HOLDOUT,
+        RAYS,
+        MASKS,
+        BACKWARD,
+        *APPEARANCE.values(),
+        DEPTH,
+        POSES,
+        LENSES,
+        LIBRARY,
+    )
     group = next(stages for stages in groups if last in stages)
     before = () if group is FORWARD else FORWARD
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
