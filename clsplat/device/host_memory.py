@@ -17,7 +17,7 @@ LEAST = 1 << 18
 MOST = 1 << 28
 """Bytes that wait to be handed out again, at most."""
 
-_lock = threading.RLock()  # an array may end in the middle of any statement, those under the lock too
+_lock = threading.Lock()
 _idle: list[NDArray[np.uint8]] = []
 
 
@@ -41,10 +41,15 @@ class _Block:
         self.__array_interface__: dict[str, Any] = raw.__array_interface__
 
     def __del__(self) -> None:
-        with _lock:
+        # an array may end within any statement, those under the lock too: then the memory is not kept
+        if not _lock.acquire(blocking=False):
+            return
+        try:
             _idle.append(self._raw)
             while sum(map(len, _idle)) > MOST:
                 _idle.pop(0)
+        finally:
+            _lock.release()
 
 
 def _aligned(memory: NDArray[np.uint8]) -> NDArray[np.uint8]:

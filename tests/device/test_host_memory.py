@@ -64,6 +64,17 @@ def test_no_more_waits_than_the_limit_and_the_oldest_goes() -> None:
     assert all(len(raw) <= MOST for raw in host_memory._idle)
 
 
+def test_an_array_that_ends_while_memory_is_looked_for_changes_nothing() -> None:
+    """As the collector may end one within any statement: what was found would be in another place then."""
+    memory = host_bytes(LEAST)
+    with host_memory._lock:
+        del memory
+    assert not host_memory._idle
+    memory = host_bytes(LEAST)
+    del memory
+    assert len(host_memory._idle) == 1
+
+
 def test_threads() -> None:
     wrong = []
 
