@@ -27,10 +27,21 @@ def host_bytes(count: int) -> NDArray[np.uint8]:
     size = -(-count // ALIGNED) * ALIGNED
     if size < LEAST:
         return _aligned(np.empty(size + ALIGNED, np.uint8))[:count]
-    with _lock:
-        place = next((place for place, raw in enumerate(_idle) if len(raw) == size + ALIGNED), None)
-        raw = np.empty(size + ALIGNED, np.uint8) if place is None else _idle.pop(place)
-    return _aligned(np.asarray(_Block(raw)))[:count]
+    raw = _found(size + ALIGNED)
+    return _aligned(np.asarray(_Block(np.empty(size + ALIGNED, np.uint8) if raw is None else raw)))[:count]
+
+
+def _found(size: int) -> NDArray[np.uint8] | None:
+    # a finalizer that runs within these statements may ask too: it gets new memory, and nobody waits
+    if not _lock.acquire(blocking=False):
+        return None
+    try:
+        for place, raw in enumerate(_idle):
+            if len(raw) == size:
+                return _idle.pop(place)
+        return None
+    finally:
+        _lock.release()
 
 
 class _Block:

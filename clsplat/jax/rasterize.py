@@ -18,6 +18,7 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.jax.host import on_host, shape_like
 from clsplat.library.checks import Shape, check_shape, choice
+from clsplat.library.checks import sizes as check_sizes
 from clsplat.library.rasterize import RENDER_MODES, Rasterization
 from clsplat.library.rasterize import rasterize as rasterize_numpy
 
@@ -137,6 +138,7 @@ class Call:
         for name, side in (("width", self.width), ("height", self.height)):
             if np.ndim(side):
                 raise InputError(f"{name} is {side!r:.80}, expected a whole number: all cameras have one size in JAX")
+            check_sizes(name, side, 1)
         check_shape("means", sizes["means"], ("N", 3))
         check_shape("viewmats", sizes["viewmats"], ("C", 4, 4))
         count, views = sizes["means"][0], sizes["viewmats"][0]

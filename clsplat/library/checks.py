@@ -41,13 +41,14 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
         return None
     array = _numbers(name, values)
     check_shape(name, array.shape, shape)
-    return np.ascontiguousarray(array, np.float32)
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(array, np.float32)
 
 
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
     """(count, side, side) float64, of one matrix or of many. Raises InputError as `floats`."""
     floats(name, given, (count, side, side), (side, side))
-    array: Float64 = np.asarray(given, np.float64)
+    array: Float64 = np.array(given, np.float64)  # a copy: the caller's may change before the gradient
     return array.reshape(-1, side, side)
 
 
@@ -70,6 +71,15 @@ def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
         bound = f"from {least:g} to {most:g}" if np.isfinite(most) else f"of at least {least:g}"
         raise InputError(f"{name} is {given!r:.80}, expected a number {bound}")
     return float(given)
+
+
+def degree(name: str, given: Any, highest: int, otherwise: str = "") -> int:
+    """A degree of spherical harmonics, 0 to `highest`; otherwise: what else may be given, in words. Raises
+    InputError."""
+    whole = isinstance(given, (int, np.integer)) and not isinstance(given, bool)
+    if not whole or not 0 <= given <= highest:
+        raise InputError(f"{name} is {given!r:.80}, expected 0 to {highest}{otherwise}")
+    return int(given)
 
 
 def choice(name: str, given: Any, choices: Sequence[str]) -> None:

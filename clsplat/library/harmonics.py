@@ -12,6 +12,7 @@ from clsplat.arrays import Float32
 from clsplat.device.buffers import from_host, hosted
 from clsplat.device.context import Device
 from clsplat.errors import InputError
+from clsplat.library import checks
 from clsplat.library.checks import floats, gradient
 from clsplat.library.session import Session, session_of
 from clsplat.stages.harmonics import HIGHEST, Harmonics, harmonics, harmonics_grad
@@ -66,10 +67,9 @@ def spherical_harmonics(
     """
     batch = np.shape(directions)[:-1]
     given = floats("directions", directions, (*batch, 3))
-    if not isinstance(degree, int | np.integer) or not 0 <= degree <= HIGHEST:
-        raise InputError(f"degree is {degree!r}: expected 0 to {HIGHEST}")
+    degree = checks.degree("degree", degree, HIGHEST)
     sh = floats("coefficients", coefficients, (*batch, "K", 3))
-    used = (int(degree) + 1) ** 2
+    used = (degree + 1) ** 2
     if sh.shape[-2] < used:
         raise InputError(f"coefficients: got {sh.shape[-2]} of them, expected {used} or more for degree {degree}")
     mask = None
@@ -83,7 +83,7 @@ def spherical_harmonics(
         inputs = Harmonics(
             from_host(session.device, given.reshape(-1, 3)),
             from_host(session.device, sh.reshape(-1, *sh.shape[-2:])),
-            int(degree),
+            degree,
             None if mask is None else from_host(session.device, mask),
         )
         colours = hosted(session.device, inputs.directions.shape)

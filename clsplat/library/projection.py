@@ -254,7 +254,8 @@ def checked_cameras(
     near, far = number("near_plane", near_plane, -np.inf), number("far_plane", far_plane, -np.inf)
     if not near < far:
         raise InputError(f"near_plane is {near_plane} and far_plane {far_plane}, expected the second to be larger")
-    planes = (near, far, number("eps2d", eps2d, 0.0), number("radius_clip", radius_clip, 0.0))
+    most = float(np.finfo(np.float32).max)
+    planes = (near, far, number("eps2d", eps2d, 0.0, most), number("radius_clip", radius_clip, 0.0, most))
     listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
     return [EwaCamera(*camera, *planes, camera_model) for camera in listed]
 

@@ -88,7 +88,8 @@ class Rasterization:
         where absolute_gradients was: sums over pixels of absolute gradients by means2d (AbsGS, Ye et al. 2024).
         Numbers that are not finite pass, to what they have a part in. Raises InputError for other shapes.
         """
-        pairs = zip(self._views, self._each("d_images", d_images), self._each("d_alphas", d_alphas), strict=True)
+        by_alphas = [None] * len(self._views) if d_alphas is None else self._each("d_alphas", d_alphas)
+        pairs = zip(self._views, self._each("d_images", d_images), by_alphas, strict=True)
         each = [view.pixel_gradients(d_image, d_alpha) for view, d_image, d_alpha in pairs]
         return {name: stacked([found[name] for found in each]) for name in each[0]}
 
@@ -141,8 +142,8 @@ class Rasterization:
         return stacked(arrays) if len({array.shape for array in arrays}) == 1 else arrays
 
     def _each(self, name: str, given: Any) -> list[Any]:
-        if given is None:
-            return [None] * len(self._views)
+        if not hasattr(given, "__len__") or getattr(given, "ndim", 1) == 0:
+            raise InputError(f"{name} is {given!r:.80}, expected {len(self._views)} images, one for each camera")
         if len(given) != len(self._views):
             raise InputError(f"{name} has {len(given)} images, expected {len(self._views)}, one for each camera")
         return list(given)
@@ -208,6 +209,8 @@ def rasterize(
         camera_model=camera_model,
     )
     count = len(cameras)
+    if count == 0:
+        raise InputError("viewmats has no matrix, expected 1 or more")
     given = Given.checked(means, quaternions, scales, covars, opacities, colors, sh_degree, count)
     if given.channels > MOST_CHANNELS:
         raise InputError(f"colors has {given.channels} channels, expected at most {MOST_CHANNELS}")

@@ -14,7 +14,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import DeviceArray, Hosted, from_host, hosted
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.checks import floats, gradient
+from clsplat.library.checks import degree, floats, gradient
 from clsplat.library.pixels import Pixels
 from clsplat.library.projection import ProjectedView, checked_shapes, full_gradient, hosted_gradients
 from clsplat.library.session import Session
@@ -59,8 +59,7 @@ class Given:
         if sh_degree is None:
             values = floats("colors", colors, (n, "D"), (cameras, n, "D"))
         else:
-            if isinstance(sh_degree, bool) or sh_degree not in range(HIGHEST + 1):
-                raise InputError(f"sh_degree is {sh_degree!r:.80}, expected 0 to {HIGHEST}, or None")
+            sh_degree = degree("sh_degree", sh_degree, HIGHEST, ", or None")
             values = floats("colors", colors, (n, "K", 3), (cameras, n, "K", 3))
             if values.shape[-2] < (sh_degree + 1) ** 2:
                 wanted = (sh_degree + 1) ** 2

@@ -133,17 +133,17 @@ def of_splats(bench: Bench) -> Outcome:
         *(upload(device, np.ascontiguousarray(each, kind)) for each, kind in zip(arrays, kinds, strict=True))
     )
 
+    work = Workspace(device)  # the scene's own splats stay as they are
+
     def launch() -> Projected:
-        return splats(device, bench.work, given, camera.width, camera.height)
+        return splats(device, work, given, camera.width, camera.height)
 
     def take(found: Projected) -> list[Array]:
         tiles = found.tile_counts.get()
         rows = np.where(tiles[:, None] > 0, found.splats.get(), 0)
         return [tiles, *(rows[:, k] for k in WRITTEN.values())]
 
-    kept, bench.work = bench.work, Workspace(device)  # the scene's own splats stay as they are
     _, outcome = bench.twice(launch, take)
-    bench.work = kept
     tiles, *columns = outcome.arrays
     both = seen & (tiles > 0)
     wrong = max(int((seen != (tiles > 0)).sum()) - 2, 0)  # of ellipses that end at a tile's first pixel

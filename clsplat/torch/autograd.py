@@ -101,12 +101,12 @@ class Call:
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
 
     def whole(self, name: str, value: Tensor | None) -> Any:
-        """A gradient in the layout of `meta`, as (B, C, N, ...). What `in_layout` has packed is not spread again, if by
-        PyTorch's count of versions it is as it was."""
+        """A gradient in the layout of `meta`, as (B, C, N, ...). What `in_layout` has packed is not spread again, if it
+        is the same and by PyTorch's count of versions as it was."""
         packed, version, array = self._handed_on.pop(name, (None, 0, None))
         if value is None:
             return None
-        if packed is not None and value.data_ptr() == packed.data_ptr() and value._version == version:  # noqa: SLF001
+        if packed is not None and _is_same(value, packed) and value._version == version:  # noqa: SLF001
             return array
         array = as_array(value)
         if self.in_view is None:
@@ -140,14 +140,22 @@ class Call:
         pairs = zip(inputs, found, strict=True)
         return [self.of_rows(part) if part is not None and name in SPARSE else part for name, part in pairs]
 
-    def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor, *, hand_on: bool = True) -> Tensor:
-        """Gradients of splats from every batch, in the layout of `meta`; hand_on: `whole` will be asked for them."""
+    def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor, *, hand_on: bool) -> Tensor:
+        """Gradients of splats from every batch, in the layout of `meta`; hand_on: `whole` will be asked for them, with
+        what hooks make of them, which may change them uncounted."""
         arrays = [found[name] for found in each]
         array = arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
         tensor = as_tensor(self.laid_out(array), like)
-        if self.packed and hand_on:
+        if self.packed and hand_on and not like._backward_hooks and not tensor.is_inference():  # noqa: SLF001
             self._handed_on[name] = (tensor, tensor._version, array)  # noqa: SLF001
         return tensor
+
+
+def _is_same(one: Tensor, other: Tensor) -> bool:
+    """True for one tensor, or two of the same numbers in the same places."""
+    if one.is_sparse or one.data_ptr() != other.data_ptr():
+        return False
+    return bool(one.shape == other.shape and one.stride() == other.stride() and one.dtype == other.dtype)
 
 
 class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
@@ -238,16 +246,18 @@ class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no typ
         for index, result in enumerate(call.results):
             image = np.zeros_like(result.images) if d_images is None else images[index]
             each.append(result.vjp_pixels(image, alphas[index]))
+        hand_on = any(ctx.needs_input_grad[1:5])
+        has_depths = all(found.get("depths") is not None for found in each)
         if call.absolute:
             means2d.absgrad = call.in_layout(each, "absolute", means2d, hand_on=False)
         if values is not None and values.dim() == len(call.batch) + 2:  # one for all cameras
             each = [{**found, "colors2d": found["colors2d"].sum(0)} for found in each]
         return (
             None,
-            call.in_layout(each, "means2d", means2d),
-            call.in_layout(each, "conics", conics),
-            call.in_layout(each, "depths", depths) if all(found.get("depths") is not None for found in each) else None,
-            call.in_layout(each, "opacities", opacities),
+            call.in_layout(each, "means2d", means2d, hand_on=hand_on),
+            call.in_layout(each, "conics", conics, hand_on=hand_on),
+            call.in_layout(each, "depths", depths, hand_on=hand_on) if has_depths else None,
+            call.in_layout(each, "opacities", opacities, hand_on=hand_on),
             call.gradient(each, "colors2d", values),
             call.gradient(each, "backgrounds", backgrounds),
         )

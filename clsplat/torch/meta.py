@@ -52,6 +52,27 @@ class Meta(dict[str, Any]):
     def __iter__(self) -> Iterator[str]:  # one of its own, or dict(meta) takes the values past __getitem__
         return super().__iter__()
 
+    def update(self, *given: Any, **named: Any) -> None:
+        """Set entries, as of a dictionary."""
+        for name, value in dict(*given, **named).items():
+            self[name] = value
+
+    def __ior__(self, other: Any) -> Meta:  # type: ignore[override]  # noqa: PYI034  # typing has Self from 3.11 on
+        self.update(other)
+        return self
+
+    def clear(self) -> None:
+        """Take all entries out."""
+        self._makers.clear()
+        super().clear()
+
+    def popitem(self) -> tuple[str, Any]:
+        """The last name and its entry, which is taken out."""
+        if not self:
+            raise KeyError("popitem(): dictionary is empty")
+        name = next(reversed(self))
+        return name, self.pop(name)
+
     def values(self) -> Any:
         """A view of the values, all of them made."""
         self._made_all()

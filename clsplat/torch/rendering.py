@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from clsplat.device.context import Device
+from clsplat.library.checks import degree
 from clsplat.library.rasterize import rasterize
 from clsplat.stages.harmonics import HIGHEST
 from clsplat.torch.arguments import check_choice, check_number, check_shape, check_size, refuse, renamed
@@ -223,8 +224,7 @@ def _check_tensors(
         if not 1 <= colors.shape[-1] <= MOST_CHANNELS:
             raise refuse("colors", f"of {colors.shape[-1]} channels", f"1 to {MOST_CHANNELS}")
     else:
-        if isinstance(sh_degree, bool) or sh_degree not in range(HIGHEST + 1):
-            raise refuse("sh_degree", sh_degree, f"0 to {HIGHEST}, or None for colours")
+        sh_degree = degree("sh_degree", sh_degree, HIGHEST, ", or None for colours")
         check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
         if colors.shape[-2] < (sh_degree + 1) ** 2:
             raise refuse(
@@ -250,11 +250,12 @@ def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_
     def radii() -> dict[str, Any]:
         return {"radii": torch.from_numpy(call.radii).to(like.device)}
 
+    # none of these holds the dictionary: in a ring with it a call and its memory would wait for the collector
     def tiles() -> dict[str, Any]:
-        batch_ids, camera_ids, gaussian_ids = (meta[name] for name in IDS)
+        batch_ids, camera_ids, gaussian_ids = (None, None, None) if call.in_view is None else call.ids(like.device)
         per_gauss, isect_ids, flatten_ids = isect_tiles(
             like,
-            meta["radii"],
+            radii()["radii"],
             depths.detach(),
             tile_size,
             columns,

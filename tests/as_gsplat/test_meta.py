@@ -192,3 +192,34 @@ def test_an_entry_that_is_set_is_not_made() -> None:
     assert (meta["late"], counted.calls, meta["later"], meta["late"]) == (7, 0, 3, 7)
     del meta["later"]
     assert "later" not in meta
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_tiles_are_the_calls_whatever_becomes_of_other_entries(packed: bool) -> None:
+    _, _, wanted = rasterization(**given(), packed=packed)
+    _, _, meta = rasterization(**given(), packed=packed)
+    meta["radii"] = meta["radii"].amax(-1)
+    for name in ("batch_ids", "camera_ids", "gaussian_ids"):
+        del meta[name]
+    assert torch.equal(meta["tiles_per_gauss"], wanted["tiles_per_gauss"])
+    assert torch.equal(meta["flatten_ids"], wanted["flatten_ids"])
+
+
+def test_entries_that_are_set_are_not_made_over() -> None:
+    meta = Meta({"first": 1})
+    meta.later(("late", "later"), lambda: {"late": 2, "later": 3})
+    meta.update({"late": "mine"}, first=4)
+    assert (meta["late"], meta["first"], meta["later"]) == ("mine", 4, 3)
+    meta.later(("late",), lambda: {"late": 2})
+    meta |= {"late": "again"}
+    assert type(meta) is Meta
+    assert meta["late"] == "again"
+    meta.later(("late",), lambda: {"late": 2})
+    assert meta.popitem() == ("later", 3)
+    assert meta.popitem() == ("late", 2)
+    meta.later(("late",), lambda: {"late": 2})
+    meta.clear()
+    assert "late" not in meta
+    assert meta.get("late") is None
+    with pytest.raises(KeyError):
+        meta.popitem()

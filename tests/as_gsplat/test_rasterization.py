@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Collection, Sequence
 from itertools import product
 from typing import Any
@@ -126,6 +128,12 @@ def test_packed_gradients_are_those_that_are_not() -> None:
     def in_place(gradient: Tensor) -> None:
         gradient.mul_(2)
 
+    def uncounted(gradient: Tensor) -> None:
+        gradient.data.mul_(2)
+
+    def first_of_each(gradient: Tensor) -> Tensor:
+        return gradient[..., :1].expand_as(gradient)
+
     def gradients(packed: bool, hook: Any, depths: bool) -> dict[str, Tensor]:
         given, tensors = leaves(arguments, torch.float32)
         images, _, meta = rasterization(**given, packed=packed)
@@ -136,11 +144,37 @@ def test_packed_gradients_are_those_that_are_not() -> None:
         return {name: tensor.grad for name, tensor in tensors.items()}
 
     plain = gradients(packed=True, hook=None, depths=False)
-    for hook, depths in ((None, False), (doubled, False), (in_place, False), (None, True)):
+    ways = [(hook, False) for hook in (None, doubled, in_place, uncounted, first_of_each)]
+    for hook, depths in (*ways, (None, True)):
         found, wanted = (gradients(packed, hook, depths) for packed in (True, False))
         for name, tensor in found.items():
             assert torch.equal(tensor, wanted[name]), name
         assert torch.equal(found["means"], plain["means"]) == (hook is None and not depths)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_call_ends_with_the_last_that_holds_it(packed: bool) -> None:
+    """Without the collector, which may come late: a call holds the device's memory."""
+    given, _ = leaves(clouds.rounded(clouds.cloud(20)), torch.float32)
+    gc.collect()
+    gc.disable()
+    try:
+        images, alphas, meta = rasterization(**given, packed=packed)
+        images.sum().backward()
+        held = weakref.ref(meta)
+        del images, alphas, meta
+        assert held() is None
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_backward_pass_in_inference_mode(packed: bool) -> None:
+    given, tensors = leaves(clouds.rounded(clouds.cloud(20)), torch.float32)
+    images, _, _ = rasterization(**given, packed=packed)
+    with torch.inference_mode():
+        images.backward(torch.ones_like(images))
+    assert tensors["means"].grad.norm() > 0
 
 
 def test_every_driver(device: Device) -> None:

@@ -75,6 +75,15 @@ def test_an_array_that_ends_while_memory_is_looked_for_changes_nothing() -> None
     assert len(host_memory._idle) == 1
 
 
+def test_memory_that_is_asked_for_while_some_is_looked_for_is_new() -> None:
+    """As a finalizer may ask for it within any statement: it does not wait for its own thread."""
+    memory = host_bytes(LEAST)
+    del memory
+    with host_memory._lock:
+        assert len(host_bytes(LEAST)) == LEAST
+        assert len(host_memory._idle) == 1
+
+
 def test_threads() -> None:
     wrong = []
 

@@ -155,6 +155,27 @@ def test_images_alone_have_the_same_bits_and_so_have_gradients_after_all(channel
         np.testing.assert_array_equal(array, expected[name])
 
 
+def test_a_degree_may_be_numpys_and_the_first_of_its_kind(default_device: Device) -> None:
+    colors = np.random.default_rng(1).normal(size=(12, 16, 3))
+    images = [
+        call({**with_lenses(scene()), "colors": colors}, default_device, sh_degree=degree).images
+        for degree in (np.int64(2), 2)
+    ]
+    np.testing.assert_array_equal(*images)
+
+
+def test_matrices_may_change_after_the_call(default_device: Device) -> None:
+    arguments = {**with_lenses(scene()), "colors": np.random.default_rng(1).normal(size=(12, 4, 3))}
+    arguments |= {name: np.array(arguments[name], np.float64) for name in ("viewmats", "intrinsics")}
+    result = call(arguments, default_device, sh_degree=1)
+    by = np.random.default_rng(2).normal(size=result.images.shape)
+    before = result.vjp(by)
+    for name in ("viewmats", "intrinsics"):
+        arguments[name] *= 1.5
+    for name, array in result.vjp(by).items():
+        np.testing.assert_array_equal(array, before[name])
+
+
 def test_gradients_that_are_not_finite_pass_to_what_they_have_a_part_in(default_device: Device) -> None:
     result = call(with_lenses(scene()), default_device)
     d_images = np.random.default_rng(3).normal(size=result.images.shape).astype(np.float32)
@@ -261,6 +282,12 @@ def test_absolute_gradients(default_device: Device) -> None:
             {"colors": np.zeros((12, 4, 3)), "sh_degree": 2},
             "colors has 4 SH coefficients, expected 9 or more for sh_degree 2",
         ),
+        ({"sh_degree": 2.0}, "sh_degree is 2.0, expected 0 to 4, or None"),
+        ({"sh_degree": True}, "sh_degree is True, expected 0 to 4, or None"),
+        (
+            {"viewmats": np.zeros((0, 4, 4)), "intrinsics": np.zeros((0, 3, 3))},
+            "viewmats has no matrix, expected 1 or more",
+        ),
         ({"sh_degree": 5}, "sh_degree is 5, expected 0 to 4, or None"),
         ({"viewmats": np.zeros((2, 3, 4))}, "viewmats: got shape (2, 3, 4), expected (C, 4, 4) or (4, 4)"),
         ({"intrinsics": np.zeros((2, 3, 3))}, "intrinsics: a focal length is 0, expected those of a camera"),
@@ -273,7 +300,7 @@ def test_absolute_gradients(default_device: Device) -> None:
         ({"rasterize_mode": "smooth"}, "rasterize_mode is 'smooth', expected one of classic, antialiased"),
         ({"camera_model": "ftheta"}, "camera_model is 'ftheta', expected one of pinhole, ortho, fisheye"),
         ({"alpha_max": 1.0}, "alpha_max is 1.0, expected a number from 0.00392157 to 0.999999"),
-        ({"eps2d": -1}, "eps2d is -1, expected a number of at least 0"),
+        ({"eps2d": -1}, "eps2d is -1, expected a number from 0 to 3.40282e+38"),
         (
             {"viewmats": np.zeros((2, 4, 4)), "sh_degree": 0, "colors": np.zeros((12, 1, 3))},
             "viewmats: a matrix has no inverse",
@@ -289,6 +316,9 @@ def test_what_makes_no_sense_names_its_argument(change: dict[str, Any], words: s
 
 def test_gradients_that_make_no_sense_name_their_argument(default_device: Device) -> None:
     result = call(with_lenses(scene()), default_device)
+    for none in (None, 1.0, np.float32(1)):
+        with pytest.raises(InputError, match=r"d_images is .*, expected 2 images, one for each camera"):
+            result.vjp(none)
     with pytest.raises(InputError, match="d_images has 1 images, expected 2"):
         result.vjp(np.zeros((1, HEIGHT, WIDTH, 3)))
     with pytest.raises(InputError, match=r"d_images: got shape \(24, 40, 4\), expected \(24, 40, 3\)"):
