@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from clsplat.arrays import Int64
+from clsplat.library.projection import stacked
 from clsplat.torch.arguments import as_array, as_tensor
 from clsplat.torch.covariances import UPPER
 from clsplat.torch.graphs import differentiable_once
@@ -78,8 +79,7 @@ class Call:
 
     def stacked(self, name: str) -> NDArray[Any]:
         """A result of every batch, (B, ...)."""
-        arrays = [getattr(result, name) for result in self.results]
-        return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
+        return stacked([getattr(result, name) for result in self.results])
 
     def by_camera(self, name: str) -> NDArray[Any]:
         """A result of every batch, (..., C, ...)."""
@@ -144,7 +144,7 @@ class Call:
         """Gradients of splats from every batch, in the layout of `meta`; hand_on: `whole` will be asked for them, with
         what hooks make of them, which may change them uncounted."""
         arrays = [found[name] for found in each]
-        array = arrays[0][None] if len(arrays) == 1 else np.stack(arrays)
+        array = stacked(arrays)
         tensor = as_tensor(self.laid_out(array), like)
         if self.packed and hand_on and not like._backward_hooks and not tensor.is_inference():  # noqa: SLF001
             self._handed_on[name] = (tensor, tensor._version, array)  # noqa: SLF001
