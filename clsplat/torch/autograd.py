@@ -21,6 +21,8 @@ from clsplat.torch.graphs import differentiable_once
 
 SPARSE = ("means", "quaternions", "scales", "covars")
 """Arguments whose gradients may be sparse."""
+SPLATS = ("means2d", "conics", "depths", "opacities")
+"""What `Projection` makes of Gaussians, beside their colours."""
 
 
 class Batches:
@@ -53,11 +55,26 @@ class Call:
         self.results, self.batch, self.packed, self.sparse, self.absolute = results, batch, packed, sparse, absolute
         self.expected_depth = expected_depth
         self._handed_on: dict[str, tuple[Tensor, int, NDArray[Any]]] = {}
-        radii = self.stacked("radii")
-        self.sizes = (len(results), *radii.shape[1:3])
-        self.in_view: Int64 | None = None
-        if packed:  # a column at a time: numpy takes ten times as long for an axis of two
-            self.in_view = np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
+        self.sizes = (len(results), *results[0].depths.shape)
+
+    @cached_property
+    def in_view(self) -> Int64 | None:
+        """Numbers of the splats in view; None unless packed."""
+        if not self.packed:
+            return None
+        radii = self.stacked("radii")  # a column at a time: numpy takes ten times as long for an axis of two
+        return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
+
+    @cached_property
+    def opacities(self) -> NDArray[np.float32]:
+        """(B, C, N), the call's own, as the library's may be the caller's array, and change."""
+        return self.stacked("opacities").copy()
+
+    def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """SPLATS in the layout of `meta`, of the device and kind of another tensor."""
+        arrays = {name: self.opacities if name == "opacities" else self.stacked(name) for name in SPLATS}
+        means2d, conics, depths, opacities = (as_tensor(self.laid_out(array), like) for array in arrays.values())
+        return means2d, conics, depths, opacities
 
     @cached_property
     def radii(self) -> NDArray[np.int32]:
@@ -85,6 +102,10 @@ class Call:
         """A result of every batch, (..., C, ...)."""
         array = self.stacked(name)
         return array.reshape(*self.batch, *array.shape[1:])
+
+    def pixels(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Images and alphas, of the device and kind of another tensor."""
+        return as_tensor(self.by_camera("images"), like), as_tensor(self.by_camera("alphas"), like)
 
     def of_rows(self, gradient: Tensor) -> Tensor:
         """A gradient (N, ...) as a COO tensor of the rows in view, each once."""
@@ -174,14 +195,12 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         viewmats: Tensor,
         intrinsics: Tensor,
     ) -> tuple[Tensor | None, ...]:
-        """means2d, conics, depths, opacities, and, with coefficients, colours (..., C, N, 3)."""
+        """SPLATS and, with coefficients, colours (..., C, N, 3)."""
         ctx.call = call
         ctx.save_for_backward(means, quats, scales, covars, opacities, coefficients, viewmats, intrinsics)
         ctx.set_materialize_grads(False)
-        names = ("means2d", "conics", "depths", "opacities")
-        splats = [as_tensor(call.laid_out(call.stacked(name)), means) for name in names]
         colors = None if coefficients is None else as_tensor(call.by_camera("colors2d"), means)
-        return (*splats, colors)
+        return (*call.splats(means), colors)
 
     @staticmethod
     @differentiable_once
@@ -191,8 +210,7 @@ class Projection(torch.autograd.Function):  # type: ignore[misc]  # torch has no
         inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
         if all(gradient is None for gradient in given):
             return (None,) * (1 + len(inputs))
-        names = ("means2d", "conics", "depths", "opacities")
-        splats = {name: call.whole(name, gradient) for name, gradient in zip(names, given[:4], strict=True)}
+        splats = {name: call.whole(name, gradient) for name, gradient in zip(SPLATS, given[:4], strict=True)}
         colors = given[4]
         splats["colors2d"] = None if colors is None else as_array(colors).reshape(*call.sizes, colors.shape[-1])
         cameras = any(ctx.needs_input_grad[-2:])
@@ -226,7 +244,7 @@ class Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no typ
     ) -> tuple[Tensor, Tensor]:
         """Images (..., C, H, W, X) and alphas (..., C, H, W, 1); values: (..., N, D) or (..., C, N, D), or None."""
         ctx.call = call
-        images, alphas = (as_tensor(call.by_camera(name), means2d) for name in ("images", "alphas"))
+        images, alphas = call.pixels(means2d)
         # outputs that the gradient reads too: to change them in place is an error then
         read = (images, alphas) if call.expected_depth else (alphas,)
         ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds, *read)

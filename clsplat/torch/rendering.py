@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import Enum
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ from clsplat.library.checks import degree
 from clsplat.library.rasterize import rasterize
 from clsplat.stages.harmonics import HIGHEST
 from clsplat.torch.arguments import check_choice, check_number, check_shape, check_size, refuse, renamed
-from clsplat.torch.autograd import Batches, Call, Pixels, Projection
+from clsplat.torch.autograd import SPLATS, Batches, Call, Pixels, Projection
 from clsplat.torch.covariances import UPPER
 from clsplat.torch.graphs import outside_graphs
 from clsplat.torch.meta import Meta
@@ -174,14 +175,15 @@ def rasterization(
         ]
     expected = render_mode.endswith("ED")
     call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
+    if not settings["differentiable"]:
+        _ = call.opacities  # of the arguments as they are now, which `meta` is made of later
+        return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     covars = None if covars is None else covars[..., UPPER[0], UPPER[1]]
     coefficients = None if sh_degree is None or depth_alone else colors
-    means2d, conics, depths, opacities2d, colors2d = Projection.apply(
-        call, means, quats, scales, covars, opacities, coefficients, viewmats, Ks
-    )
+    *splats, colors2d = Projection.apply(call, means, quats, scales, covars, opacities, coefficients, viewmats, Ks)
     values = None if depth_alone else colors if sh_degree is None else colors2d
-    images, alphas = Pixels.apply(call, means2d, conics, depths, opacities2d, values, backgrounds)
-    return images, alphas, _meta(call, (means2d, depths, conics, opacities2d), width, height, tile_size)
+    images, alphas = Pixels.apply(call, *splats, values, backgrounds)
+    return images, alphas, _meta(call, means, splats, width, height, tile_size)
 
 
 def _refuse_missing(**given: Any) -> None:
@@ -237,11 +239,11 @@ def _check_tensors(
     return batch
 
 
-def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_size: int) -> Meta:
-    """gsplat's dictionary, in its order."""
-    means2d, depths, conics, opacities = splats
+def _meta(call: Call, like: Tensor, splats: Sequence[Tensor] | None, width: int, height: int, tile_size: int) -> Meta:
+    """gsplat's dictionary, in its order. like: a tensor of the results' device and kind; splats: SPLATS with their
+    gradient, or None if there is none, to make them when they are looked at."""
     batches, cameras, _ = call.sizes
-    like = means2d.detach()
+    like = like.detach()
     columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
 
     def ids() -> dict[str, Any]:
@@ -250,13 +252,17 @@ def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_
     def radii() -> dict[str, Any]:
         return {"radii": torch.from_numpy(call.radii).to(like.device)}
 
+    def all_splats() -> dict[str, Any]:
+        return dict(zip(SPLATS, call.splats(like) if splats is None else splats, strict=True))
+
     # none of these holds the dictionary: in a ring with it a call and its memory would wait for the collector
     def tiles() -> dict[str, Any]:
         batch_ids, camera_ids, gaussian_ids = (None, None, None) if call.in_view is None else call.ids(like.device)
+        means2d, _, depths, _ = call.splats(like)
         per_gauss, isect_ids, flatten_ids = isect_tiles(
-            like,
+            means2d,
             radii()["radii"],
-            depths.detach(),
+            depths,
             tile_size,
             columns,
             rows,
@@ -274,10 +280,10 @@ def _meta(call: Call, splats: tuple[Tensor, ...], width: int, height: int, tile_
         }
 
     meta = Meta(dict.fromkeys(IDS))
-    if call.in_view is not None:
+    if call.packed:
         meta.later(IDS, ids)
     meta.later(("radii",), radii)
-    meta.update({"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities})
+    meta.later(("means2d", "depths", "conics", "opacities"), all_splats)
     meta.update({"tile_width": columns, "tile_height": rows})
     meta.later(("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets"), tiles)
     meta.update({"width": width, "height": height, "tile_size": tile_size, "n_batches": batches, "n_cameras": cameras})

@@ -134,10 +134,34 @@ def test_results_that_are_changed_in_place() -> None:
         images.sum().backward()
 
 
-def test_without_gradients() -> None:
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("cams", [1, 2])
+def test_without_gradients(cams: int, packed: bool, mode: str) -> None:
+    """What `meta` makes later is of the arguments as they were at the call."""
+    made = given(cams)
+    wanted = rasterization(**made, packed=packed, rasterize_mode=mode)[2]
+    expected = {name: wanted[name].clone() if torch.is_tensor(wanted[name]) else wanted[name] for name in wanted}
     with torch.no_grad():
-        images, alphas, meta = rasterization(**given())
+        images, alphas, meta = rasterization(**made, packed=packed, rasterize_mode=mode)
+        for value in made.values():
+            if torch.is_tensor(value):
+                value.mul_(0.5)
     assert not (images.requires_grad or alphas.requires_grad or meta["means2d"].requires_grad)
+    assert list(meta) == list(wanted)
+    for name, value in expected.items():
+        assert torch.equal(meta[name], value) if torch.is_tensor(value) else meta[name] == value, name
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_opacities_are_the_calls_own(packed: bool) -> None:
+    """With one camera the library has no others than the caller's."""
+    made = given(cams=1)
+    meta = rasterization(**made, packed=packed)[2]
+    before = meta["opacities"].detach().clone()
+    with torch.no_grad():
+        made["opacities"].mul_(0.5)
+    assert torch.equal(meta["opacities"], before)
 
 
 class Counted:
