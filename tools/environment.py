@@ -7,6 +7,7 @@ named as arguments and prints the path of the environment's Python.
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import os
 import shutil
@@ -89,4 +90,6 @@ def _call(command: list[str], *, quiet: bool = False) -> int:
 
 if __name__ == "__main__":
     sys.stdout.reconfigure(encoding=sys.getfilesystemencoding(), errors=sys.getfilesystemencodeerrors())  # as paths are
-    print(set_up(tuple(sys.argv[1:])))
+    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
+    parser.add_argument("extras", nargs="*", metavar="EXTRA", help="as pyproject.toml names them: test, dev, docs, ...")
+    print(set_up(tuple(parser.parse_args().extras)))
