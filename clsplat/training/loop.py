@@ -452,6 +452,12 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
     ends = f"training ends at step {last}"
     if steps := [step for step in config.density.prune_at if step > last]:
         yield f"--density.prune-at {','.join(map(str, steps))}: nothing is pruned then, {ends}; {expected}"
+    density = config.density
+    if density.every and density.growth != "paper" and density.stop > last:
+        yield (
+            f"--density.growth {density.growth}: --density.max-gaussians {density.max_gaussians:,} is reached at "
+            f"--density.stop {density.stop}, {ends}; {expected}, such as {5 * last // 7}"
+        )
     optimiser = config.optimiser
     if optimiser.cooldown > last:
         part = optimiser.cooldown_to ** (1 - last / optimiser.cooldown)

@@ -180,6 +180,13 @@ LATE = {
             "at most --iterations 3"
         ),
     ),
+    "growth": (
+        {"density": {"every": 1, "growth": "mcmc", "max_gaussians": 2000, "stop": 9}},
+        (
+            "--density.growth mcmc: --density.max-gaussians 2,000 is reached at --density.stop 9, training ends at "
+            "step 3; expected at most --iterations 3, such as 2"
+        ),
+    ),
     "warmup": (
         {"warmup": (1, 3, 9)},
         (
