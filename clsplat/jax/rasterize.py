@@ -17,10 +17,13 @@ import numpy as np
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.jax.host import on_host, shape_like
-from clsplat.library.checks import Shape, check_shape, choice
+from clsplat.library.checks import Shape, check_shape, degree
 from clsplat.library.checks import sizes as check_sizes
-from clsplat.library.rasterize import RENDER_MODES, Rasterization
+from clsplat.library.projection import check_given, checked_planes
+from clsplat.library.rasterize import Rasterization, check_channels, checked_modes
 from clsplat.library.rasterize import rasterize as rasterize_numpy
+from clsplat.library.view import check_coefficients
+from clsplat.stages.harmonics import HIGHEST
 
 KEPT = 8
 """Forward passes that stay on the device for a gradient; of older ones the gradient makes them again, bit for bit."""
@@ -46,6 +49,7 @@ class Rasterized(NamedTuple):
 
 WITH_GRADIENT = ("images", "alphas", "means2d", "depths", "conics", "opacities")
 PROJECTED = ("means2d", "depths", "conics", "opacities")
+REQUIRED = ("means", "opacities", "colors", "viewmats", "intrinsics")
 
 
 def rasterize(
@@ -76,14 +80,16 @@ def rasterize(
 ) -> Rasterized:
     """`clsplat.rasterize` in a program of JAX, with the gradient of all its arrays.
 
-    The arguments are those of `clsplat.rasterize`; all that are no arrays are static under `jit`, and so are shapes.
+    The arguments are those of `clsplat.rasterize` but for `differentiable`, which JAX knows, and one size of all
+    cameras; all that are no arrays are static under `jit`, and so are shapes.
     Arrays of other dtypes become float32. means2d_probe (C, N, 2): zeros, which are not used; its gradient is that of
     the loss by `means2d` (with absolute_gradients, the sum of what pixels add to it, each without its sign), as
     density control wants it. device: of OpenCL, open or by its name; JAX's own
     devices have no part in it.
 
-    Raises InputError for wrong shapes and settings when it is called or traced. Values that are wrong are found when
-    the program runs, and JAX raises an error of its own with that message.
+    Raises InputError for wrong shapes and settings when it is called or traced. Arrays with numbers that are not
+    finite, and a device that is not there, are found when the program runs, and JAX raises an error of its own with
+    that message.
 
     Source: `clsplat.rasterize`, by jax.pure_callback and jax.custom_vjp.
     """
@@ -112,7 +118,16 @@ def rasterize(
         "absolute_gradients": absolute_gradients,
         "device": device,
     }
+    for name in REQUIRED:
+        if arrays[name] is None:
+            raise InputError(f"{name} is None, expected an array")
+    check_given(covars, quaternions, scales)
     floats = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items() if array is not None}
+    for name, side in (("viewmats", 4), ("intrinsics", 3)):
+        if floats[name].shape == (side, side):  # of one camera
+            floats[name] = floats[name][None]
+    if backgrounds is not None and floats["backgrounds"].shape == floats["colors"].shape[-1:]:
+        floats["backgrounds"] = jnp.tile(floats["backgrounds"], (len(floats["viewmats"]), 1))
     return Rasterized(**_rasterize(Call(width, height, tuple(settings.items())), floats))
 
 
@@ -134,7 +149,9 @@ class Call:
         """Shapes and dtypes of the results. Raises InputError, which names the argument, for arrays of shapes that
         `rasterize` does not take."""
         settings, sizes = dict(self.settings), {name: array.shape for name, array in arrays.items()}
-        choice("render_mode", settings["render_mode"], RENDER_MODES)
+        checked_modes(*(settings[name] for name in ("render_mode", "rasterize_mode", "alpha_max")))
+        planes = ("near_plane", "far_plane", "eps2d", "radius_clip", "camera_model")
+        checked_planes(*(settings[name] for name in planes))
         for name, side in (("width", self.width), ("height", self.height)):
             if np.ndim(side):
                 raise InputError(f"{name} is {side!r:.80}, expected a whole number: all cameras have one size in JAX")
@@ -142,9 +159,15 @@ class Call:
         check_shape("means", sizes["means"], ("N", 3))
         check_shape("viewmats", sizes["viewmats"], ("C", 4, 4))
         count, views = sizes["means"][0], sizes["viewmats"][0]
-        colors: Shape = (count, "D") if settings["sh_degree"] is None else (count, "K", 3)
+        highest = settings["sh_degree"]
+        if highest is not None:
+            highest = degree("sh_degree", highest, HIGHEST, ", or None")
+        colors: Shape = (count, "D") if highest is None else (count, "K", 3)
         check_shape("colors", sizes["colors"], colors, (views, *colors))
+        if highest is not None:
+            check_coefficients(highest, sizes["colors"][-2])
         values = sizes["colors"][-1]
+        check_channels(values)
         expected: dict[str, Shape] = {
             "quaternions": (count, 4),
             "scales": (count, 3),

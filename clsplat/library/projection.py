@@ -243,7 +243,7 @@ def checked_cameras(
 ) -> list[EwaCamera]:
     """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or of one of each, (4, 4) and (3, 3); width, height:
     pixels of all cameras or of each. Raises InputError, which names the argument."""
-    choice("camera_model", camera_model, tuple(MODELS))
+    planes = checked_planes(near_plane, far_plane, eps2d, radius_clip, camera_model)
     poses = matrices("viewmats", viewmats, 4, "C")
     count = len(poses)
     lenses = matrices("intrinsics", intrinsics, 3, count)
@@ -251,13 +251,29 @@ def checked_cameras(
         raise InputError(f"intrinsics has {len(lenses)} matrices, expected {count}, one for each of viewmats")
     if not (lenses[:, [0, 1], [0, 1]] != 0).all():
         raise InputError("intrinsics: a focal length is 0, expected those of a camera")
+    listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
+    return [EwaCamera(*camera, *planes, camera_model) for camera in listed]
+
+
+def checked_planes(
+    near_plane: float, far_plane: float, eps2d: float, radius_clip: float, camera_model: str
+) -> tuple[float, float, float, float]:
+    """Settings of `EwaCamera`, but for the model. Raises InputError, which names the argument."""
+    choice("camera_model", camera_model, tuple(MODELS))
     near, far = number("near_plane", near_plane, -np.inf), number("far_plane", far_plane, -np.inf)
     if not near < far:
         raise InputError(f"near_plane is {near_plane} and far_plane {far_plane}, expected the second to be larger")
     most = float(np.finfo(np.float32).max)
-    planes = (near, far, number("eps2d", eps2d, 0.0, most), number("radius_clip", radius_clip, 0.0, most))
-    listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
-    return [EwaCamera(*camera, *planes, camera_model) for camera in listed]
+    return near, far, number("eps2d", eps2d, 0.0, most), number("radius_clip", radius_clip, 0.0, most)
+
+
+def check_given(covars: object, quaternions: object, scales: object) -> None:
+    """Raise InputError, which names the argument, unless there are covars or the other two, and None for the rest."""
+    if covars is None and (quaternions is None or scales is None):
+        missing = "quaternions" if quaternions is None else "scales"
+        raise InputError(f"{missing} is None, expected an array, as covars is None too")
+    if covars is not None and (quaternions is not None or scales is not None):
+        raise InputError("covars: expected either these, or quaternions and scales")
 
 
 def checked_shapes(
@@ -265,16 +281,13 @@ def checked_shapes(
 ) -> tuple[dict[str, Float32], str]:
     """Arrays of `EwaInputs` for what shape the Gaussians have, and of covars "upper" or "full", how they were given;
     empty of quaternions and scales. Raises InputError, which names the argument."""
-    if covars is None:
-        if quaternions is None or scales is None:
-            missing = "quaternions" if quaternions is None else "scales"
-            raise InputError(f"{missing} is None, expected an array, as covars is None too")
+    check_given(covars, quaternions, scales)
+    if quaternions is not None and scales is not None:
         return {
             "quaternions": floats("quaternions", quaternions, (count, 4)),
             "scales": floats("scales", scales, (count, 3)),
         }, ""
-    if quaternions is not None or scales is not None:
-        raise InputError("covars: expected either these, or quaternions and scales")
+    assert covars is not None, "check_given"
     given = floats("covars", covars, (count, 6), (count, 3, 3))
     if given.ndim == 2:
         return {"covariances": given}, "upper"

@@ -71,7 +71,8 @@ class Rasterization:
     @cached_property
     def colors2d(self) -> Float32:
         """(C, N, D) float32: the values that are blended, but for the depth."""
-        return stacked([view.colors for view in self._views])
+        colors = stacked([view.colors for view in self._views])
+        return colors.copy() if np.may_share_memory(colors, self._given.colors) else colors
 
     @cached_property
     def tile_counts(self) -> NDArray[np.int32]:
@@ -192,11 +193,10 @@ def rasterize(
     gradients by means2d have their absolute sums too. differentiable: False for images alone, which takes less; their
     gradient, of the same bits, is slower then. device: an open one, or a name as `clsplat devices` lists them.
 
-    Raises InputError for an argument that is not so, and for one that is not finite; it is named. Raises DeviceError.
+    Raises InputError, which names the argument, for other shapes, settings out of range and arrays with numbers that
+    are not finite. Raises DeviceError.
     """
-    choice("render_mode", render_mode, RENDER_MODES)
-    choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
-    cap = number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6)
+    cap = checked_modes(render_mode, rasterize_mode, alpha_max)
     cameras = checked_cameras(
         viewmats,
         intrinsics,
@@ -212,8 +212,7 @@ def rasterize(
     if count == 0:
         raise InputError("viewmats has no matrix, expected 1 or more")
     given = Given.checked(means, quaternions, scales, covars, opacities, colors, sh_degree, count)
-    if given.channels > MOST_CHANNELS:
-        raise InputError(f"colors has {given.channels} channels, expected at most {MOST_CHANNELS}")
+    check_channels(given.channels)
     behind: list[Float32 | None] = [None] * count
     if backgrounds is not None:
         rows = floats("backgrounds", backgrounds, (count, given.channels), (given.channels,))
@@ -235,3 +234,16 @@ def rasterize(
         for index, camera in enumerate(cameras)
     ]
     return Rasterization(views, given, session.device)
+
+
+def check_channels(channels: int) -> None:
+    """Raise InputError where colors has more than can be blended, or none."""
+    if not 1 <= channels <= MOST_CHANNELS:
+        raise InputError(f"colors has {channels} channels, expected 1 to {MOST_CHANNELS}")
+
+
+def checked_modes(render_mode: str, rasterize_mode: str, alpha_max: float) -> float:
+    """The cap of alpha. Raises InputError, which names the argument."""
+    choice("render_mode", render_mode, RENDER_MODES)
+    choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    return number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6)

@@ -61,14 +61,7 @@ class Given:
         else:
             sh_degree = degree("sh_degree", sh_degree, HIGHEST, ", or None")
             values = floats("colors", colors, (n, "K", 3), (cameras, n, "K", 3))
-            if values.shape[-2] < (sh_degree + 1) ** 2:
-                wanted = (sh_degree + 1) ** 2
-                raise InputError(
-                    f"colors has {values.shape[-2]} SH coefficients, "
-                    f"expected {wanted} or more for sh_degree {sh_degree}"
-                )
-        if values.shape[-1] == 0:
-            raise InputError("colors has no channel, expected 1 to 512")
+            check_coefficients(sh_degree, values.shape[-2])
         return cls(n, cameras, centres, shapes, covariances, covers, values, sh_degree)
 
     @property
@@ -84,6 +77,12 @@ class Given:
     def colors_of(self, camera: int) -> Float32:
         """(N, D), or (N, K, 3)."""
         return self.colors[camera] if self.by_camera else self.colors
+
+
+def check_coefficients(sh_degree: int, found: int) -> None:
+    """Raise InputError where colors has fewer than the degree wants."""
+    if found < (wanted := (sh_degree + 1) ** 2):
+        raise InputError(f"colors has {found} SH coefficients, expected {wanted} or more for sh_degree {sh_degree}")
 
 
 class Gradients:
@@ -210,7 +209,7 @@ class View:
     def opacities(self) -> Float32:
         """(N,): compensated."""
         given = self._given.opacities
-        return given if self.compensations is None else given * self.compensations
+        return given.copy() if self.compensations is None else given * self.compensations
 
     @property
     def colors(self) -> Float32:

@@ -22,7 +22,7 @@ from clsplat.torch.graphs import differentiable_once
 SPARSE = ("means", "quaternions", "scales", "covars")
 """Arguments whose gradients may be sparse."""
 SPLATS = ("means2d", "conics", "depths", "opacities")
-"""What `Projection` makes of Gaussians, beside their colours."""
+"""Names of the splats that `Projection` makes of Gaussians."""
 
 
 class Batches:
@@ -65,20 +65,14 @@ class Call:
         radii = self.stacked("radii")  # a column at a time: numpy takes ten times as long for an axis of two
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
-    @cached_property
-    def opacities(self) -> NDArray[np.float32]:
-        """(B, C, N), the call's own, as the library's may be the caller's array, and change."""
-        return self.stacked("opacities").copy()
-
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """SPLATS in the layout of `meta`, of the device and kind of another tensor."""
-        arrays = {name: self.opacities if name == "opacities" else self.stacked(name) for name in SPLATS}
-        means2d, conics, depths, opacities = (as_tensor(self.laid_out(array), like) for array in arrays.values())
+        arrays = (self.laid_out(self.stacked(name)) for name in SPLATS)
+        means2d, conics, depths, opacities = (as_tensor(array, like) for array in arrays)
         return means2d, conics, depths, opacities
 
-    @cached_property
     def radii(self) -> NDArray[np.int32]:
-        """In the layout of `meta`; the caller's own, as the gradient reads the library's."""
+        """In the layout of `meta`; a copy each time, as the gradient reads the library's."""
         radii = self.laid_out(self.stacked("radii"))
         return radii if self.packed else radii.copy()
 

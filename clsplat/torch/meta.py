@@ -6,11 +6,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from clsplat.torch.graphs import outside_graphs
+
 
 class Meta(dict[str, Any]):
     """A dictionary with entries that functions make: each is called once, at the first look at one of its names.
 
-    Equal in all but time to the dictionary with every entry made.
+    Equal in all but time to the dictionary with every entry made; but where one is changed in place, those that are
+    made of it later are of what it is then.
     """
 
     def __init__(self, entries: dict[str, Any]) -> None:
@@ -23,6 +26,7 @@ class Meta(dict[str, Any]):
             super().__setitem__(name, None)
             self._makers[name] = make
 
+    @outside_graphs
     def _made(self, name: object) -> None:
         if name in self._makers:
             for key, value in self._makers[str(name)]().items():

@@ -107,7 +107,7 @@ def fully_fused_projection(
         ]
     call = Call(results, leading, packed=packed, sparse=sparse_grad)
     splats = _Projection.apply(call, means, quats, scales, covars, viewmats, Ks)
-    radii = torch.from_numpy(call.radii).to(means.device)
+    radii = torch.from_numpy(call.radii()).to(means.device)
     return (*call.ids(means.device), radii, *splats) if packed else (radii, *splats)
 
 

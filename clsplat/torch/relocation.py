@@ -25,6 +25,8 @@ def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms
     check("binoms", binoms, ("n_max", binoms.shape[0] if isinstance(binoms, Tensor) and binoms.dim() else "n_max"))
     if not isinstance(ratios, Tensor) or ratios.shape != (count,):
         raise refuse("ratios", getattr(ratios, "shape", type(ratios).__name__), f"a tensor ({count},)")
+    if ratios.is_floating_point():
+        check("ratios", ratios, (count,))
     with torch.no_grad():
         table = binoms.to(opacities.device, torch.float64)
         most = len(table)

@@ -10,12 +10,13 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from clsplat.device.context import Device
 from clsplat.library.checks import degree
 from clsplat.library.rasterize import rasterize
 from clsplat.stages.harmonics import HIGHEST
-from clsplat.torch.arguments import check_choice, check_number, check_shape, check_size, refuse, renamed
+from clsplat.torch.arguments import check, check_choice, check_number, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import SPLATS, Batches, Call, Pixels, Projection
 from clsplat.torch.covariances import UPPER
 from clsplat.torch.graphs import outside_graphs
@@ -109,7 +110,7 @@ def rasterization(
     flatten_ids, isect_offsets, made when they are first looked at; tile_width, tile_height, width, height, tile_size,
     n_batches, n_cameras.
 
-    Raises InputError, which names the argument: other shapes, NaN, numbers out of range; and `distributed`, `with_ut`,
+    Raises InputError, which names the argument: other shapes, NaN, settings out of range; and `distributed`, `with_ut`,
     `with_eval3d`, the model ftheta, coefficients of lenses, and shutters other than GLOBAL, which clsplat does not
     have.
 
@@ -167,6 +168,7 @@ def rasterization(
         "covars": covars,
     }
     settings["differentiable"] &= any(each is not None and each.requires_grad for each in tensors.values())
+    dual = any(each is not None and forward_ad.unpack_dual(each).tangent is not None for each in tensors.values())
     arrays = {name: Batches(each, batch) for name, each in tensors.items()}
     with renamed(quaternions="quats", intrinsics="Ks"):
         results = [
@@ -175,8 +177,10 @@ def rasterization(
         ]
     expected = render_mode.endswith("ED")
     call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
-    if not settings["differentiable"]:
-        _ = call.opacities  # of the arguments as they are now, which `meta` is made of later
+    if not settings["differentiable"] and not dual:  # of a dual tensor PyTorch says that there is no derivative
+        _ = [
+            result.opacities for result in results
+        ]  # of the arguments as they are now, for `meta`, which is made later
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     covars = None if covars is None else covars[..., UPPER[0], UPPER[1]]
     coefficients = None if sh_degree is None or depth_alone else colors
@@ -234,8 +238,8 @@ def _check_tensors(
                 f"of {colors.shape[-2]} coefficients",
                 f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}",
             )
-    if backgrounds is not None:
-        check_shape("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
+    if backgrounds is not None:  # depths have none behind them, so that nothing else looks at its numbers then
+        check("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
     return batch
 
 
@@ -250,7 +254,7 @@ def _meta(call: Call, like: Tensor, splats: Sequence[Tensor] | None, width: int,
         return dict(zip(IDS, call.ids(like.device), strict=True))
 
     def radii() -> dict[str, Any]:
-        return {"radii": torch.from_numpy(call.radii).to(like.device)}
+        return {"radii": torch.from_numpy(call.radii()).to(like.device)}
 
     def all_splats() -> dict[str, Any]:
         return dict(zip(SPLATS, call.splats(like) if splats is None else splats, strict=True))

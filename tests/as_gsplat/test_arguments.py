@@ -140,6 +140,11 @@ def test_nan_is_refused_by_name_and_place(name: str, place: tuple[int, ...]) -> 
         rasterization(**given(**{name: spoiled(name, place)}))
 
 
+def test_nan_in_backgrounds_that_depths_do_not_have() -> None:
+    with pytest.raises(InputError, match=r"^backgrounds has 3 NaN"):
+        rasterization(**given(backgrounds=torch.full((1, 3), torch.nan), render_mode="D"))
+
+
 def test_other_kinds_of_numbers_come_back_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arguments, "_SAID", set())
     float64 = clouds.cloud(8)

@@ -14,6 +14,7 @@ require("torch")
 import clouds
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from clsplat.torch import rasterization
 
@@ -78,6 +79,30 @@ def test_compiled_code_may_call_it() -> None:
         found.backward()
         assert torch.equal(found, plain)
         assert torch.equal(made["means"].grad, expected)
+
+
+@pytest.mark.slow  # importing the compiler
+@pytest.mark.parametrize("packed", [False, True])
+def test_compiled_code_may_look_at_meta_without_gradients(packed: bool) -> None:
+    made, tensors = wide(None)
+    made = {**made, **dict(zip(NAMES, tensors, strict=True)), "packed": packed}
+
+    def drawn(**given: Any) -> tuple[Tensor, Tensor, Tensor]:
+        images, _, meta = rasterization(**given)
+        return images * 2, meta["means2d"], meta["radii"]
+
+    with torch.inference_mode():
+        expected = drawn(**made)
+        compiled = torch.compile(drawn, backend="eager")
+        for _ in range(2):
+            assert all(map(torch.equal, compiled(**made), expected))
+
+
+def test_a_tangent_is_refused_and_not_lost() -> None:
+    made, tensors = wide(None)
+    given = {**made, **{name: tensor.detach() for name, tensor in zip(NAMES, tensors, strict=True)}}
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="jvp"):
+        rasterization(**{**given, "means": forward_ad.make_dual(given["means"], torch.ones_like(given["means"]))})
 
 
 def test_a_scaled_loss_that_overflows_is_a_step_left_out() -> None:

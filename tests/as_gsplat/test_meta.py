@@ -164,6 +164,13 @@ def test_opacities_are_the_calls_own(packed: bool) -> None:
     assert torch.equal(meta["opacities"], before)
 
 
+def test_radii_that_are_changed_in_place_leave_the_tiles() -> None:
+    wanted = rasterization(**given())[2]["flatten_ids"]
+    meta = rasterization(**given())[2]
+    meta["radii"].mul_(3)
+    assert torch.equal(meta["flatten_ids"], wanted)
+
+
 class Counted:
     calls = 0
 

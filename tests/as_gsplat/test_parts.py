@@ -97,6 +97,7 @@ def test_relocation_names_its_arguments() -> None:
     for name, value in (
         ("scales", torch.ones(2)),
         ("ratios", torch.ones(3)),
+        ("ratios", torch.tensor([2.0, math.nan])),
         ("opacities", torch.full((2,), math.nan)),
     ):
         with pytest.raises(InputError, match=name):

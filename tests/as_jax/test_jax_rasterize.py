@@ -208,15 +208,36 @@ def test_counts(default_device: Device, count: int) -> None:
         ("means", np.zeros((65, 2)), r"means: got shape \(65, 2\), expected \(N, 3\)"),
         ("quaternions", np.zeros((65, 3)), r"quaternions: got shape \(65, 3\), expected \(65, 4\)"),
         ("colors", np.zeros(65), r"colors: got shape \(65,\), expected \(65, D\) or \(2, 65, D\)"),
-        ("viewmats", np.eye(4), r"viewmats: got shape \(4, 4\), expected \(C, 4, 4\)"),
-        ("backgrounds", np.zeros(3), r"backgrounds: got shape \(3,\), expected \(2, 3\)"),
+        ("viewmats", np.eye(4)[:3], r"viewmats: got shape \(3, 4\), expected \(C, 4, 4\)"),
+        ("backgrounds", np.zeros(4), r"backgrounds: got shape \(4,\), expected \(2, 3\)"),
+        ("means", None, "means is None, expected an array"),
+        ("scales", None, "scales is None, expected an array, as covars is None too"),
+        ("covars", np.zeros((65, 6)), "covars: expected either these, or quaternions and scales"),
+        ("colors", np.zeros((65, 513)), "colors has 513 channels, expected 1 to 512"),
         ("render_mode", "depth", "render_mode is 'depth', expected one of RGB, D"),
+        ("rasterize_mode", "smooth", "rasterize_mode is 'smooth', expected one of classic, antialiased"),
+        ("camera_model", "lens", "camera_model is 'lens', expected one of pinhole"),
+        ("near_plane", np.nan, "near_plane is nan, expected"),
+        ("eps2d", -1, "eps2d is -1, expected"),
+        ("alpha_max", 2.0, "alpha_max is 2.0, expected"),
+        ("sh_degree", 7, "sh_degree is 7, expected 0 to 4, or None"),
         ("width", [40, 20], r"width is \[40, 20\], expected a whole number"),
     ],
 )
 def test_an_argument_that_is_wrong_is_named_before_anything_runs(name: str, value: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        clsplat.jax.rasterize(**{**cloud(), **SIZE, name: value})
+        jax.eval_shape(lambda: clsplat.jax.rasterize(**{**cloud(), **SIZE, name: value}))
+
+
+def test_one_camera_and_one_background_as_numpy_takes_them(default_device: Device) -> None:
+    arrays = {**cloud(), "backgrounds": np.array([0.1, 0.5, 0.9], np.float32)}
+    both = clsplat.jax.rasterize(**arrays, **SIZE, device=default_device)
+    assert np.array_equal(both.images, clsplat.rasterize(**arrays, **SIZE, device=default_device).images)
+    arrays |= {name: arrays[name][0] for name in ("viewmats", "intrinsics")}
+    one = clsplat.jax.rasterize(**arrays, **SIZE, device=default_device)
+    assert np.array_equal(one.images, both.images[:1])
+    found = jax.grad(lambda pose: clsplat.jax.rasterize(**{**arrays, "viewmats": pose}, **SIZE).images.sum())
+    assert found(jnp.asarray(arrays["viewmats"])).shape == (4, 4)
 
 
 def test_values_that_are_wrong_are_named_by_the_program() -> None:

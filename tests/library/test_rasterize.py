@@ -176,6 +176,14 @@ def test_matrices_may_change_after_the_call(default_device: Device) -> None:
         np.testing.assert_array_equal(array, before[name])
 
 
+def test_results_are_not_the_arguments(default_device: Device) -> None:
+    arguments = {name: np.float32(value) for name, value in with_lenses(scene()).items()}
+    arguments |= {name: arguments[name][:1] for name in ("viewmats", "intrinsics")}
+    result = call(arguments, default_device)
+    assert not np.may_share_memory(result.opacities, arguments["opacities"])
+    assert not np.may_share_memory(result.colors2d, arguments["colors"])
+
+
 def test_gradients_that_are_not_finite_pass_to_what_they_have_a_part_in(default_device: Device) -> None:
     result = call(with_lenses(scene()), default_device)
     d_images = np.random.default_rng(3).normal(size=result.images.shape).astype(np.float32)
@@ -276,8 +284,8 @@ def test_absolute_gradients(default_device: Device) -> None:
         ({"scales": "wide"}, "scales: got <U4, expected an array of real numbers"),
         ({"opacities": np.full(12, np.inf)}, "opacities: [0] is inf, expected finite numbers within float32"),
         ({"colors": np.zeros((3, 12, 3))}, "colors: got shape (3, 12, 3), expected (12, D) or (2, 12, D)"),
-        ({"colors": np.zeros((12, 513))}, "colors has 513 channels, expected at most 512"),
-        ({"colors": np.zeros((12, 0))}, "colors has no channel, expected 1 to 512"),
+        ({"colors": np.zeros((12, 513))}, "colors has 513 channels, expected 1 to 512"),
+        ({"colors": np.zeros((12, 0))}, "colors has 0 channels, expected 1 to 512"),
         (
             {"colors": np.zeros((12, 4, 3)), "sh_degree": 2},
             "colors has 4 SH coefficients, expected 9 or more for sh_degree 2",
