@@ -5,7 +5,6 @@ photographs. They come from glances at the photographs, the cameras and the poin
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -14,23 +13,14 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.errors import InputError, examples
-from clsplat.scenes.data_set import PANORAMA, RADIAL, pixels_of
+from clsplat.scenes.data_set import RADIAL
 from clsplat.scenes.glance import GREY
+from clsplat.scenes.looked import BRIGHT, LEAST_POINTS, Looked
 from clsplat.scenes.masks import masks_beside, read_mask
 from clsplat.scenes.scene import Scene, View
 
 Kind = Literal["exposure", "scales", "masks", "cut out", "alpha", "fisheye", "sky", "few views", "blur", "duplicates"]
 
-MAX_POINTS = 4000
-"""Points of the scene that are looked at: more move a median of brightness by less than a hundredth."""
-BEHIND = 1.15
-"""Depth, in that of the nearest point around, from which on a point is taken to be hidden."""
-CELL = 8
-"""Pixels of a glance that a point is alone in front of."""
-LEAST_POINTS = 40
-"""Points in a photograph without which nothing is said of its brightness or scale."""
-DARK, BRIGHT = 0.06, 0.94
-"""Colours outside are clipped or noise, and say nothing of exposure."""
 EXPOSURE = 0.2
 """Standard deviation over the photographs, in stops, of a channel's brightness. Cameras that hold their exposure are
 under 0.1 by this measure, as points are hidden and shine; gains that are learnt begin to pay at about 0.2."""
@@ -77,7 +67,7 @@ class Finding:
 
 def findings(scene: Scene, use: MaskUse = NO_MASKS) -> list[Finding]:
     """All findings about a scene, read with these masks. Raises InputError as `Scene.check_pictures`."""
-    looked = _Looked(scene)
+    looked = Looked(scene)
     found = (
         _few(scene),
         _exposure(looked),
@@ -92,55 +82,7 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS) -> list[Finding]:
     return [each for each in found if each is not None]
 
 
-class _Looked:
-    """The training photographs' glances, with the places of the scene's points in them."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        step = max(-(-len(scene.points) // MAX_POINTS), 1)
-        self.points = scene.points[::step]
-        self.colors = scene.point_colors[::step].astype(np.float64)
-
-    @cached_property
-    def places(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]]:
-        """By view: points that lie in it and are not hidden, their rows and columns in the glance, and their depths."""
-        flat = [view for view in self.scene.train_views if view.lens.model not in (PANORAMA, *RADIAL)]
-        return {view.name: self._place(view) for view in flat}
-
-    @cached_property
-    def up(self) -> Float64:
-        """Upwards in the world, as the cameras were held on average, (3,)."""
-        mean: Float64 = -np.mean([view.camera.rotation[1] for view in self.scene.train_views], axis=0)
-        return mean / max(float(np.linalg.norm(mean)), 1e-9)
-
-    def _place(self, view: View) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]:
-        height, width = self.scene.glances[view.name].pixels.shape[:2]
-        camera = view.camera.resized(width, height)
-        rows, columns, inside = pixels_of(self.points, camera, view.lens)
-        where = np.flatnonzero(inside)
-        depths = (self.points[where] - camera.position) @ camera.rotation[2]
-        across = -(-width // CELL)
-        cells = rows // CELL * across + columns // CELL
-        nearest = np.full(across * -(-height // CELL), np.inf)
-        np.minimum.at(nearest, cells, depths)
-        seen = depths <= BEHIND * nearest[cells]
-        return where[seen], rows[seen], columns[seen], depths[seen]
-
-    @cached_property
-    def gains(self) -> dict[str, Float64]:
-        """log2 of the brightness (3,) of each view by that of the points' colours, less the views' medians."""
-        found = {}
-        for name, (which, rows, columns, _) in self.places.items():
-            seen, known = self.scene.glances[name].pixels[rows, columns], self.colors[which]
-            both = np.concatenate([seen, known], axis=1)
-            good = ((both > DARK) & (both < BRIGHT)).all(axis=1)
-            if good.sum() >= LEAST_POINTS:
-                found[name] = np.median(np.log2(seen[good] / known[good]), axis=0)
-        middle = np.median(list(found.values()), axis=0) if found else 0.0
-        return {name: gain - middle for name, gain in found.items()}
-
-
-def _exposure(looked: _Looked) -> Finding | None:
+def _exposure(looked: Looked) -> Finding | None:
     gains = looked.gains
     if len(gains) < 3:
         return None
@@ -157,7 +99,7 @@ def _exposure(looked: _Looked) -> Finding | None:
     )
 
 
-def _scales(looked: _Looked) -> Finding | None:
+def _scales(looked: Looked) -> Finding | None:
     distances = []
     for view in looked.scene.train_views:
         _, _, _, depths = looked.places.get(view.name, (0, 0, 0, np.empty(0)))
@@ -220,7 +162,7 @@ def _few(scene: Scene) -> Finding | None:
     return Finding("few views", f"{count} photographs to train on are few, so that views from elsewhere will show fog")
 
 
-def _sky(looked: _Looked) -> Finding | None:
+def _sky(looked: Looked) -> Finding | None:
     scene = looked.scene
     parts = [_sky_part(looked, view) for view in scene.train_views if view.name in looked.places]
     with_sky = [part for part in parts if part >= SKY_PART]
@@ -231,7 +173,7 @@ def _sky(looked: _Looked) -> Finding | None:
     )
 
 
-def _sky_part(looked: _Looked, view: View) -> float:
+def _sky_part(looked: Looked, view: View) -> float:
     """Part of a view that is sky: light, smooth, blue or white, joined to the upper border, above the horizon, and
     without points."""
     pixels = looked.scene.glances[view.name].pixels

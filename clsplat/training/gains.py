@@ -16,6 +16,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.images.colour import SRGB, photos_space
 from clsplat.images.exif import exposure_of
+from clsplat.scenes.looked import Looked
 from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, step_gains
 from clsplat.training.learnt import loaded, rate_at, saved
 
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
 
 CODED = 1 / 2.2
 """Octaves of a coded value for one of light, about: where gains begin that EXIF tells of photographs that are not
-linear."""
+linear, and points nothing."""
+
+STEP = 2.0**-10
+"""Octaves to which what points tell is rounded: processors add in other orders, and begin alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +93,11 @@ class GainsOfAll:
         self._config, self._device, self._scene = config, device, scene
         self._told = [exposure_of(view.path) for view in scene.train_views]
         curve = CODED if photos_space(view.path for view in scene.views) == SRGB else 1.0
-        start = curve * np.nan_to_num(_from_mean(self._told, self._told))
-        self._gains = Gains.on(device, np.repeat(start[:, None], 3, axis=1).astype(np.float32))
+        by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
+        by_points = {name: np.round(told / STEP) * STEP for name, told in Looked(scene).exposures.items()}
+        views = zip(scene.train_views, by_exif, strict=True)
+        start = np.array([by_points.get(view.name, np.full(3, told)) for view, told in views])
+        self._gains = Gains.on(device, (start - start.mean(axis=0)).astype(np.float32))
 
     @property
     def pixel_bytes(self) -> int:

@@ -23,6 +23,7 @@ from clsplat.images.reading import read_image
 from clsplat.runs.appearance import held_out_gains
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
+from clsplat.scenes.looked import Looked
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.gains import GainsOfAll
 from clsplat.training.photographs import Photographs
@@ -44,6 +45,19 @@ def test_a_batch_learns_from_all_of_its_views(default_device: Device, scene: Sce
     logs = trainer.checkpoint()[0]["appearance/logs"]
     assert logs.any(axis=1).all()
     assert trainer.step == 2 * batch
+
+
+def test_gains_begin_where_the_points_have_them(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By EXIF, which tells nothing here, for photographs of which the points tell nothing."""
+    first, second, *others = (view.name for view in scene.train_views)
+    told = {first: np.array([1.0, 0.5, 0.0]), second: np.array([-1.0, 0.25, 0.0])}
+    monkeypatch.setattr(Looked, "exposures", told)
+    logs = GainsOfAll(EXPOSED, default_device, scene).arrays()["appearance/logs"]
+    start = np.array([told[first], told[second], *(np.zeros(3) for _ in others)])
+    # rounded to a 1024th
+    np.testing.assert_allclose(logs, start - start.mean(axis=0), atol=2.0**-11)
 
 
 def test_gains_of_photographs_are_learnt(
