@@ -46,8 +46,9 @@ SIZES = (400, 200, 100, 50)
 
 @dataclass(frozen=True)
 class Row:
-    """A training: its scene's folder and settings. half_of: names of rows of this scene; the most Gaussians are half
-    of the better one's. sizes: pictures' sides to measure at, beside the one it was trained at."""
+    """A training: its scene's folder and settings, {stop} for the step at which the short schedule's growth ends.
+    half_of: names of rows of this scene; the most Gaussians are half of the better one's. sizes: pictures' sides to
+    measure at, beside the one it was trained at."""
 
     name: str
     scene: str
@@ -64,6 +65,8 @@ HALVES = {
 """Rows of the growth table that get half of the Gaussians."""
 FEWEST = ("bonsai", 290_000)
 """A scene whose mcmc is measured with this many Gaussians too, a third of what the short schedule ends with."""
+BY_PAPER = "sceaux_castle"
+"""A scene whose mcmc is measured at the paper's rates too, which are the better ones there."""
 
 
 def growth_rows() -> list[Row]:
@@ -74,9 +77,12 @@ def growth_rows() -> list[Row]:
         ends = (f"{scene} default", f"{scene} short")
         for name, more in HALVES.items():
             rows.append(Row(f"{scene} {name}", scene, ("--schedule", "short", *more), half_of=ends))
+    ends = (f"{BY_PAPER} default", f"{BY_PAPER} short")
+    rows.append(Row(f"{BY_PAPER} mcmc paper", BY_PAPER, (*HALVES["mcmc"], "--density.stop", "{stop}"), half_of=ends))
     scene, most = FEWEST
     settings = ("--schedule", "short", *HALVES["mcmc"], "--density.max-gaussians", str(most))
-    return [*rows, Row(f"{scene} mcmc {most // 1000}k", scene, settings)]
+    few = Row(f"{scene} mcmc {most // 1000}k", scene, settings)
+    return [*rows, few, Row(f"{few.name} antialiased", scene, (*settings, "--antialiased"))]
 
 
 def antialiasing_rows() -> list[Row]:
@@ -127,7 +133,7 @@ class Book:
         return [("--density.max-gaussians", str(result.gaussians // 2)) for result in better]
 
     def _result(self, table: str, row: Row, seed: int, most: Sequence[str]) -> Finished:
-        settings = (*row.settings, *most)
+        settings = (*(each.format(stop=5 * self.iterations // 7) for each in row.settings), *most)
         code = code_digest(ROOT, mcmc="mcmc" in settings)
         named = (table, row.name, seed, settings, self.iterations, self.resolution, code, commit())
         if known := self.kept.find(Finished(*named, "", "", 0.0, 0.0, 0, 0.0)):

@@ -185,5 +185,9 @@ def test_only_the_rows_that_are_asked_for(
     assert rows == ["| fox mcmc", "| bonsai mcmc 290k"]
     trained = {row["row"] for row in json.loads((tmp_path / "rows.json").read_text())["rows"]}
     assert trained == {"fox default", "fox short", "fox mcmc", "bonsai mcmc 290k"}  # and what they are half of
+    assert quality_table.main([*where, "--rows", "sceaux_castle mcmc paper", "--iterations", "700"]) == 0
+    rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
+    (settings,) = (row["settings"] for row in rows if row["row"] == "sceaux_castle mcmc paper")
+    assert settings[settings.index("--density.stop") + 1] == "500"
     assert quality_table.main([*where, "--rows", "fax *"]) == 2
     assert capsys.readouterr().err.endswith("--rows fax *: no such row; --list prints them\n")
