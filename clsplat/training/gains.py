@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.config.training import TrainConfig
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
 from clsplat.images.colour import SRGB, photos_space
@@ -92,12 +93,17 @@ class GainsOfAll:
     def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
         self._config, self._device, self._scene = config, device, scene
         self._told = [exposure_of(view.path) for view in scene.train_views]
+
+    @cached_property
+    def _gains(self) -> Gains:
+        """Where training begins, unless a checkpoint has been loaded: glances at the photographs take their time."""
+        scene = self._scene
         curve = CODED if photos_space(view.path for view in scene.views) == SRGB else 1.0
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
         by_points = {name: np.round(told / STEP) * STEP for name, told in Looked(scene).exposures.items()}
         views = zip(scene.train_views, by_exif, strict=True)
         start = np.array([by_points.get(view.name, np.full(3, told)) for view, told in views])
-        self._gains = Gains.on(device, (start - start.mean(axis=0)).astype(np.float32))
+        return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32))
 
     @property
     def pixel_bytes(self) -> int:
@@ -144,5 +150,6 @@ class GainsOfAll:
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take the arrays of a checkpoint. Raises ValueError where that is of other photographs."""
         names = ("logs", "first", "second", "gains")
-        values = loaded(self._device, arrays, names, self._gains.logs.shape)
-        self._gains = Gains(**values, moved=self._gains.moved)
+        shape = (len(self._scene.train_views), 3)
+        values = loaded(self._device, arrays, names, shape)
+        self._gains = Gains(**values, moved=allocate(self._device, shape, np.float32))
