@@ -79,8 +79,8 @@ class Looked:
 
     @cached_property
     def exposures(self) -> dict[str, Float64]:
-        """log2 of how bright each photograph is beside the others, (3,): each point has one colour in
-        all photographs that show it, and what differs is their exposure. Of photographs that show LEAST_POINTS.
+        """log2 of how bright each photograph is beside the others, (3,): each point has one colour in all photographs
+        that show it, and what differs is their exposure. Of photographs that show LEAST_POINTS of these.
 
         Both by least absolute differences, in reweighted least squares; of the points' colours in the scene nothing is
         taken.

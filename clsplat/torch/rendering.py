@@ -178,9 +178,8 @@ def rasterization(
     expected = render_mode.endswith("ED")
     call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
     if not settings["differentiable"] and not dual:  # of a dual tensor PyTorch says that there is no derivative
-        _ = [
-            result.opacities for result in results
-        ]  # of the arguments as they are now, for `meta`, which is made later
+        for result in results:  # by the arguments as they are now, for a later look at `meta`
+            _ = result.opacities
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     covars = None if covars is None else covars[..., UPPER[0], UPPER[1]]
     coefficients = None if sh_degree is None or depth_alone else colors
@@ -244,10 +243,10 @@ def _check_tensors(
 
 
 def _meta(call: Call, like: Tensor, splats: Sequence[Tensor] | None, width: int, height: int, tile_size: int) -> Meta:
-    """gsplat's dictionary, in its order. like: a tensor of the results' device and kind; splats: SPLATS with their
-    gradient, or None if there is none, to make them when they are looked at."""
+    """gsplat's dictionary, in its order. like: a tensor of the device and kind of what is made later; splats: SPLATS
+    with their gradient, or None if there is none, to make them when they are looked at."""
     batches, cameras, _ = call.sizes
-    like = like.detach()
+    like = like.new_empty(0)  # the caller's own would live as long as the dictionary
     columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
 
     def ids() -> dict[str, Any]:
