@@ -85,6 +85,8 @@ class Looked:
         Both by least absolute differences, in reweighted least squares; of the points' colours in the scene nothing is
         taken.
         """
+        if len(self.points) < LEAST_POINTS:  # without a glance at any photograph
+            return {}
         seen = {name: self._logs(name) for name in self.places}
         counts = np.bincount(np.concatenate([np.empty(0, np.int64), *(which for which, _ in seen.values())]))
         several = {name: counts[which] > 1 for name, (which, _) in seen.items()}

@@ -72,7 +72,8 @@ def test_gains_on_photographs_are_told_from_them_alone() -> None:
 
 @pytest.mark.parametrize("count", [0, LEAST_POINTS - 1])
 def test_few_points_tell_nothing(count: int) -> None:
+    """And no photograph is looked at, of which there is no file here."""
     scene = made()
     few = replace(scene, points=scene.points[:count], point_colors=scene.point_colors[:count])
-    few.__dict__["glances"] = scene.glances
+    assert "glances" not in few.__dict__
     assert Looked(few).exposures == {}
