@@ -160,6 +160,9 @@ class View:
                 self._harmonics = Harmonics(*arrays, given.sh_degree, self.projected.arrays.radii, centre)
                 self._colours = hosted(device, (given.count, 3))
                 harmonics(device, self._harmonics, self._colours.array)
+            factors = self.compensations
+            self.opacities: Float32 = given.opacities.copy() if factors is None else given.opacities * factors
+            """(N,): compensated; of the call, whatever becomes of the caller's."""
             splats = self.projected.arrays
             self.pixels = Pixels(
                 session,
@@ -204,12 +207,6 @@ class View:
     def compensations(self) -> Float32 | None:
         """(N,), or None."""
         return None if self.projected.arrays.compensations is None else self.splats("compensations")
-
-    @cached_property
-    def opacities(self) -> Float32:
-        """(N,): compensated."""
-        given = self._given.opacities
-        return given.copy() if self.compensations is None else given * self.compensations
 
     @property
     def colors(self) -> Float32:

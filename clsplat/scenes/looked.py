@@ -89,17 +89,16 @@ class Looked:
             return {}
         seen = {name: self._logs(name) for name in self.places}
         counts = np.bincount(np.concatenate([np.empty(0, np.int64), *(which for which, _ in seen.values())]))
-        several = {name: counts[which] > 1 for name, (which, _) in seen.items()}
-        shared = {
-            name: (seen[name][0][good], seen[name][1][good])
-            for name, good in several.items()
-            if good.sum() >= LEAST_POINTS
-        }
+        shared = {}
+        for name, (which, logs) in seen.items():
+            several = counts[which] > 1
+            if several.sum() >= LEAST_POINTS:
+                shared[name] = which[several], logs[several]
         if not shared:
             return {}
         views = np.repeat(np.arange(len(shared)), [len(which) for which, _ in shared.values()])
-        points, logs = (np.concatenate(each) for each in zip(*shared.values(), strict=True))
-        return dict(zip(shared, relative_exposures(points, views, logs), strict=True))
+        points, colors = (np.concatenate(each) for each in zip(*shared.values(), strict=True))
+        return dict(zip(shared, relative_exposures(points, views, colors), strict=True))
 
     def _logs(self, name: str) -> tuple[NDArray[np.int64], Float64]:
         """Points (n,) that a view shows neither dark nor clipped, and log2 of their colours in it (n, 3)."""

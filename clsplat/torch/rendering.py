@@ -178,8 +178,6 @@ def rasterization(
     expected = render_mode.endswith("ED")
     call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
     if not settings["differentiable"] and not dual:  # of a dual tensor PyTorch says that there is no derivative
-        for result in results:  # by the arguments as they are now, for a later look at `meta`
-            _ = result.opacities
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     covars = None if covars is None else covars[..., UPPER[0], UPPER[1]]
     coefficients = None if sh_degree is None or depth_alone else colors

@@ -138,7 +138,7 @@ def test_results_that_are_changed_in_place() -> None:
 @pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("cams", [1, 2])
 def test_without_gradients(cams: int, packed: bool, mode: str) -> None:
-    """What `meta` makes later is of the arguments as they were at the call."""
+    """Entries that `meta` makes later are of the arguments as they were at the call."""
     made = given(cams)
     wanted = rasterization(**made, packed=packed, rasterize_mode=mode)[2]
     expected = {name: wanted[name].clone() if torch.is_tensor(wanted[name]) else wanted[name] for name in wanted}

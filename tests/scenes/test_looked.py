@@ -51,7 +51,7 @@ def test_groups_that_share_no_point_have_a_mean_of_their_own() -> None:
 
 
 def spread(scene: Scene, gains: np.ndarray) -> np.ndarray:
-    """What is told of the scene with gains on its photographs, which do not clip."""
+    """Exposures that are told of the scene with gains on its photographs, which do not clip."""
     for index, gain in enumerate(gains):
         changed(scene, index, pixels=scene.glances[scene.views[index].name].pixels * np.float32(gain))
     told = Looked(scene).exposures
