@@ -14,6 +14,7 @@
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 // section 6
 //   and algorithm 2.
+#define WIDENED
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -33,7 +34,9 @@
 #define RECORD(statements)
 #endif
 // By ellipse few vectors are visited in vain: the test costs more than they.
-#if defined(CELLS_BY_ELLIPSE) && !defined(RECORD_CELLS)
+#ifdef RECORD_CELLS
+#define CONTRIBUTES(mask) REACHED_CELLS(mask)
+#elif defined(CELLS_BY_ELLIPSE)
 #define CONTRIBUTES(mask) 1
 #else
 #define CONTRIBUTES(mask) REACHES(mask)
@@ -137,8 +140,9 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       const floatL power = LOG2_ALPHA(splat, cell);
       COUNT(evaluated += LANES;)
       const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
-      if (CONTRIBUTES(reached)) {
-        RECORD(cells |= 1u << cell;)
+      const uint contributes = CONTRIBUTES(reached);
+      if (contributes) {
+        RECORD(cells |= contributes << FIRST_RECORDED(cell);)
         if (add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue NEAR_ARGUMENT)) CLOSE_CELL(open, cell);
         COUNT(added -= reached & MASKL(pixels[cell].t > 0.0f);)
       }

@@ -13,6 +13,7 @@
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
 // moments of g = alpha * dL/dalpha in (u, v); with CONTRIBUTIONS there is the sum of the weights too (55).
+#define WIDENED
 #include "shared/math.h"
 #include "shared/splat.h"
 #include "shared/lanes.h"
@@ -31,8 +32,12 @@
 #endif
 #ifdef RECORD_CELLS // by blend: each cell that is visited has a pixel that takes the Gaussian
 #define CONTRIBUTES(mask) 1
+#define REACHED_AT_FIRST recorded
+#define ADD_REACHED(mask, cell)
 #else
 #define CONTRIBUTES(mask) REACHES(mask)
+#define REACHED_AT_FIRST 0
+#define ADD_REACHED(mask, cell) reached |= REACHED_CELLS(mask) << FIRST_RECORDED(cell);
 #endif
 
 // 1 / x for x in [0.01, 1]. In a group by Newton's steps, to 2e-7 of it, where a division takes twice as many
@@ -48,12 +53,12 @@ static inline float inverse_of(float x) {
 }
 #endif
 
-// State of a cell's pixels on the way to the front; the image's gradient there.
+// State of the cells' pixels on the way to the front; the image's gradient there.
 typedef struct {
-  floatL t, behind, red, green, blue;
-  intL stop;
+  floatL t[OWNED], behind[OWNED], red[OWNED], green[OWNED], blue[OWNED];
+  intL stop[OWNED];
 #ifdef NEARNESS
-  floatL near;
+  floatL near[OWNED];
 #endif
 } Pixels;
 
@@ -63,21 +68,23 @@ typedef struct {
 } Share;
 
 // Takes a pair out of a cell's pixels, by its alpha before the cap, 0 in the lanes that did not take it.
-static inline Share take_out(Pixels *p, floatL uncapped, float c_red, float c_green, float c_blue NEAR_PARAMETER) {
+static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
+                             float c_blue NEAR_PARAMETER) {
   const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
   const floatL inverse = INVERSE(1.0f - alpha);
-  const floatL before = p->t * inverse;
-  const floatL colour = fmaL(p->red, (floatL)(c_red), fmaL(p->green, (floatL)(c_green), p->blue * c_blue));
+  const floatL before = p->t[cell] * inverse;
+  const floatL colour =
+      fmaL(p->red[cell], (floatL)(c_red), fmaL(p->green[cell], (floatL)(c_green), p->blue[cell] * c_blue));
 #ifdef NEARNESS
-  const floatL shade = fmaL(p->near, (floatL)(c_near), colour);
+  const floatL shade = fmaL(p->near[cell], (floatL)(c_near), colour);
 #else
   const floatL shade = colour;
 #endif
   const floatL weight = alpha * before;
-  const floatL d_alpha = fmaL(before, shade, -(p->behind * inverse));
+  const floatL d_alpha = fmaL(before, shade, -(p->behind[cell] * inverse));
   const floatL g = AS_FLOATL(AS_INTL(alpha * d_alpha) & MASKL(uncapped < ALPHA_MAX));
-  p->behind = fmaL(weight, shade, p->behind);
-  p->t = before;
+  p->behind[cell] = fmaL(weight, shade, p->behind[cell]);
+  p->t[cell] = before;
   const Share share = {g, weight};
   return share;
 }
@@ -97,26 +104,27 @@ static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, floa
 }
 #endif
 
-// Adds a cell's gradients to a pair's sums (SLOT_STRIDE).
-static inline void add_gradients(floatL *sums, const Pixels *p, Share share, floatL u, floatL v, float l11, float l12,
-                                 float l22) {
-  sums[SLOT_RED] = fmaL(share.weight, p->red, sums[SLOT_RED]);
-  sums[SLOT_GREEN] = fmaL(share.weight, p->green, sums[SLOT_GREEN]);
-  sums[SLOT_BLUE] = fmaL(share.weight, p->blue, sums[SLOT_BLUE]);
+// Adds the gradients of a vector of the shape to a pair's sums (SLOT_STRIDE).
+#define IN_PLACE(cells, place) (((const floatS *)(cells))[place])
+static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floatS g, floatS weight, floatS u, floatS v,
+                                 float l11, float l12, float l22) {
+  sums[SLOT_RED] = fmaS(weight, IN_PLACE(p->red, place), sums[SLOT_RED]);
+  sums[SLOT_GREEN] = fmaS(weight, IN_PLACE(p->green, place), sums[SLOT_GREEN]);
+  sums[SLOT_BLUE] = fmaS(weight, IN_PLACE(p->blue, place), sums[SLOT_BLUE]);
 #ifdef RAYS
-  add_ray_moments(share.g, u, v, l11, l12, l22, sums);
+  add_ray_moments(g, u, v, l11, l12, l22, sums);
 #else
-  add_moments(share.g, u, v, sums);
+  add_moments(g, u, v, sums);
 #ifdef ABSOLUTE_GRADIENTS
-  sums[SLOT_ABSX] += fabs(share.g * (l11 * u));
-  sums[SLOT_ABSY] += fabs(share.g * fmaL((floatL)(l12), u, l22 * v));
+  sums[SLOT_ABSX] += fabs(g * (l11 * u));
+  sums[SLOT_ABSY] += fabs(g * fmaS((floatS)(l12), u, l22 * v));
 #endif
 #endif
 #ifdef CONTRIBUTIONS
-  sums[SLOT_WEIGHT] += share.weight;
+  sums[SLOT_WEIGHT] += weight;
 #endif
 #ifdef NEARNESS
-  sums[SLOT_NEAR] = fmaL(share.weight, p->near, sums[SLOT_NEAR]);
+  sums[SLOT_NEAR] = fmaS(weight, IN_PLACE(p->near, place), sums[SLOT_NEAR]);
 #endif
 }
 
@@ -131,7 +139,7 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
 #define ALPHA_IN(cell)                                                                                                 \
   floatL u, v;                                                                                                         \
   const floatL power = offset_of_ray(ray_x[cell], ray_y[cell], ray_z[cell], splat, &u, &v);                            \
-  const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels[cell].stop);                            \
+  const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);                            \
   u = AS_FLOATL(AS_INTL(u) & taken); /* of a ray that goes away from the mean they are nothing */                      \
   v = AS_FLOATL(AS_INTL(v) & taken);
 #else
@@ -143,26 +151,32 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
   const floatL dy = my - AT_Y(cell);                                                                                   \
   const floatL u = whitened_u(l11, l12, mx - AT_X(cell), dy), v = l22 * dy;                                            \
   const floatL power = log2_alpha(u, v, log2o);                                                                        \
-  const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels[cell].stop);
+  const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);
 #endif
 
 // The pair in the pixels of the cells that it reaches. Where a work-item walks many cells there is a loop for each of
 // three tasks: with short chains and few registers a processor has more cells under way (docs/performance.md).
 #if LANES >= 8 && !defined(RAYS)
 #define TAKE_PAIR(reach)                                                                                               \
-  floatL alpha_of[CELLS], u_of[CELLS];                                                                                 \
-  Share share_of[CELLS];                                                                                               \
-  uint reached = 0;                                                                                                    \
+  floatL alpha_of[CELLS], u_of[CELLS], g_of[CELLS], weight_of[CELLS];                                                  \
+  uint reached = REACHED_AT_FIRST;                                                                                     \
   FOR_CELLS(cell, reach) {                                                                                             \
     ALPHA_IN(cell)                                                                                                     \
     alpha_of[cell] = AS_FLOATL(AS_INTL(exp2L(power)) & taken);                                                         \
     u_of[cell] = u;                                                                                                    \
-    reached |= (uint)(CONTRIBUTES(taken) != 0) << cell;                                                                \
+    ADD_REACHED(taken, cell)                                                                                           \
   }                                                                                                                    \
-  FOR_CELLS(cell, reached)                                                                                             \
-  share_of[cell] = take_out(pixels + cell, alpha_of[cell], c_red, c_green, c_blue NEAR_ARGUMENT);                      \
-  FOR_CELLS(cell, reached)                                                                                             \
-  add_gradients(sums, pixels + cell, share_of[cell], u_of[cell], l22 * (my - AT_Y(cell)), l11, l12, l22);
+  FOR_CELLS(cell, CELLS_OF(reached)) {                                                                                 \
+    const Share share = take_out(&pixels, cell, alpha_of[cell], c_red, c_green, c_blue NEAR_ARGUMENT);                 \
+    g_of[cell] = share.g;                                                                                              \
+    weight_of[cell] = share.weight;                                                                                    \
+  }                                                                                                                    \
+  FOR_CELLS(each, reached) {                                                                                           \
+    const uint place = PLACE_OF(each);                                                                                 \
+    const floatS v = l22 * (my - IN_PLACE(table_y, place));                                                            \
+    add_gradients(sums, &pixels, place, IN_PLACE(g_of, place), IN_PLACE(weight_of, place), IN_PLACE(u_of, place), v,   \
+                  l11, l12, l22);                                                                                      \
+  }
 #else
 #define TAKE_PAIR(reach)                                                                                               \
   WHITENING_HERE                                                                                                       \
@@ -170,8 +184,8 @@ static inline void add_gradients(floatL *sums, const Pixels *p, Share share, flo
     ALPHA_IN(cell)                                                                                                     \
     if (CONTRIBUTES(taken)) {                                                                                          \
       const floatL alpha = AS_FLOATL(AS_INTL(exp2L(power)) & taken);                                                   \
-      const Share share = take_out(pixels + cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
-      add_gradients(sums, pixels + cell, share, u, v, W11, W12, W22);                                                  \
+      const Share share = take_out(&pixels, cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
+      add_gradients(sums, &pixels, cell, share.g, share.weight, u, v, W11, W12, W22);                                  \
     }                                                                                                                  \
   }
 #endif
@@ -242,8 +256,8 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #else
   PIXEL_TABLES
   RAY_TABLES
-  Pixels pixels[OWNED];
-  Open live = 0; // cells with a pixel that has a gradient
+  Pixels pixels;
+  uint live = 0; // of what is recorded, cells with a pixel that has a gradient
   ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
     const intL stop = LOAD_CELL(int, stops + pixel, stride);
@@ -259,19 +273,25 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
         AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + 3 * plane + pixel, stride) & inside);
 #endif
     const floatL behind = t * AT_END(red * background[0] + green * background[1] + blue * background[2]);
-    const Pixels p = {t, behind, red, green, blue, stop};
-    pixels[cell] = p;
+    pixels.t[cell] = t;
+    pixels.behind[cell] = behind;
+    pixels.red[cell] = red;
+    pixels.green[cell] = green;
+    pixels.blue[cell] = blue;
+    pixels.stop[cell] = stop;
     last = max(last, maxL(stop));
     intL alive = (red != 0.0f) | (green != 0.0f) | (blue != 0.0f);
 #ifdef ALPHA_GRADIENT
     alive |= by_t != 0.0f;
 #endif
 #ifdef NEARNESS
-    pixels[cell].near =
+    pixels.near[cell] =
         AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + NEAR_PLANE * plane + pixel, stride) & inside);
-    alive |= pixels[cell].near != 0.0f;
+    alive |= pixels.near[cell] != 0.0f;
 #endif
-    if (ANYL(alive)) OPEN_CELL(live, cell);
+#ifdef RECORD_CELLS
+    live |= RECORDED(alive) << FIRST_RECORDED(cell);
+#endif
   }
 #endif
   RAISE_TO_GROUP_MAX(last)
@@ -296,32 +316,32 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     const float c_red = splat[SPLAT_RED], c_green = splat[SPLAT_GREEN], c_blue = splat[SPLAT_BLUE];
     NEAR_HERE(1.0f / splat[SPLAT_DEPTH])
 #ifdef RECORD_CELLS
-    const uint reach = LIVE(cells_from_sorted[i], live);
-    if (reach == 0) {
+    const uint recorded = LIVE(cells_from_sorted[i], live), reach = CELLS_OF(recorded);
+    if (recorded == 0) {
       for (int field = 0; field < SLOT_STRIDE; ++field) slot[field] = 0.0f;
       continue;
     }
 #else
     const Reach reach = reach_of(splat, tile_x, tile_y);
 #endif
-    floatL sums[SLOT_STRIDE] = {(floatL)(0.0f)};
+    floatS sums[SLOT_STRIDE] = {(floatS)(0.0f)};
     TAKE_PAIR(reach)
 #if LANES >= 8
     typedef float8 float8U __attribute__((aligned(4)));
     *(__global float8U *)slot = sums8(sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]);
 #else
-    for (int field = 0; field < 8; ++field) slot[field] = sumL(sums[field]);
+    for (int field = 0; field < 8; ++field) slot[field] = sumS(sums[field]);
 #endif
-    slot[SLOT_BLUE] = sumL(sums[SLOT_BLUE]);
+    slot[SLOT_BLUE] = sumS(sums[SLOT_BLUE]);
 #ifdef ABSOLUTE_GRADIENTS
-    slot[SLOT_ABSX] = sumL(sums[SLOT_ABSX]);
-    slot[SLOT_ABSY] = sumL(sums[SLOT_ABSY]);
+    slot[SLOT_ABSX] = sumS(sums[SLOT_ABSX]);
+    slot[SLOT_ABSY] = sumS(sums[SLOT_ABSY]);
 #endif
 #ifdef CONTRIBUTIONS
-    slot[SLOT_WEIGHT] = sumL(sums[SLOT_WEIGHT]);
+    slot[SLOT_WEIGHT] = sumS(sums[SLOT_WEIGHT]);
 #endif
 #ifdef NEARNESS
-    slot[SLOT_NEAR] = sumL(sums[SLOT_NEAR]);
+    slot[SLOT_NEAR] = sumS(sums[SLOT_NEAR]);
 #endif
   }
 #elif defined(BY_GAUSSIAN)

@@ -1,5 +1,6 @@
 // One pass of a stable least-significant-digit radix sort in three launches: the histogram of each chunk, the scan of
-// each digit's counts over the chunks, the scatter. It needs no forward progress between groups.
+// each digit's counts over the chunks, the scatter. It needs no forward progress between groups. Where one item has
+// all keys, one launch does all passes.
 //
 // Owner: A group owns a chunk; in radix_offsets some digits. In the scatter a group of one item takes its keys one
 // after
@@ -66,6 +67,17 @@ GROUP __kernel void radix_offsets(const uint groups, const uint digits, const ui
 // The chunk's keys, values (n), histograms and totals as radix_offsets leaves them -> keys_out, values_out (n);
 // identity != 0 takes positions for values. places[digit]: where the next key with the digit goes.
 #if ITEMS == 1
+static inline void scatter(const uint begin, const uint end, const uint base, const uint shift, const uint digits,
+                           const int identity, __global const uint *keys, __global const uint *values,
+                           __global uint *keys_out, __global uint *values_out, __local uint *places) {
+  for (uint i = begin; i < end; ++i) {
+    const uint key = keys[i];
+    const uint place = places[DIGIT(key)]++;
+    keys_out[place] = key;
+    values_out[place] = identity ? i : values[i];
+  }
+}
+
 GROUP __kernel void radix_scatter(SCATTER) {
   FIND_ELEMENTS(n)
   const uint begin = get_group_id(0) * chunk, end = min(begin + chunk, n);
@@ -74,11 +86,29 @@ GROUP __kernel void radix_scatter(SCATTER) {
     places[digit] = before + histograms[digit * get_num_groups(0) + get_group_id(0)];
     before += totals[digit];
   }
-  for (uint i = begin; i < end; ++i) {
-    const uint key = keys[i];
-    const uint place = places[DIGIT(key)]++;
-    keys_out[place] = key;
-    values_out[place] = identity ? i : values[i];
+  scatter(begin, end, base, shift, digits, identity, keys, values, keys_out, values_out, places);
+}
+
+// keys (n) -> keys and positions in arrays 0 if the number of passes is odd, else in arrays 1.
+GROUP __kernel void radix_sort(ELEMENTS(n), const uint base, const uint digit_bits, const uint passes,
+                               __global const uint *keys, __global uint *keys0, __global uint *values0,
+                               __global uint *keys1, __global uint *values1, __local uint *places) {
+  FIND_ELEMENTS(n)
+  const uint digits = 1u << digit_bits;
+  __global const uint *values = values1;
+  for (uint pass = 0; pass < passes; ++pass) {
+    const uint shift = pass * digit_bits;
+    __global uint *keys_out = pass % 2 ? keys1 : keys0, *values_out = pass % 2 ? values1 : values0;
+    for (uint digit = 0; digit < digits; ++digit) places[digit] = 0;
+    for (uint i = 0; i < n; ++i) COUNT(places[DIGIT(keys[i])]);
+    uint before = 0;
+    for (uint digit = 0; digit < digits; ++digit) {
+      const uint count = places[digit];
+      places[digit] = before;
+      before += count;
+    }
+    scatter(0, n, base, shift, digits, pass == 0, keys, values, keys_out, values_out, places);
+    keys = keys_out, values = values_out;
   }
 }
 #else

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,12 +34,16 @@ class Limits:
     items: int
 
 
-def measure_limits(device: Device, *, seconds: float = 0.1, repeat: int = 5, copy_bytes: int = _COPY_BYTES) -> Limits:
-    """The best of `repeat` runs each; those of the arithmetic are made to last about `seconds`."""
+def measure_limits(
+    device: Device, *, seconds: float = 0.1, repeat: int = 5, copy_bytes: int = _COPY_BYTES, widened: bool = True
+) -> Limits:
+    """The best of `repeat` runs each; those of the arithmetic are made to last about `seconds`. widened: by vectors of
+    16 where blending has them, else by the shape's."""
     items = tile_items(device)
+    defines = {"WIDENED": True} if widened else {}
     return Limits(
-        _pairs_per_second(device, "limit_blend", items, seconds, repeat),
-        _pairs_per_second(device, "limit_blend_grad", items, seconds, repeat),
+        _pairs_per_second(device, "limit_blend", items, seconds, repeat, defines),
+        _pairs_per_second(device, "limit_blend_grad", items, seconds, repeat, defines),
         _copy_rate(device, copy_bytes, repeat),
         device.shape.lanes,
         items,
@@ -57,8 +62,10 @@ def _splats() -> NDArray[np.float32]:
     return splats
 
 
-def _pairs_per_second(device: Device, name: str, items: int, seconds: float, repeat: int) -> float:
-    kernel = getattr(device.kernels("limit", ITEMS=items), name)
+def _pairs_per_second(
+    device: Device, name: str, items: int, seconds: float, repeat: int, defines: Mapping[str, object]
+) -> float:
+    kernel = getattr(device.kernels("limit", ITEMS=items, **defines), name)
     groups = _GROUPS[device.kind] * int(device.cl_device.max_compute_units)
     splats = upload(device, _splats())
     sums = allocate(device, (groups * items,), np.float32)

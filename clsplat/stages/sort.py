@@ -18,12 +18,14 @@ BITONIC_WINS = {"cpu": 512, "gpu": 1024, "other": 1024}
 """Up to this many keys one launch of bitonic sort beats the radix sort's three a pass."""
 
 
+_SORTED = ("keys", "positions")
 SORT_BYTES = 16
 """Bytes of each key that is sorted: keys and positions, each in two arrays that take turns."""
 
 WIDE_DIGIT, WIDE_FROM = 13, 1 << 17
 """Bits of a wide digit, and the number of keys from which it is used, where a group is one item. Its counters fill the
-32 KiB of local memory, and fewer passes save more than the larger histograms cost."""
+32 KiB of local memory, and fewer passes save more than the larger histograms cost. An item that sorts alone has one
+histogram, and always uses it."""
 
 
 def _widest_digit(device: Device, n: int) -> int:
@@ -54,18 +56,24 @@ def radix_sort(
     elements = elements or Elements(n)
     groups, chunk = chunking(device, n, items)
     kernels = device.kernels("sort_radix", ITEMS=items, **elements.defines)
-    passes = max(-(-bits // _widest_digit(device, n)), 1)
+    alone = groups == items == 1
+    passes = max(-(-bits // (WIDE_DIGIT if alone else _widest_digit(device, n))), 1)
     digit_bits = -(-bits // passes) or 1
     digits = 1 << digit_bits
+    counters = cl.LocalMemory(4 * digits)
+    turns = [[work.array(f"{name}_{kind}{turn}", (n,), np.uint32) for kind in _SORTED] for turn in (0, 1)]
+    if alone:
+        numbers = (*elements.arguments, base, digit_bits, passes)
+        launch_groups(device, kernels.radix_sort, 1, 1, *numbers, keys, *turns[0], *turns[1], counters)
+        keys_out, positions_out = turns[(passes - 1) % 2]
+        return keys_out, positions_out
     rows = 1 if items > 1 else -(-digits // device.shape.chunks)
     histograms = work.array("radix_histograms", (digits * groups,), np.uint32)
     totals = work.array("radix_totals", (digits,), np.uint32)
-    counters = cl.LocalMemory(4 * digits)
     positions = keys
     for index in range(passes):
         chunks = (groups, items, *elements.arguments, chunk, base, index * digit_bits, digits)
-        keys_out = work.array(f"{name}_keys{index % 2}", (n,), np.uint32)
-        positions_out = work.array(f"{name}_positions{index % 2}", (n,), np.uint32)
+        keys_out, positions_out = turns[index % 2]
         launch_groups(device, kernels.radix_histogram, *chunks, keys, histograms, counters)
         offsets = (groups, digits, rows, histograms, totals)
         launch_groups(device, kernels.radix_offsets, -(-digits // rows), items, *offsets)

@@ -25,17 +25,17 @@ static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
 }
 
 // Adds g and its moments in pixels to the first fields of a slot; by_u, by_v: to those of the first order.
-static inline void add_moments_by(floatL g, floatL u, floatL v, floatL by_u, floatL by_v, floatL *sums) {
-  const floatL gu = g * u, gv = g * v;
+static inline void add_moments_by(floatS g, floatS u, floatS v, floatS by_u, floatS by_v, floatS *sums) {
+  const floatS gu = g * u, gv = g * v;
   sums[SLOT_G] += g;
   sums[SLOT_GU] += by_u;
   sums[SLOT_GV] += by_v;
-  sums[SLOT_GUU] = fmaL(gu, u, sums[SLOT_GUU]);
-  sums[SLOT_GUV] = fmaL(gu, v, sums[SLOT_GUV]);
-  sums[SLOT_GVV] = fmaL(gv, v, sums[SLOT_GVV]);
+  sums[SLOT_GUU] = fmaS(gu, u, sums[SLOT_GUU]);
+  sums[SLOT_GUV] = fmaS(gu, v, sums[SLOT_GUV]);
+  sums[SLOT_GVV] = fmaS(gv, v, sums[SLOT_GVV]);
 }
 
-static inline void add_moments(floatL g, floatL u, floatL v, floatL *sums) {
+static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
   add_moments_by(g, u, v, g * u, g * v, sums);
 }
 

@@ -140,12 +140,15 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 }
 
 // Pixels' coordinates by table: conversions from integers in the inner loop made a chain through it in some compilers.
+// A cell is in the same place in every table and array: places are a good part of a loop's instructions.
 #define PIXEL_TABLES                                                                                                   \
-  floatL table_x[COLUMNS], table_y[ROWS];                                                                              \
-  for (int column = 0; column < COLUMNS; ++column) table_x[column] = PIXELS_X(column);                                 \
-  for (int row = 0; row < ROWS; ++row) table_y[row] = PIXELS_Y(row * COLUMNS);
-#define AT_X(cell) table_x[(cell) % COLUMNS]
-#define AT_Y(cell) table_y[(cell) / COLUMNS]
+  floatL table_x[CELLS], table_y[CELLS];                                                                               \
+  ALL_CELLS(cell) {                                                                                                    \
+    table_x[cell] = PIXELS_X(cell);                                                                                    \
+    table_y[cell] = PIXELS_Y(cell);                                                                                    \
+  }
+#define AT_X(cell) table_x[cell]
+#define AT_Y(cell) table_y[cell]
 
 // Cells that have a pixel left to fill.
 typedef uint Open;
@@ -158,6 +161,40 @@ typedef uint Open;
 #endif
 
 #define FOR_CELLS(cell, reach) for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
+
+// Cells of the shape's vectors, which are what is recorded, as bits. RECORDED(mask) << FIRST_RECORDED(cell): those in
+// which the mask of a cell has a lane; CELLS_OF(recorded): the cells that they are in; PLACE_OF(each): where in an
+// array of cells, which is one of floatS too, it is.
+#if VECTORS == 1
+#define FIRST_RECORDED(cell) (cell)
+#define RECORDED(mask) ((uint)(ANYL(mask) != 0))
+#define ALL_RECORDED 1
+#define CELLS_OF(recorded) (recorded)
+#define PLACE_OF(each) (each)
+#else // one below the other
+#define FIRST_RECORDED(cell) ((cell) / COLUMNS * (2 * COLUMNS) + (cell) % COLUMNS)
+#define RECORDED(mask) recorded_of(mask)
+#define ALL_RECORDED (1 | 1 << COLUMNS)
+#define CELLS_OF(recorded) cells_of(recorded)
+#define PLACE_OF(each) place_of[each]
+__constant uchar place_of[2 * CELLS] = {0,  2,  4,  6,  1,  3,  5,  7,  8,  10, 12, 14, 9,  11, 13, 15,
+                                        16, 18, 20, 22, 17, 19, 21, 23, 24, 26, 28, 30, 25, 27, 29, 31};
+static inline uint recorded_of(intL mask) {
+  const long4 upper = as_long4(mask.lo), lower = as_long4(mask.hi);
+  const long2 a = upper.lo | upper.hi, b = lower.lo | lower.hi;
+  return (uint)((a.x | a.y) != 0) | (uint)((b.x | b.y) != 0) << COLUMNS;
+}
+static inline uint cells_of(uint recorded) {
+  const uint rows = (recorded | recorded >> COLUMNS) & 0x0f0f0f0f;
+  const uint pairs = (rows | rows >> 4) & 0x00ff00ff;
+  return (pairs | pairs >> 8) & 0xffff;
+}
+#endif
+#ifdef NO_VECTOR_SKIP
+#define REACHED_CELLS(mask) ALL_RECORDED
+#else
+#define REACHED_CELLS(mask) RECORDED(mask)
+#endif
 #else
 typedef struct {
   int x0, x1, y0, y1;

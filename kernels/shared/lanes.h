@@ -3,6 +3,15 @@
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
+// A kernel that is WIDENED has two vectors of the shape in one where the compiler makes code for vectors of 16. No bit
+// changes: what is added up over pixels is added up in floatS, the shape's vectors.
+#if defined(WIDENED) && ITEMS == 1 && LANES == 8 && defined(__AVX512F__) && !defined(RAYS)
+#undef LANES
+#define LANES 16
+#define VECTORS 2
+#else
+#define VECTORS 1
+#endif
 #define CAT_(a, b) a##b
 #define CAT(a, b) CAT_(a, b)
 #if LANES == 1
@@ -66,6 +75,22 @@ static inline floatL fmaL(floatL a, floatL b, floatL c) {
 #endif
 }
 
+#if VECTORS == 1 || defined(SUMS_OF_LANES)
+typedef floatL floatS;
+#define fmaS fmaL
+#else
+#define SUMS_OF_EIGHT
+typedef float8 floatS;
+static inline floatS fmaS(floatS a, floatS b, floatS c) {
+#ifdef FMA_BY_CONTRACTION
+#pragma OPENCL FP_CONTRACT ON
+  return a * b + c;
+#else
+  return fma(a, b, c);
+#endif
+}
+#endif
+
 static inline int maxL(intL x) {
 #if LANES == 16
   const int8 a = max(x.lo, x.hi);
@@ -103,14 +128,24 @@ static inline float sumL(floatL x) {
 #endif
 }
 
+#ifndef SUMS_OF_EIGHT
+#define sumS sumL
+#else
+static inline float sumS(floatS x) {
+  const float4 b = x.lo + x.hi;
+  const float2 c = b.lo + b.hi;
+  return c.x + c.y;
+}
+#endif
+
 #if LANES >= 8
-#if LANES == 16
+#if LANES == 16 && !defined(SUMS_OF_EIGHT)
 #define EIGHT(x) ((x).lo + (x).hi)
 #else
 #define EIGHT(x) (x)
 #endif
-// The sums of eight vectors, each as sumL adds it up, in fewer steps than one after the other.
-static inline float8 sums8(floatL x0, floatL x1, floatL x2, floatL x3, floatL x4, floatL x5, floatL x6, floatL x7) {
+// The sums of eight vectors, each as sumS adds it up, in fewer steps than one after the other.
+static inline float8 sums8(floatS x0, floatS x1, floatS x2, floatS x3, floatS x4, floatS x5, floatS x6, floatS x7) {
   const float8 a = EIGHT(x0), b = EIGHT(x1), c = EIGHT(x2), d = EIGHT(x3);
   const float8 e = EIGHT(x4), f = EIGHT(x5), g = EIGHT(x6), h = EIGHT(x7);
   const float8 ae = (float8)(a.lo, e.lo) + (float8)(a.hi, e.hi);

@@ -10,9 +10,9 @@ from quick import quick
 
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.stages.scan import MOST_GROUPS, PER_ITEM, scan
+from clsplat.stages.scan import LEAST_CHUNK, MOST_GROUPS, PER_ITEM, scan
 
-SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 4096, 4097, 8 * 1024 + 1, 100_003)
+SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 4096, 4097, LEAST_CHUNK - 1, LEAST_CHUNK, LEAST_CHUNK + 1, 100_003)
 
 
 def check(device: Device, n: int) -> None:
@@ -38,7 +38,7 @@ def test_scan_in_every_size_of_group(device: Device, items: int) -> None:
 
 
 def test_scan_in_place(shaped_device: Device) -> None:
-    values = np.arange(5000, dtype=np.uint32)
+    values = np.arange(3 * LEAST_CHUNK - 1, dtype=np.uint32)
     work = Workspace(shaped_device)
     array, out = upload(shaped_device, values), allocate(shaped_device, (1,), np.uint32)
     scan(shaped_device, work, array, array, out)
@@ -51,9 +51,9 @@ def test_nothing_to_scan(shaped_device: Device) -> None:
     assert out.get()[0] == 0
 
 
-@pytest.mark.parametrize(("n", "value"), [(3000, 0x00200000), (9, 0x80000000), (5000, 0x000D1B72)])
+@pytest.mark.parametrize(("n", "value"), [(48_000, 0x00020000), (9, 0x80000000), (50_000, 0x00014F8C)])
 def test_a_total_over_32_bits_is_told(shaped_device: Device, n: int, value: int) -> None:
-    """Over many chunks, within one, and by little: 2^32 + 2704."""
+    """Over many chunks, within one, and by little: 2^32 + 32,704."""
     values = upload(shaped_device, np.full(n, value, np.uint32))
     total = allocate(shaped_device, (1,), np.uint32)
     scan(shaped_device, Workspace(shaped_device), values, values, total)
