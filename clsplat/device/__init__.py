@@ -12,6 +12,7 @@ from clsplat.process import undisturbed
 
 # before a driver is loaded
 quirks.make_cache_folder()
+quirks.pin_threads()
 quirks.offer_packaged()
 with undisturbed():  # an exception of a signal's handler while it is imported would abort the process
     import pyopencl as cl  # for all that follow

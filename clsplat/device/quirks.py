@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Differences between drivers. This is the one module that knows drivers by their names.
 
-It is imported before pyopencl: what `offer_packaged` and `make_cache_folder` put into the environment is read as a
-driver is loaded.
+It is imported before pyopencl: what `offer_packaged`, `make_cache_folder` and `pin_threads` put into the environment is
+read as a driver is loaded.
 """
 
 from __future__ import annotations
@@ -31,9 +31,15 @@ _ICD_FILENAMES = "OCL_ICD_FILENAMES"
 _INTEL = Path("Library", "bin", "intelocl64.dll")
 """Path of intel-opencl-rt's driver, below `sys.prefix`, with the libraries that it needs beside it."""
 _POCL_CACHE = "POCL_CACHE_DIR"
+_POCL_PINNED = "POCL_AFFINITY"
+_POCL_COUNTS = ("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "POCL_MAX_COMPUTE_UNITS")
+"""Variables, by version, that have PoCL use fewer processors than there are."""
 _VENDORS = "OCL_ICD_VENDORS"
 """Variable for another folder of drivers than the system's."""
-VARIABLES = (_VENDORS, _ICD_FILENAMES, _POCL_CACHE, "POCL_DEVICES", "RUSTICL_ENABLE", "CUDA_VISIBLE_DEVICES")
+VARIABLES = (
+    *(_VENDORS, _ICD_FILENAMES, _POCL_CACHE, _POCL_PINNED, *_POCL_COUNTS),
+    *("POCL_DEVICES", "RUSTICL_ENABLE", "CUDA_VISIBLE_DEVICES"),
+)
 """Variables of loaders and drivers that change which devices there are, or how they work."""
 MAKERS = {0x10DE: "NVIDIA", 0x1002: "AMD", 0x8086: "Intel"}
 """Makers of GPUs by their number on the PCI bus."""
@@ -233,6 +239,19 @@ def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Pat
     atexit.register(remove)
     environment[_POCL_CACHE] = folder
     return Path(folder)
+
+
+def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Have each thread of PoCL keep to the processor of its number, in this process and its children.
+
+    Else two threads that wake up together are on one processor for whole kernels while another idles. Not where the
+    process may use but some processors, or PoCL is told to: two processes of one thread each would share the first. A
+    variable that is set is left as it is.
+    """
+    if sys.platform != "linux" or any(environment.get(name) for name in (_POCL_PINNED, *_POCL_COUNTS)):
+        return
+    if os.sched_getaffinity(0) == set(range(os.cpu_count() or 0)):
+        environment[_POCL_PINNED] = "1"
 
 
 def _can_be_made(folder: Path) -> bool:
