@@ -14,7 +14,7 @@
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 // section 6
 //   and algorithm 2.
-#define WIDENED
+#include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
@@ -34,7 +34,9 @@
 #define RECORD(statements)
 #endif
 // By ellipse few vectors are visited in vain: the test costs more than they.
-#ifdef RECORD_CELLS
+#if defined(RECORD_CELLS) && VECTORS > 1 // a cell of two vectors is open as long as one of them is
+#define CONTRIBUTES(mask) REACHED_CELLS((mask) & MASKL(pixels[cell].t > 0.0f))
+#elif defined(RECORD_CELLS)
 #define CONTRIBUTES(mask) REACHED_CELLS(mask)
 #elif defined(CELLS_BY_ELLIPSE)
 #define CONTRIBUTES(mask) 1

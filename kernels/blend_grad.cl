@@ -13,7 +13,7 @@
 // Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
 // after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
 // moments of g = alpha * dL/dalpha in (u, v); with CONTRIBUTIONS there is the sum of the weights too (55).
-#define WIDENED
+#include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/splat.h"
 #include "shared/lanes.h"

@@ -5,7 +5,8 @@
 // Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep the work from being left out.
 //   limit_copy: from (n) -> to (n).
 // Equations: those of blend.cl and blend_grad.cl, with no branch.
-#define SUMS_OF_LANES // WIDENED by who launches it: nobody compares them
+#define SUMS_OF_LANES // no bit of them is looked at
+#include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"

@@ -16,7 +16,7 @@ behind every other step, and the median counts, as of the steps: so neighbours o
 (20000 repetitions of limit.c). Build it for the vectors that the machine has: with wider ones it is too slow, and the
 peer would look slower than it is. For the same reason clsplat's own kernel of that limit is measured too, by the
 shape's vectors, and counts where it is the faster. (By vectors of 16 it does a quarter more than limit.c on AVX-512, as
-a pair takes it fewer operations: what it would have done where the peer was is not known.) --limit-gpairs is a figure
+a pair takes it fewer operations; its figure where the peer was is not known.) --limit-gpairs is a figure
 known already, and is taken as it is.
 """
 

@@ -38,6 +38,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.depth import KnownDepth
 from clsplat.scenes.scene import Scene
+from clsplat.stages import scan as stages_scan
 from clsplat.stages.adam import adam, add_view
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.density import Marker, carry, gather, new_statistics
@@ -275,9 +276,17 @@ def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene
 
 
 def sorts(device: Device) -> None:
-    """Both sorts, the radix sort with several groups and passes; scans with them."""
+    """Both sorts, the radix sort with several groups and passes, and of one item alone; scans with them."""
     rng, work = np.random.default_rng(4), Workspace(device)
-    for n, bits, sort in ((300, 16, None), (2500, 13, radix_sort), (77, 5, radix_sort), (1, 1, radix_sort)):
+    few = stages_scan.MOST_ALONE
+    for alone, n, bits, sort in (
+        (few, 300, 16, None),
+        (few, 700, 20, radix_sort),
+        (0, 2500, 13, radix_sort),
+        (0, 77, 5, radix_sort),
+        (few, 1, 1, radix_sort),
+    ):
+        stages_scan.MOST_ALONE = alone
         keys = rng.integers(0, 1 << bits, n).astype(np.uint32)
         on_device = upload(device, keys)
         done = sort(device, work, "keys", on_device, bits) if sort else bitonic_sort(device, work, "keys", on_device)
@@ -285,7 +294,9 @@ def sorts(device: Device) -> None:
         if not (np.array_equal(done[0].get(), keys[order]) and np.array_equal(done[1].get(), order)):
             raise SystemExit(f"{n} keys were not sorted")
     values, total = upload(device, np.ones(2100, np.uint32)), allocate(device, (1,), np.uint32)
+    stages_scan.MOST_ALONE = 0
     scan(device, work, values, values, total)  # more than one chunk
+    stages_scan.MOST_ALONE = few
     if int(total.get()[0]) != 2100:
         raise SystemExit("2100 values were not added up")
 

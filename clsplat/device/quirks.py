@@ -245,10 +245,10 @@ def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
     """Have each thread of PoCL keep to the processor of its number, in this process and its children.
 
     Else two threads that wake up together are on one processor for whole kernels while another idles. Not where the
-    process may use but some processors, or PoCL is told to: two processes of one thread each would share the first. A
-    variable that is set is left as it is.
+    process may use only some processors, or PoCL is told to use fewer: two processes of one thread each would share the
+    first. A variable that is set is left as it is.
     """
-    if sys.platform != "linux" or any(environment.get(name) for name in (_POCL_PINNED, *_POCL_COUNTS)):
+    if sys.platform != "linux" or any(name in environment for name in (_POCL_PINNED, *_POCL_COUNTS)):
         return
     if os.sched_getaffinity(0) == set(range(os.cpu_count() or 0)):
         environment[_POCL_PINNED] = "1"

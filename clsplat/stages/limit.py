@@ -40,7 +40,7 @@ def measure_limits(
     """The best of `repeat` runs each; those of the arithmetic are made to last about `seconds`. widened: by vectors of
     16 where blending has them, else by the shape's."""
     items = tile_items(device)
-    defines = {"WIDENED": True} if widened else {}
+    defines = {} if widened else {"NARROW": True}
     return Limits(
         _pairs_per_second(device, "limit_blend", items, seconds, repeat, defines),
         _pairs_per_second(device, "limit_blend_grad", items, seconds, repeat, defines),
@@ -88,6 +88,6 @@ def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
     copy.fill(0.0)  # so that its pages are there
-    kernel = device.kernels("limit", ITEMS=tile_items(device)).limit_copy
+    kernel = device.kernels("limit", ITEMS=tile_items(device), NARROW=True).limit_copy
     runs = [device.timed(lambda: launch_items(device, kernel, n // lanes, n, source, copy)) for _ in range(repeat + 1)]
     return 8e3 * n / min(ms for _, ms in runs)

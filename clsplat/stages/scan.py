@@ -14,8 +14,9 @@ from clsplat.device.launch import launch_groups
 
 PER_ITEM = 16
 """Elements of a chunk for each item of a group, or a multiple of it."""
-LEAST_CHUNK = 1 << 14
-"""Elements of a chunk at least, where a group is one item: fewer are done sooner than another launch begins."""
+LEAST_CHUNK, MOST_ALONE = 1024, 1 << 14
+"""Elements of a chunk at least, where a group is one item, and up to how many are one chunk: they are done sooner than
+another launch begins."""
 MOST_GROUPS = 2048
 """Groups of more than one item that share a scan or sort: each reads what all before it have counted."""
 
@@ -45,7 +46,7 @@ def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
     shape's."""
     items = items or device.shape.items
     if items == 1:
-        chunk = max(-(-n // device.shape.chunks), LEAST_CHUNK)
+        chunk = max(-(-n // device.shape.chunks), LEAST_CHUNK) if n > MOST_ALONE else max(n, 1)
     else:
         tile = items * PER_ITEM
         chunk = tile * max(-(-n // (tile * MOST_GROUPS)), 1)

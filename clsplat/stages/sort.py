@@ -15,7 +15,7 @@ BITONIC_MAX = 2048
 """Number of keys that, with their positions, fill 16 KiB of local memory: half of what every device has."""
 
 BITONIC_WINS = {"cpu": 512, "gpu": 1024, "other": 1024}
-"""Up to this many keys one launch of bitonic sort beats the radix sort's three a pass."""
+"""Up to this many keys bitonic sort beats the radix sort's launches."""
 
 
 _SORTED = ("keys", "positions")
@@ -61,10 +61,12 @@ def radix_sort(
     digit_bits = -(-bits // passes) or 1
     digits = 1 << digit_bits
     counters = cl.LocalMemory(4 * digits)
-    turns = [[work.array(f"{name}_{kind}{turn}", (n,), np.uint32) for kind in _SORTED] for turn in (0, 1)]
+    turns = [
+        [work.array(f"{name}_{kind}{turn}", (n,), np.uint32) for kind in _SORTED] for turn in range(min(passes, 2))
+    ]
     if alone:
         numbers = (*elements.arguments, base, digit_bits, passes)
-        launch_groups(device, kernels.radix_sort, 1, 1, *numbers, keys, *turns[0], *turns[1], counters)
+        launch_groups(device, kernels.radix_sort, 1, 1, *numbers, keys, *turns[0], *turns[-1], counters)
         keys_out, positions_out = turns[(passes - 1) % 2]
         return keys_out, positions_out
     rows = 1 if items > 1 else -(-digits // device.shape.chunks)

@@ -3,13 +3,7 @@
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
-// A kernel that is WIDENED has two vectors of the shape in one where the compiler makes code for vectors of 16. No bit
-// changes: what is added up over pixels is added up in floatS, the shape's vectors.
-#if defined(WIDENED) && ITEMS == 1 && LANES == 8 && defined(__AVX512F__) && !defined(RAYS)
-#undef LANES
-#define LANES 16
-#define VECTORS 2
-#else
+#ifndef VECTORS // of the shape in one: widened.h
 #define VECTORS 1
 #endif
 #define CAT_(a, b) a##b

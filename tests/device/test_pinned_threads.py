@@ -39,6 +39,6 @@ def test_not_where_pocl_has_fewer_threads(monkeypatch: pytest.MonkeyPatch, name:
     assert pinned(monkeypatch, {0, 1, 2, 3}, **{name: "1"}) == {name: "1"}
 
 
-@pytest.mark.parametrize("value", ["0", "1"])
+@pytest.mark.parametrize("value", ["0", "1", ""])
 def test_a_variable_that_is_set_is_left(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     assert pinned(monkeypatch, {0, 1, 2, 3}, POCL_AFFINITY=value) == {"POCL_AFFINITY": value}

@@ -19,12 +19,12 @@ from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
 from clsplat.stages.density import add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.project import project_step
-from clsplat.stages.scan import Elements, scan
+from clsplat.stages.scan import MOST_ALONE, Elements, scan
 from clsplat.stages.sort import BITONIC_MAX, bitonic_sort, radix_sort
 
 SEAMS = [
     (most, count)
-    for most in (1, 64, 1023, 1024, 1025, 4097, 20_000)
+    for most in (1, 64, 1023, 1024, 1025, MOST_ALONE, MOST_ALONE + 1, 20_000)
     for count in sorted({0, 1, most // 3, most - 1, most})
 ]
 """Elements that a launch is for at most, about a group's and a chunk's, and elements that there are."""

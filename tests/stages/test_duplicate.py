@@ -20,6 +20,7 @@ from clsplat.reference.tiles import touched_tiles
 from clsplat.stages import scan as stages_scan
 from clsplat.stages.duplicate import count
 from clsplat.stages.project import Projected
+from clsplat.stages.scan import MOST_ALONE
 from clsplat.stages.sort import BITONIC_WINS
 
 NAMES = [*scenes.NAMED, "cloud"]
@@ -149,7 +150,7 @@ def counted(device: Device, depths: np.ndarray, visible: np.ndarray, **options: 
     return count(device, Workspace(device), Projected(upload(device, splats), upload(device, tiles)), **options)
 
 
-@pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1025, 9000])
+@pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1025, 9000, MOST_ALONE + 1])
 def test_key_bits_are_those_in_which_the_visible_depths_differ(shaped_device: Device, n: int) -> None:
     rng = np.random.default_rng(n)
     depths, visible = rng.uniform(1.5, 11, n).astype(np.float32), rng.random(n) < 0.7
@@ -173,7 +174,8 @@ def test_key_bits_of_no_gaussian_and_of_equal_ones(shaped_device: Device) -> Non
 
 
 def test_fewer_bits_are_fewer_launches(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages_scan, "LEAST_CHUNK", 256)  # else one item sorts so few alone, in one launch
+    monkeypatch.setattr(stages_scan, "MOST_ALONE", 0)  # else one item sorts so few alone, in one launch
+    monkeypatch.setattr(stages_scan, "LEAST_CHUNK", 256)
     device = default_device.with_shape()  # with a recorder of its own: nobody else's launches are counted
     gaussians, camera = make("cloud")
     # Depths from 2 to 3 differ in 22 bits: two digits of 11 rather than three.

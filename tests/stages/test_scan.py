@@ -10,9 +10,9 @@ from quick import quick
 
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.stages.scan import LEAST_CHUNK, MOST_GROUPS, PER_ITEM, scan
+from clsplat.stages.scan import MOST_ALONE, MOST_GROUPS, PER_ITEM, scan
 
-SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 4096, 4097, LEAST_CHUNK - 1, LEAST_CHUNK, LEAST_CHUNK + 1, 100_003)
+SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 4096, 4097, MOST_ALONE - 1, MOST_ALONE, MOST_ALONE + 1, 100_003)
 
 
 def check(device: Device, n: int) -> None:
@@ -38,7 +38,7 @@ def test_scan_in_every_size_of_group(device: Device, items: int) -> None:
 
 
 def test_scan_in_place(shaped_device: Device) -> None:
-    values = np.arange(3 * LEAST_CHUNK - 1, dtype=np.uint32)
+    values = np.arange(3 * MOST_ALONE - 1, dtype=np.uint32)
     work = Workspace(shaped_device)
     array, out = upload(shaped_device, values), allocate(shaped_device, (1,), np.uint32)
     scan(shaped_device, work, array, array, out)

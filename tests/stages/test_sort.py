@@ -14,11 +14,11 @@ from quick import quick
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.stages import scan as stages_scan
-from clsplat.stages.scan import LEAST_CHUNK, PER_ITEM
+from clsplat.stages.scan import MOST_ALONE, PER_ITEM
 from clsplat.stages.sort import BITONIC_MAX, BITONIC_WINS, WIDE_DIGIT, WIDE_FROM, bitonic_sort, radix_sort, sort
 
 SIZES = (0, 1, 2, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 2048)
-RADIX_SIZES = (*SIZES, 4095, 4096, 4097, 8 * 1024 + 1, LEAST_CHUNK - 1, LEAST_CHUNK, LEAST_CHUNK + 1, 70_001)
+RADIX_SIZES = (*SIZES, 4095, 4096, 4097, 8 * 1024 + 1, MOST_ALONE - 1, MOST_ALONE, MOST_ALONE + 1, 70_001)
 
 
 def check(keys: NDArray[np.uint32], result: tuple[NDArray[np.uint32], NDArray[np.uint32]]) -> None:
@@ -77,7 +77,7 @@ def test_one_item_sorts_a_chunk_in_one_launch(device: Device) -> None:
     """And leaves what it has in the arrays of its last pass: one, two and three passes."""
     alone = shaped(device, 1, 1)
     for bits in (WIDE_DIGIT, WIDE_DIGIT + 1, 32):
-        keys = np.random.default_rng(bits).integers(0, 2**bits, LEAST_CHUNK, dtype=np.uint32)
+        keys = np.random.default_rng(bits).integers(0, 2**bits, MOST_ALONE, dtype=np.uint32)
         before = copy(alone.calls)
         check(keys, radix(alone, keys, bits))
         assert alone.calls.since(before).launches == 1
