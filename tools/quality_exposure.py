@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photographs whose exposure changes against the same photographs as they were, with and without --appearance.
 
-    .venv/bin/python tools/quality_exposure.py SCENE FOLDER [--size 200] [--iterations 2000] [--seed 0]
+    .venv/bin/python tools/quality_exposure.py SCENE FOLDER [--resolution 200] [--iterations 2000] [--seed 0]
         [--appearance exposure] [--rate 2e-3] [--only NAME ...]
 
-Writes the scene's photographs at that size as float EXR into FOLDER, once as they are and once times 2^U(-1, 1), so
-that nothing clips, and trains on each of them with and without. All models are measured against the held-out
+Writes the scene's photographs at that resolution as float EXR into FOLDER, once as they are and once times 2^U(-1, 1),
+so that nothing clips, and trains on each of them with and without. All models are measured against the held-out
 photographs as they are, after the affine map of colours that fits them best. Gains that were learnt are compared with
 those put on, but for a common factor: largest and mean error; then but for those learnt of the photographs as they
 are too, whose exposure may change as well. A row that FOLDER has already, of the same settings, is printed again.
@@ -88,14 +88,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--size", type=int, default=200, help="longest side of the photographs, in pixels")
+    parser.add_argument("--resolution", type=int, default=200, help="longest side of the photographs; 0: as they are")
     parser.add_argument("--iterations", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--appearance", default="exposure")
     parser.add_argument("--rate", type=float, default=TrainConfig.appearance_rate)
     parser.add_argument("--only", nargs="*", choices=ROWS, default=list(ROWS))
     options = parser.parse_args()
-    device, clean = open_device(), load_scene(options.scene, resolution=options.size)
+    device, clean = open_device(), load_scene(options.scene, resolution=options.resolution)
     gains = 2.0 ** np.random.default_rng(options.seed).uniform(-1, 1, len(clean.views))
     config = TrainConfig(
         iterations=options.iterations,
@@ -113,7 +113,7 @@ def main() -> None:
     keys: dict[str, str] = {}
     for name in options.only:
         learns = (options.appearance, options.rate) if ROWS[name][1] else ()
-        key = keys[name] = " ".join(map(str, (name, options.size, options.iterations, options.seed, *learns)))
+        key = keys[name] = " ".join(map(str, (name, options.resolution, options.iterations, options.seed, *learns)))
         if key not in rows:
             rows[key] = row(name, clean, options.folder, gains, config, device)
             atomic_write(known, json.dumps(rows).encode())

@@ -58,9 +58,9 @@ class Row:
 
 
 HALVES = {
-    "budget": ("--density.growth", "budget"),
-    "long axis": ("--density.growth", "budget", "--density.long-axis"),
-    "mcmc": ("--density.growth", "mcmc"),
+    "budget": ("--schedule", "short", "--density.growth", "budget"),
+    "long axis": ("--schedule", "short", "--density.growth", "budget", "--density.long-axis"),
+    "mcmc": ("--schedule", "mcmc"),
 }
 """Rows of the growth table that get half of the Gaussians."""
 FEWEST = ("bonsai", 290_000)
@@ -76,13 +76,13 @@ def growth_rows() -> list[Row]:
         rows += [Row(f"{scene} default", scene), Row(f"{scene} short", scene, ("--schedule", "short"))]
         ends = (f"{scene} default", f"{scene} short")
         for name, more in HALVES.items():
-            rows.append(Row(f"{scene} {name}", scene, ("--schedule", "short", *more), half_of=ends))
+            rows.append(Row(f"{scene} {name}", scene, more, half_of=ends))
     ends = (f"{BY_PAPER} default", f"{BY_PAPER} short")
-    rows.append(Row(f"{BY_PAPER} mcmc paper", BY_PAPER, (*HALVES["mcmc"], "--density.stop", "{stop}"), half_of=ends))
+    by_paper = ("--density.growth", "mcmc", "--density.stop", "{stop}")
+    rows.append(Row(f"{BY_PAPER} mcmc paper", BY_PAPER, by_paper, half_of=ends))
     scene, most = FEWEST
-    settings = ("--schedule", "short", *HALVES["mcmc"], "--density.max-gaussians", str(most))
-    few = Row(f"{scene} mcmc {most // 1000}k", scene, settings)
-    return [*rows, few, Row(f"{few.name} antialiased", scene, (*settings, "--antialiased"))]
+    settings = (*HALVES["mcmc"], "--density.max-gaussians", str(most))
+    return [*rows, Row(f"{scene} mcmc {most // 1000}k", scene, settings)]
 
 
 def antialiasing_rows() -> list[Row]:
@@ -95,18 +95,20 @@ def antialiasing_rows() -> list[Row]:
 
 
 TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antialiasing": antialiasing_rows}
-FEW_VIEWS = ("--iterations", "{iterations}", "--seeds", "0,1", "--try", "thinning:thinning=0.2")
+SIZED = ("--iterations", "{iterations}", "--resolution", "{resolution}")
 AUTO = ("--try", "auto:thinning=0.2,penalty=0.02,iterations=2000")
 """Settings that --auto takes for few photographs."""
 TOOLS: dict[str, tuple[str, ...]] = {
-    "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", "--iterations", "{iterations}"),
+    "masks": ("quality_masks.py", "{scenes}/fox", "{work}", *SIZED),
+    "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED),
+    "exposure of seed 1": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED, "--seed", "1"),
     "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
     "poses": ("quality_poses.py", "{work}", "--width", "320", "--iterations", "{iterations}"),
     "lenses": ("quality_poses.py", "{work}", "--width", "320", "--lens", "2", "--iterations", "{iterations}"),
     "points": ("quality_points.py", "{work}", "--iterations", "{iterations}"),
     "real points": ("quality_points.py", "{work}", "--rgbd", "{scenes}/rgbd_7scenes", "--iterations", "{iterations}"),
-    "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *FEW_VIEWS, *AUTO),
-    "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *FEW_VIEWS, *AUTO),
+    "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *SIZED, "--seeds", "0,1", *AUTO),
+    "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *SIZED, "--seeds", "0,1", *AUTO),
 }
 """Tables that tools of their own print: the commands, with the folder of scenes, one to work in, and the steps."""
 
@@ -141,10 +143,12 @@ class Book:
         run = self.folder / table / f"{row.name.replace(' ', '-')}-{seed}-{code}"
         run.parent.mkdir(exist_ok=True)
         print(f"{table}: {row.name}, seed {seed}", file=sys.stderr, flush=True)
-        size = ("--iterations", str(self.iterations), "--resolution", str(self.resolution))
-        given = [*size, *settings, "--seed", str(seed), "--no-report"]
-        how = ["--resume"] if (run / "config.toml").exists() else []
-        _clsplat("train", str(self.scenes / row.scene), "-o", str(run), *given, *how)
+        if (run / "config.toml").exists():
+            _clsplat("train", "--resume", "-o", str(run), "--no-report")
+        else:
+            size = ("--iterations", str(self.iterations), "--resolution", str(self.resolution))
+            given = [*size, *settings, "--seed", str(seed), "--no-report"]
+            _clsplat("train", str(self.scenes / row.scene), "-o", str(run), *given)
         found = json.loads((run / "eval.json").read_text("utf-8"))
         sizes = tuple(self._psnr_at(run, size) for size in row.sizes)
         today, psnr, ssim = datetime.now(timezone.utc).date().isoformat(), found["mean"]["psnr"], found["mean"]["ssim"]
@@ -162,7 +166,8 @@ class Book:
         done = self.folder / f"{table}.md"
         if not done.exists():
             print(f"{table}: {TOOLS[table][0]}", file=sys.stderr, flush=True)
-            known = {"scenes": self.scenes, "work": self.folder / table, "iterations": self.iterations}
+            known = {"scenes": self.scenes, "work": self.folder / table}
+            known |= {"iterations": self.iterations, "resolution": self.resolution}
             name, *more = (word.format(**known) for word in TOOLS[table])
             words = _run([sys.executable, str(ROOT / "tools" / name), *more])
             atomic_write(done, words.encode())

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from tiny import write_scene
 
 from clsplat.cli.main import main
-from clsplat.config.presets import PRESETS, bundled, scheduled
+from clsplat.config.presets import PRESETS, Schedule, bundled, scheduled
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.runs.run import Run
 
@@ -112,9 +113,15 @@ def test_the_papers_schedule_is_the_default() -> None:
     assert scheduled("paper", 7000) == TrainConfig(iterations=7000)
 
 
+def capped(config: TrainConfig) -> TrainConfig:
+    """The settings with the number of Gaussians that growth by mcmc wants."""
+    return replace(config, density=replace(config.density, max_gaussians=1000))
+
+
+@pytest.mark.parametrize("schedule", ["short", "mcmc"])
 @pytest.mark.parametrize("iterations", [1, 2, 13, 7000, 30_000])
-def test_the_short_schedule_makes_sense_for_any_number_of_steps(iterations: int) -> None:
-    config = scheduled("short", iterations)
+def test_a_schedule_makes_sense_for_any_number_of_steps(schedule: Schedule, iterations: int) -> None:
+    config = capped(scheduled(schedule, iterations))
     config.check()
     assert config.iterations == config.optimiser.means_rate_steps == iterations
     assert config.density.stop + config.optimiser.cooldown <= iterations
@@ -123,9 +130,11 @@ def test_the_short_schedule_makes_sense_for_any_number_of_steps(iterations: int)
 @pytest.mark.parametrize("iterations", [1, 2, 3, 13, 7000, 30_000])
 def test_presets_make_sense_for_any_number_of_steps(iterations: int) -> None:
     for preset, rasterizer in PRESETS.items():
-        for schedule in (None, "paper", "short"):
+        for schedule in (None, *get_args(Schedule)):
+            if (preset, schedule) == ("fast", "mcmc"):
+                continue
             config = bundled(preset, schedule, iterations)
-            config.check()
+            capped(config).check()
             assert config.iterations == iterations
             assert config.rasterizer == rasterizer
     assert bundled("default", None, iterations) == bundled("exact", None, iterations) == scheduled("paper", iterations)
@@ -144,6 +153,18 @@ def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> 
     assert Run.open(run).config == wanted, "flags go before the bundles, which go together"
     assert main(["train", "-o", str(run), "--resume", *short]) == 2
     assert "--schedule short and --resume" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_mcmc_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    words = ["train", str(scene), "-o", str(run), "--schedule", "mcmc", "--iterations", "14"]
+    assert main(words) == 2
+    assert "--density.growth mcmc: expected --density.max-gaussians too" in capsys.readouterr().err
+    assert main([*words, "--density.max-gaussians", "1000", "--preset", "fast"]) == 2
+    assert "--preset fast and --schedule mcmc exclude each other" in capsys.readouterr().err
+    assert main([*words, "--density.max-gaussians", "1000"]) == 0
+    assert Run.open(run).config == capped(scheduled("mcmc", 14))
 
 
 def test_a_setting_that_two_places_have_has_one_default() -> None:

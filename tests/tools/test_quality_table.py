@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ class FakeClsplat:
 
     def __init__(self, ends: int = 0) -> None:
         self.calls: list[tuple[str, ...]] = []
+        self.seeds: dict[Path, int] = {}
         self.ends = ends
 
     def __call__(self, *arguments: str) -> str:
@@ -29,14 +31,18 @@ class FakeClsplat:
         if arguments[0] == "eval":
             return json.dumps({"mean": {"psnr": 20.0 + int(arguments[3])}})
         run = Path(arguments[3])
+        assert ("--resume" in arguments) == (run in self.seeds), "a run that is there goes on"
+        if "--resume" in arguments:
+            assert "--schedule" not in arguments, "the run has its settings"
+        else:
+            self.seeds[run] = int(arguments[arguments.index("--seed") + 1])
         run.mkdir(parents=True, exist_ok=True)
         (run / "config.toml").write_text("")
         if self.ends:
             self.ends -= 1
             raise SystemExit("interrupted")
         psnr = 31.0 if "short" in run.name else 30.0
-        seed = int(arguments[arguments.index("--seed") + 1])
-        count = (1000 if "short" in run.name else 500) + 10 * seed
+        count = (1000 if "short" in run.name else 500) + 10 * self.seeds[run]
         told = {"mean": {"psnr": psnr, "ssim": 0.9}, "gaussians": count, "seconds": 7.0}
         (run / "eval.json").write_text(json.dumps(told))
         session = {"device": "a device", "driver": "a driver 1.0  and its parts"}
@@ -141,8 +147,8 @@ def test_an_interrupted_row_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(quality_table, "_clsplat", fake)
     book = book_at(tmp_path, 1)
     with pytest.raises(SystemExit):
-        book.results("growth", ENDS[0], ENDS)
-    book.results("growth", ENDS[0], ENDS)
+        book.results("growth", ENDS[1], ENDS)
+    book.results("growth", ENDS[1], ENDS)
     assert ["--resume" in call for call in fake.calls] == [False, True]
 
 
@@ -191,3 +197,25 @@ def test_only_the_rows_that_are_asked_for(
     assert settings[settings.index("--density.stop") + 1] == "500"
     assert quality_table.main([*where, "--rows", "fax *"]) == 2
     assert capsys.readouterr().err.endswith("--rows fax *: no such row; --list prints them\n")
+
+
+def test_tools_of_other_tables_are_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their commands, with every word filled in."""
+    commands: list[list[str]] = []
+
+    def run(command: Sequence[str]) -> str:
+        commands.append([str(word) for word in command[1:]])
+        return "a table\n"
+
+    monkeypatch.setattr(quality_table, "_run", run)
+    book = book_at(tmp_path, 1)
+    for table in quality_table.TOOLS:
+        assert book.printed(table) == "a table\n"
+    assert len(commands) == len(quality_table.TOOLS)
+    for path, *words in commands:
+        assert Path(path).is_file()
+        assert not any("{" in word or "}" in word for word in words)
+    folders = [next(word for word in words if word.startswith(str(book.folder))) for _, *words in commands]
+    assert len(set(folders)) == len(folders), "two tables would take each other's runs"
+    assert [book.printed(table) for table in quality_table.TOOLS] == ["a table\n"] * len(folders)
+    assert len(commands) == len(folders), "a table that is there is not made again"
