@@ -60,7 +60,7 @@ class Row:
 HALVES = {
     "budget": ("--schedule", "short", "--density.growth", "budget"),
     "long axis": ("--schedule", "short", "--density.growth", "budget", "--density.long-axis"),
-    "mcmc": ("--schedule", "mcmc"),
+    "mcmc": ("--schedule", "high-rates", "--density.growth", "mcmc"),
 }
 """Rows of the growth table that get half of the Gaussians."""
 FEWEST = ("bonsai", 290_000)

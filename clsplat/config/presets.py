@@ -11,7 +11,7 @@ from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import InputError
 
 Preset = Literal["exact", "default", "fast"]
-Schedule = Literal["paper", "short", "mcmc"]
+Schedule = Literal["paper", "short", "high-rates"]
 PRESETS: dict[Preset, RasterizerConfig] = {
     "exact": RasterizerConfig(),
     "default": RasterizerConfig(),
@@ -27,9 +27,8 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
     paper: the defaults, made for 30,000 steps, whatever `iterations` is. short: for runs of about 7000 steps, in which
     the paper's rates leave a model unfinished. Colours, opacities and rotations learn faster, SH degrees come twice as
     fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
-    (docs/decisions/0013-a-short-schedule.md). mcmc: the same with growth by mcmc, which wants `density.max_gaussians`
-    too; means, sizes, rotations and colours by direction learn faster still, and cool down further
-    (docs/decisions/0031-rates-for-mcmc.md).
+    (docs/decisions/0013-a-short-schedule.md). high-rates: the same, but means, sizes, rotations and colours by
+    direction learn faster still, and cool down further (docs/decisions/0031-high-rates.md).
     """
     if schedule == "paper":
         return TrainConfig(iterations=iterations)
@@ -61,7 +60,7 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
             quaternions_rate=4e-3,
             cooldown_to=0.05,
         ),
-        density=replace(config.density, growth="mcmc", noise_rate=2e5),
+        density=replace(config.density, noise_rate=2e5),
     )
 
 
@@ -72,12 +71,10 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
     sevenths. There are fewer Gaussians, as splits are along the longest axis, and those that add less than a tenth of
     a pixel to every view are dropped. The rates are those of the short schedule, those of means, scales and rotations
     up to four times higher. The higher SH bands are updated in every second step
-    (docs/decisions/0015-the-fast-preset.md). Raises InputError for fast with the schedule mcmc.
+    (docs/decisions/0015-the-fast-preset.md). Raises InputError for fast with high-rates.
     """
-    if preset == "fast" and schedule == "mcmc":
-        raise InputError(
-            "--preset fast and --schedule mcmc exclude each other: each has rates and growth of its own; expected one"
-        )
+    if preset == "fast" and schedule == "high-rates":
+        raise InputError("--preset fast and --schedule high-rates exclude each other: each has rates of its own")
     config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
     config = replace(config, rasterizer=PRESETS[preset])
     if preset != "fast":

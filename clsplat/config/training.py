@@ -209,7 +209,7 @@ class TrainConfig:
 
     iterations: int = 30_000
     """Number of training steps, each of which is one view. Learning rates and density control do not depend on it, but
-    for --optimiser.cooldown, --schedule short and mcmc, and --preset fast."""
+    for --optimiser.cooldown, --schedule short and high-rates, and --preset fast."""
     batch: int = 1
     """Views whose gradients are added up before the model changes. Each still counts as a step; with more of them
     learning rates and Adam's constants are scaled for it (Zhao et al. 2024). With several devices, if not given: one

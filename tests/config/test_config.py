@@ -113,15 +113,10 @@ def test_the_papers_schedule_is_the_default() -> None:
     assert scheduled("paper", 7000) == TrainConfig(iterations=7000)
 
 
-def capped(config: TrainConfig) -> TrainConfig:
-    """The settings with the number of Gaussians that growth by mcmc wants."""
-    return replace(config, density=replace(config.density, max_gaussians=1000))
-
-
-@pytest.mark.parametrize("schedule", ["short", "mcmc"])
+@pytest.mark.parametrize("schedule", ["short", "high-rates"])
 @pytest.mark.parametrize("iterations", [1, 2, 13, 7000, 30_000])
 def test_a_schedule_makes_sense_for_any_number_of_steps(schedule: Schedule, iterations: int) -> None:
-    config = capped(scheduled(schedule, iterations))
+    config = scheduled(schedule, iterations)
     config.check()
     assert config.iterations == config.optimiser.means_rate_steps == iterations
     assert config.density.stop + config.optimiser.cooldown <= iterations
@@ -131,10 +126,10 @@ def test_a_schedule_makes_sense_for_any_number_of_steps(schedule: Schedule, iter
 def test_presets_make_sense_for_any_number_of_steps(iterations: int) -> None:
     for preset, rasterizer in PRESETS.items():
         for schedule in (None, *get_args(Schedule)):
-            if (preset, schedule) == ("fast", "mcmc"):
+            if (preset, schedule) == ("fast", "high-rates"):
                 continue
             config = bundled(preset, schedule, iterations)
-            capped(config).check()
+            config.check()
             assert config.iterations == iterations
             assert config.rasterizer == rasterizer
     assert bundled("default", None, iterations) == bundled("exact", None, iterations) == scheduled("paper", iterations)
@@ -156,15 +151,15 @@ def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> 
 
 
 @pytest.mark.slow
-def test_mcmc_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
+def test_high_rates_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
     scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
-    words = ["train", str(scene), "-o", str(run), "--schedule", "mcmc", "--iterations", "14"]
-    assert main(words) == 2
-    assert "--density.growth mcmc: expected --density.max-gaussians too" in capsys.readouterr().err
-    assert main([*words, "--density.max-gaussians", "1000", "--preset", "fast"]) == 2
-    assert "--preset fast and --schedule mcmc exclude each other" in capsys.readouterr().err
-    assert main([*words, "--density.max-gaussians", "1000"]) == 0
-    assert Run.open(run).config == capped(scheduled("mcmc", 14))
+    words = ["train", str(scene), "-o", str(run), "--schedule", "high-rates", "--iterations", "14"]
+    assert main([*words, "--preset", "fast"]) == 2
+    assert "--preset fast and --schedule high-rates exclude each other" in capsys.readouterr().err
+    assert not run.exists()
+    assert main([*words, "--optimiser.opacities-rate", "0.04"]) == 0
+    wanted = scheduled("high-rates", 14)
+    assert Run.open(run).config == replace(wanted, optimiser=replace(wanted.optimiser, opacities_rate=0.04))
 
 
 def test_a_setting_that_two_places_have_has_one_default() -> None:
