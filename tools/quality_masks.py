@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What masks are worth: a block that moves over a scene's photographs, and a thing on a turntable.
+"""Trainings with masks and without: a block that moves over a scene's photographs, and a thing on a turntable.
 
     .venv/bin/python tools/quality_masks.py SCENE FOLDER [--resolution 200] [--iterations 7000] [--seed 0]
 
-SCENE is COLMAP's model, sparse/0 beside images/. Its photographs to train on get a block of patterned pixels that
-moves from one to the next, and masks of it. Trained are they as they were, with the block, with the block masked, and
-with a block of other pixels, masked: the models of the last two have the same bytes, or the call ends with status 1.
-All are measured on the held-out photographs, which have no block.
+SCENE is a COLMAP scene, sparse/0 beside images/. A block of patterned pixels covers a twelfth of each photograph to
+train on, elsewhere in each, and masks cover the block. There are four trainings: on the photographs as they were, with
+the block, with the block masked, and with a block of other pixels masked. The last two models have the same bytes, or
+the call ends with status 1. All are measured on the held-out photographs, which have no block.
 
-The turntable is the demo's still life without its floor and wall, by the ray caster: photographs with alpha. Trained
-is it with each meaning of alpha but ignore, over black. Measured is the mean alpha of the renders where the held-out
-photographs are transparent, and PSNR over white. Runs that FOLDER has are not made again; FOLDER/block.png and
-FOLDER/turntable.png have a photograph and the renders.
+The turntable is the demo's still life without its floor and wall: photographs with alpha, by the ray caster. There are
+two trainings over black, with `--alpha blend` and `--alpha transparent`. Measured are the mean alpha of the renders
+where the held-out photographs are transparent, and PSNR over white.
+
+FOLDER/ITERATIONS-RESOLUTION-SEED has the runs, which are not made again, and block.png and turntable.png:
+photographs and renders side by side.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 
@@ -33,6 +37,7 @@ from clsplat.cli.main import main as clsplat
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.demo.ray_caster import Floor, Surface, Wall, bake, cameras, render, still_life
 from clsplat.device.context import open_device
+from clsplat.errors import InputError
 from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
 from clsplat.images.reading import read_image
@@ -48,6 +53,8 @@ ROUNDS = 3
 
 def with_block(scene: Path, folder: Path, seed: int) -> Path:
     """The scene with a block on each photograph to train on, of pixels by the seed, and masks of it."""
+    if not (scene / "sparse" / "0").is_dir():
+        raise InputError(f"{scene}: has no sparse/0, expected a COLMAP scene")
     for name in ("images", "masks", "sparse/0"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
@@ -102,8 +109,11 @@ def turntable(folder: Path, seed: int) -> Path:
 def trained(scene: Path, run: Path, options: argparse.Namespace, *more: str) -> Gaussians:
     """The model of a run, which is trained where it is not there."""
     words = ["--iterations", str(options.iterations), "--seed", str(options.seed), "--no-report", *more]
-    if not (run / "eval.json").is_file() and clsplat(["train", str(scene), "-o", str(run), *words]):
-        raise SystemExit(1)
+    if not (run / "eval.json").is_file():
+        with redirect_stdout(sys.stderr):  # where the table is not
+            status = clsplat(["train", str(scene), "-o", str(run), *words])
+        if status:
+            raise SystemExit(status)
     return Gaussians.load(run / "model.ply")
 
 
@@ -154,7 +164,7 @@ def table_of_turntable(options: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    """Make both tables; 1 if masked pixels have changed a bit of the model."""
+    """Make both tables; 1 if masked pixels have changed a bit of the model, 2 for a scene that is none."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("folder", type=Path)
@@ -162,10 +172,14 @@ def main() -> int:
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
-    status = block(options)
-    print()
-    table_of_turntable(options)
+    options.folder /= f"{options.iterations}-{options.resolution}-{options.seed}"
+    try:
+        status = block(options)
+        print()
+        table_of_turntable(options)
+    except InputError as error:
+        print(f"quality_masks: {error}", file=sys.stderr)
+        return 2
     return status
 
 

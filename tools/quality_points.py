@@ -16,7 +16,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -158,14 +160,17 @@ def main() -> None:
         run = options.folder / name
         steps = ",".join(str(step) for step in STEPS if step < iterations)
         words = ["--iterations", str(iterations), "--eval-at", steps, "--seed", str(options.seed), "--no-report"]
-        if not (run / "eval.json").is_file() and clsplat(["train", str(scene), "-o", str(run), *words, *more]):
-            raise SystemExit(1)
+        if not (run / "eval.json").is_file():
+            with redirect_stdout(sys.stderr):  # where the table is not
+                status = clsplat(["train", str(scene), "-o", str(run), *words, *more])
+            if status:
+                raise SystemExit(status)
         records = [json.loads(line) for line in (run / "metrics.jsonl").read_text("utf-8").splitlines()]
         scores[name] = {r["step"]: r["eval"]["mean"]["psnr"] for r in records if "eval" in r}
         scores[name][iterations] = json.loads((run / "eval.json").read_text("utf-8"))["mean"]["psnr"]
         print(f"{name}: {records[-1]['gaussians']:,} Gaussians, {records[-1]['seconds']:.0f} s", flush=True)
     steps = sorted({step for values in scores.values() for step in values})
-    print(f"| PSNR, dB | {' | '.join(map(str, steps))} |")
+    print(f"| PSNR, dB | {' | '.join(map(str, steps))} |\n|---{'|---' * len(steps)}|")
     for name, values in scores.items():
         row = " | ".join(f"{values[step]:.2f}" if step in values else "" for step in steps)
         print(f"| {name} | {row} |")
