@@ -67,7 +67,7 @@ def row(name: str, clean: Scene, folder: Path, gains: Float64, config: TrainConf
     """Train and measure one row."""
     changes, learns = ROWS[name]
     factors = gains if changes else np.ones_like(gains)
-    scene = with_gains(clean, folder / ("gains" if changes else "clean"), factors)
+    scene = with_gains(clean, folder / f"{'gains' if changes else 'clean'}-{config.resolution}-{config.seed}", factors)
     config = config if learns else replace(config, appearance="none")
     run, start = Run.create(folder / "runs" / name.replace(", ", "-"), config, overwrite=True), time.process_time()
     model = train(scene, config, device=device, run=run)
@@ -88,7 +88,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--resolution", type=int, default=200, help="longest side of the photographs; 0: as they are")
+    parser.add_argument("--resolution", type=int, default=200, help="pixels of the longest side; 0: up to 1600")
     parser.add_argument("--iterations", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--appearance", default="exposure")
@@ -100,6 +100,7 @@ def main() -> None:
     config = TrainConfig(
         iterations=options.iterations,
         seed=options.seed,
+        resolution=options.resolution,
         appearance=options.appearance,
         appearance_rate=options.rate,
         report=False,

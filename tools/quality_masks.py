@@ -12,7 +12,7 @@ The turntable is the demo's still life without its floor and wall: photographs w
 two trainings over black, with `--alpha blend` and `--alpha transparent`. Measured are the mean alpha of the renders
 where the held-out photographs are transparent, and PSNR over white.
 
-FOLDER/ITERATIONS-RESOLUTION-SEED has the runs, which are not made again, and block.png and turntable.png:
+FOLDER/SCENE-ITERATIONS-RESOLUTION-SEED has the runs, which are not made again, and block.png and turntable.png:
 photographs and renders side by side.
 """
 
@@ -23,23 +23,22 @@ import hashlib
 import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from quality_points import depth_of, write_scene
+from quality_points import depth_of, trained, write_scene
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.cli.main import main as clsplat
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.demo.ray_caster import Floor, Surface, Wall, bake, cameras, render, still_life
 from clsplat.device.context import open_device
-from clsplat.errors import InputError
+from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import composite
 from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.rendering.renderer import Renderer
@@ -54,14 +53,17 @@ ROUNDS = 3
 def with_block(scene: Path, folder: Path, seed: int) -> Path:
     """The scene with a block on each photograph to train on, of pixels by the seed, and masks of it."""
     if not (scene / "sparse" / "0").is_dir():
-        raise InputError(f"{scene}: has no sparse/0, expected a COLMAP scene")
+        raise InputError(f"{scene / 'sparse' / '0'}: no such folder, expected a COLMAP scene")
     for name in ("images", "masks", "sparse/0"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    try:
+        model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"{scene / 'sparse' / '0'}: {error}, expected a COLMAP model") from None
     images = sorted(model.images.values(), key=lambda image: image.name)
     for index, image in enumerate(images):
-        photograph = read_image(scene / "images" / image.name)[:, :, :3]
-        image.name = f"{index:03d}.png"
+        photograph = composite(read_image(scene / "images" / image.name, orient=False), (0, 0, 0))
+        image.name = f"{index:06d}.png"
         if index % TEST_EVERY:
             height, width = photograph.shape[:2]
             across, down = width // 3, height // 4
@@ -106,14 +108,9 @@ def turntable(folder: Path, seed: int) -> Path:
     return write_scene(folder, views, pictures, depths, POINTS, seed)
 
 
-def trained(scene: Path, run: Path, options: argparse.Namespace, *more: str) -> Gaussians:
+def model_of(scene: Path, run: Path, options: argparse.Namespace, *more: str) -> Gaussians:
     """The model of a run, which is trained where it is not there."""
-    words = ["--iterations", str(options.iterations), "--seed", str(options.seed), "--no-report", *more]
-    if not (run / "eval.json").is_file():
-        with redirect_stdout(sys.stderr):  # where the table is not
-            status = clsplat(["train", str(scene), "-o", str(run), *words])
-        if status:
-            raise SystemExit(status)
+    trained(scene, run, ["--iterations", str(options.iterations), "--seed", str(options.seed), *more])
     return Gaussians.load(run / "model.ply")
 
 
@@ -132,7 +129,7 @@ def block(options: argparse.Namespace) -> int:
     renderer, pictures, digests = Renderer(open_device()), [view.load()[:, :, :3]], []
     for number, (name, (scene, more)) in enumerate(rows.items()):
         run = options.folder / f"block-run-{number}"
-        model = trained(scene, run, options, *size, *more)
+        model = model_of(scene, run, options, *size, *more)
         found = json.loads((run / "eval.json").read_text("utf-8"))["mean"]
         digests.append(hashlib.blake2b((run / "model.ply").read_bytes(), digest_size=8).hexdigest())
         print(f"| {name} | {found['psnr']:.2f} | {found['ssim']:.4f} | {len(model):,} | {digests[-1]} |", flush=True)
@@ -149,7 +146,7 @@ def table_of_turntable(options: argparse.Namespace) -> None:
     renderer, rows = Renderer(open_device()), []
     print("| turntable | alpha outside | PSNR over white, dB | Gaussians |\n|---|---|---|---|")
     for meaning in ("blend", "transparent"):
-        model = trained(scene, options.folder / f"turntable-{meaning}", options, "--alpha", meaning)
+        model = model_of(scene, options.folder / f"turntable-{meaning}", options, "--alpha", meaning)
         outside, scores, pictures = [], [], []
         for view in load_scene(scene).test_views:
             truth, seen = view.load(), renderer.render(model, view.camera, background=(1, 1, 1))
@@ -164,22 +161,26 @@ def table_of_turntable(options: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    """Make both tables; 1 if masked pixels have changed a bit of the model, 2 for a scene that is none."""
+    """Make both tables; 1 if masked pixels have changed a bit of the model, or where the work fails, 2 for a scene that
+    is none."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--resolution", type=int, default=200, help="longest side of the photographs; 0: as they are")
+    parser.add_argument(
+        "--resolution", type=int, default=200, help="longest side of the photographs; 0: as they are, up to 1600"
+    )
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    options.folder /= f"{options.iterations}-{options.resolution}-{options.seed}"
+    options.scene = options.scene.resolve()
+    options.folder /= f"{options.scene.name}-{options.iterations}-{options.resolution}-{options.seed}"
     try:
         status = block(options)
         print()
         table_of_turntable(options)
-    except InputError as error:
+    except (ClsplatError, OSError) as error:
         print(f"quality_masks: {error}", file=sys.stderr)
-        return 2
+        return 2 if isinstance(error, InputError) else 1
     return status
 
 

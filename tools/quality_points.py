@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
 from functools import partial
@@ -131,6 +132,17 @@ def rgbd(folder: Path, width: int, photos: int) -> tuple[list[Camera], list[Floa
     return views, pictures, depths
 
 
+def trained(scene: Path, run: Path, words: Sequence[str]) -> None:
+    """Train with these words of the command line, or go on where that was interrupted; nothing if it is done."""
+    if (run / "eval.json").is_file():
+        return
+    more = ["--resume"] if (run / "config.toml").is_file() else words
+    with redirect_stdout(sys.stderr):  # where the table is not
+        status = clsplat(["train", str(scene), "-o", str(run), "--no-report", *more])
+    if status:
+        raise SystemExit(status)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
@@ -159,12 +171,8 @@ def main() -> None:
     for name, (iterations, more) in trainings.items():
         run = options.folder / name
         steps = ",".join(str(step) for step in STEPS if step < iterations)
-        words = ["--iterations", str(iterations), "--eval-at", steps, "--seed", str(options.seed), "--no-report"]
-        if not (run / "eval.json").is_file():
-            with redirect_stdout(sys.stderr):  # where the table is not
-                status = clsplat(["train", str(scene), "-o", str(run), *words, *more])
-            if status:
-                raise SystemExit(status)
+        words = ["--iterations", str(iterations), "--eval-at", steps, "--seed", str(options.seed)]
+        trained(scene, run, [*words, *more])
         records = [json.loads(line) for line in (run / "metrics.jsonl").read_text("utf-8").splitlines()]
         scores[name] = {r["step"]: r["eval"]["mean"]["psnr"] for r in records if "eval" in r}
         scores[name][iterations] = json.loads((run / "eval.json").read_text("utf-8"))["mean"]["psnr"]

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import hashlib
 import json
 import subprocess
 import sys
@@ -57,10 +58,15 @@ class Row:
     sizes: tuple[int, ...] = ()
 
 
+SHORT, HIGH = ("--schedule", "short"), ("--schedule", "high-rates")
+WHOLES = {"default": (), "short": SHORT, "high rates": HIGH}
+"""Rows of the growth table that grow as the paper's method has it; the first two are what others get half of."""
 HALVES = {
-    "budget": ("--schedule", "short", "--density.growth", "budget"),
-    "long axis": ("--schedule", "short", "--density.growth", "budget", "--density.long-axis"),
-    "mcmc": ("--schedule", "high-rates", "--density.growth", "mcmc"),
+    "budget": (*SHORT, "--density.growth", "budget"),
+    "long axis": (*SHORT, "--density.growth", "budget", "--density.long-axis"),
+    "mcmc": (*SHORT, "--density.growth", "mcmc"),
+    "high rates long axis": (*HIGH, "--density.growth", "budget", "--density.long-axis"),
+    "high rates mcmc": (*HIGH, "--density.growth", "mcmc"),
 }
 """Rows of the growth table that get half of the Gaussians."""
 FEWEST = ("bonsai", 290_000)
@@ -73,16 +79,17 @@ def growth_rows() -> list[Row]:
     """The paper's growth and the short schedule, and the others with half of the better one's Gaussians."""
     rows = []
     for scene in SCENES:
-        rows += [Row(f"{scene} default", scene), Row(f"{scene} short", scene, ("--schedule", "short"))]
+        rows += [Row(f"{scene} {name}", scene, settings) for name, settings in WHOLES.items()]
         ends = (f"{scene} default", f"{scene} short")
-        for name, more in HALVES.items():
-            rows.append(Row(f"{scene} {name}", scene, more, half_of=ends))
+        rows += [Row(f"{scene} {name}", scene, settings, half_of=ends) for name, settings in HALVES.items()]
     ends = (f"{BY_PAPER} default", f"{BY_PAPER} short")
     by_paper = ("--density.growth", "mcmc", "--density.stop", "{stop}")
     rows.append(Row(f"{BY_PAPER} mcmc paper", BY_PAPER, by_paper, half_of=ends))
     scene, most = FEWEST
-    settings = (*HALVES["mcmc"], "--density.max-gaussians", str(most))
-    return [*rows, Row(f"{scene} mcmc {most // 1000}k", scene, settings)]
+    for name in ("mcmc", "high rates mcmc"):
+        settings = (*HALVES[name], "--density.max-gaussians", str(most))
+        rows.append(Row(f"{scene} {name} {most // 1000}k", scene, settings))
+    return rows
 
 
 def antialiasing_rows() -> list[Row]:
@@ -110,7 +117,7 @@ TOOLS: dict[str, tuple[str, ...]] = {
     "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *SIZED, "--seeds", "0,1", *AUTO),
     "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *SIZED, "--seeds", "0,1", *AUTO),
 }
-"""Tables that tools of their own print: the commands, with the folder of scenes, one to work in, and the steps."""
+"""Tables that tools of their own print: the commands, with the folder of scenes, one to work in, steps and size."""
 
 
 class Book:
@@ -140,15 +147,14 @@ class Book:
         named = (table, row.name, seed, settings, self.iterations, self.resolution, code, commit())
         if known := self.kept.find(Finished(*named, "", "", 0.0, 0.0, 0, 0.0)):
             return known
-        run = self.folder / table / f"{row.name.replace(' ', '-')}-{seed}-{code}"
+        given = hashlib.blake2b(repr(settings).encode(), digest_size=4).hexdigest()
+        run = self.folder / table / f"{row.name.replace(' ', '-')}-{seed}-{given}-{code}"
         run.parent.mkdir(exist_ok=True)
         print(f"{table}: {row.name}, seed {seed}", file=sys.stderr, flush=True)
-        if (run / "config.toml").exists():
-            _clsplat("train", "--resume", "-o", str(run), "--no-report")
-        else:
-            size = ("--iterations", str(self.iterations), "--resolution", str(self.resolution))
-            given = [*size, *settings, "--seed", str(seed), "--no-report"]
-            _clsplat("train", str(self.scenes / row.scene), "-o", str(run), *given)
+        size = ("--iterations", str(self.iterations), "--resolution", str(self.resolution))
+        begun = (run / "config.toml").exists()
+        more = ("--resume",) if begun else (*size, *settings, "--seed", str(seed))
+        _clsplat("train", str(self.scenes / row.scene), "-o", str(run), "--no-report", *more)
         found = json.loads((run / "eval.json").read_text("utf-8"))
         sizes = tuple(self._psnr_at(run, size) for size in row.sizes)
         today, psnr, ssim = datetime.now(timezone.utc).date().isoformat(), found["mean"]["psnr"], found["mean"]["ssim"]

@@ -60,8 +60,8 @@ class Train(Verb):
     time, and lost at most 0.3 dB of PSNR on the scenes it was made on. Flags that are given override it."""
     schedule: Schedule | None = None
     """Bundle of learning rates and of the steps at which things happen: paper, made for 30,000 steps; short, for
-    --iterations of about 7000; high-rates, for as many, with rates up to four times as high: better pictures of a scene
-    with some dozens of photographs. Flags that are given override it. If not given: paper, but short with --preset
+    --iterations of about 7000; high-rates, for about 7000 too, with higher rates than short: better pictures where
+    photographs are not few. Flags that are given override it. If not given: paper, but short with --preset
     fast."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     given: Annotated[frozenset[str], Suppress] = field(default=frozenset(), compare=False)

@@ -28,7 +28,8 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
     the paper's rates leave a model unfinished. Colours, opacities and rotations learn faster, SH degrees come twice as
     fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
     (docs/decisions/0013-a-short-schedule.md). high-rates: the same, but means, sizes, rotations and colours by
-    direction learn faster still, and cool down further (docs/decisions/0031-high-rates.md).
+    direction learn faster still and cool down further, SH degrees come every 300 steps, and mcmc has less noise for its
+    rate (docs/decisions/0031-high-rates.md).
     """
     if schedule == "paper":
         return TrainConfig(iterations=iterations)
@@ -74,7 +75,9 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
     (docs/decisions/0015-the-fast-preset.md). Raises InputError for fast with high-rates.
     """
     if preset == "fast" and schedule == "high-rates":
-        raise InputError("--preset fast and --schedule high-rates exclude each other: each has rates of its own")
+        raise InputError(
+            "--preset fast and --schedule high-rates exclude each other: fast raises the short schedule's rates"
+        )
     config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
     config = replace(config, rasterizer=PRESETS[preset])
     if preset != "fast":

@@ -13,6 +13,7 @@ from tiny import write_scene
 from clsplat.cli.main import main
 from clsplat.config.presets import PRESETS, Schedule, bundled, scheduled
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
+from clsplat.errors import InputError
 from clsplat.runs.run import Run
 
 Capture = pytest.CaptureFixture[str]
@@ -148,6 +149,18 @@ def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> 
     assert Run.open(run).config == wanted, "flags go before the bundles, which go together"
     assert main(["train", "-o", str(run), "--resume", *short]) == 2
     assert "--schedule short and --resume" in capsys.readouterr().err
+
+
+def test_high_rates_are_those_of_the_short_schedule_but_for_these() -> None:
+    """The values that docs/decisions/0031-high-rates.md measured."""
+    short, high = scheduled("short", 7000), scheduled("high-rates", 7000)
+    rates = {"means_rate": 3.2e-4, "means_rate_end": 1.6e-5, "sh_rest_rate": 1.6e-3}
+    rates |= {"scales_rate": 0.01, "quaternions_rate": 4e-3, "cooldown_to": 0.05}
+    assert high.optimiser == replace(short.optimiser, **rates)  # type: ignore[arg-type]
+    assert high.density == replace(short.density, noise_rate=2e5)
+    assert high == replace(short, sh_degree_every=300, optimiser=high.optimiser, density=high.density)
+    with pytest.raises(InputError, match="--preset fast and --schedule high-rates exclude each other"):
+        bundled("fast", "high-rates", 7000)
 
 
 @pytest.mark.slow
