@@ -60,9 +60,9 @@ class Train(Verb):
     time, and lost at most 0.3 dB of PSNR on the scenes it was made on. Flags that are given override it."""
     schedule: Schedule | None = None
     """Bundle of learning rates and of the steps at which things happen: paper, made for 30,000 steps; short, for
-    --iterations of about 7000; high-rates, for about 7000 too, with higher rates than short: better pictures where
-    photographs are not few. Flags that are given override it. If not given: paper, but short with --preset
-    fast."""
+    --iterations of about 7000; high-rates, for about 7000 too, with higher rates than short, which pay where there
+    are fewer than about 60 steps a photograph. Flags that are given override it. If not given: paper, but short with
+    --preset fast."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     given: Annotated[frozenset[str], Suppress] = field(default=frozenset(), compare=False)
     """Names of the settings on the command line."""
