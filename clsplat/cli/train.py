@@ -59,10 +59,9 @@ class Train(Verb):
     """Bundle of settings. exact and default approximate nothing and are the same; fast takes less than half of the
     time, and lost at most 0.3 dB of PSNR on the scenes it was made on. Flags that are given override it."""
     schedule: Schedule | None = None
-    """Bundle of learning rates and of the steps at which things happen: paper, made for 30,000 steps; short, for
-    --iterations of about 7000; high-rates, for about 7000 too, with higher rates than short, which pay where there
-    are fewer than about 60 steps a photograph. Flags that are given override it. If not given: paper, but short with
-    --preset fast."""
+    """Bundle of learning rates and of the steps at which things happen: paper, made for 30,000 steps; short, for about
+    7000; high-rates, for about 7000 too, with rates above those of short, which pay where there are fewer than about 60
+    steps a photograph. Flags that are given override it. If not given: paper, but short with --preset fast."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     given: Annotated[frozenset[str], Suppress] = field(default=frozenset(), compare=False)
     """Names of the settings on the command line."""
