@@ -39,7 +39,7 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation.metrics import psnr
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import composite
-from clsplat.images.reading import read_image
+from clsplat.images.reading import downscale, read_image
 from clsplat.images.writing import write_image
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.scene import load_scene
@@ -90,10 +90,7 @@ def cut_out(surfaces: list[Surface], camera: Camera) -> Float32:
     fine = camera.resized(2 * camera.width, 2 * camera.height)
     hit = (depth_of(surfaces, fine) > 0).astype(np.float32)[:, :, None]
     both = np.concatenate([render(surfaces, fine, samples=1) * hit, hit], axis=2)
-    sums = both.reshape(camera.height, 2, camera.width, 2, 4).sum(axis=(1, 3))
-    sums[:, :, :3] /= np.maximum(sums[:, :, 3:], 1)
-    sums[:, :, 3] /= 4
-    return np.asarray(sums, np.float32)
+    return downscale(both, camera.width, camera.height)
 
 
 def turntable(folder: Path, seed: int) -> Path:
@@ -114,7 +111,7 @@ def model_of(scene: Path, run: Path, options: argparse.Namespace, *more: str) ->
     return Gaussians.load(run / "model.ply")
 
 
-def block(options: argparse.Namespace) -> int:
+def block(options: argparse.Namespace, renderer: Renderer) -> int:
     """The table of the block; 1 if masked pixels have changed a bit of the model."""
     size = ("--resolution", str(options.resolution))
     scenes = [with_block(options.scene, options.folder / f"block-{seed}", seed) for seed in (1, 2)]
@@ -126,7 +123,7 @@ def block(options: argparse.Namespace) -> int:
     }
     print(f"| {options.scene.name} | PSNR, dB | SSIM | Gaussians | digest of the model |\n|---|---|---|---|---|")
     view = load_scene(scenes[0], resolution=options.resolution).train_views[0]
-    renderer, pictures, digests = Renderer(open_device()), [view.load()[:, :, :3]], []
+    pictures, digests = [view.load()[:, :, :3]], []
     for number, (name, (scene, more)) in enumerate(rows.items()):
         run = options.folder / f"block-run-{number}"
         model = model_of(scene, run, options, *size, *more)
@@ -140,10 +137,10 @@ def block(options: argparse.Namespace) -> int:
     return 0 if same else 1
 
 
-def table_of_turntable(options: argparse.Namespace) -> None:
+def table_of_turntable(options: argparse.Namespace, renderer: Renderer) -> None:
     """The table of the turntable."""
     scene = turntable(options.folder / "turntable", options.seed)
-    renderer, rows = Renderer(open_device()), []
+    rows = []
     print("| turntable | alpha outside | PSNR over white, dB | Gaussians |\n|---|---|---|---|")
     for meaning in ("blend", "transparent"):
         model = model_of(scene, options.folder / f"turntable-{meaning}", options, "--alpha", meaning)
@@ -151,7 +148,7 @@ def table_of_turntable(options: argparse.Namespace) -> None:
         for view in load_scene(scene).test_views:
             truth, seen = view.load(), renderer.render(model, view.camera, background=(1, 1, 1))
             outside.append(seen.alpha[truth[:, :, 3] == 0])
-            white = truth[:, :, :3] * truth[:, :, 3:] + 1 - truth[:, :, 3:]
+            white = composite(truth, (1, 1, 1))
             scores.append(psnr(seen.image[:, :, :3], white))
             pictures.append(np.concatenate([white, seen.image[:, :, :3]]))
         rows.append(pictures[0])
@@ -175,9 +172,10 @@ def main() -> int:
     options.scene = options.scene.resolve()
     options.folder /= f"{options.scene.name}-{options.iterations}-{options.resolution}-{options.seed}"
     try:
-        status = block(options)
+        renderer = Renderer(open_device())
+        status = block(options, renderer)
         print()
-        table_of_turntable(options)
+        table_of_turntable(options, renderer)
     except (ClsplatError, OSError) as error:
         print(f"quality_masks: {error}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1

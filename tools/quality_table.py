@@ -94,7 +94,7 @@ def growth_rows() -> list[Row]:
 
 def antialiasing_rows() -> list[Row]:
     """lego with and without, seen from farther and farther."""
-    usual = ("--schedule", "short", "--background", "white", "--resolution", str(SIZES[0]))
+    usual = (*SHORT, "--background", "white", "--resolution", str(SIZES[0]))
     return [
         Row("lego", "lego_blender_400", usual, sizes=SIZES),
         Row("lego antialiased", "lego_blender_400", (*usual, "--antialiased"), sizes=SIZES),
