@@ -2,13 +2,14 @@
 """Photographs whose exposure changes against the same photographs as they were, with and without --appearance.
 
     .venv/bin/python tools/quality_exposure.py SCENE FOLDER [--resolution 200] [--iterations 2000] [--seed 0]
-        [--appearance exposure] [--rate 2e-3] [--only NAME ...]
+        [--appearance exposure] [--rate 2e-3] [--with setting=value,density.setting=value] [--only NAME ...]
 
 Writes the scene's photographs at that resolution as float EXR into FOLDER, once as they are and once times 2^U(-1, 1),
 so that nothing clips, and trains on each of them with and without. All models are measured against the held-out
 photographs as they are, after the affine map of colours that fits them best. Gains that were learnt are compared with
 those put on, but for a common factor: largest and mean error; then but for those learnt of the photographs as they
-are too, whose exposure may change as well. A row that FOLDER has already, of the same settings, is printed again.
+are too, whose exposure may change as well. --with has settings as quality_views.py takes them, over the paper's
+schedule if it names none. A row that FOLDER has already, of the same settings, is printed again.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from quality_views import with_settings
 
 from clsplat.api import train
 from clsplat.arrays import Float64
@@ -93,12 +95,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--appearance", default="exposure")
     parser.add_argument("--rate", type=float, default=TrainConfig.appearance_rate)
+    parser.add_argument("--with", dest="settings", default="", help="setting=value,...")
     parser.add_argument("--only", nargs="*", choices=ROWS, default=list(ROWS))
     options = parser.parse_args()
     device, clean = open_device(), load_scene(options.scene, resolution=options.resolution)
     gains = 2.0 ** np.random.default_rng(options.seed).uniform(-1, 1, len(clean.views))
-    config = TrainConfig(
-        iterations=options.iterations,
+    config = replace(
+        with_settings(options.iterations, f"schedule=paper,{options.settings}"),
         seed=options.seed,
         resolution=options.resolution,
         appearance=options.appearance,
@@ -115,6 +118,7 @@ def main() -> None:
     for name in options.only:
         learns = (options.appearance, options.rate) if ROWS[name][1] else ()
         key = keys[name] = " ".join(map(str, (name, options.resolution, options.iterations, options.seed, *learns)))
+        key += f" {options.settings}" if options.settings else ""
         if key not in rows:
             rows[key] = row(name, clean, options.folder, gains, config, device)
             atomic_write(known, json.dumps(rows).encode())
