@@ -8,8 +8,8 @@ Writes the scene's photographs at that resolution as float EXR into FOLDER, once
 so that nothing clips, and trains on each of them with and without. All models are measured against the held-out
 photographs as they are, after the affine map of colours that fits them best. Gains that were learnt are compared with
 those put on, but for a common factor: largest and mean error; then but for those learnt of the photographs as they
-are too, whose exposure may change as well. --with has settings as quality_views.py takes them, over the paper's
-schedule if it names none. A row that FOLDER has already, of the same settings, is printed again.
+are too, whose exposure may change as well. --with has settings as quality_views.py takes them. A row
+that FOLDER has already, of the same settings, is printed again.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def main() -> None:
     device, clean = open_device(), load_scene(options.scene, resolution=options.resolution)
     gains = 2.0 ** np.random.default_rng(options.seed).uniform(-1, 1, len(clean.views))
     config = replace(
-        with_settings(options.iterations, f"schedule=paper,{options.settings}"),
+        with_settings(options.iterations, options.settings),
         seed=options.seed,
         resolution=options.resolution,
         appearance=options.appearance,

@@ -103,8 +103,9 @@ def antialiasing_rows() -> list[Row]:
 
 TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antialiasing": antialiasing_rows}
 SIZED = ("--iterations", "{iterations}", "--resolution", "{resolution}")
-AUTO = ("--try", "auto:thinning=0.2,penalty=0.02,iterations=2000")
+AUTO = ("--try", "auto:schedule=short,thinning=0.2,penalty=0.02,iterations=2000")
 """Settings that --auto takes for few photographs."""
+FEW = ("--views", "3,12", "--seeds", "0,1")
 TOOLS: dict[str, tuple[str, ...]] = {
     "masks": ("quality_masks.py", "{scenes}/fox", "{work}", *SIZED),
     "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED),
@@ -114,8 +115,8 @@ TOOLS: dict[str, tuple[str, ...]] = {
     "lenses": ("quality_poses.py", "{work}", "--width", "320", "--lens", "2", "--iterations", "{iterations}"),
     "points": ("quality_points.py", "{work}", "--iterations", "{iterations}"),
     "real points": ("quality_points.py", "{work}", "--rgbd", "{scenes}/rgbd_7scenes", "--iterations", "{iterations}"),
-    "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *SIZED, "--seeds", "0,1", *AUTO),
-    "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *SIZED, "--seeds", "0,1", *AUTO),
+    "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *SIZED, *FEW, *AUTO),
+    "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *SIZED, *FEW, *AUTO),
 }
 """Tables that tools of their own print: the commands, with the folder of scenes, one to work in, steps and size."""
 

@@ -6,7 +6,7 @@
         [--try NAME:setting=value,density.setting=value]...
 
 The photographs are picked evenly from the training views by name, so that they are the same each time; the points are
-those of the whole scene. Each --try is a row of the table beside that of `--schedule short`, in the settings' names of
+those of the whole scene. Each --try is a row of the table beside that of the defaults, in the settings' names of
 config.toml; its schedule and iterations, if there are any, are taken first. FOLDER/views.json keeps what is measured,
 and a call goes on from there.
 """
@@ -40,7 +40,7 @@ def picked(scene: Scene, count: int) -> Scene:
 
 
 def with_settings(iterations: int, settings: str) -> TrainConfig:
-    """The short schedule of so many steps, or that of `schedule=NAME`, with these settings, `name=value` with commas
+    """The schedule `schedule=NAME`, else the paper's, of so many steps with these settings, `name=value` with commas
     between; values as in JSON, other words as they are."""
     values: dict[str, Any] = {}
     for setting in filter(None, settings.split(",")):
@@ -49,7 +49,7 @@ def with_settings(iterations: int, settings: str) -> TrainConfig:
             values[name] = json.loads(text)
         except json.JSONDecodeError:
             values[name] = text
-    config = scheduled(values.pop("schedule", "short"), values.pop("iterations", iterations))
+    config = scheduled(values.pop("schedule", "paper"), values.pop("iterations", iterations))
     for name, value in values.items():
         *group, field = name.replace("-", "_").split(".")
         part = replace(getattr(config, group[0]) if group else config, **{field: value})
