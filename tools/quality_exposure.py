@@ -117,8 +117,9 @@ def main() -> None:
     keys: dict[str, str] = {}
     for name in options.only:
         learns = (options.appearance, options.rate) if ROWS[name][1] else ()
-        key = keys[name] = " ".join(map(str, (name, options.resolution, options.iterations, options.seed, *learns)))
-        key += f" {options.settings}" if options.settings else ""
+        settings = filter(None, [options.settings])
+        named = (name, options.resolution, options.iterations, options.seed, *learns, *settings)
+        key = keys[name] = " ".join(map(str, named))
         if key not in rows:
             rows[key] = row(name, clean, options.folder, gains, config, device)
             atomic_write(known, json.dumps(rows).encode())

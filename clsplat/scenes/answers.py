@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 from clsplat.config.presets import scheduled
@@ -21,6 +22,7 @@ ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "cut out": ({"masks": "transparent"}, {"masks": "ignore"}),
     "alpha": ({"alpha": "transparent"}, {"alpha": "ignore"}),
     "fisheye": ({"lenses": "native"},),
+    "few steps": ({SCHEDULE: "high-rates"},),
     "few views": (
         {"thinning": 0.2, "penalty": 0.02, SCHEDULE: "short", "iterations": 2000},
         {"thinning": 0.2, "penalty": 0.02},
@@ -28,8 +30,8 @@ ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     ),
 }
 """Settings by the finding that they answer, the best first: the first that goes with the other settings is taken."""
-SCHEDULED = ("sh_degree_every", "optimiser", "density")
-"""Settings that a schedule has, beside the number of steps."""
+SCHEDULED = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
+"""Settings that schedules have, beside the number of steps."""
 ADVICE: Mapping[Kind, str] = {
     "sky": "--sky 1000 starts with points far away for it",
     "blur": "leave them out where others show the same",
@@ -91,21 +93,29 @@ def answered(
 def _touches(option: Mapping[str, Any], given: Collection[str]) -> bool:
     """True if an answer has a setting that is given, its schedule's too."""
     names = {*option, *(SCHEDULED if SCHEDULE in option else ())}
-    return any(name.partition(".")[0] in names for name in given)
+    return any(name in names or name.partition(".")[0] in names for name in given)
 
 
 def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:
     """The settings with those of an answer. Raises InputError where they do not go together, and for a schedule where
-    these are not the paper's."""
+    its settings are not the paper's."""
     changes = dict(settings)
     if (name := changes.pop(SCHEDULE, None)) is not None:
-        paper, bundle = scheduled("paper", config.iterations), scheduled(name, changes["iterations"])
-        if any(getattr(config, each) != getattr(paper, each) for each in SCHEDULED):
+        paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED)
+        if values(config) != values(paper):
             raise InputError(f"--schedule {name}: the run has settings of its own in place of the paper's schedule")
-        changes |= {each: getattr(bundle, each) for each in SCHEDULED}
+        bundle = scheduled(name, changes.get("iterations", config.iterations))
+        for each, value in zip(SCHEDULED, values(bundle), strict=True):
+            config = _changed(config, each, value)
     config = replace(config, **changes)
     config.check()
     return config
+
+
+def _changed(config: TrainConfig, name: str, value: Any) -> TrainConfig:
+    """The settings with another value of one, whose name has a dot after its group's."""
+    group, dot, field = name.partition(".")
+    return replace(config, **{group: replace(getattr(config, group), **{field: value}) if dot else value})
 
 
 def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:

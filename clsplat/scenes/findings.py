@@ -19,7 +19,9 @@ from clsplat.scenes.looked import BRIGHT, LEAST_POINTS, Looked
 from clsplat.scenes.masks import masks_beside, read_mask
 from clsplat.scenes.scene import Scene, View
 
-Kind = Literal["exposure", "scales", "masks", "cut out", "alpha", "fisheye", "sky", "few views", "blur", "duplicates"]
+Kind = Literal[
+    "few steps", "exposure", "scales", "masks", "cut out", "alpha", "fisheye", "sky", "few views", "blur", "duplicates"
+]
 
 EXPOSURE = 0.2
 """Standard deviation over the photographs, in stops, of a channel's brightness. Cameras that hold their exposure are
@@ -38,6 +40,10 @@ WIDE = 100.0
 FEW = 16
 """Training photographs under which each part of a scene is seen from too few sides to fix its depth; published
 trainings of 12 are 8 dB under those of 100, of 24 about 3."""
+FEW_STEPS = 60
+"""Steps for each training photograph under which high rates pay (docs/decisions/0031-high-rates.md)."""
+SHORT_TRAINING = range(1000, 10_001)
+"""Numbers of steps that these rates were measured with, 2000 to 7000, and those not far from them."""
 BLURRED = 0.72
 """Sharpness, in the scene's median, under which a photograph is called blurred; a blur of a pixel and a half is there.
 What is photographed moves it by a tenth or two."""
@@ -65,11 +71,13 @@ class Finding:
     text: str
 
 
-def findings(scene: Scene, use: MaskUse = NO_MASKS) -> list[Finding]:
-    """All findings about a scene, read with these masks. Raises InputError as `Scene.check_pictures`."""
+def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list[Finding]:
+    """All findings about a scene, read with these masks, to be trained in so many steps if that is known. Raises
+    InputError as `Scene.check_pictures`."""
     looked = Looked(scene)
     found = (
         _few(scene),
+        _few_steps(scene, iterations),
         _exposure(looked),
         _scales(looked),
         _masks(scene, use),
@@ -160,6 +168,17 @@ def _few(scene: Scene) -> Finding | None:
     if count >= FEW:
         return None
     return Finding("few views", f"{count} photographs to train on are few, so that views from elsewhere will show fog")
+
+
+def _few_steps(scene: Scene, iterations: int) -> Finding | None:
+    count = len(scene.train_views)
+    if iterations not in SHORT_TRAINING or iterations >= FEW_STEPS * count:
+        return None
+    each = iterations / count
+    text = (
+        f"{iterations:,} steps are {each:.0f} for each of {count:,} photographs to train on, which takes higher rates"
+    )
+    return Finding("few steps", text)
 
 
 def _sky(looked: Looked) -> Finding | None:

@@ -20,7 +20,7 @@ from clsplat.config.presets import bundled, scheduled
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
-from clsplat.scenes.answers import ADVICE, ANSWERS, answered, paragraph, with_settings
+from clsplat.scenes.answers import ADVICE, ANSWERS, SCHEDULED, answered, paragraph, with_settings
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.findings import FEW, Finding, findings
 from clsplat.scenes.glance import Glance, glance_at, sharpness_of
@@ -113,6 +113,17 @@ def test_near_and_far() -> None:
 def test_few_views() -> None:
     assert kinds(made(FEW - 1)) == ["few views"]
     assert kinds(made(FEW)) == []
+
+
+def test_few_steps() -> None:
+    scene = made(40)
+    for steps, found in ((2399, ["few steps"]), (2400, []), (1000, ["few steps"]), (999, []), (0, [])):
+        assert [finding.kind for finding in findings(scene, iterations=steps)] == found, steps
+    (found,) = findings(scene, iterations=2000)
+    assert found.text.startswith("2,000 steps are 50 for each of 40 photographs")
+    many = made(200)
+    assert findings(many, iterations=10_001) == [], "nothing is known of longer trainings"
+    assert [finding.kind for finding in findings(many, iterations=10_000)] == ["few steps"]
 
 
 def test_a_sky() -> None:
@@ -246,6 +257,32 @@ def test_few_views_are_trained_for_fewer_steps() -> None:
     assert answered(few, mcmc)[1] == replace(mcmc, thinning=0.2), "which has penalties of its own"
     (answer,), config = answered(few, TrainConfig(), {"thinning"})
     assert (answer.words, config) == ("a (--thinning is given)", TrainConfig())
+
+
+def test_few_steps_are_trained_with_high_rates() -> None:
+    """Whatever grows the model; not where rates or a schedule are somebody's own."""
+    few = [Finding("few steps", "a")]
+    mcmc = TrainConfig(iterations=7000, density=DensityConfig(growth="mcmc", max_gaussians=1000))
+    (answer,), config = answered(few, mcmc, {"iterations", "density.growth", "density.max_gaussians"})
+    high = scheduled("high-rates", 7000)
+    assert answer.words == "a (--schedule high-rates)"
+    assert config == replace(high, density=replace(high.density, growth="mcmc", max_gaussians=1000))
+    own = replace(mcmc, density=replace(mcmc.density, stop=4000))
+    for mine, given, words in (
+        (TrainConfig(), {"schedule"}, "--schedule is given"), (own, {"density.stop"}, "--schedule is given"),
+        (bundled("fast", None, 7000), {"preset"}, "--schedule high-rates does not go with the other settings"),
+    ):  # fmt: skip
+        (answer,), config = answered(few, mine, given)
+        assert (answer.words, config) == (f"a ({words})", mine)
+
+
+@pytest.mark.parametrize("name", ["short", "high-rates"])
+def test_settings_of_schedules_are_known(name: str) -> None:
+    density = {field.partition(".")[2] for field in SCHEDULED if field.startswith("density.")}
+    paper, bundle = TrainConfig(iterations=7000), scheduled(name, 7000)  # type: ignore[arg-type]
+    same = {field: getattr(paper.density, field) for field in density}
+    assert replace(bundle, sh_degree_every=paper.sh_degree_every, optimiser=paper.optimiser,
+                   density=replace(bundle.density, **same)) == paper  # fmt: skip
 
 
 @pytest.mark.slow
