@@ -4,8 +4,8 @@
 //   (column_sums), or one gain of one photograph (move_gains, centre_gains). Sums have one order on every device.
 //   Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of the `count` gains.
-// Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, first, second, moved, gains (photographs, 3),
-//   logs to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
+// Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, start, pulls, first, second, moved, gains
+//   (photographs, 3), logs to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -46,17 +46,20 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// columns of one photograph, logs -> moved; first and second in place. All photographs move: the others' gradient is 0.
+// columns of one photograph, logs, start, pulls -> moved; first and second in place. All photographs move: the others'
+// gradient is 0.
 __kernel void move_gains(const int count, const int photograph, const int stride, const float rate, const float root,
                          const float beta1, const float beta2, const float epsilon, __global const uint *readback,
-                         __global const float *columns, __global const float *logs, __global float *moved,
-                         __global float *first, __global float *second) {
+                         __global const float *columns, __global const float *start, __global const float *pulls,
+                         __global const float *logs, __global float *moved, __global float *first,
+                         __global float *second) {
   const int i = get_global_id(0);
   if (i >= count || readback[READBACK_STOPPED]) return;
   float g = 0.0f;
   if (i / 3 == photograph)
     for (int x = 0; x < stride; ++x) g = added(g, columns[(size_t)stride * (i % 3) + x]);
   g *= LN2;
+  if (i / 3 == photograph) g = fma1(pulls[i], logs[i] - start[i], g);
   if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));
   first[i] = m, second[i] = v;

@@ -20,6 +20,11 @@ def gradient(image: Float64, logs: Float64, by_seen: Float64) -> tuple[Float64, 
     return by_seen * np.exp2(logs), by_logs
 
 
+def pulled(by_logs: Float64, logs: Float64, start: Float64, pulls: Float64) -> Float64:
+    """The gradient by a photograph's logs, all (3,), with a part of their distance from where they started."""
+    return by_logs + pulls * (logs - start)
+
+
 def step(
     logs: Float64, first: Float64, second: Float64, by_logs: Float64, number: int, rate: float
 ) -> tuple[Float64, Float64, Float64]:

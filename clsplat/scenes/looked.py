@@ -22,8 +22,9 @@ LEAST_POINTS = 40
 """Points in a photograph without which nothing is said of its brightness or scale."""
 DARK, BRIGHT = 0.06, 0.94
 """Colours outside are clipped or noise, and say nothing of exposure."""
-NOISE = 0.015
-"""Colours under which a logarithm is one of noise."""
+NOISE = 1 / 255
+"""Colours under which a logarithm is one of noise: a step of 8 bits. With a higher bound a dark photograph loses the
+darkest of its points, and seems brighter."""
 ROUNDS, LEAST_APART = 10, 0.02
 """Weighings of the points by how well they fit, and stops up to which one fits as well as any."""
 RIDGE = 1e-9

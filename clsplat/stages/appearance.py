@@ -21,22 +21,27 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, Adam's moments of these, 2^logs; moved:
-    scratch."""
+    """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, where they started, the part of their
+    distance from there that is added to their gradient, Adam's moments, 2^logs; moved: scratch."""
 
     logs: DeviceArray
+    start: DeviceArray
+    pulls: DeviceArray
     first: DeviceArray
     second: DeviceArray
     gains: DeviceArray
     moved: DeviceArray
 
     @classmethod
-    def on(cls, device: Device, logs: NDArray[np.float32]) -> Gains:
-        """Gains with these logs, and moments of zero."""
+    def on(cls, device: Device, logs: NDArray[np.float32], pulls: NDArray[np.float32] | None = None) -> Gains:
+        """Gains that start with these logs, and moments of zero. pulls: 0 if not given."""
         zeros = np.zeros_like(logs)
-        values = (logs, zeros, zeros, np.exp2(logs.astype(np.float64)).astype(np.float32))
-        held, first, second, gains = (upload(device, value) for value in values)
-        return cls(held, first, second, gains, allocate(device, logs.shape, np.float32))
+        gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
+        pulls = zeros if pulls is None else pulls
+        held, start, pulled, first, second, factors = (
+            upload(device, value) for value in (logs, logs, pulls, zeros, zeros, gains)
+        )
+        return cls(held, start, pulled, first, second, factors, allocate(device, logs.shape, np.float32))
 
 
 @stage("appearance")
@@ -90,8 +95,7 @@ def step_gains(
     stopped changes nothing."""
     kernels, count = device.kernels("appearance", LANES=1), gains.logs.size
     constants = (rate / (1 - BETA1**step), (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
-    sizes, moments = (count, photograph, columns.shape[1]), (gains.first, gains.second)
-    launch_items(
-        device, kernels.move_gains, count, *sizes, *constants, readback, columns, gains.logs, gains.moved, *moments
-    )
+    sizes, kept = (count, photograph, columns.shape[1]), (gains.start, gains.pulls)
+    changed = (gains.moved, gains.first, gains.second)
+    launch_items(device, kernels.move_gains, count, *sizes, *constants, readback, columns, *kept, gains.logs, *changed)
     launch_items(device, kernels.centre_gains, count, count, readback, gains.moved, gains.logs, gains.gains)

@@ -32,6 +32,15 @@ STEP = 2.0**-10
 """Octaves to which what points tell is rounded: processors add in other orders, and begin alike."""
 
 
+PULL = 0.02
+"""Part of the distance, in octaves, from where points say that gains begin, in the loss's gradient. Neighbouring views
+may all be brighter by a little if what they alone show is darker; there the points are better. Of gains that points do
+not tell there is none, as it would hold them at the mean."""
+
+KEPT = ("logs", "start", "pulls", "first", "second", "gains")
+"""Arrays of `Gains` in a checkpoint."""
+
+
 @dataclass(frozen=True, eq=False)
 class ViewGains:
     """The gains of one view in one step. place: the view's in a batch."""
@@ -46,7 +55,7 @@ class ViewGains:
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGains:
         """The same on another device, by `values`, to apply and to find its gradient."""
         gains = upload(device, values)
-        return replace(self, device=device, gains=Gains(gains, gains, gains, gains, gains), view=0)
+        return replace(self, device=device, gains=Gains(*[gains] * 7), view=0)
 
     def values(self) -> NDArray[np.float32]:
         """The photograph's gains, as `on` takes them."""
@@ -103,7 +112,8 @@ class GainsOfAll:
         by_points = {name: np.round(told / STEP) * STEP for name, told in Looked(scene).exposures.items()}
         views = zip(scene.train_views, by_exif, strict=True)
         start = np.array([by_points.get(view.name, np.full(3, told)) for view, told in views])
-        return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32))
+        pulls = np.array([np.full(3, PULL * (view.name in by_points), np.float32) for view in scene.train_views])
+        return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), pulls)
 
     @property
     def pixel_bytes(self) -> int:
@@ -143,13 +153,10 @@ class GainsOfAll:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""
-        gains = self._gains
-        held = {"logs": gains.logs, "first": gains.first, "second": gains.second, "gains": gains.gains}
-        return saved(held)
+        return saved({name: getattr(self._gains, name) for name in KEPT})
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take the arrays of a checkpoint. Raises ValueError where that is of other photographs."""
-        names = ("logs", "first", "second", "gains")
         shape = (len(self._scene.train_views), 3)
-        values = loaded(self._device, arrays, names, shape)
+        values = loaded(self._device, arrays, KEPT, shape)
         self._gains = Gains(**values, moved=allocate(self._device, shape, np.float32))

@@ -52,20 +52,24 @@ def test_gains_and_their_gradient(shaped_device: Device, width: int, height: int
 
 def test_steps_and_the_mean(shaped_device: Device) -> None:
     rng = np.random.default_rng(1)
-    logs = np.zeros((4, 3), np.float32)
-    gains = Gains.on(shaped_device, logs)
+    start = rng.normal(0, 0.1, (4, 3)).astype(np.float32)
+    pulls = np.repeat(np.array([[0.0], [20.0], [0.5], [20.0]], np.float32), 3, axis=1)
+    gains = Gains.on(shaped_device, start, pulls)
     readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
-    state = tuple(np.zeros((4, 3)) for _ in range(3))
+    state = start.astype(np.float64), np.zeros((4, 3)), np.zeros((4, 3))
     for number in range(1, 12):
         columns = rng.normal(0, 1, (3, 16)).astype(np.float32)
         by_logs = np.zeros((4, 3))
-        by_logs[number % 4] = np.log(2) * columns.astype(np.float64).sum(axis=1)
+        view = number % 4
+        by_view = np.log(2) * columns.astype(np.float64).sum(axis=1)
+        by_logs[view] = reference.pulled(by_view, state[0][view], start[view].astype(np.float64), pulls[view])
         state = reference.step(*state, by_logs, number, 0.05)
-        step_gains(shaped_device, gains, number % 4, upload(shaped_device, columns), number, 0.05, readback)
+        step_gains(shaped_device, gains, view, upload(shaped_device, columns), number, 0.05, readback)
     # Eleven steps of 0.05; a sum of 16 floats that nearly cancel is good to 1e-5 of itself.
     assert_close(gains.logs.get(), state[0], absolute=1e-5)
     assert_close(gains.gains.get(), np.exp2(state[0]), absolute=1e-5)
     assert_close(gains.logs.get().mean(axis=0), np.zeros(3), absolute=1e-7)
+    assert_same_bits(gains.start.get(), start)
 
 
 def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:

@@ -25,6 +25,7 @@ from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.looked import Looked
 from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.training import gains
 from clsplat.training.gains import GainsOfAll
 from clsplat.training.photographs import Photographs
 from clsplat.training.trainer import Trainer
@@ -54,10 +55,31 @@ def test_gains_begin_where_the_points_have_them(
     first, second, *others = (view.name for view in scene.train_views)
     told = {first: np.array([1.0, 0.5, 0.0]), second: np.array([-1.0, 0.25, 0.0])}
     monkeypatch.setattr(Looked, "exposures", told)
-    logs = GainsOfAll(EXPOSED, default_device, scene).arrays()["appearance/logs"]
+    arrays = GainsOfAll(EXPOSED, default_device, scene).arrays()
     start = np.array([told[first], told[second], *(np.zeros(3) for _ in others)])
     # rounded to a 1024th
-    np.testing.assert_allclose(logs, start - start.mean(axis=0), atol=2.0**-11)
+    np.testing.assert_allclose(arrays["appearance/logs"], start - start.mean(axis=0), atol=2.0**-11)
+    np.testing.assert_array_equal(arrays["appearance/start"], arrays["appearance/logs"])
+    pulled = arrays["appearance/pulls"].any(axis=1)
+    assert pulled.tolist() == [True, True, *(False for _ in others)], "those of which points tell"
+
+
+def test_gains_that_points_tell_are_held_there(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a pull that is far stronger than the loss they stay; without one they go where the loss is least."""
+    truth = dict.fromkeys((view.name for view in scene.train_views), np.zeros(3))
+    truth |= {scene.train_views[0].name: np.full(3, 0.5), scene.train_views[1].name: np.full(3, -0.5)}
+    monkeypatch.setattr(Looked, "exposures", truth)
+    moved = {}
+    for pull in (0.0, 1e3):
+        monkeypatch.setattr(gains, "PULL", pull)
+        trainer = Trainer(scene, EXPOSED, default_device)
+        for _ in range(30):
+            trainer.train_step()
+        arrays = trainer.checkpoint()[0]
+        moved[pull] = np.abs(arrays["appearance/logs"] - arrays["appearance/start"]).max()
+    assert moved[1e3] < 0.3 * moved[0.0], moved
 
 
 def test_gains_of_photographs_are_learnt(
@@ -87,10 +109,10 @@ def test_gains_of_photographs_are_learnt(
         pattern = f"{tmp_path}/{kind}/{{name}}.exr"
         assert main(["render", str(run.path), "--cameras", cameras, "-o", pattern, "--exr", "float", *more]) == 0
         frames[kind] = read_image(next((tmp_path / kind).rglob("*.exr")))
-    gains = 2.0 ** np.array(record["photographs"][name]["log2_gains"])
+    factors = 2.0 ** np.array(record["photographs"][name]["log2_gains"])
     assert frames["plain"].max() > 0.2
     # Coefficients and colours of up to 4, rounded.
-    np.testing.assert_allclose(frames["exposed"], frames["plain"] * gains, atol=2e-5)
+    np.testing.assert_allclose(frames["exposed"], frames["plain"] * factors, atol=2e-5)
 
 
 def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_path: Path) -> None:
@@ -124,10 +146,10 @@ def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_pat
         got = record["photographs" if view.split == "train" else "held_out"][view.name]["log2_gains"]
         np.testing.assert_allclose(got, 3 * [wanted], atol=1e-6)  # of 32 bits
     assert sum(view.split == "test" and exposures[view.name] is not None for view in scene.views)
-    gains = held_out_gains(record)
+    expected = held_out_gains(record)
     name = scene.test_views[0].name
-    np.testing.assert_allclose(gains(name), 2.0 ** np.array(record["held_out"][name]["log2_gains"]), rtol=1e-6)
-    assert (gains("elsewhere") == 1).all()
+    np.testing.assert_allclose(expected(name), 2.0 ** np.array(record["held_out"][name]["log2_gains"]), rtol=1e-6)
+    assert (expected("elsewhere") == 1).all()
 
 
 def test_switched_off_there_is_nothing_of_it(default_device: Device, scene: Scene) -> None:
