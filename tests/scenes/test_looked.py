@@ -70,6 +70,18 @@ def test_gains_on_photographs_are_told_from_them_alone() -> None:
     assert np.array_equal(spread(grey, gains), found)
 
 
+def test_a_dark_photograph_keeps_its_dark_points() -> None:
+    """Many points are of 0.012 to 0.03; without the darkest of them the photograph would seem brighter than it is."""
+    gains = np.tile([0.5, 1.0], 12)
+    dark = [made(), made()]
+    for scene in dark:
+        for index, view in enumerate(scene.views):
+            pixels = scene.glances[view.name].pixels
+            changed(scene, index, pixels=np.where(pixels < 0.5, pixels * np.float32(0.06), pixels))
+    apart = spread(dark[0], gains) - spread(dark[1], np.ones(24)) - np.log2(gains)[:, None]
+    assert np.abs(apart - apart.mean(axis=0)).max() < 0.01
+
+
 @pytest.mark.parametrize("count", [0, LEAST_POINTS - 1])
 def test_few_points_tell_nothing(count: int) -> None:
     """And no photograph is looked at, of which there is no file here."""
