@@ -5,7 +5,8 @@
 //   Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of the `count` gains.
 // Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, start, pulls, first, second, moved, gains
-//   (photographs, 3), logs to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
+//   (photographs, 3), logs to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are
+//   above each.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -59,7 +60,11 @@ __kernel void move_gains(const int count, const int photograph, const int stride
   if (i / 3 == photograph)
     for (int x = 0; x < stride; ++x) g = added(g, columns[(size_t)stride * (i % 3) + x]);
   g *= LN2;
-  if (i / 3 == photograph) g = fma1(pulls[i], logs[i] - start[i], g);
+  if (i / 3 == photograph && pulls[i] > 0.0f) {
+    float weight = 0.0f, apart = 0.0f; // of all that are pulled: a common factor is nobody's to hold
+    for (int k = i % 3; k < count; k += 3) weight += pulls[k], apart = fma1(pulls[k], logs[k] - start[k], apart);
+    g = fma1(pulls[i], logs[i] - start[i] - apart / weight, g);
+  }
   if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));
   first[i] = m, second[i] = v;

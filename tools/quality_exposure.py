@@ -100,15 +100,9 @@ def main() -> None:
     options = parser.parse_args()
     device, clean = open_device(), load_scene(options.scene, resolution=options.resolution)
     gains = 2.0 ** np.random.default_rng(options.seed).uniform(-1, 1, len(clean.views))
-    config = replace(
-        with_settings(options.iterations, options.settings),
-        seed=options.seed,
-        resolution=options.resolution,
-        appearance=options.appearance,
-        appearance_rate=options.rate,
-        report=False,
-    )
-    config.check()
+    settings = f"appearance={options.appearance},appearance_rate={options.rate},{options.settings}"
+    config = with_settings(options.iterations, settings)
+    config = replace(config, seed=options.seed, resolution=options.resolution, report=False)
     known = options.folder / "rows.json"
     rows = json.loads(known.read_text("utf-8")) if known.exists() else {}
     put_on = {view.name: [np.log2(gain)] for view, gain in zip(clean.views, gains, strict=True)}
@@ -117,8 +111,8 @@ def main() -> None:
     keys: dict[str, str] = {}
     for name in options.only:
         learns = (options.appearance, options.rate) if ROWS[name][1] else ()
-        settings = filter(None, [options.settings])
-        named = (name, options.resolution, options.iterations, options.seed, *learns, *settings)
+        more = filter(None, [options.settings])
+        named = (name, options.resolution, options.iterations, options.seed, *learns, *more)
         key = keys[name] = " ".join(map(str, named))
         if key not in rows:
             rows[key] = row(name, clean, options.folder, gains, config, device)

@@ -17,14 +17,15 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from clsplat.api import train
-from clsplat.config.presets import scheduled
+from clsplat.config.presets import Schedule, scheduled
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
+from clsplat.errors import InputError
 from clsplat.evaluation.held_out import evaluate
 from clsplat.images.writing import write_image
 from clsplat.rendering.renderer import Renderer
@@ -41,7 +42,7 @@ def picked(scene: Scene, count: int) -> Scene:
 
 def with_settings(iterations: int, settings: str) -> TrainConfig:
     """The schedule `schedule=NAME`, else the paper's, of so many steps with these settings, `name=value` with commas
-    between; values as in JSON, other words as they are."""
+    between; values as in JSON, other words as they are. Raises InputError."""
     values: dict[str, Any] = {}
     for setting in filter(None, settings.split(",")):
         name, _, text = setting.partition("=")
@@ -49,7 +50,9 @@ def with_settings(iterations: int, settings: str) -> TrainConfig:
             values[name] = json.loads(text)
         except json.JSONDecodeError:
             values[name] = text
-    config = scheduled(values.pop("schedule", "paper"), values.pop("iterations", iterations))
+    if (schedule := values.pop("schedule", "paper")) not in get_args(Schedule):
+        raise InputError(f"schedule={schedule}: expected one of {', '.join(get_args(Schedule))}")
+    config = scheduled(schedule, values.pop("iterations", iterations))
     for name, value in values.items():
         *group, field = name.replace("-", "_").split(".")
         part = replace(getattr(config, group[0]) if group else config, **{field: value})
@@ -76,17 +79,14 @@ def measured(scene: Scene, config: TrainConfig, device: Device, pictures: Path) 
     return {"psnr": result["mean"]["psnr"], "gaussians": len(model)}
 
 
-def table(rows: dict[str, dict[str, float]], methods: list[str], counts: list[int], seeds: list[int]) -> str:
+def table(psnrs: dict[tuple[str, int, int], float], methods: list[str], counts: list[int], seeds: list[int]) -> str:
     """Markdown: means over the seeds."""
     lines = [
         "| settings | " + " | ".join(f"{count} views" for count in counts) + " |",
         "|---" * (len(counts) + 1) + "|",
     ]
     for method in methods:
-        cells = []
-        for count in counts:
-            found = [rows[key]["psnr"] for seed in seeds if (key := f"{method} {count} {seed}") in rows]
-            cells.append(f"{np.mean(found):.2f}" if found else "")
+        cells = [f"{np.mean([psnrs[method, count, seed] for seed in seeds]):.2f}" for count in counts]
         lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -110,21 +110,24 @@ def main() -> None:
     options.folder.mkdir(parents=True, exist_ok=True)
     file = options.folder / "views.json"
     rows = json.loads(file.read_text("utf-8")) if file.exists() else {}
+    psnrs: dict[tuple[str, int, int], float] = {}
     scene = load_scene(options.scene, resolution=options.resolution)
     device = open_device()
     for count in options.views:
         few = picked(scene, count)
         for seed in options.seeds:
             for method, settings in methods.items():
-                key = f"{method} {count} {seed}"
+                key = f"{method} {count} {seed} {options.iterations} {options.resolution} {settings}"
                 config = with_settings(options.iterations, settings)
                 config = replace(config, seed=seed, resolution=options.resolution, report=False)
                 if key not in rows:
-                    name = key.replace(" ", "_") + ".png"
-                    rows[key] = measured(few, config, device, options.folder / name)
+                    picture = options.folder / f"{method.replace(' ', '_')}_{count}_{seed}.png"
+                    rows[key] = measured(few, config, device, picture)
                     file.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
-                    print(f"{key}: {rows[key]['psnr']:.2f} dB, {rows[key]['gaussians']:,} Gaussians", flush=True)
-    print(table(rows, list(methods), options.views, options.seeds))
+                psnrs[method, count, seed] = rows[key]["psnr"]
+                words = f"{psnrs[method, count, seed]:.2f} dB, {rows[key]['gaussians']:,} Gaussians"
+                print(f"{method}, {count} views, seed {seed}: {words}", flush=True)
+    print(table(psnrs, list(methods), options.views, options.seeds))
 
 
 if __name__ == "__main__":

@@ -197,8 +197,8 @@ def _looked_at(verb: Train, services: Services, source: Path) -> tuple[Scene, Tr
     scene = _scene(services, source, config)
     if verb.resume:
         return scene, config
-    found = services.findings(scene, config.mask_use, config.iterations)
-    answers, better = answered(found, config, verb.given)
+    findings = services.findings(scene, config.mask_use, config.iterations)
+    answers, better = answered(findings, config, verb.given)
     print(paragraph(answers, len(scene.views), auto=verb.auto), file=sys.stderr)
     if not verb.auto:
         return scene, config

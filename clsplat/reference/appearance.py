@@ -20,9 +20,13 @@ def gradient(image: Float64, logs: Float64, by_seen: Float64) -> tuple[Float64, 
     return by_seen * np.exp2(logs), by_logs
 
 
-def pulled(by_logs: Float64, logs: Float64, start: Float64, pulls: Float64) -> Float64:
-    """The gradient by a photograph's logs, all (3,), with a part of their distance from where they started."""
-    return by_logs + pulls * (logs - start)
+def pull(logs: Float64, start: Float64, pulls: Float64) -> Float64:
+    """What is added to the gradients by the logs, all (photographs, 3): parts of their distance from where they
+    started, less its mean by these parts."""
+    total, apart = pulls.sum(axis=0), logs - start
+    mean = np.divide((pulls * apart).sum(axis=0), total, out=np.zeros(3), where=total > 0)
+    result: Float64 = pulls * (apart - mean)
+    return result
 
 
 def step(

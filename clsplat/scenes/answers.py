@@ -43,11 +43,11 @@ ADVICE: Mapping[Kind, str] = {
 @dataclass(frozen=True)
 class Answer:
     """A finding and the settings that answer it; none where nothing does, or nothing that goes with the others. given:
-    whether such a setting is given already."""
+    the name of a setting that is given in place of it."""
 
     finding: Finding
     settings: Mapping[str, Any]
-    given: bool = False
+    given: str = ""
 
     @property
     def words(self) -> str:
@@ -56,9 +56,8 @@ class Answer:
         answer = flags(self.settings) or ADVICE.get(kind, "")
         if kind in ANSWERS and not self.settings:
             wanted = flags(ANSWERS[kind][0])
-            answer = (
-                f"{wanted.split(' ')[0]} is given" if self.given else f"{wanted} does not go with the other settings"
-            )
+            given = f"--{self.given.replace('_', '-')} is given"
+            answer = given if self.given else f"{wanted} does not go with the other settings"
         return f"{self.finding.text} ({answer})" if answer else self.finding.text
 
 
@@ -77,7 +76,8 @@ def answered(
     answers = []
     for finding in found:
         options = ANSWERS.get(finding.kind, ())
-        free = [option for option in options if not _touches(option, given)]
+        touched = [_touched(option, given) for option in options]
+        free = [option for option, name in zip(options, touched, strict=True) if not name]
         taken: Mapping[str, Any] = {}
         for option in free:
             try:
@@ -86,14 +86,14 @@ def answered(
                 continue
             taken = option
             break
-        answers.append(Answer(finding, taken, given=bool(options) and not free))
+        answers.append(Answer(finding, taken, "" if free or not options else touched[0]))
     return answers, config
 
 
-def _touches(option: Mapping[str, Any], given: Collection[str]) -> bool:
-    """True if an answer has a setting that is given, its schedule's too."""
-    names = {*option, *(SCHEDULED if SCHEDULE in option else ())}
-    return any(name in names or name.partition(".")[0] in names for name in given)
+def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
+    """The first given setting that an answer has too, or its schedule; "" if there is none."""
+    names = {*option, *((*SCHEDULED, "density.start") if SCHEDULE in option else ())}
+    return min((name for name in given if name in names or name.partition(".")[0] in names), default="")
 
 
 def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:

@@ -176,7 +176,7 @@ def _few_steps(scene: Scene, iterations: int) -> Finding | None:
         return None
     each = iterations / count
     text = (
-        f"{iterations:,} steps are {each:.0f} for each of {count:,} photographs to train on, which takes higher rates"
+        f"{iterations:,} steps are {each:.1f} for each of {count:,} photographs to train on, which takes higher rates"
     )
     return Finding("few steps", text)
 

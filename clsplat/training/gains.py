@@ -34,8 +34,8 @@ STEP = 2.0**-10
 
 PULL = 0.02
 """Part of the distance, in octaves, from where points say that gains begin, in the loss's gradient. Neighbouring views
-may all be brighter by a little if what they alone show is darker; there the points are better. Of gains that points do
-not tell there is none, as it would hold them at the mean."""
+may all be brighter by a little if what they alone show is darker; there the points are better. Gains that points do not
+tell have none, as it would hold them at the mean."""
 
 KEPT = ("logs", "start", "pulls", "first", "second", "gains")
 """Arrays of `Gains` in a checkpoint."""
@@ -156,7 +156,7 @@ class GainsOfAll:
         return saved({name: getattr(self._gains, name) for name in KEPT})
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Take the arrays of a checkpoint. Raises ValueError where that is of other photographs."""
+        """Take the arrays of a checkpoint. Raises ValueError where one is missing, or of other photographs."""
         shape = (len(self._scene.train_views), 3)
         values = loaded(self._device, arrays, KEPT, shape)
         self._gains = Gains(**values, moved=allocate(self._device, shape, np.float32))

@@ -120,7 +120,7 @@ def test_few_steps() -> None:
     for steps, found in ((2399, ["few steps"]), (2400, []), (1000, ["few steps"]), (999, []), (0, [])):
         assert [finding.kind for finding in findings(scene, iterations=steps)] == found, steps
     (found,) = findings(scene, iterations=2000)
-    assert found.text.startswith("2,000 steps are 50 for each of 40 photographs")
+    assert found.text.startswith("2,000 steps are 50.0 for each of 40 photographs")
     many = made(200)
     assert findings(many, iterations=10_001) == [], "nothing is known of longer trainings"
     assert [finding.kind for finding in findings(many, iterations=10_000)] == ["few steps"]
@@ -260,16 +260,19 @@ def test_few_views_are_trained_for_fewer_steps() -> None:
 
 
 def test_few_steps_are_trained_with_high_rates() -> None:
-    """Whatever grows the model; not where rates or a schedule are somebody's own."""
+    """Whatever grows the model; not where rates or a schedule are given."""
     few = [Finding("few steps", "a")]
     mcmc = TrainConfig(iterations=7000, density=DensityConfig(growth="mcmc", max_gaussians=1000))
     (answer,), config = answered(few, mcmc, {"iterations", "density.growth", "density.max_gaussians"})
     high = scheduled("high-rates", 7000)
     assert answer.words == "a (--schedule high-rates)"
     assert config == replace(high, density=replace(high.density, growth="mcmc", max_gaussians=1000))
-    own = replace(mcmc, density=replace(mcmc.density, stop=4000))
+    stopped = replace(mcmc, density=replace(mcmc.density, stop=4000))
+    late = replace(mcmc, density=replace(mcmc.density, start=6000, stop=7000))
     for mine, given, words in (
-        (TrainConfig(), {"schedule"}, "--schedule is given"), (own, {"density.stop"}, "--schedule is given"),
+        (TrainConfig(), {"schedule"}, "--schedule is given"), (stopped, {"density.stop"}, "--density.stop is given"),
+        (late, {"density.start"}, "--density.start is given"),
+        (TrainConfig(), {"sh_degree_every", "sh_degree"}, "--sh-degree-every is given"),
         (bundled("fast", None, 7000), {"preset"}, "--schedule high-rates does not go with the other settings"),
     ):  # fmt: skip
         (answer,), config = answered(few, mine, given)

@@ -61,8 +61,8 @@ def test_steps_and_the_mean(shaped_device: Device) -> None:
         columns = rng.normal(0, 1, (3, 16)).astype(np.float32)
         by_logs = np.zeros((4, 3))
         view = number % 4
-        by_view = np.log(2) * columns.astype(np.float64).sum(axis=1)
-        by_logs[view] = reference.pulled(by_view, state[0][view], start[view].astype(np.float64), pulls[view])
+        by_logs[view] = np.log(2) * columns.astype(np.float64).sum(axis=1)
+        by_logs[view] += reference.pull(state[0], start.astype(np.float64), pulls.astype(np.float64))[view]
         state = reference.step(*state, by_logs, number, 0.05)
         step_gains(shaped_device, gains, view, upload(shaped_device, columns), number, 0.05, readback)
     # Eleven steps of 0.05; a sum of 16 floats that nearly cancel is good to 1e-5 of itself.
@@ -70,6 +70,25 @@ def test_steps_and_the_mean(shaped_device: Device) -> None:
     assert_close(gains.gains.get(), np.exp2(state[0]), absolute=1e-5)
     assert_close(gains.logs.get().mean(axis=0), np.zeros(3), absolute=1e-7)
     assert_same_bits(gains.start.get(), start)
+
+
+def test_pulled_gains_do_not_hold_those_of_other_photographs(shaped_device: Device) -> None:
+    """Two photographs begin where they are to be but for a common factor, which the third, not pulled, makes so."""
+    truth = np.array([[0.5], [-0.5], [1.5]]) * np.ones(3)
+    truth -= truth.mean(axis=0)
+    start = truth.copy()
+    start[2] = 0
+    start -= start.mean(axis=0)
+    pulls = np.repeat(np.array([[10.0], [10.0], [0.0]], np.float32), 3, axis=1)
+    gains = Gains.on(shaped_device, start.astype(np.float32), pulls)
+    readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
+    for number in range(1, 601):
+        view = number % 3
+        by_logs = gains.logs.get()[view] - truth[view]
+        columns = upload(shaped_device, (by_logs[:, None] * np.ones(16) / (16 * np.log(2))).astype(np.float32))
+        step_gains(shaped_device, gains, view, columns, number, 0.05 * 0.99**number, readback)
+    # What the last steps of Adam, of under 0.001, leave; a pull of each by itself leaves 0.9 of the third's octave.
+    assert_close(gains.logs.get(), truth, absolute=0.02)
 
 
 def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:

@@ -22,6 +22,8 @@ def test_settings_of_a_row() -> None:
     words = "schedule=short,iterations=2000,thinning=0.2,density.growth=budget,density.max-gaussians=100"
     tried = quality_views.with_settings(7000, words)
     assert tried == replace(short, thinning=0.2, density=replace(short.density, growth="budget", max_gaussians=100))
+    with pytest.raises(InputError, match="schedule=none: expected one of paper, short, high-rates"):
+        quality_views.with_settings(7000, "schedule=none")
     with pytest.raises(InputError, match="--thinning 2: expected"):
         quality_views.with_settings(7000, "thinning=2")
 
