@@ -47,13 +47,13 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// columns of one photograph, logs, start, pulls -> moved; first and second in place. All photographs move: the others'
-// gradient is 0.
+// columns of one photograph, logs, gains, start, pulls -> moved; first and second in place. All photographs move: the
+// others' gradient is 0.
 __kernel void move_gains(const int count, const int photograph, const int stride, const float rate, const float root,
                          const float beta1, const float beta2, const float epsilon, __global const uint *readback,
                          __global const float *columns, __global const float *start, __global const float *pulls,
-                         __global const float *logs, __global float *moved, __global float *first,
-                         __global float *second) {
+                         __global const float *logs, __global const float *gains, __global float *moved,
+                         __global float *first, __global float *second) {
   const int i = get_global_id(0);
   if (i >= count || readback[READBACK_STOPPED]) return;
   float g = 0.0f;
@@ -63,7 +63,7 @@ __kernel void move_gains(const int count, const int photograph, const int stride
   if (i / 3 == photograph && pulls[i] > 0.0f) {
     float weight = 0.0f, apart = 0.0f; // of all that are pulled: a common factor is nobody's to hold
     for (int k = i % 3; k < count; k += 3) weight += pulls[k], apart = fma1(pulls[k], logs[k] - start[k], apart);
-    g = fma1(pulls[i], logs[i] - start[i] - apart / weight, g);
+    g = fma1(pulls[i] * gains[i], logs[i] - start[i] - apart / weight, g);
   }
   if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));

@@ -22,7 +22,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 @dataclass(frozen=True, eq=False)
 class Gains:
     """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, where they started, the part of their
-    distance from there that is added to their gradient, Adam's moments, 2^logs; moved: scratch."""
+    distance from there, times the gain, that is added to their gradient, Adam's moments, 2^logs; moved: scratch."""
 
     logs: DeviceArray
     start: DeviceArray
@@ -95,7 +95,7 @@ def step_gains(
     stopped changes nothing."""
     kernels, count = device.kernels("appearance", LANES=1), gains.logs.size
     constants = (rate / (1 - BETA1**step), (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
-    sizes, kept = (count, photograph, columns.shape[1]), (gains.start, gains.pulls)
+    sizes, read = (count, photograph, columns.shape[1]), (gains.start, gains.pulls, gains.logs, gains.gains)
     changed = (gains.moved, gains.first, gains.second)
-    launch_items(device, kernels.move_gains, count, *sizes, *constants, readback, columns, *kept, gains.logs, *changed)
+    launch_items(device, kernels.move_gains, count, *sizes, *constants, readback, columns, *read, *changed)
     launch_items(device, kernels.centre_gains, count, count, readback, gains.moved, gains.logs, gains.gains)
