@@ -86,6 +86,7 @@ def growth_rows() -> list[Row]:
     ends = (f"{BY_PAPER} default", f"{BY_PAPER} short")
     by_paper = ("--density.growth", "mcmc", "--density.stop", "{stop}")
     rows.append(Row(f"{BY_PAPER} mcmc paper", BY_PAPER, by_paper, half_of=ends))
+    rows.append(Row(f"{BY_PAPER} mcmc paper thinned", BY_PAPER, (*by_paper, "--thinning", "0.2"), half_of=ends))
     rows.append(Row(f"{BY_PAPER} high rates mcmc SH 0", BY_PAPER, (*HALVES["high rates mcmc"], *FLAT), half_of=ends))
     scene, most = FEWEST
     for name in ("mcmc", "high rates mcmc"):

@@ -21,8 +21,8 @@ def gradient(image: Float64, logs: Float64, by_seen: Float64) -> tuple[Float64, 
 
 
 def pull(logs: Float64, start: Float64, pulls: Float64) -> Float64:
-    """What is added to the gradients by the logs, all (photographs, 3): parts of their distance from where they
-    started, less its mean by these parts, times the gains, as the loss's gradient is."""
+    """The pull that is added to the gradients by the logs, all (photographs, 3): parts of their distance from where
+    they started, less its mean by these parts, times the gains, as the loss's gradient is."""
     total, apart = pulls.sum(axis=0), logs - start
     mean = np.divide((pulls * apart).sum(axis=0), total, out=np.zeros(3), where=total > 0)
     result: Float64 = pulls * np.exp2(logs) * (apart - mean)
