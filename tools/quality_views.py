@@ -29,6 +29,7 @@ from clsplat.errors import InputError
 from clsplat.evaluation.held_out import evaluate
 from clsplat.images.writing import write_image
 from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.answers import changed
 from clsplat.scenes.scene import Scene, load_scene
 
 
@@ -54,9 +55,7 @@ def with_settings(iterations: int, settings: str) -> TrainConfig:
         raise InputError(f"schedule={schedule}: expected one of {', '.join(get_args(Schedule))}")
     config = scheduled(schedule, values.pop("iterations", iterations))
     for name, value in values.items():
-        *group, field = name.replace("-", "_").split(".")
-        part = replace(getattr(config, group[0]) if group else config, **{field: value})
-        config = replace(config, **{group[0]: part}) if group else part
+        config = changed(config, name.replace("-", "_"), value)
     config.check()
     return config
 

@@ -106,13 +106,13 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
             raise InputError(f"--schedule {name}: the run has settings of its own in place of the paper's schedule")
         bundle = scheduled(name, changes.get("iterations", config.iterations))
         for each, value in zip(SCHEDULED, values(bundle), strict=True):
-            config = _changed(config, each, value)
+            config = changed(config, each, value)
     config = replace(config, **changes)
     config.check()
     return config
 
 
-def _changed(config: TrainConfig, name: str, value: Any) -> TrainConfig:
+def changed(config: TrainConfig, name: str, value: Any) -> TrainConfig:
     """The settings with another value of one, whose name has a dot after its group's."""
     group, dot, field = name.partition(".")
     return replace(config, **{group: replace(getattr(config, group), **{field: value}) if dot else value})

@@ -31,7 +31,6 @@ linear, and points nothing."""
 STEP = 2.0**-10
 """Octaves to which what points tell is rounded: processors add in other orders, and begin alike."""
 
-
 PULL = 0.02
 """Part of the distance, in octaves, from where points say that gains begin, in the loss's gradient. Neighbouring views
 may all be brighter by a little if what they alone show is darker; there the points are better. Gains that points do not

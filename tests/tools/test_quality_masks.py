@@ -16,7 +16,7 @@ from clsplat.images.reading import read_image
 from clsplat.scenes.scene import load_scene
 
 LEVEL = 1 / 255
-"""What two 8 bit pictures of the same values are apart at most."""
+"""The largest distance of two 8 bit pictures of the same values."""
 
 
 def test_a_block_is_where_the_mask_is_and_other_pixels_stay(tmp_path: Path) -> None:
