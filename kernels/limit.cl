@@ -1,7 +1,7 @@
 // The most that the device can do, in the terms of the pipeline: `clsplat bench` states each stage's share of it.
 //
-// Owner: A work-item owns OWNED cells of pixels that nobody sees; in limit_copy LANES elements.
-// Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy one work-item for each LANES elements.
+// Owner: A work-item owns OWNED cells of pixels that nobody sees; in limit_copy COPIED elements.
+// Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy one for each COPIED elements.
 // Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep the work from being left out.
 //   limit_copy: from (n) -> to (n).
 // Equations: those of blend.cl and blend_grad.cl, with no branch.
@@ -80,8 +80,15 @@ GROUP __kernel void limit_blend_grad(const int rounds, __global const float *spl
   sums[get_global_id(0)] = sum;
 }
 
-// from (n) -> to (n): LANES elements a work-item.
-__kernel void limit_copy(const uint n, __global const float *from, __global float *to) {
-  const uint i = get_global_id(0) * LANES;
-  if (i + LANES <= n) STOREL(LOADL(from + i), to + i);
+// from (n) -> to (n): COPIED elements a work-item, 16 bytes at least, n a multiple of them.
+#if LANES > 4
+#define COPIED LANES
+typedef floatL copied;
+#else
+#define COPIED 4
+typedef float4 copied;
+#endif
+__kernel void limit_copy(const uint n, __global const copied *from, __global copied *to) {
+  const uint i = get_global_id(0);
+  if (i < n / COPIED) to[i] = from[i];
 }

@@ -321,14 +321,14 @@ def density(device: Device) -> None:
 def limits(device: Device) -> None:
     """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the
     tests and of the self-test."""
-    items, lanes = tile_items(device), device.shape.lanes
+    items, copied = tile_items(device), max(device.shape.lanes, 4)
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
     kernels = device.kernels("limit", ITEMS=items)
     for kernel in (kernels.limit_blend, kernels.limit_blend_grad):
         launch.launch_groups(device, kernel, 1, items, 2, splats, sums)
     sums.get()
-    source, copy = upload(device, np.ones(16 * lanes, np.float32)), allocate(device, (16 * lanes,), np.float32)
-    launch.launch_items(device, device.kernels("limit").limit_copy, 16, 16 * lanes, source, copy)
+    source, copy = upload(device, np.ones(16 * copied, np.float32)), allocate(device, (16 * copied,), np.float32)
+    launch.launch_items(device, device.kernels("limit").limit_copy, 16, 16 * copied, source, copy)
     probe = device.kernels("probe")
     for name, values, rows in (
         ("probe_elementary", np.linspace(0.1, 0.9, 5, dtype=np.float32), 4),

@@ -83,11 +83,11 @@ def _pairs_per_second(
 
 
 def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
-    lanes = device.shape.lanes
-    n = min(nbytes, device.max_allocation // 4, device.budget // 4) // 4 // lanes * lanes
+    copied = max(device.shape.lanes, 4)  # elements of a work-item: on GPUs it takes 16 bytes to keep memory busy
+    n = min(nbytes, device.max_allocation // 4, device.budget // 4) // 4 // copied * copied
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
     copy.fill(0.0)  # so that its pages are there
     kernel = device.kernels("limit", ITEMS=tile_items(device), NARROW=True).limit_copy
-    runs = [device.timed(lambda: launch_items(device, kernel, n // lanes, n, source, copy)) for _ in range(repeat + 1)]
+    runs = [device.timed(lambda: launch_items(device, kernel, n // copied, n, source, copy)) for _ in range(repeat + 1)]
     return 8e3 * n / min(ms for _, ms in runs)
