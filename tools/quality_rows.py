@@ -6,11 +6,14 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import io
 import json
 import re
+import tokenize
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -112,8 +115,8 @@ class Kept:
 
 @cache
 def code_digest(root: Path, *, mcmc: bool) -> str:
-    """Digest of the code that a row runs, of the folders CODE without comments, docstrings and layout. What is equal
-    gives the same bytes on one device; what differs may give them too."""
+    """Digest of the code that a row runs, of the folders CODE without comments, docstrings and empty lines. What is
+    equal gives the same bytes on one device; what differs may give them too."""
     digest = hashlib.blake2b(digest_size=8)
     for folder in CODE:
         for path in sorted((root / folder).rglob("*")):
@@ -125,18 +128,28 @@ def code_digest(root: Path, *, mcmc: bool) -> str:
 
 def _bare(path: Path) -> str:
     text = path.read_text("utf-8")
-    if path.suffix != ".py":
-        return " ".join(COMMENT.sub(" ", text).split())
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [each for each in body if not _is_words(each)] or [ast.Pass()]  # type: ignore[attr-defined]
-    return ast.unparse(tree)
+    return bare_python(text) if path.suffix == ".py" else " ".join(COMMENT.sub(" ", text).split())
 
 
-def _is_words(node: ast.AST) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+def bare_python(text: str) -> str:
+    """Python's text without comments, docstrings and empty lines. It is the same in every version of Python, which
+    what `ast.unparse` makes is not."""
+    lines = text.splitlines(keepends=True)
+    starts = list(accumulate(map(len, lines), initial=0))
+    spans = [
+        (starts[token.start[0] - 1] + token.start[1], starts[token.end[0] - 1] + token.end[1])
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        if token.type == tokenize.COMMENT
+    ]
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            last = (node.end_lineno or node.lineno, node.end_col_offset)
+            ends = ((node.lineno, node.col_offset), last)
+            begin, end = (starts[line - 1] + len(lines[line - 1].encode()[:column].decode()) for line, column in ends)
+            spans.append((begin, end))
+    for begin, end in sorted(spans, reverse=True):
+        text = text[:begin] + text[end:]
+    return "\n".join(line.rstrip() for line in text.splitlines() if line.strip())
 
 
 def device_of(run: Path) -> str:

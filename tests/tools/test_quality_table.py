@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import quality_table
-from quality_rows import Kept, Same, code_digest
+from quality_rows import Kept, Same, bare_python, code_digest
 from quality_table import ROOT, Book, Row
 
 from clsplat.errors import InputError
@@ -123,6 +123,12 @@ def test_the_digest_is_of_code_alone(tmp_path: Path) -> None:
     other = digests(plain, kernel, "a = 2\n")
     assert other[0] == first[0]
     assert other[1] != first[1]
+
+
+def test_bare_python_is_text_as_it_was_written() -> None:
+    """What `ast.unparse` makes of a string in a string differs between versions of Python."""
+    text = """'''Words.'''\nname = f'{"ä"}'  # one\n\n\ndef f():\n    "More."; return f"{name!r:>{8}}"  # two\n"""
+    assert bare_python(text) == """name = f'{"ä"}'\ndef f():\n    ; return f"{name!r:>{8}}\""""
 
 
 def test_rows_that_are_committed_can_be_read() -> None:
