@@ -321,7 +321,8 @@ def density(device: Device) -> None:
 def limits(device: Device) -> None:
     """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the
     tests and of the self-test."""
-    items, copied = tile_items(device), max(device.shape.lanes, 4)
+    items, lanes = tile_items(device), device.shape.lanes
+    copied = max(lanes, 4)
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
     kernels = device.kernels("limit", ITEMS=items)
     for kernel in (kernels.limit_blend, kernels.limit_blend_grad):

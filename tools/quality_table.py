@@ -106,7 +106,10 @@ def antialiasing_rows() -> list[Row]:
 
 TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antialiasing": antialiasing_rows}
 SIZED = ("--iterations", "{iterations}", "--resolution", "{resolution}")
-AUTO = ("--try", "auto:schedule=short,thinning=0.2,penalty=0.02,iterations=2000")
+AUTO = (
+    "--try",
+    "auto:schedule=high-rates,thinning=0.2,penalty=0.02,iterations=2000,optimiser.sh_rest_rate=4e-4",
+)
 """Settings that --auto takes for few photographs."""
 FEW = ("--views", "3,12", "--seeds", "0,1")
 TOOLS: dict[str, tuple[str, ...]] = {

@@ -24,7 +24,13 @@ ANSWERS: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "fisheye": ({"lenses": "native"},),
     "few steps": ({SCHEDULE: "high-rates"},),
     "few views": (
-        {"thinning": 0.2, "penalty": 0.02, SCHEDULE: "short", "iterations": 2000},
+        {
+            "thinning": 0.2,
+            "penalty": 0.02,
+            SCHEDULE: "high-rates",
+            "iterations": 2000,
+            "optimiser.sh_rest_rate": 4e-4,  # colours by direction are what few photographs tell least of
+        },
         {"thinning": 0.2, "penalty": 0.02},
         {"thinning": 0.2},
     ),
@@ -100,14 +106,14 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
     """The settings with those of an answer. Raises InputError where they do not go together, and for a schedule where
     its settings are not the paper's."""
     changes = dict(settings)
+    config = replace(config, iterations=changes.pop("iterations", config.iterations))
     if (name := changes.pop(SCHEDULE, None)) is not None:
         paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED)
         if values(config) != values(paper):
             raise InputError(f"--schedule {name}: the run has settings of its own in place of the paper's schedule")
-        bundle = scheduled(name, changes.get("iterations", config.iterations))
-        for each, value in zip(SCHEDULED, values(bundle), strict=True):
-            config = changed(config, each, value)
-    config = replace(config, **changes)
+        changes = dict(zip(SCHEDULED, values(scheduled(name, config.iterations)), strict=True)) | changes
+    for each, value in changes.items():
+        config = changed(config, each, value)
     config.check()
     return config
 

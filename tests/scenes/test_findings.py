@@ -238,12 +238,15 @@ def test_answers_that_do_not_go_together() -> None:
 
 
 def test_few_views_are_trained_for_fewer_steps() -> None:
-    """By the short schedule for so many, unless steps, a schedule or rates are somebody's own."""
+    """By high rates for so many, unless steps, a schedule or rates are somebody's own."""
     few = [Finding("few views", "a")]
     (answer,), config = answered(few, TrainConfig(antialiased=True))
     steps = int(answer.settings["iterations"])
-    assert answer.words == f"a (--thinning 0.2 --penalty 0.02 --schedule short --iterations {steps})"
-    assert config == replace(scheduled("short", steps), thinning=0.2, penalty=0.02, antialiased=True)
+    taken = f"--thinning 0.2 --penalty 0.02 --schedule high-rates --iterations {steps} --optimiser.sh-rest-rate 0.0004"
+    assert answer.words == f"a ({taken})"
+    high = scheduled("high-rates", steps)
+    high = replace(high, optimiser=replace(high.optimiser, sh_rest_rate=4e-4))
+    assert config == replace(high, thinning=0.2, penalty=0.02, antialiased=True)
     own = replace(TrainConfig(), optimiser=replace(TrainConfig().optimiser, means_rate=1e-4))
     for mine, given in (
         (TrainConfig(), {"iterations"}), (TrainConfig(), {"schedule"}), (own, {"optimiser.means_rate"}),
