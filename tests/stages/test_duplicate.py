@@ -176,6 +176,7 @@ def test_key_bits_of_no_gaussian_and_of_equal_ones(shaped_device: Device) -> Non
 def test_fewer_bits_are_fewer_launches(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stages_scan, "MOST_ALONE", 0)  # else one item sorts so few alone, in one launch
     monkeypatch.setattr(stages_scan, "LEAST_CHUNK", 256)
+    monkeypatch.setitem(BITONIC_WINS, default_device.kind, 0)  # of so few, which a GPU sorts in one launch
     device = default_device.with_shape()  # with a recorder of its own: nobody else's launches are counted
     gaussians, camera = make("cloud")
     # Depths from 2 to 3 differ in 22 bits: two digits of 11 rather than three.
@@ -187,7 +188,6 @@ def test_fewer_bits_are_fewer_launches(default_device: Device, monkeypatch: pyte
     for key_bits in ("needed", "all"):
         config = BenchSwitches(key_bits=key_bits)  # type: ignore[arg-type]  # one of them
         run = Pipeline.run(device, (gaussians, camera), config=config)
-        assert run.visible.sum() > BITONIC_WINS["cpu"]
         with device.recorder.recording(wait=False) as stages:
             run.rasterizer.forward(run.gaussians, run.camera, run.frame.background)
         launches[key_bits] = {name: stages[name].launches for name in ("duplicate", "ranges")}
