@@ -4,9 +4,9 @@
 //   (column_sums), or one gain of one photograph (move_gains, centre_gains). Sums have one order on every device.
 //   Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of the `count` gains.
-// Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, start, pulls, first, second, moved, gains
-//   (photographs, 3), logs to base 2; partials (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are
-//   above each.
+// Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, start, first, second, moved, gains
+//   (photographs, 3), logs to base 2; begins (photographs + 1), others, weights: rows of a sparse matrix; partials
+//   (3, tiles_y, stride); columns (3, stride). Shapes of the kernels are above each.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -47,23 +47,30 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// columns of one photograph, logs, gains, start, pulls -> moved; first and second in place. All photographs move: the
-// others' gradient is 0.
+// columns of one photograph, logs, gains, start, begins, others, weights -> moved; first and second in place. All
+// photographs move: the others' gradient is 0.
 __kernel void move_gains(const int count, const int photograph, const int stride, const float rate, const float root,
                          const float beta1, const float beta2, const float epsilon, __global const uint *readback,
-                         __global const float *columns, __global const float *start, __global const float *pulls,
-                         __global const float *logs, __global const float *gains, __global float *moved,
-                         __global float *first, __global float *second) {
-  const int i = get_global_id(0);
+                         __global const float *columns, __global const float *start, __global const int *begins,
+                         __global const int *others, __global const float *weights, __global const float *logs,
+                         __global const float *gains, __global float *moved, __global float *first,
+                         __global float *second) {
+  const int i = get_global_id(0), c = i % 3;
   if (i >= count || readback[READBACK_STOPPED]) return;
   float g = 0.0f;
   if (i / 3 == photograph)
-    for (int x = 0; x < stride; ++x) g = added(g, columns[(size_t)stride * (i % 3) + x]);
+    for (int x = 0; x < stride; ++x) g = added(g, columns[(size_t)stride * c + x]);
   g *= LN2;
-  if (i / 3 == photograph && pulls[i] > 0.0f) {
-    float weight = 0.0f, apart = 0.0f; // of all that are pulled: a common factor is nobody's to hold
-    for (int k = i % 3; k < count; k += 3) weight += pulls[k], apart = fma1(pulls[k], logs[k] - start[k], apart);
-    g = fma1(pulls[i] * gains[i], logs[i] - start[i] - apart / weight, g);
+  const int begin = begins[photograph], end = begins[photograph + 1];
+  if (i / 3 == photograph && end > begin) {
+    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean of all that are pulled is nobody's to hold
+    for (int k = 0; 3 * k < count; ++k)
+      if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[3 * k + c] - start[3 * k + c]);
+    for (int k = begin; k < end; ++k) {
+      const int j = 3 * others[k] + c;
+      pull = fma1(weights[k], logs[j] - start[j] - apart / told, pull);
+    }
+    g = fma1(gains[i], pull, g);
   }
   if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));

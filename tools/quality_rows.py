@@ -134,22 +134,25 @@ def _bare(path: Path) -> str:
 def bare_python(text: str) -> str:
     """Python's text without comments, docstrings and empty lines. It is the same in every version of Python, which
     what `ast.unparse` makes is not."""
-    lines = text.splitlines(keepends=True)
+    lines = [f"{line}\n" for line in text.split("\n")]
     starts = list(accumulate(map(len, lines), initial=0))
-    spans = [
-        (starts[token.start[0] - 1] + token.start[1], starts[token.end[0] - 1] + token.end[1])
-        for token in tokenize.generate_tokens(io.StringIO(text).readline)
-        if token.type == tokenize.COMMENT
-    ]
+    spans = []
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        blank = token.type == tokenize.NL and not lines[token.start[0] - 1].strip()
+        if blank or token.type == tokenize.COMMENT:
+            spans.append((starts[token.start[0] - 1] + token.start[1], starts[token.end[0] - 1] + token.end[1]))
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             last = (node.end_lineno or node.lineno, node.end_col_offset)
             ends = ((node.lineno, node.col_offset), last)
             begin, end = (starts[line - 1] + len(lines[line - 1].encode()[:column].decode()) for line, column in ends)
             spans.append((begin, end))
+    text = "".join(lines)
     for begin, end in sorted(spans, reverse=True):
-        text = text[:begin] + text[end:]
-    return "\n".join(line.rstrip() for line in text.splitlines() if line.strip())
+        before, after = text[:begin].rstrip(" "), text[end:]
+        alone = not before or before.endswith("\n")
+        text = before + (after.removeprefix("\n") if alone else after)
+    return text.rstrip("\n")
 
 
 def device_of(run: Path) -> str:

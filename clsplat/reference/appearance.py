@@ -20,12 +20,13 @@ def gradient(image: Float64, logs: Float64, by_seen: Float64) -> tuple[Float64, 
     return by_seen * np.exp2(logs), by_logs
 
 
-def pull(logs: Float64, start: Float64, pulls: Float64) -> Float64:
-    """The pull that is added to the gradients by the logs, all (photographs, 3): parts of their distance from where
-    they started, less its mean by these parts, times the gains, as the loss's gradient is."""
-    total, apart = pulls.sum(axis=0), logs - start
-    mean = np.divide((pulls * apart).sum(axis=0), total, out=np.zeros(3), where=total > 0)
-    result: Float64 = pulls * np.exp2(logs) * (apart - mean)
+def pull(logs: Float64, start: Float64, weights: Float64) -> Float64:
+    """The pull that is added to the gradients by the logs, (photographs, 3) both: weights (photographs, photographs)
+    times the distances from where they started, less the mean of those that have weights, times the gains, as the
+    loss's gradient is."""
+    told, apart = weights.any(axis=1), logs - start
+    mean = apart[told].mean(axis=0) if told.any() else 0.0
+    result: Float64 = np.exp2(logs) * (weights @ (apart - mean))
     return result
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.layout import READBACK
@@ -21,13 +22,17 @@ def of_appearance(bench: Bench) -> Outcome:
     """A photograph of three, whose picture is what the scene's blending has made."""
     device, camera, image = bench.device, bench.camera, bench.blended.image
     logs = evenly(41, (3, 3), -1.0, 1.0).astype(np.float32)
-    start, pulls = evenly(43, (3, 3), -1.0, 1.0).astype(np.float32), evenly(44, (3, 3), 0.0, 0.5).astype(np.float32)
+    start, pull = evenly(43, (3, 3), -1.0, 1.0).astype(np.float32), evenly(44, (3, 3), 0.0, 0.5).astype(np.float32)
+    pull[2] = pull[:, 2] = 0  # a photograph that is not pulled
     by_seen = evenly(42, tuple(image.shape), -0.25, 1.0).astype(np.float32)
     by_seen[:, :, camera.width :] = 0  # like the gradient of the loss
     readback = upload(device, np.zeros(len(READBACK), np.uint32))
 
     def launch() -> tuple[Gains, DeviceArray, DeviceArray, DeviceArray]:
-        gains, gradient = replace(Gains.on(device, logs, pulls), start=upload(device, start)), upload(device, by_seen)
+        gains, gradient = (
+            replace(Gains.on(device, logs, csr_array(pull)), start=upload(device, start)),
+            upload(device, by_seen),
+        )
         seen = apply_gains(device, bench.work, gains, VIEW, image)
         columns = gain_gradient(device, bench.work, gains, VIEW, seen, gradient, camera.height)
         step_gains(device, gains, VIEW, columns, STEP, RATE, readback)
@@ -43,7 +48,7 @@ def of_appearance(bench: Bench) -> Outcome:
     given = (cropped(image.get(), camera).astype(np.float64), logs[VIEW].astype(np.float64))
     by_image, by_logs = reference.gradient(*given, cropped(by_seen, camera).astype(np.float64))
     gradients, zeros = np.zeros((3, 3)), np.zeros((3, 3))
-    gradients[VIEW] = by_logs + reference.pull(*(array.astype(np.float64) for array in (logs, start, pulls)))[VIEW]
+    gradients[VIEW] = by_logs + reference.pull(*(array.astype(np.float64) for array in (logs, start, pull)))[VIEW]
     after = reference.step(logs.astype(np.float64), zeros, zeros, gradients, STEP, RATE)
     parts = dict(zip(("logs", "first", "second"), after, strict=True)) | {"gains": np.exp2(after[0])}
     parts |= {"seen": reference.apply(*given), "gradient": by_image}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
@@ -21,27 +22,40 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, where they started, the part of their
-    distance from there, times the gain, that is added to their gradient, Adam's moments, 2^logs; moved: scratch."""
+    """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, where they started, Adam's moments,
+    2^logs; moved: scratch. begins (photographs + 1,), others, weights (n,): rows of a matrix, as a `csr_array` has.
+    Times the distances from where the gains started, and the photograph's gain, it is added to the gradient."""
 
     logs: DeviceArray
     start: DeviceArray
-    pulls: DeviceArray
     first: DeviceArray
     second: DeviceArray
     gains: DeviceArray
     moved: DeviceArray
+    begins: DeviceArray
+    others: DeviceArray
+    weights: DeviceArray
 
     @classmethod
-    def on(cls, device: Device, logs: NDArray[np.float32], pulls: NDArray[np.float32] | None = None) -> Gains:
-        """Gains that start with these logs, and moments of zero. pulls: 0 if not given."""
+    def on(cls, device: Device, logs: NDArray[np.float32], pull: csr_array | None = None) -> Gains:
+        """Gains that start with these logs, and moments of zero. pull: the matrix; of zeros if not given."""
         zeros = np.zeros_like(logs)
         gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
-        pulls = zeros if pulls is None else pulls
-        held, start, pulled, first, second, factors = (
-            upload(device, value) for value in (logs, logs, pulls, zeros, zeros, gains)
-        )
-        return cls(held, start, pulled, first, second, factors, allocate(device, logs.shape, np.float32))
+        held, start, first, second, factors = (upload(device, value) for value in (logs, logs, zeros, zeros, gains))
+        moved = allocate(device, logs.shape, np.float32)
+        return cls(held, start, first, second, factors, moved, **rows_on(device, len(logs), pull))
+
+
+def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
+    """begins, others and weights of a matrix; None: of zeros."""
+    matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
+    spare = np.zeros(1)  # an array has an element at least
+    parts = {
+        "begins": matrix.indptr.astype(np.int32),
+        "others": np.append(matrix.indices, spare).astype(np.int32),
+        "weights": np.append(matrix.data, spare).astype(np.float32),
+    }
+    return {name: upload(device, part) for name, part in parts.items()}
 
 
 @stage("appearance")
@@ -95,7 +109,7 @@ def step_gains(
     stopped changes nothing."""
     kernels, count = device.kernels("appearance", LANES=1), gains.logs.size
     constants = (rate / (1 - BETA1**step), (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
-    sizes, read = (count, photograph, columns.shape[1]), (gains.start, gains.pulls, gains.logs, gains.gains)
-    changed = (gains.moved, gains.first, gains.second)
-    launch_items(device, kernels.move_gains, count, *sizes, *constants, readback, columns, *read, *changed)
+    sizes, matrix = (count, photograph, columns.shape[1]), (gains.begins, gains.others, gains.weights)
+    read = (readback, columns, gains.start, *matrix, gains.logs, gains.gains)
+    launch_items(device, kernels.move_gains, count, *sizes, *constants, *read, gains.moved, gains.first, gains.second)
     launch_items(device, kernels.centre_gains, count, count, readback, gains.moved, gains.logs, gains.gains)

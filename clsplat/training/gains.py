@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
@@ -18,8 +19,9 @@ from clsplat.device.launch import only_tried
 from clsplat.images.colour import SRGB, photos_space
 from clsplat.images.exif import exposure_of
 from clsplat.scenes.looked import Looked
-from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, step_gains
+from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, rows_on, step_gains
 from clsplat.training.learnt import loaded, rate_at, saved
+from clsplat.training.neighbours import common
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
@@ -31,13 +33,14 @@ linear, and points nothing."""
 STEP = 2.0**-10
 """Octaves to which what points tell is rounded: processors add in other orders, and begin alike."""
 
-PULL = 0.02
-"""Part of the distance, in octaves, from where points say that gains begin, in the loss's gradient. Neighbouring views
-may all be brighter by a little if what they alone show is darker; there the points are better. Gains that points do not
-tell have none, as it would hold them at the mean."""
+PULL, COMMON = 0.02, 0.2
+"""Parts of the distance, in octaves, from where points say that gains begin, in the loss's gradient: of each
+photograph's, and of what it has in common with its neighbours. Neighbouring views may all be brighter by a little if
+what they alone show is darker; there the points are better. Gains that points do not tell have neither, as it would
+hold them at the mean."""
 
-KEPT = ("logs", "start", "pulls", "first", "second", "gains")
-"""Arrays of `Gains` in a checkpoint."""
+KEPT = ("logs", "start", "first", "second", "gains")
+"""Arrays of `Gains` in a checkpoint, where `told` has 1 for photographs that points tell, else 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class ViewGains:
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGains:
         """The same on another device, by `values`, to apply and to find its gradient."""
         gains = upload(device, values)
-        return replace(self, device=device, gains=Gains(*[gains] * 7), view=0)
+        return replace(self, device=device, gains=Gains(*[gains] * 9), view=0)
 
     def values(self) -> NDArray[np.float32]:
         """The photograph's gains, as `on` takes them."""
@@ -111,8 +114,13 @@ class GainsOfAll:
         by_points = {name: np.round(told / STEP) * STEP for name, told in Looked(scene).exposures.items()}
         views = zip(scene.train_views, by_exif, strict=True)
         start = np.array([by_points.get(view.name, np.full(3, told)) for view, told in views])
-        pulls = np.array([np.full(3, PULL * (view.name in by_points), np.float32) for view in scene.train_views])
-        return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), pulls)
+        self._by_points = np.array([view.name in by_points for view in scene.train_views])
+        return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), self._pull)
+
+    @property
+    def _pull(self) -> csr_array:
+        told, cameras = self._by_points, [view.camera for view in self._scene.train_views]
+        return csr_array(PULL * diags_array(told.astype(np.float64)) + COMMON * common(cameras, told))
 
     @property
     def pixel_bytes(self) -> int:
@@ -152,10 +160,13 @@ class GainsOfAll:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""
-        return saved({name: getattr(self._gains, name) for name in KEPT})
+        held = saved({name: getattr(self._gains, name) for name in KEPT})
+        return {**held, "appearance/told": np.repeat(self._by_points[:, None], 3, axis=1).astype(np.float32)}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take the arrays of a checkpoint. Raises ValueError where one is missing, or of other photographs."""
         shape = (len(self._scene.train_views), 3)
-        values = loaded(self._device, arrays, KEPT, shape)
-        self._gains = Gains(**values, moved=allocate(self._device, shape, np.float32))
+        values = loaded(self._device, arrays, (*KEPT, "told"), shape)
+        self._by_points = values.pop("told").get()[:, 0] > 0
+        moved = allocate(self._device, shape, np.float32)
+        self._gains = Gains(**values, moved=moved, **rows_on(self._device, shape[0], self._pull))

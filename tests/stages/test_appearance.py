@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
+from scipy.sparse import csr_array
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
@@ -53,8 +54,9 @@ def test_gains_and_their_gradient(shaped_device: Device, width: int, height: int
 def test_steps_and_the_mean(shaped_device: Device) -> None:
     rng = np.random.default_rng(1)
     start = rng.normal(0, 0.1, (4, 3)).astype(np.float32)
-    pulls = np.repeat(np.array([[0.0], [20.0], [0.5], [20.0]], np.float32), 3, axis=1)
-    gains = Gains.on(shaped_device, start, pulls)
+    pull = np.diag([0.0, 20.0, 0.5, 20.0])
+    pull[1, 3] = pull[3, 1] = 6.0
+    gains = Gains.on(shaped_device, start, csr_array(pull))
     readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
     state = start.astype(np.float64), np.zeros((4, 3)), np.zeros((4, 3))
     for number in range(1, 12):
@@ -62,7 +64,7 @@ def test_steps_and_the_mean(shaped_device: Device) -> None:
         by_logs = np.zeros((4, 3))
         view = number % 4
         by_logs[view] = np.log(2) * columns.astype(np.float64).sum(axis=1)
-        by_logs[view] += reference.pull(state[0], start.astype(np.float64), pulls.astype(np.float64))[view]
+        by_logs[view] += reference.pull(state[0], start.astype(np.float64), pull)[view]
         state = reference.step(*state, by_logs, number, 0.05)
         step_gains(shaped_device, gains, view, upload(shaped_device, columns), number, 0.05, readback)
     # Eleven steps of 0.05; a sum of 16 floats that nearly cancel is good to 1e-5 of itself.
@@ -79,8 +81,7 @@ def test_pulled_gains_do_not_hold_those_of_other_photographs(shaped_device: Devi
     start = truth.copy()
     start[2] = 0
     start -= start.mean(axis=0)
-    pulls = np.repeat(np.array([[10.0], [10.0], [0.0]], np.float32), 3, axis=1)
-    gains = Gains.on(shaped_device, start.astype(np.float32), pulls)
+    gains = Gains.on(shaped_device, start.astype(np.float32), csr_array(np.diag([10.0, 10.0, 0.0])))
     readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
     for number in range(1, 601):
         view = number % 3

@@ -60,26 +60,29 @@ def test_gains_begin_where_the_points_have_them(
     # rounded to a 1024th
     np.testing.assert_allclose(arrays["appearance/logs"], start - start.mean(axis=0), atol=2.0**-11)
     np.testing.assert_array_equal(arrays["appearance/start"], arrays["appearance/logs"])
-    pulled = arrays["appearance/pulls"].any(axis=1)
-    assert pulled.tolist() == [True, True, *(False for _ in others)], "those of which points tell"
+    told = arrays["appearance/told"].any(axis=1)
+    assert told.tolist() == [True, True, *(False for _ in others)], "those of which points tell"
 
 
 def test_gains_that_points_tell_are_held_there(
     default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By a pull that is far stronger than the loss they stay; without one they go where the loss is least."""
+    """By a pull that is far stronger than the loss, of each or of what neighbours have in common, they stay; without
+    one they go where the loss is least."""
     truth = dict.fromkeys((view.name for view in scene.train_views), np.zeros(3))
     truth |= {scene.train_views[0].name: np.full(3, 0.5), scene.train_views[1].name: np.full(3, -0.5)}
     monkeypatch.setattr(Looked, "exposures", truth)
     moved = {}
-    for pull in (0.0, 1e3):
-        monkeypatch.setattr(gains, "PULL", pull)
+    for pulls in ((0.0, 0.0), (1e3, 0.0), (0.0, 1e3)):
+        for name, pull in zip(("PULL", "COMMON"), pulls, strict=True):
+            monkeypatch.setattr(gains, name, pull)
         trainer = Trainer(scene, EXPOSED, default_device)
         for _ in range(30):
             trainer.train_step()
         arrays = trainer.checkpoint()[0]
-        moved[pull] = np.abs(arrays["appearance/logs"] - arrays["appearance/start"]).max()
-    assert moved[1e3] < 0.3 * moved[0.0], moved
+        moved[pulls] = np.abs(arrays["appearance/logs"] - arrays["appearance/start"]).max()
+    assert moved[1e3, 0.0] < 0.3 * moved[0.0, 0.0], moved
+    assert moved[0.0, 1e3] < 0.3 * moved[0.0, 0.0], moved
 
 
 def test_gains_of_photographs_are_learnt(
