@@ -33,7 +33,7 @@ linear, and points nothing."""
 STEP = 2.0**-10
 """Octaves to which what points tell is rounded: processors add in other orders, and begin alike."""
 
-PULL, COMMON = 0.02, 0.2
+PULL, COMMON = 0.02, 0.7
 """Parts of the distance, in octaves, from where points say that gains begin, in the loss's gradient: of each
 photograph's, and of what it has in common with its neighbours. Neighbouring views may all be brighter by a little if
 what they alone show is darker; there the points are better. Gains that points do not tell have neither, as it would

@@ -27,9 +27,10 @@ def kept(count: int, waves: int, told: np.ndarray | None = None) -> float:
 
 
 def test_what_neighbours_have_in_common_is_kept_and_what_each_has_alone_is_not() -> None:
-    assert kept(60, 1) > 0.7
-    assert kept(60, 30) < 0.02
-    assert kept(4, 2) == pytest.approx(0.5, abs=1e-5), "no neighbours"
+    assert kept(60, 1) > 0.8
+    assert kept(60, 2) > 0.6
+    assert kept(60, 10) < 0.02
+    assert kept(4, 2) == pytest.approx(0.5, abs=1e-3), "no neighbours"
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 60])
@@ -68,9 +69,10 @@ def test_the_scale_of_the_world_and_one_camera_far_away_do_not_count() -> None:
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (1.0, 2.0, 3.0), (100.0, 200.0, 30.0)])
 def test_a_tripod_is_one_place(centre: tuple[float, float, float]) -> None:
     """Wherever it stands: what rounding makes of its centre is no distance."""
+    told = np.ones(90, bool)
+    wanted = common([camera.posed(camera.rotation, np.zeros(3)) for camera in ring(90)], told)
     cameras = [camera.posed(camera.rotation, -camera.rotation @ centre) for camera in ring(90)]
-    matrix = common(cameras, np.ones(90, bool))
-    assert np.unique(np.diff(matrix.indptr)).tolist() == [27], "of those less than 56 degrees away; others round to 0"
+    np.testing.assert_allclose(common(cameras, told).toarray(), wanted.toarray(), atol=2.0**-19)
 
 
 def test_many_photographs_have_no_more_neighbours() -> None:
