@@ -15,8 +15,8 @@ from clsplat.camera import Camera
 
 REACH = 2.5
 """Distance at which cameras are no neighbours any more: of their centres, in parts of the median distance from the
-middle, and of the unit vectors in which they look, together. About half of the weight is left at a quarter of it, about as
-far as colours by direction, of SH degree 3, can follow."""
+middle, and of the unit vectors in which they look, together. About half of the weight is left at a quarter of it,
+as far as colours by direction, of SH degree 3, can follow."""
 MOST = 256
 """Neighbours of a camera on average, itself among them; where there were more, they reach less far."""
 GRAIN = 2.0**-20
