@@ -39,6 +39,7 @@ from quality_rows import Finished, Kept, Same, code_digest, device_of  # noqa: E
 
 from clsplat.errors import InputError  # noqa: E402
 from clsplat.files import atomic_write  # noqa: E402
+from clsplat.scenes.answers import ANSWERS  # noqa: E402
 
 SCENES = ("fox", "banana", "sceaux_castle", "snowmiku", "bonsai")
 SIZES = (400, 200, 100, 50)
@@ -111,10 +112,7 @@ def antialiasing_rows() -> list[Row]:
 
 TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antialiasing": antialiasing_rows}
 SIZED = ("--iterations", "{iterations}", "--resolution", "{resolution}")
-AUTO = (
-    "--try",
-    "auto:schedule=high-rates,thinning=0.2,penalty=0.02,iterations=2000,optimiser.sh_rest_rate=4e-4",
-)
+AUTO = ("--try", "auto:" + ",".join(f"{name}={value}" for name, value in ANSWERS["few views"][0].items()))
 """Settings that --auto takes for few photographs."""
 FEW = ("--views", "3,12", "--seeds", "0,1")
 TOOLS: dict[str, tuple[str, ...]] = {

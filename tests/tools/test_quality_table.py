@@ -126,7 +126,7 @@ def test_the_digest_is_of_code_alone(tmp_path: Path) -> None:
 
 
 def test_bare_python_is_text_as_it_was_written() -> None:
-    """What `ast.unparse` makes of a string in a string differs between versions of Python."""
+    """Versions of Python differ in how `ast.unparse` writes a string in a string."""
     text = """'''Words.'''\nname = f'{"ä"}'  # one\n\n\ndef f():\n    "More."; return f"{name!r:>{8}}"  # two\n"""
     assert bare_python(text) == """name = f'{"ä"}'\ndef f():\n; return f"{name!r:>{8}}\""""
     assert bare_python('a = """b\n\n  # c\n"""\n\n  # d\n') == 'a = """b\n\n  # c\n"""', "a string is as it is"

@@ -19,10 +19,10 @@ def ring(count: int, *, size: float = 3.0) -> list[Camera]:
     return cameras
 
 
-def kept(count: int, waves: int, told: np.ndarray | None = None) -> float:
+def kept(count: int, waves: int) -> float:
     """The part of a wave around a ring that neighbours have in common."""
     wave = np.cos(waves * 2 * np.pi * np.arange(count) / count)
-    matrix = common(ring(count), np.ones(count, bool) if told is None else told)
+    matrix = common(ring(count), np.ones(count, bool))
     return float(wave @ (matrix @ wave) / (wave @ wave))
 
 
