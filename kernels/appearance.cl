@@ -1,6 +1,6 @@
-// Exposure and white balance of photographs: a gain for each channel of the render, its gradient, and Adam's step.
+// Exposure and white balance of photographs: a gain for each channel, its gradient, and Adam's step.
 //
-// Owner: A work-item owns a pixel (apply_gains), sixteen pixels below each other (gain_sums), a column of these
+// Owner: A work-item owns a pixel (remove_gains), sixteen pixels below each other (gain_sums), a column of these
 //   (column_sums), or one gain of one photograph (move_gains, centre_gains). Sums have one order on every device.
 //   Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x 3; a work-item for each of the `count` gains.
@@ -13,26 +13,22 @@
 
 #define MOST_LOG 16.0f
 
-// gains, image -> seen: the image, exposed for the photograph.
-__kernel void apply_gains(const int photograph, const int stride, const int plane, __global const float *gains,
-                          __global const float *image, __global float *seen) {
+// gains, target -> target, the photograph, exposed as the model is.
+__kernel void remove_gains(const int photograph, const int stride, const int plane, __global const float *gains,
+                           __global float *target) {
   const size_t at = (size_t)stride * get_global_id(1) + get_global_id(0);
-  for (int c = 0; c < 3; ++c) seen[(size_t)plane * c + at] = gains[3 * photograph + c] * image[(size_t)plane * c + at];
+  for (int c = 0; c < 3; ++c) target[(size_t)plane * c + at] /= gains[3 * photograph + c];
 }
 
-// gains, seen, gradient by seen -> gradient by image, in its place; partials of the gradient by logs over ln 2.
-__kernel void gain_sums(const int photograph, const int height, const int stride, const int plane, const int tiles_y,
-                        __global const float *gains, __global const float *seen, __global float *partials,
-                        __global float *gradient) {
+// image, gradient by image -> partials of the gradient by logs over ln 2.
+__kernel void gain_sums(const int height, const int stride, const int plane, const int tiles_y,
+                        __global const float *image, __global const float *gradient, __global float *partials) {
   const int x = get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
   for (int c = 0; c < 3; ++c) {
-    const float gain = gains[3 * photograph + c];
     float sum = 0.0f;
     for (int y = y0; y < y1; ++y) {
       const size_t at = (size_t)plane * c + (size_t)stride * y + x;
-      const float g = gradient[at];
-      sum = fma1(seen[at], g, sum);
-      gradient[at] = gain * g;
+      sum = fma1(image[at], gradient[at], sum);
     }
     partials[((size_t)tiles_y * c + get_global_id(1)) * stride + x] = sum;
   }
@@ -47,14 +43,13 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// columns of one photograph, logs, gains, start, begins, others, weights -> moved; first and second in place. All
+// columns of one photograph, logs, start, begins, others, weights -> moved; first and second in place. All
 // photographs move: the others' gradient is 0.
 __kernel void move_gains(const int count, const int photograph, const int stride, const float rate, const float root,
                          const float beta1, const float beta2, const float epsilon, __global const uint *readback,
                          __global const float *columns, __global const float *start, __global const int *begins,
                          __global const int *others, __global const float *weights, __global const float *logs,
-                         __global const float *gains, __global float *moved, __global float *first,
-                         __global float *second) {
+                         __global float *moved, __global float *first, __global float *second) {
   const int i = get_global_id(0), c = i % 3;
   if (i >= count || readback[READBACK_STOPPED]) return;
   float g = 0.0f;
@@ -70,7 +65,7 @@ __kernel void move_gains(const int count, const int photograph, const int stride
       const int j = 3 * others[k] + c;
       pull = fma1(weights[k], logs[j] - start[j] - apart / told, pull);
     }
-    g = fma1(gains[i], pull, g);
+    g = added(g, pull);
   }
   if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));

@@ -8,25 +8,25 @@ import numpy as np
 from clsplat.arrays import Float64
 
 
-def apply(image: Float64, logs: Float64) -> Float64:
-    """The image (H, W, 3) as a photograph with these logs (3,) to base 2 has it."""
-    seen: Float64 = image * np.exp2(logs)
-    return seen
+def removed(photograph: Float64, logs: Float64) -> Float64:
+    """The photograph (H, W, 3), whose gains are 2^logs (3,), as the model is exposed."""
+    result: Float64 = photograph / np.exp2(logs)
+    return result
 
 
-def gradient(image: Float64, logs: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
-    """Gradients by the image (H, W, 3) and by the logs (3,), from that by what is seen."""
-    by_logs: Float64 = np.log(2) * (apply(image, logs) * by_seen).sum(axis=(0, 1))
-    return by_seen * np.exp2(logs), by_logs
+def gradient(image: Float64, by_image: Float64) -> Float64:
+    """Gradient by the logs (3,), of a loss whose gradient by the image (H, W, 3) is known: that by what the image is
+    times 2^logs, at 0."""
+    by_logs: Float64 = np.log(2) * (image * by_image).sum(axis=(0, 1))
+    return by_logs
 
 
 def pull(logs: Float64, start: Float64, weights: Float64) -> Float64:
     """The pull that is added to the gradients by the logs, (photographs, 3) both: weights (photographs, photographs)
-    times the distances from where they started, less the mean of those that have weights, times the gains, as the
-    loss's gradient is."""
+    times the distances from where they started, less the mean of those that have weights."""
     told, apart = weights.any(axis=1), logs - start
     mean = apart[told].mean(axis=0) if told.any() else 0.0
-    result: Float64 = np.exp2(logs) * (weights @ (apart - mean))
+    result: Float64 = weights @ (apart - mean)
     return result
 
 

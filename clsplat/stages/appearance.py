@@ -15,8 +15,8 @@ from clsplat.device.launch import launch_grid, launch_items
 from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 
-PIXEL_BYTES = 14
-"""Bytes of each pixel with its padding: three planes, and its share of the partial sums."""
+PIXEL_BYTES = 2
+"""Bytes of each pixel with its padding: its share of the partial sums."""
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
@@ -24,7 +24,7 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 class Gains:
     """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, where they started, Adam's moments,
     2^logs; moved: scratch. begins (photographs + 1,), others, weights (n,): rows of a matrix, as a `csr_array` has.
-    Times the distances from where the gains started, and the photograph's gain, it is added to the gradient."""
+    Times the distances from where the gains started, it is added to the gradient."""
 
     logs: DeviceArray
     start: DeviceArray
@@ -59,38 +59,33 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
 
 
 @stage("appearance")
-def apply_gains(device: Device, work: Workspace, gains: Gains, photograph: int, image: DeviceArray) -> DeviceArray:
-    """Planes (3, rows, stride) of the image, exposed for the photograph."""
-    _, rows, stride = image.shape
-    seen = work.array("appearance_seen", image.shape)
-    kernel = device.kernels("appearance", LANES=1).apply_gains
-    launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, image, seen)
-    return seen
+def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
+    """Expose planes (3 or more, rows, stride) of the photograph, of which three are colours, as the model is."""
+    _, rows, stride = target.shape
+    kernel = device.kernels("appearance", LANES=1).remove_gains
+    launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
 
 
 @stage("appearance")
 def gain_gradient(
     device: Device,
     work: Workspace,
-    gains: Gains,
-    photograph: int,
-    seen: DeviceArray,
+    image: DeviceArray,
     gradient: DeviceArray,
     height: int,
     place: int = 0,
 ) -> DeviceArray:
-    """Make the gradient by what was seen that by the image, in its place. Returns sums (3, stride), those of each
-    `place` in a batch in an array of their own: ln 2 times their sum over x is the gradient by the photograph's
-    logs."""
-    _, rows, stride = seen.shape
+    """Sums (3, stride) of the image times the gradient by it, those of each `place` in a batch in an array of their
+    own: ln 2 times their sum over x is the gradient by the photograph's logs."""
+    _, rows, stride = image.shape
     down = rows // TILE
     partials, columns = (
         work.array("appearance_partials", (3, down, stride)),
         work.array(f"appearance_columns_{place}", (3, stride)),
     )
     kernels = device.kernels("appearance", LANES=1)
-    sizes = (photograph, height, stride, rows * stride, down)
-    launch_grid(device, kernels.gain_sums, (stride, down), *sizes, gains.gains, seen, partials, gradient)
+    sizes = (height, stride, rows * stride, down)
+    launch_grid(device, kernels.gain_sums, (stride, down), *sizes, image, gradient, partials)
     launch_grid(device, kernels.column_sums, (stride, 3), stride, down, partials, columns)
     return columns
 
@@ -110,6 +105,6 @@ def step_gains(
     kernels, count = device.kernels("appearance", LANES=1), gains.logs.size
     constants = (rate / (1 - BETA1**step), (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
     sizes, matrix = (count, photograph, columns.shape[1]), (gains.begins, gains.others, gains.weights)
-    read = (readback, columns, gains.start, *matrix, gains.logs, gains.gains)
+    read = (readback, columns, gains.start, *matrix, gains.logs)
     launch_items(device, kernels.move_gains, count, *sizes, *constants, *read, gains.moved, gains.first, gains.second)
     launch_items(device, kernels.centre_gains, count, count, readback, gains.moved, gains.logs, gains.gains)

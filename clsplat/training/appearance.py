@@ -33,14 +33,17 @@ class ViewAppearance(Protocol):
         """Values that `on` takes."""
         ...
 
-    def apply(self, work: Workspace, image: DeviceArray, width: int, height: int) -> DeviceArray:
-        """The image with the photograph's colours."""
+    def compared(
+        self, work: Workspace, image: DeviceArray, target: DeviceArray, width: int, height: int
+    ) -> DeviceArray:
+        """What is compared with the photograph, `target`, once its planes have changed in place: one of the two has
+        the other's colours."""
         ...
 
     def gradient(
-        self, work: Workspace, image: DeviceArray, seen: DeviceArray, gradient: DeviceArray, width: int, height: int
+        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
     ) -> DeviceArray:
-        """Make the gradient by what is seen that by the image. Returns what `update` takes."""
+        """Make the gradient by what was compared that by the image. Returns what `update` takes."""
         ...
 
     def update(self, columns: DeviceArray, readback: DeviceArray) -> None:

@@ -19,7 +19,7 @@ from clsplat.device.launch import only_tried
 from clsplat.images.colour import SRGB, photos_space
 from clsplat.images.exif import exposure_of
 from clsplat.scenes.looked import Looked
-from clsplat.stages.appearance import PIXEL_BYTES, Gains, apply_gains, gain_gradient, rows_on, step_gains
+from clsplat.stages.appearance import PIXEL_BYTES, Gains, gain_gradient, remove_gains, rows_on, step_gains
 from clsplat.training.learnt import loaded, rate_at, saved
 from clsplat.training.neighbours import common
 
@@ -38,6 +38,10 @@ PULL, COMMON = 0.02, 0.7
 photograph's, and of what it has in common with its neighbours. Neighbouring views may all be brighter by a little if
 what they alone show is darker; there the points are better. Gains that points do not tell have neither, as it would
 hold them at the mean."""
+
+ENDS = 0.001
+"""Part of itself that the rate ends with. Adam's steps are of the rate's size wherever a gain is; at ten times this a
+photograph's last ones leave 0.5 % of noise."""
 
 KEPT = ("logs", "start", "first", "second", "gains")
 """Arrays of `Gains` in a checkpoint, where `told` has 1 for photographs that points tell, else 0."""
@@ -63,21 +67,28 @@ class ViewGains:
         """The photograph's gains, as `on` takes them."""
         return self.gains.gains.get_rows(self.view, self.view + 1)
 
-    def apply(self, work: Workspace, image: DeviceArray, width: int, height: int) -> DeviceArray:  # noqa: ARG002
-        """The image, exposed for the photograph."""
-        return apply_gains(self.device, work, self.gains, self.view, image)
+    def compared(
+        self,
+        work: Workspace,  # noqa: ARG002
+        image: DeviceArray,
+        target: DeviceArray,
+        width: int,  # noqa: ARG002
+        height: int,  # noqa: ARG002
+    ) -> DeviceArray:
+        """The image; the photograph is exposed as the model is."""
+        remove_gains(self.device, self.gains, self.view, target)
+        return image
 
     def gradient(
         self,
         work: Workspace,
-        image: DeviceArray,  # noqa: ARG002
-        seen: DeviceArray,
+        image: DeviceArray,
         gradient: DeviceArray,
         width: int,  # noqa: ARG002
         height: int,
     ) -> DeviceArray:
-        """Make the gradient that by the image; sums for `update`, which is tried here, before anything changes."""
-        columns = gain_gradient(self.device, work, self.gains, self.view, seen, gradient, height, self.place)
+        """Sums for `update`, which is tried here, before anything changes."""
+        columns = gain_gradient(self.device, work, image, gradient, height, self.place)
         if self.step == 1:
             with only_tried(self.device):
                 self.update(columns, columns)
@@ -131,7 +142,7 @@ class GainsOfAll:
         """The gains of the views of a step, the last of which is number `step`."""
         device, gains = self._device, self._gains
         numbers, count = range(step - len(views) + 1, step + 1), gains.logs.shape[0]
-        rates = [rate_at(self._config, number, count) for number in numbers]
+        rates = [rate_at(self._config, number, count, ends=ENDS) for number in numbers]
         each = enumerate(zip(views, numbers, rates, strict=True))
         return [ViewGains(device, gains, *values, place) for place, values in each]
 

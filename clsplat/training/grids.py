@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 VARIATION = 10.0
 """Weight of a grid's variation beside the loss."""
 
+ENDS = 0.01
+"""Part of itself that the rate ends with."""
+
 
 @dataclass(frozen=True, eq=False)
 class ViewGrid:
@@ -46,18 +49,19 @@ class ViewGrid:
         """The photograph's grid, as `on` takes it."""
         return self.grids.grids.get_rows(self.view, self.view + 1)
 
-    def apply(self, work: Workspace, image: DeviceArray, width: int, height: int) -> DeviceArray:
+    def compared(
+        self,
+        work: Workspace,
+        image: DeviceArray,
+        target: DeviceArray,  # noqa: ARG002
+        width: int,
+        height: int,
+    ) -> DeviceArray:
         """The image with the photograph's colours."""
         return apply_grid(self.device, work, self.grids, self.view, image, width, height)
 
     def gradient(
-        self,
-        work: Workspace,
-        image: DeviceArray,
-        seen: DeviceArray,  # noqa: ARG002
-        gradient: DeviceArray,
-        width: int,
-        height: int,
+        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
     ) -> DeviceArray:
         """Make the gradient that by the image; that by the grid for `update`, which is tried here, before anything
         changes."""
@@ -99,7 +103,7 @@ class GridsOfAll:
                 self._grids,
                 view,
                 (number - 1) // count + 1,
-                rate_at(self._config, number, count, hastens=False),
+                rate_at(self._config, number, count, ends=ENDS, hastens=False),
                 number % count == 0,
                 place,
             )

@@ -14,16 +14,17 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 
 WARM_UP, LEAST = 500, 0.01
-"""Steps over which the rate rises, or a tenth of all; the part of itself that it begins and ends with."""
+"""Steps over which the rate rises, or a tenth of all; the part of itself that it begins with."""
 FULL = 10_000
-"""Steps under which a training is short: with the rate of the settings a gain can come 4 octaves far in so many."""
+"""Steps under which a training is short: with the rate of the settings a gain can come 3 octaves far in so many."""
 
 
-def rate_at(config: TrainConfig, step: int, views: int, *, hastens: bool = True) -> float:
-    """The learning rate of step number `step`. A photograph has a gradient in one of `views` steps, by the
-    root of which Adam makes its steps smaller. In a short training gains have to come as far, where it hastens."""
+def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
+    """The learning rate of step number `step`, of which the last has the part `ends`. A photograph has a gradient in
+    one of `views` steps, by the root of which Adam makes its steps smaller. In a short training gains have to come as
+    far, where it hastens."""
     rise: float = LEAST ** (1 - min(step / min(WARM_UP, config.iterations / 10), 1.0))
-    fall: float = LEAST ** (step / config.iterations)
+    fall: float = ends ** (step / config.iterations)
     short = max(FULL / config.iterations, 1.0) if hastens else 1.0
     return float(config.appearance_rate * short * views**0.5 * rise * fall)
 

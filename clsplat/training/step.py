@@ -168,7 +168,9 @@ class GradientStep:
         alpha_weight = self.config.alpha_loss if photograph.shape[2] > 3 else 0.0
         planes = target(device, work, photograph, frame.background, frame.blended, alpha=alpha_weight > 0)
         size, weight, appearance = (camera.width, camera.height), self.config.dssim_weight, self.appearance
-        image = frame.blended.image if appearance is None else appearance.apply(work, frame.blended.image, *size)
+        image = frame.blended.image
+        if appearance is not None:
+            image = appearance.compared(work, image, planes, *size)
         settings: dict[str, Any] = {"kept": kept, "alpha_weight": alpha_weight, "depth": depth}
 
         def compared() -> Loss:
@@ -183,7 +185,7 @@ class GradientStep:
             result = result.fetched()
         probe.loss(result)
         if appearance is not None:
-            columns = appearance.gradient(work, frame.blended.image, image, result.gradient, *size)
+            columns = appearance.gradient(work, frame.blended.image, result.gradient, *size)
         slots = self.replayed(
             model[0],
             (frame.part, frame.background, result.gradient, self.fields),

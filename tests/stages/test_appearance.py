@@ -12,7 +12,7 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import READBACK, TILE
 from clsplat.reference import appearance as reference
-from clsplat.stages.appearance import Gains, apply_gains, gain_gradient, step_gains
+from clsplat.stages.appearance import Gains, gain_gradient, remove_gains, step_gains
 
 
 def padded(image: np.ndarray) -> np.ndarray:
@@ -34,21 +34,24 @@ def padded(image: np.ndarray) -> np.ndarray:
 )
 def test_gains_and_their_gradient(shaped_device: Device, width: int, height: int) -> None:
     rng = np.random.default_rng(width)
-    image = rng.random((height, width, 3)).astype(np.float32)
-    by_seen = rng.normal(0.3, 1, image.shape).astype(np.float32)
+    image, photograph = rng.random((2, height, width, 3)).astype(np.float32)
+    by_image = rng.normal(0.3, 1, image.shape).astype(np.float32)
     logs = rng.uniform(-1, 1, (5, 3)).astype(np.float32)
     work, gains = Workspace(shaped_device), Gains.on(shaped_device, logs)
-    seen = apply_gains(shaped_device, work, gains, 3, upload(shaped_device, padded(image)))
-    wide, row = image.astype(np.float64), logs[3].astype(np.float64)
-    # A product of two floats, one of them rounded.
-    assert_close(seen.get()[:, :height, :width].transpose(1, 2, 0), reference.apply(wide, row), relative=3e-7)
-    below = padded(by_seen)
+    planes = np.concatenate([padded(photograph), padded(photograph)[:1]])  # the fourth is of alpha
+    target = upload(shaped_device, planes)
+    remove_gains(shaped_device, gains, 3, target)
+    wanted = reference.removed(photograph.astype(np.float64), logs[3].astype(np.float64))
+    # A quotient of two floats, one of them rounded.
+    assert_close(target.get()[:3, :height, :width].transpose(1, 2, 0), wanted, relative=3e-7)
+    assert_same_bits(target.get()[3], planes[3])
+    below = padded(by_image)
     below[:, height:] = np.nan  # the loss leaves it unwritten
     gradient = upload(shaped_device, below)
-    columns = gain_gradient(shaped_device, work, gains, 3, seen, gradient, height)
-    by_image, by_logs = reference.gradient(wide, row, by_seen.astype(np.float64))
-    assert_close_gradient(gradient.get()[:, :height, :width].transpose(1, 2, 0), by_image, 1e-6)
+    columns = gain_gradient(shaped_device, work, upload(shaped_device, padded(image)), gradient, height)
+    by_logs = reference.gradient(image.astype(np.float64), by_image.astype(np.float64))
     assert_close_gradient(np.log(2) * columns.get().sum(axis=1, dtype=np.float64), by_logs, 1e-5)
+    assert_same_bits(gradient.get(), below)
 
 
 def test_steps_and_the_mean(shaped_device: Device) -> None:
@@ -107,14 +110,20 @@ def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:
 
 
 def test_the_twin_against_finite_differences() -> None:
+    """By the loss of the render times 2^x against the photograph as the model is exposed, at x = 0."""
     rng = np.random.default_rng(2)
-    image, weights, logs = rng.random((4, 5, 3)), rng.normal(0, 1, (4, 5, 3)), rng.uniform(-1, 1, 3)
-    by_image, by_logs = reference.gradient(image, logs, weights)
+    image, photograph, logs = rng.random((4, 5, 3)), rng.random((4, 5, 3)), rng.uniform(-1, 1, 3)
+    target = reference.removed(photograph, logs)
+    by_logs = reference.gradient(image, 2 * (image - target))
     step = 1e-6 * np.eye(3)
     numeric = [
-        (weights * (reference.apply(image, logs + d) - reference.apply(image, logs - d))).sum() / 2e-6 for d in step
+        (np.square(image * np.exp2(d) - target) - np.square(image * np.exp2(-d) - target)).sum() / 2e-6 for d in step
     ]
     assert_close_gradient(by_logs, numeric, 1e-7)
-    direction = rng.normal(0, 1, image.shape)
-    moved = weights * (reference.apply(image + 1e-6 * direction, logs) - reference.apply(image, logs))
-    assert_close(moved.sum() / 1e-6, (by_image * direction).sum(), relative=1e-6)
+
+
+def test_no_gain_changes_what_is_learnt() -> None:
+    """A photograph that is twice as bright, with twice the gain, has the same gradient by the model and by its log."""
+    rng = np.random.default_rng(3)
+    photograph, logs = rng.random((4, 5, 3)), rng.uniform(-1, 1, 3)
+    assert_close(reference.removed(2 * photograph, logs + 1), reference.removed(photograph, logs), relative=1e-15)

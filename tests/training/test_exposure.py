@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from compare import assert_same_bits
 from tiny import CONFIG, write_scene
 
 from clsplat.api import train
@@ -85,18 +86,42 @@ def test_gains_that_points_tell_are_held_there(
     assert moved[0.0, 1e3] < 0.3 * moved[0.0, 0.0], moved
 
 
+def exposed(monkeypatch: pytest.MonkeyPatch, logs: np.ndarray) -> None:
+    """Let photographs be float, of these exposures (photographs,)."""
+    plain = Photographs.load
+
+    def load(self: Photographs, index: int, factor: float) -> np.ndarray:
+        image = plain(self, index, factor)
+        values = image / np.float32(255) if image.dtype == np.uint8 else image
+        return np.ascontiguousarray(values * np.float32(2.0 ** logs[index]), np.float32)
+
+    monkeypatch.setattr(Photographs, "load", load)
+
+
+def test_exposures_that_are_known_change_no_bit(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A photograph counts alike, however bright it is: by powers of two, which round nothing, to the bit."""
+    truth = np.zeros(len(scene.train_views))
+    truth[:4] = 1.0, -1.0, 2.0, -2.0
+    models = []
+    for logs in (np.zeros_like(truth), truth):
+        with monkeypatch.context() as patch:
+            exposed(patch, logs)
+            told = {view.name: np.full(3, log) for view, log in zip(scene.train_views, logs, strict=True)}
+            patch.setattr(Looked, "exposures", told)
+            trainer = Trainer(scene, replace(EXPOSED, batch=len(truth)), default_device)
+            trainer.train_step()
+            models.append(trainer.gaussians())
+    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
+        assert_same_bits(getattr(models[1], name), getattr(models[0], name), name)
+
+
 def test_gains_of_photographs_are_learnt(
     default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     truth = np.where(np.arange(len(scene.train_views)) % 2, 1.0, -1.0)
-    plain = Photographs.load
-
-    def exposed(self: Photographs, index: int, factor: float) -> np.ndarray:
-        image = plain(self, index, factor)
-        values = image / np.float32(255) if image.dtype == np.uint8 else image
-        return np.ascontiguousarray(values * np.float32(2.0 ** truth[index]), np.float32)
-
-    monkeypatch.setattr(Photographs, "load", exposed)
+    exposed(monkeypatch, truth)
     config = replace(EXPOSED, iterations=400, density=replace(CONFIG.density, every=0), warmup=())
     run = Run.create(tmp_path / "run", config)
     train(scene, config, device=default_device, run=run)
