@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -61,7 +61,7 @@ class ViewGains:
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGains:
         """The same on another device, by `values`, to apply and to find its gradient."""
         gains = upload(device, values)
-        return replace(self, device=device, gains=Gains(*[gains] * 9), view=0)
+        return replace(self, device=device, gains=Gains(*[gains] * len(fields(Gains))), view=0)
 
     def values(self) -> NDArray[np.float32]:
         """The photograph's gains, as `on` takes them."""
