@@ -110,7 +110,7 @@ def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:
 
 
 def test_the_twin_against_finite_differences() -> None:
-    """By the loss of the render times 2^x against the photograph as the model is exposed, at x = 0."""
+    """The loss of the render times 2^x against the photograph, exposed as the model is, has this gradient at x = 0."""
     rng = np.random.default_rng(2)
     image, photograph, logs = rng.random((4, 5, 3)), rng.random((4, 5, 3)), rng.uniform(-1, 1, 3)
     target = reference.removed(photograph, logs)
