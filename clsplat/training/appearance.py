@@ -36,8 +36,8 @@ class ViewAppearance(Protocol):
     def compared(
         self, work: Workspace, image: DeviceArray, target: DeviceArray, width: int, height: int
     ) -> DeviceArray:
-        """What is compared with the photograph, `target`, once its planes have changed in place: one of the two has
-        the other's colours."""
+        """The picture to compare with the photograph, `target`, whose planes may be changed in place: one of the two
+        takes the other's colours."""
         ...
 
     def gradient(
