@@ -99,6 +99,7 @@ _UPDATED = {
     "add_view": 1,
     "join_view": 1,
     "add_noise": 1,
+    "remove_gains": 1,
 }
 """Kernels that read and write some arrays in place: how many of their last ones."""
 

@@ -16,7 +16,7 @@ from clsplat.device.context import Device
 WARM_UP, LEAST = 500, 0.01
 """Steps over which the rate rises, or a tenth of all; the part of itself that it begins with."""
 FULL = 10_000
-"""Steps under which a training is short: with the rate of the settings a gain can come 3 octaves far in so many."""
+"""Steps under which a training is short: in so many a gain comes about 2 octaves far, at the rate of the settings."""
 
 
 def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:

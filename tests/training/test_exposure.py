@@ -101,10 +101,11 @@ def exposed(monkeypatch: pytest.MonkeyPatch, logs: np.ndarray) -> None:
 def test_exposures_that_are_known_change_no_bit(
     default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A photograph counts alike, however bright it is: by powers of two, which round nothing, to the bit."""
+    """A photograph counts alike, however bright it is: in the model by powers of two, which round nothing, to the
+    bit; in its gains but for the rounding of their logs."""
     truth = np.zeros(len(scene.train_views))
     truth[:4] = 1.0, -1.0, 2.0, -2.0
-    models = []
+    arrays = []
     for logs in (np.zeros_like(truth), truth):
         with monkeypatch.context() as patch:
             exposed(patch, logs)
@@ -112,9 +113,17 @@ def test_exposures_that_are_known_change_no_bit(
             patch.setattr(Looked, "exposures", told)
             trainer = Trainer(scene, replace(EXPOSED, batch=len(truth)), default_device)
             trainer.train_step()
-            models.append(trainer.gaussians())
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-        assert_same_bits(getattr(models[1], name), getattr(models[0], name), name)
+            arrays.append(trainer.checkpoint()[0])
+    wanted, got = arrays
+    moved = [each["appearance/logs"] - each["appearance/start"] for each in arrays]
+    assert moved[0].all()
+    np.testing.assert_allclose(moved[1], moved[0], rtol=0, atol=3e-7)  # of up to 2, in 24 bits
+    for name in ("appearance/first", "appearance/second"):
+        np.testing.assert_allclose(got[name], wanted[name], rtol=1e-5, atol=1e-12, err_msg=name)
+    models = [name for name in wanted if not name.startswith("appearance/")]
+    assert any("second" in name for name in models), "squares of the model's gradients"
+    for name in models:
+        assert_same_bits(got[name], wanted[name], name)
 
 
 def test_gains_of_photographs_are_learnt(
