@@ -40,8 +40,8 @@ what they alone show is darker; there the points are better. Gains that points d
 hold them at the mean."""
 
 ENDS = 0.001
-"""Part of itself that the rate ends with. Adam's steps are of the rate's size wherever a gain is; at ten times this a
-photograph's last ones leave 0.5 % of noise."""
+"""Part of itself that the rate ends with. Adam's steps are of the rate's size wherever a gain is: those that end with
+ten times this are of 0.25 % for a photograph of 127."""
 
 KEPT = ("logs", "start", "first", "second", "gains")
 """Arrays of `Gains` in a checkpoint, where `told` has 1 for photographs that points tell, else 0."""
