@@ -26,24 +26,24 @@ class ViewAppearance(Protocol):
     def place(self) -> int: ...
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewAppearance:
-        """The same on another device, by `values`, to apply and to find its gradient."""
+        """The same on another device, by `values`, to share colours and to find its gradient."""
         ...
 
     def values(self) -> NDArray[np.float32]:
         """Values that `on` takes."""
         ...
 
-    def compared(
+    def share_colours(
         self, work: Workspace, image: DeviceArray, target: DeviceArray, width: int, height: int
     ) -> DeviceArray:
-        """The picture to compare with the photograph, `target`, whose planes may be changed in place: one of the two
-        takes the other's colours."""
+        """Give the image, or the photograph in the planes of `target`, in their place, the other's colours. Returns
+        the image to compare."""
         ...
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
     ) -> DeviceArray:
-        """Make the gradient by what was compared that by the image. Returns what `update` takes."""
+        """Make the gradient by the compared image that by the image. Returns what `update` takes."""
         ...
 
     def update(self, columns: DeviceArray, readback: DeviceArray) -> None:

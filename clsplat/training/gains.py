@@ -59,7 +59,7 @@ class ViewGains:
     place: int = 0
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGains:
-        """The same on another device, by `values`, to apply and to find its gradient."""
+        """The same on another device, by `values`, to share colours and to find its gradient."""
         gains = upload(device, values)
         return replace(self, device=device, gains=Gains(*[gains] * len(fields(Gains))), view=0)
 
@@ -67,7 +67,7 @@ class ViewGains:
         """The photograph's gains, as `on` takes them."""
         return self.gains.gains.get_rows(self.view, self.view + 1)
 
-    def compared(
+    def share_colours(
         self,
         work: Workspace,  # noqa: ARG002
         image: DeviceArray,

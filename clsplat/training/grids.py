@@ -41,7 +41,7 @@ class ViewGrid:
     place: int = 0
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGrid:
-        """The same on another device, by `values`, to apply and to find its gradient."""
+        """The same on another device, by `values`, to share colours and to find its gradient."""
         grids = upload(device, values)
         return replace(self, device=device, grids=Grids(grids, grids, grids), view=0)
 
@@ -49,7 +49,7 @@ class ViewGrid:
         """The photograph's grid, as `on` takes it."""
         return self.grids.grids.get_rows(self.view, self.view + 1)
 
-    def compared(
+    def share_colours(
         self,
         work: Workspace,
         image: DeviceArray,

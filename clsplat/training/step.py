@@ -170,7 +170,7 @@ class GradientStep:
         size, weight, appearance = (camera.width, camera.height), self.config.dssim_weight, self.appearance
         image = frame.blended.image
         if appearance is not None:
-            image = appearance.compared(work, image, planes, *size)
+            image = appearance.share_colours(work, image, planes, *size)
         settings: dict[str, Any] = {"kept": kept, "alpha_weight": alpha_weight, "depth": depth}
 
         def compared() -> Loss:
