@@ -73,8 +73,8 @@ HALVES = {
 FEWEST = ("bonsai", 290_000)
 """A scene whose mcmc is measured with this many Gaussians too, a third of what the short schedule ends with."""
 BY_PAPER, FLAT = ("banana", "sceaux_castle"), ("--sh-degree", "0")
-"""Scenes of few photographs, whose mcmc is measured at the paper's rates too, and with one colour in all directions:
-of nine photographs these are learnt wrong, and the more so the higher their rate."""
+"""Scenes of few photographs, measured at the paper's rates too, and with one colour in all directions: of nine
+photographs these are learnt wrong, and the more so the higher their rate."""
 
 
 def growth_rows() -> list[Row]:
@@ -84,10 +84,12 @@ def growth_rows() -> list[Row]:
         rows += [Row(f"{scene} {name}", scene, settings) for name, settings in WHOLES.items()]
         ends = (f"{scene} default", f"{scene} short")
         rows += [Row(f"{scene} {name}", scene, settings, half_of=ends) for name, settings in HALVES.items()]
-    by_paper = ("--density.growth", "mcmc", "--density.stop", "{stop}")
+    until = ("--density.stop", "{stop}")
+    by_paper = ("--density.growth", "mcmc", *until)
     for scene in BY_PAPER:
         ends = (f"{scene} default", f"{scene} short")
         more = {
+            "long axis paper": ("--density.growth", "budget", "--density.long-axis", *until),
             "mcmc paper": by_paper,
             "mcmc paper thinned": (*by_paper, "--thinning", "0.2"),
             "mcmc paper SH 0": (*by_paper, *FLAT),
