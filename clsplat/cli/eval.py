@@ -39,6 +39,9 @@ class Eval(Verb):
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians and behind images with alpha. If not given: the run's setting, else black."""
+    corrected: Flag = False
+    """Tell PSNR of the affine map of colours that fits each photograph best, too; of a run with --appearance it always
+    is told."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
     json: Flag = False
     """Print the result as JSON, as in eval.json."""
@@ -113,7 +116,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
         gaussians=len(gaussians),
         seconds=model_record.get("seconds"),
         space=colour_space(file),
-        corrected=config.appearance != "none",
+        corrected=verb.corrected or config.appearance != "none",
     )
     if given_run:
         given_run.write_eval(result)

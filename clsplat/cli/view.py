@@ -43,7 +43,7 @@ class View(Verb):
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians. If not given: the run's setting, else black."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
-    """Expose the model as this photograph of its training is, by the run's appearance.json; if not given, as all are on
+    """Expose the model as this photograph of its scene is, by the run's appearance.json; if not given, as all are on
     average."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)

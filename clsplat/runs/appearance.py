@@ -23,9 +23,9 @@ EXPECTED = "what clsplat train --appearance exposure writes"
 
 
 def gains_of(model: Path, photograph: str) -> tuple[float, float, float]:
-    """The gains by which colours of a run's model become the photograph's. model: the run's folder, or a file there;
-    photograph: its name in the data set, or the end of that from a folder on, with or without extension. Raises
-    InputError."""
+    """The gains by which colours of a run's model become the photograph's; of a held-out one those that EXIF tells, or
+    1. model: the run's folder, or a file there; photograph: its name in the data set, or the end of that from a folder
+    on, with or without extension. Raises InputError."""
     run = run_of(model)
     path = run.appearance_path if run is not None else None
     if run is None or path is None or not path.exists():
@@ -38,15 +38,15 @@ def gains_of(model: Path, photograph: str) -> tuple[float, float, float]:
             f"--appearance {photograph}: {path} is of bilateral grids, which are for training alone; expected a run of "
             "clsplat train --appearance exposure"
         )
-    gains = _read(path, "photographs")
+    gains = _read(path, "photographs") | _read(path, "held_out")
     found = [name for name in gains if photograph in (name, *_ends(name))]
     if len(found) > 1 and photograph not in found:
         raise InputError(f"--appearance {photograph}: is {len(found)} photographs, {examples(found)}; name one of them")
     if not found:
         near = get_close_matches(photograph, gains, 3, 0.0)
         raise InputError(
-            f"--appearance {photograph}: no photograph of the training in {path}, expected one of its {len(gains)}, "
-            f"such as {examples(near)}"
+            f"--appearance {photograph}: no photograph in {path}, expected one of its {len(gains)}, such as "
+            f"{examples(near)}"
         )
     return gains[photograph if photograph in found else found[0]]
 

@@ -33,8 +33,8 @@ def bases_of(images: Sequence[Named]) -> list[Path]:
 
 
 def beside(base: Path, names: Sequence[str]) -> Path | None:
-    """The folder of one of these names beside a folder of photographs, or in it."""
-    return next((at for parent in (base.parent, base) for name in names if (at := parent / name).is_dir()), None)
+    """The folder of one of these names in a folder of photographs, or beside it, which may be outside the scene."""
+    return next((at for parent in (base, base.parent) for name in names if (at := parent / name).is_dir()), None)
 
 
 def owned(folder: Path, paths: Iterable[Path], known: Mapping[str, str], what: str, example: str) -> dict[str, Path]:

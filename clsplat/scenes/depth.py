@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -69,7 +69,8 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
 
 def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
     """Depth maps of the photographs, relative ones with the scale and offset that the points give them."""
-    files = {**_beside(scene.views), **{view.name: view.depth_file for view in scene.views if view.depth_file}}
+    told = {view.name: view.depth_file for view in scene.views if view.depth_file}
+    files = {**_beside(scene.views, told), **told}
     if not files:
         raise InputError(
             f"{scene.name}: --depth maps, and there are none; expected depths/IMAGE.png, .exr or .npy beside images/, "
@@ -127,10 +128,13 @@ def _middle(values: Float64) -> tuple[float, float]:
     return median, float(np.abs(values - median).mean())
 
 
-def _beside(views: Sequence[View]) -> dict[str, Path]:
+def _beside(views: Sequence[View], told: Mapping[str, Path]) -> dict[str, Path]:
     """Maps in the folder beside the photographs, or in theirs, by the views' names. A map is called as its photograph,
-    with or without that one's extension, or with _depth behind. Raises InputError for one that fits no photograph, and
-    for two of one."""
+    with or without that one's extension, or with _depth behind. told: maps that a file names, to pass over. Raises
+    InputError for one that fits no photograph, and for two of one."""
+    passed = {path.resolve() for path in told.values()}
+    if all(view.name in told for view in views):
+        return {}
     for base in bases_of(views):
         folder = beside(base, FOLDERS)
         if folder is None:
@@ -141,7 +145,8 @@ def _beside(views: Sequence[View]) -> dict[str, Path]:
             stem = str(plain.with_suffix(""))
             for key in (str(plain), stem, f"{stem}_depth", f"{stem}.depth"):
                 known.setdefault(key, view.name)
-        return owned(folder, _maps_in(folder), known, "depth map", next(iter(sorted(known))))
+        files = (path for path in _maps_in(folder) if path.resolve() not in passed)
+        return owned(folder, files, known, "depth map", next(iter(sorted(known))))
     return {}
 
 

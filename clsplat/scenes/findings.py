@@ -20,7 +20,18 @@ from clsplat.scenes.masks import masks_beside, read_mask
 from clsplat.scenes.scene import Scene, View
 
 Kind = Literal[
-    "few steps", "exposure", "scales", "masks", "cut out", "alpha", "fisheye", "sky", "few views", "blur", "duplicates"
+    "few steps",
+    "exposure",
+    "scales",
+    "masks",
+    "cut out",
+    "strange masks",
+    "alpha",
+    "fisheye",
+    "sky",
+    "few views",
+    "blur",
+    "duplicates",
 ]
 
 EXPOSURE = 0.2
@@ -128,8 +139,8 @@ def _masks(scene: Scene, use: MaskUse) -> Finding | None:
         found = masks_beside(scene.views)
         some = sorted(found)[:: max(len(found) // MOST_MASKS, 1)]
         masks = [read_mask(found[name], orient=False, invert=False)[:, :, 0] for name in some]
-    except InputError:  # of something else, by another tool
-        return None
+    except InputError as error:
+        return Finding("strange masks", f"there are masks that cannot be used, and they are not: {error}")
     if not masks:
         return None
     kept = [(mask.mean(), np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()) for mask in masks]

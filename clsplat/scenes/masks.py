@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -70,9 +70,10 @@ def folder_of(images: Path) -> Path | None:
     return beside(images, FOLDERS)
 
 
-def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+def find_masks(folder: Path, names: Iterable[str], without: Iterable[Path] = ()) -> dict[str, Path]:
     """The masks in a folder by the photographs' names, relative to theirs; names: of all the photographs that there
-    are. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, or IMAGE_mask.png, in the same sub-folder.
+    are; without: files to pass over. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, or IMAGE_mask.png, in the
+    same sub-folder.
 
     Raises InputError for a mask that fits no photograph, and for two of one.
     """
@@ -83,7 +84,9 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
         for key in (name, stem, f"{stem}_mask", f"{stem}.mask", str(plain.with_name(f"mask_{plain.stem}"))):
             known.setdefault(key, name)
     example = next(iter(sorted(names)), "IMAGE.jpg")
-    return owned(folder, find_images(folder), known, "mask", example)
+    passed = {path.resolve() for path in without}
+    files = (path for path in find_images(folder) if path.resolve() not in passed)
+    return owned(folder, files, known, "mask", example)
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[str, Mask]:
@@ -96,7 +99,8 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
         return {}
     found: dict[str, Path] = {}
     if use.masks != "none":
-        found = {**masks_beside(images), **{image.name: image.mask for image in images if image.mask is not None}}
+        told = {image.name: image.mask for image in images if image.mask is not None}
+        found = {**masks_beside(images, told), **told}
         if not found:
             raise InputError(
                 f"{where}: --masks {use.masks}, and there are none; expected masks/IMAGE.png beside images/, or "
@@ -112,15 +116,19 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
     return {image.name: Mask(use, found.get(image.name)) for image in images}
 
 
-def masks_beside(images: Sequence[Named]) -> dict[str, Path]:
-    """The masks in the folder beside the photographs, or in theirs, by the photographs' names. Raises InputError as
+def masks_beside(images: Sequence[Named], told: Mapping[str, Path] | None = None) -> dict[str, Path]:
+    """The masks in the folder beside the photographs, or in theirs, by the photographs' names. told: masks that a file
+    names, by the photographs' names; there they are one for all in nerfstudio's scenes. Raises InputError as
     `find_masks`."""
+    told = told or {}
+    if all(image.name in told for image in images):
+        return {}
     for base in bases_of(images):
         folder = folder_of(base)
         if folder is not None:
             names = {str(PurePosixPath(image.path.relative_to(base).as_posix())): image.name for image in images}
             others = (file.relative_to(base).as_posix() for file in find_images(base) if folder not in file.parents)
-            masks = find_masks(folder, {*names, *others})
+            masks = find_masks(folder, {*names, *others}, without=told.values())
             return {names[key]: path for key, path in masks.items() if key in names}
     return {}
 

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
@@ -68,9 +69,10 @@ def edge_contributions(trainer: InTraining, count: int) -> Float32:
 
 
 def edge_strength(photograph: NDArray[Any]) -> Float32:
-    """Length of the gradient of grey (H, W), 1 where it is largest; 0 under a mask. photograph (H, W, 3 to 5)."""
+    """Length of the gradient of grey (H, W), 1 where it is largest; 0 under a mask and beside one, whose outline is no
+    edge. photograph (H, W, 3 to 5)."""
     grey = photograph[:, :, :3].astype(np.float32).sum(axis=2)
     strength = np.hypot(*np.gradient(grey)) if min(grey.shape) > 1 else np.zeros_like(grey)
     if photograph.shape[2] == 5:
-        strength *= photograph[:, :, 4] > 0
+        strength *= binary_erosion(photograph[:, :, 4] > 0, border_value=1)
     return np.asarray(strength / max(float(strength.max()), 1e-12), np.float32)

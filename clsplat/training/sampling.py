@@ -31,9 +31,9 @@ class SamplingFilter:
             return
         self._cameras = upload_cameras(device, cameras)
 
-    def is_due(self, step: int) -> bool:
-        """True if the least scales are worked out before this step."""
-        return self._on and (self._least is None or step % EVERY == 1)
+    def is_due(self, step: int, views: int) -> bool:
+        """True if the least scales are worked out before the `views` steps that end with this one."""
+        return self._on and (self._least is None or (step - 1) % EVERY < views)
 
     def renew(self, gaussians: AnyGaussians) -> None:
         """Work out the least scales, and apply them."""

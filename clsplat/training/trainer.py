@@ -227,7 +227,7 @@ class Trainer:
         views = self.views_ahead
         self.step += views
         self._raise_sh_degree()
-        if self.sampling.is_due(self.step):
+        if self.sampling.is_due(self.step, views):
             self.settle()
             self.sampling.renew(self.parameters)  # to no other effect if done again
         samples = [self._sample() for _ in range(views)]

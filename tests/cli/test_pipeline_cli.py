@@ -68,9 +68,12 @@ def test_eval_finds_what_training_found(trained: Path, scene: Path, capfd: Captu
     assert [view["name"] for view in result["views"]] == ["00.png", "08.png"]
     for key in ("views", "mean", "gaussians"):
         assert result[key] == stored[key]
-    assert main(["eval", str(trained), "--test-every", "2"]) == 0
+    assert main(["eval", str(trained), "--test-every", "2", "--corrected"]) == 0
     out = capfd.readouterr().out
     assert "5 held-out views" in out
+    means = json.loads((trained / "eval.json").read_text())["mean"]
+    assert means["psnr_corrected"] > means["psnr"]
+    assert f"colour-corrected {means['psnr_corrected']:.2f} dB" in out
     (trained / "eval.json").write_text(json.dumps(stored))
 
 

@@ -25,21 +25,23 @@ LOGS = {"a.jpg": [1.0, 0.0, -1.0], "x/b.jpg": [0.5, 0.5, 0.5], "y/b.jpg": [0.0, 
 def run(tmp_path: Path) -> Run:
     run = Run.create(tmp_path / "run", TrainConfig(appearance="exposure"))
     rows = {name: {"log2_gains": logs} for name, logs in LOGS.items()}
-    run.write_appearance({"kind": "exposure", "photographs": rows})
+    held_out = {"held.jpg": {"log2_gains": [-1.0, 0.0, 0.0]}}
+    run.write_appearance({"kind": "exposure", "photographs": rows, "held_out": held_out})
     return run
 
 
 def test_gains_by_name(run: Run) -> None:
     assert gains_of(run.path, "a.jpg") == gains_of(run.path, "a") == gains_of(run.model_path, "a") == (2.0, 1.0, 0.5)
     assert gains_of(run.path, "x/b.jpg") == gains_of(run.path, "x/b") == (2**0.5,) * 3
+    assert gains_of(run.path, "held") == (0.5, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
     ("photograph", "message"),
     [
         ("b", r"--appearance b: is 2 photographs, x/b.jpg, y/b.jpg; name one of them$"),
-        ("othr.png", r"no photograph of the training in .*appearance.json, expected one of its 4, such as other.png"),
-        ("", r"expected one of its 4, such as"),
+        ("othr.png", r"no photograph in .*appearance.json, expected one of its 5, such as other.png"),
+        ("", r"expected one of its 5, such as"),
     ],
 )
 def test_a_photograph_that_is_not_there(run: Run, photograph: str, message: str) -> None:

@@ -212,6 +212,10 @@ def test_masks_that_are_not_used(tmp_path: Path, part: float, kind: str) -> None
     assert kind in kinds(load_scene(folder))
     use = MaskUse("ignore")
     assert kind not in [finding.kind for finding in findings(load_scene(folder, masks=use), use)]
+    write_image(folder / "masks" / "stranger.png", mask)
+    (found,) = (finding for finding in findings(load_scene(folder)) if "mask" in finding.kind)
+    assert found.kind == "strange masks"
+    assert "fit no photograph (stranger.png)" in found.text
 
 
 def test_every_answer_is_a_setting_that_can_be() -> None:

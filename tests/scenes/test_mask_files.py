@@ -107,6 +107,43 @@ def test_mask_path_of_a_frame(tmp_path: Path) -> None:
         load_scene(tmp_path, masks=IGNORE)
 
 
+def test_one_mask_for_all_frames(tmp_path: Path) -> None:
+    """As nerfstudio writes it, in a folder where names would be of photographs; one more has its own there."""
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    frames = []
+    for index in range(3):
+        write_image(tmp_path / "images" / f"{index}.png", np.full((20, 30, 3), 0.5, np.float32))
+        pose = np.eye(4)
+        pose[0, 3] = index
+        paths = {"file_path": f"images/{index}.png", "mask_path": "masks/mask.png"}
+        frames.append({**paths, "transform_matrix": pose.tolist()})
+    write_image(tmp_path / "masks" / "mask.png", mask_of(30, 20))
+    del frames[2]["mask_path"]
+    write_image(tmp_path / "masks" / "2.png", np.ones((20, 30, 3), np.float32))
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 30, "h": 20, "frames": frames}))
+    read = load_scene(tmp_path, masks=IGNORE)
+    assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5, 0.5, 1.0]
+
+
+def test_masks_of_something_else_beside_the_scene(tmp_path: Path) -> None:
+    """Photographs beside transforms.json have theirs in the same folder; what is outside it is not asked then."""
+    scene = tmp_path / "scene"
+    (scene / "masks").mkdir(parents=True)
+    (tmp_path / "masks").mkdir()
+    write_image(tmp_path / "masks" / "of-another.png", mask_of(30, 20))
+    frames = []
+    for index in range(3):
+        write_image(scene / f"{index}.png", np.full((20, 30, 3), 0.5, np.float32))
+        write_image(scene / "masks" / f"{index}.png", mask_of(30, 20))
+        pose = np.eye(4)
+        pose[0, 3] = index
+        frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
+    (scene / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 30, "h": 20, "frames": frames}))
+    read = load_scene(scene, masks=IGNORE)
+    assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * 3
+
+
 def test_grey_from_a_half_on_counts(tmp_path: Path) -> None:
     values = np.array([[0.0, 0.4, 0.6, 1.0]] * 2, np.float32)[:, :, None] * np.ones(3, np.float32)
     write_image(tmp_path / "m.png", values)

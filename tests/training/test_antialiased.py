@@ -22,6 +22,9 @@ from clsplat.reference.sampling import sampling_limits
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, load_scene
+from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.training import sampling
+from clsplat.training.sampling import SamplingFilter
 from clsplat.training.trainer import Trainer
 
 SMOOTH = replace(CONFIG, antialiased=True)
@@ -68,6 +71,26 @@ def test_no_scale_is_less_than_the_pictures_show(scene: Scene, default_device: D
     assert np.isfinite(limits).any()
     assert (model.log_scales >= limits[:, None] - 1e-4).all()
     assert model.antialiased
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 8])
+def test_the_cameras_are_looked_at_every_hundred_steps(
+    views: int, scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[int] = []
+    renew = SamplingFilter.renew
+
+    def noted(self: SamplingFilter, gaussians: AnyGaussians) -> None:
+        looked.append(trainer.step)
+        renew(self, gaussians)
+
+    monkeypatch.setattr(sampling, "EVERY", 12)
+    monkeypatch.setattr(SamplingFilter, "renew", noted)
+    config = replace(SMOOTH, density=replace(SMOOTH.density, every=0), batch=views, iterations=48)
+    trainer = Trainer(scene, config, default_device)
+    while trainer.step < 48:
+        trainer.train_step()
+    assert [(step - 1) // 12 for step in looked] == [0, 1, 2, 3]
 
 
 @pytest.mark.slow

@@ -75,8 +75,9 @@ def test_edge_strength() -> None:
     photograph[:, 4:, :3] = 200
     photograph[..., 4] = 255
     photograph[0, :, 4] = 0
+    photograph[0, :, :3] = 0  # as what is masked is, which has an outline then
     expected = np.zeros((6, 8))
-    expected[1:, 3:5] = 1
+    expected[2:, 3:5] = 1
     np.testing.assert_array_equal(edge_strength(photograph), expected)
     assert not edge_strength(np.full((6, 8, 3), 7, np.uint8)).any()
     assert edge_strength(np.zeros((1, 8, 3), np.uint8)).shape == (1, 8)
