@@ -364,8 +364,7 @@ class TrainConfig:
             )
         if self.invert_masks and self.masks == "none":
             raise InputError("--invert-masks: no masks are used, expected --masks ignore or --masks transparent too")
-        if self.points_use != "replace" and not self.points:
-            raise InputError(f"--points-use {self.points_use}: no points are given, expected --points FILE too")
+        self._check_used()
         if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
@@ -381,11 +380,25 @@ class TrainConfig:
             raise InputError(
                 f"{self._refining}: not with --batch {self.batch}, nor with several devices; expected one view a step"
             )
-        if self.depth != "maps" and self.depth_maps != "metric":
-            raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
+
+    def _check_used(self) -> None:
+        """Raise InputError for a setting of something that is not asked for."""
+        points, maps = ("no points are given", "points FILE"), ("no depth maps are used", "depth maps")
+        poses, lenses = ("poses stay as given", "refine-poses"), ("lenses stay as given", "refine-lenses")
+        for name, used, (why, wanted) in (
+            ("points_use", self.points, points),
+            ("points_limit", self.points, points),
+            ("depth_maps", self.depth == "maps", maps),
+            ("depth_unit", self.depth == "maps", maps),
+            ("pose_reach", self.refine_poses, poses),
+            ("lens_reach", self.refine_lenses, lenses),
+        ):
+            value = getattr(self, name)
+            if not used and value != getattr(TrainConfig, name):
+                raise InputError(f"--{name.replace('_', '-')} {value}: {why}, expected --{wanted} too")
 
     @property
     def refines(self) -> bool:

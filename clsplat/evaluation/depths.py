@@ -48,9 +48,10 @@ def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
 
 
 def coloured(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The model with a grey for each Gaussian by its distance along the camera's axis: 0 to 1 between the ENDS of those
-    ahead. A frame of it has depth for colour, by no other kernel than a frame's."""
-    depths = (gaussians.means + gaussians.origin - camera.position) @ camera.rotation[2]
+    """The model with a grey for each Gaussian by its distance, along the camera's axis where that has one: 0 to 1
+    between the ENDS of those ahead. A frame of it has depth for colour, by no other kernel than a frame's."""
+    offsets = gaussians.means + gaussians.origin - camera.position
+    depths = np.linalg.norm(offsets, axis=1) if camera.kind.rays else offsets @ camera.rotation[2]
     ahead = depths[depths > gaussians.near]
     near, far = np.quantile(ahead, ENDS) if len(ahead) else (0.0, 1.0)
     sh = np.zeros_like(gaussians.sh)

@@ -57,9 +57,12 @@ class Answer:
 
     @property
     def words(self) -> str:
-        """The finding with its answer, such as "exposures differ by 0.40 stops (--appearance exposure)"."""
+        """The finding with its answer, such as "exposures differ by 0.40 stops (--appearance exposure)"; advice that
+        --auto does not take is behind a colon."""
         kind = self.finding.kind
-        answer = flags(self.settings) or ADVICE.get(kind, "")
+        if advice := ADVICE.get(kind):
+            return f"{self.finding.text}: {advice}"
+        answer = flags(self.settings)
         if kind in ANSWERS and not self.settings:
             wanted = flags(ANSWERS[kind][0])
             given = f"--{self.given.replace('_', '-')} is given"
@@ -130,7 +133,5 @@ def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:
         return f"looked at {looked:,} photographs: nothing found that a setting would answer"
     text = "; ".join(answer.words for answer in answers)
     settings = " ".join(filter(None, (flags(answer.settings) for answer in answers)))
-    end = ""
-    if settings:
-        end = f". --auto takes {settings}" if auto else ". --auto takes what is in brackets"
+    end = f". --auto {'takes' if auto else 'would take'} {settings}" if settings else ""
     return f"looked at {looked:,} photographs: {text}{end}"

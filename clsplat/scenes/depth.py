@@ -17,6 +17,7 @@ from clsplat.files import is_file
 from clsplat.images.depth_maps import EXTENSIONS, map_header, read_map
 from clsplat.scenes import colmap
 from clsplat.scenes.beside import bases_of, beside, owned
+from clsplat.scenes.data_set import pixels_of
 from clsplat.scenes.known_depth import KnownDepth, sampled
 
 if TYPE_CHECKING:
@@ -59,12 +60,36 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
         raise InputError(f"{scene.name}: {asked} wants to know which photographs show a point, expected a COLMAP model")
     tracks = colmap.read_tracks(model)
     weights = 1 / (1 + np.square(np.maximum(tracks.errors, 0.0)))
-    known = {
-        name: KnownDepth(tracks.points[rows], weights[rows]) for name, rows in tracks.by_image.items() if len(rows)
-    }
-    if not any(view.name in known for view in scene.train_views):
+    tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
+    if not tracked:
         raise InputError(f"{model}: no point has a track, and {asked} goes by them; export the model with tracks")
+    known = {}
+    for view in scene.train_views:
+        rows = tracked.get(view.name, tracked.get(view.name.partition("/")[2]))  # images/a.jpg is COLMAP's a.jpg
+        if rows is not None:
+            known[view.name] = KnownDepth(tracks.points[rows], weights[rows])
+    if not known:
+        raise InputError(
+            f"{model}: has photographs such as {examples(sorted(tracked))}, and none of the scene's "
+            f"({examples([view.name for view in scene.train_views])}), expected the same; {asked} goes by their points"
+        )
+    _check_frame(scene, known, model)
     return known
+
+
+def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
+    """Raise InputError where most points are not in the photographs that show them: cameras of another file may be in
+    another frame."""
+    seen = whole = 0
+    for view in scene.train_views:
+        if view.name in known:
+            seen += int(np.count_nonzero(pixels_of(known[view.name].points, view.camera, view.lens)[2]))
+            whole += len(known[view.name].points)
+    if seen < whole / 2:
+        raise InputError(
+            f"{model}: of {whole:,} points that its photographs show {seen:,} are in these by the scene's cameras, "
+            "expected most of them; take cameras and points of one model"
+        )
 
 
 def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:

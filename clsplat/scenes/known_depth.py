@@ -38,7 +38,7 @@ class KnownDepth:
         world units, and its weight. lens: of a camera that is no pinhole, and of the map."""
         if self.path is not None:
             nearness = self._from_map(camera, lens)
-            found = np.flatnonzero(nearness > 0)
+            found = np.flatnonzero((nearness > 0) & (nearness < np.finfo(np.float32).max))
             return found, nearness.ravel()[found].astype(np.float32), np.ones(len(found), np.float32)
         rows, columns, inside = pixels_of(self.points, camera, lens)
         local = self.points[inside] @ camera.rotation.T + camera.translation

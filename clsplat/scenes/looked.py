@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.scenes.data_set import PANORAMA, RADIAL, pixels_of
+from clsplat.scenes.initialise import of_one_colour
 from clsplat.scenes.scene import Scene, View
 
 MAX_POINTS = 4000
@@ -39,6 +40,8 @@ class Looked:
         step = max(-(-len(scene.points) // MAX_POINTS), 1)
         self.points = scene.points[::step]
         self.colors = scene.point_colors[::step].astype(np.float64)
+        grey = of_one_colour(scene.point_colors) if scene.colourless is None else scene.colourless[::step]
+        self._coloured = np.broadcast_to(~np.asarray(grey), len(self.points))
 
     @cached_property
     def places(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]]:
@@ -67,12 +70,13 @@ class Looked:
 
     @cached_property
     def gains(self) -> dict[str, Float64]:
-        """log2 of the brightness (3,) of each view by that of the points' colours, less the views' medians."""
+        """log2 of the brightness (3,) of each view by that of the points' colours, less the views' medians, of points
+        that have colours."""
         found = {}
         for name, (which, rows, columns, _) in self.places.items():
             seen, known = self.scene.glances[name].pixels[rows, columns], self.colors[which]
             both = np.concatenate([seen, known], axis=1)
-            good = ((both > DARK) & (both < BRIGHT)).all(axis=1)
+            good = ((both > DARK) & (both < BRIGHT)).all(axis=1) & self._coloured[which]
             if good.sum() >= LEAST_POINTS:
                 found[name] = np.median(np.log2(seen[good] / known[good]), axis=0)
         middle = np.median(list(found.values()), axis=0) if found else 0.0

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,9 +12,13 @@ from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.depth import DECAY
 from clsplat.config.training import TrainConfig
+from clsplat.errors import warn
 from clsplat.scenes.scene import View
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.loss import DEPTH_PIXEL_BYTES, DepthAims
+
+NEAREST = 1e6
+"""One over the least depth that is taken for one, in parts of the scene's extent: what is nearer is a damaged map's."""
 
 
 def pixel_bytes(config: TrainConfig) -> int:
@@ -33,12 +39,16 @@ class Depths:
         self._config, self._views, self._extent = config, views, extent
         self._held: dict[int, tuple[tuple[int, int], tuple[NDArray[np.int64], Float32, Float32]]] = {}
 
-    def aims(self, view: int, camera: Camera, step: int) -> DepthAims | None:
-        """The depths that a view's render is compared with, of the size of the step's camera; None where none are."""
+    def aims(self, view: int, camera: Camera, step: int, photograph: NDArray[Any] | None = None) -> DepthAims | None:
+        """The depths that a view's render is compared with, of the size of the step's camera; None where none are.
+        photograph: the view's (H, W, 3 to 5), where the fifth channel is a mask, under which no depth counts."""
         if not self._config.depth_use:
             return None
         width, height = camera.width, camera.height
         pixels, nearness, weights = self._known(view, width, height)
+        if photograph is not None and photograph.shape[2] == 5:
+            counts = photograph[:, :, 4].ravel()[pixels] > 0
+            pixels, nearness, weights = pixels[counts], nearness[counts], weights[counts]
         rows, stride = padded_size(width, height)
         planes = np.zeros((2, rows, stride), np.float32)
         at = pixels // width, pixels % width
@@ -54,5 +64,9 @@ class Depths:
         if held is None or held[0] != size:
             of, nothing = self._views[view], np.empty(0, np.float32)
             found = None if of.depth is None else of.depth.at(of.camera.resized(*size), of.lens)
-            held = self._held[view] = size, found or (np.empty(0, np.int64), nothing, nothing)
+            pixels, nearness, weights = found or (np.empty(0, np.int64), nothing, nothing)
+            sane = nearness * self._extent < NEAREST
+            if held is None and of.depth is not None and of.depth.path is not None and not sane.any():
+                warn(f"{of.depth.path}: no pixel has a depth that a camera could see, expected values over 0")
+            held = self._held[view] = size, (pixels[sane], nearness[sane], weights[sane])
         return held[1]

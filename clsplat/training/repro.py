@@ -98,7 +98,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
         "device": {"name": device.name, "driver": device.driver, "shape": str(device.shape)},
     }
     pixels = {"photograph": photograph, "background": incident.background}
-    aims = trainer.depths.aims(incident.view, camera, incident.step)
+    aims = trainer.depths.aims(incident.view, camera, incident.step, photograph)
     if aims is not None:
         record["depth_factor"], pixels["depth"] = aims.factor, aims.planes
     pose = {"rotation": camera.rotation, "translation": camera.translation}

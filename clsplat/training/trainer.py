@@ -295,7 +295,7 @@ class Trainer:
         image = bring(view, factor)
         self.background = self._background_colour()
         camera, kept = self.camera(view, image.shape[1], image.shape[0]), self.photographs.kept(view, factor)
-        aims = self.depths.aims(view, camera, self.step)
+        aims = self.depths.aims(view, camera, self.step, self.photographs.load(view, factor))
         return Sample(view, image, camera, self.background, begins, kept, aims)
 
     def _watched_in_batch(self, sample: Sample, step: GradientStep) -> StepProbe:

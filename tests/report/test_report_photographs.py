@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +104,10 @@ def test_the_worst_views_have_photograph_render_and_depth(reported: Path, tmp_pa
     greys = coloured(model, camera).sh[:, 0, 0]
     depths = (model.means + model.origin - camera.position) @ camera.rotation[2]
     assert (np.diff(greys[np.argsort(depths)]) >= 0).all()
+    around = replace(camera, projection="equirectangular")  # what is behind is as far as it is away
+    greys = coloured(model, around).sh[:, 0, 0]
+    distances = np.linalg.norm(model.means + model.origin - camera.position, axis=1)
+    assert (np.diff(greys[np.argsort(distances)]) >= 0).all()
     keep_depths(lambda *_: (np.ones((2, 2, 3)), np.ones((2, 2))), model, [], [], run / "depth")
     assert not list((run / "depth").glob("*.png"))
     assert main(["report", str(run)]) == 0

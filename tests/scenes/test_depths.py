@@ -233,8 +233,34 @@ def test_what_is_refused(folder: Path) -> None:
         assert with_depths(scene, MAPS).views[3].depth is None
     with pytest.raises(InputError, match="--depth-maps relative"):
         with_depths(scene, RELATIVE)
-    with pytest.raises(InputError, match="no depth maps are used, expected --depth maps too"):
-        TrainConfig(depth_maps="relative").check()
+    for config, words in (
+        (
+            TrainConfig(depth_maps="relative"),
+            "--depth-maps relative: no depth maps are used, expected --depth maps too",
+        ),
+        (TrainConfig(depth="points", depth_unit=0.01), "--depth-unit 0.01: no depth maps are used"),
+        (TrainConfig(points_limit=5), "--points-limit 5: no points are given, expected --points FILE too"),
+        (TrainConfig(pose_reach=3.0), "--pose-reach 3.0: poses stay as given, expected --refine-poses too"),
+        (TrainConfig(lens_reach=3.0), "--lens-reach 3.0: lenses stay as given, expected --refine-lenses too"),
+    ):
+        with pytest.raises(InputError, match=words):
+            config.check()
+
+
+def test_tracks_of_other_photographs_or_of_another_frame(folder: Path) -> None:
+    add_tracks(folder)
+    scene = load_scene(folder)
+    inside = replace(scene, views=[replace(view, name=f"images/{view.name}") for view in scene.views])
+    depths = [view.depth for view in with_depths(inside, POINTS).train_views]
+    assert all(depth is not None and len(depth.points) for depth in depths)
+    strange = replace(scene, views=[replace(view, name=f"of-{view.name}") for view in scene.views])
+    with pytest.raises(InputError, match=r"has photographs such as 00\.png, 01\.png, .*and none of the scene's \(of-0"):
+        with_depths(strange, POINTS)
+    away = [replace(view, camera=replace(view.camera, translation=view.camera.translation + 9)) for view in scene.views]
+    with pytest.raises(
+        InputError, match=r"points that its photographs show [0-9,]+ are in these by the scene's cameras"
+    ):
+        with_depths(replace(scene, views=away), POINTS)
 
 
 @pytest.mark.parametrize("array", [np.zeros((2, 3, 4)), np.array(["a"]), np.zeros((0, 5))])

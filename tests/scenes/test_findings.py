@@ -151,6 +151,22 @@ def test_a_sky() -> None:
     assert found.text.startswith("24 photographs have a sky, 14 % of each")
 
 
+def test_points_without_colours_say_nothing_of_exposures() -> None:
+    scene = made()
+    for index, view in enumerate(scene.views):
+        changed(scene, index, pixels=scene.glances[view.name].pixels * np.float32(2 ** (-index / 24)))
+    assert kinds(scene) == ["exposure"]
+    assert kinds(replace_points(scene, colourless=np.ones(len(scene.points), bool))) == []
+    assert kinds(replace_points(scene, point_colors=np.full_like(scene.point_colors, 0.5))) == []
+
+
+def replace_points(scene: Scene, **changes: object) -> Scene:
+    """The scene with other points, and the same glances."""
+    other = replace(scene, **changes)  # type: ignore[arg-type]
+    other.__dict__["glances"] = scene.glances
+    return other
+
+
 def test_a_white_table_below_is_no_sky() -> None:
     scene = made()
     for index, view in enumerate(scene.views):
@@ -230,11 +246,13 @@ def test_answers_that_do_not_go_together() -> None:
     answers, config = answered(found, TrainConfig())
     assert (config.appearance, config.masks) == ("exposure", "ignore")
     text = paragraph(answers, 3, auto=True)
-    assert text.startswith("looked at 3 photographs: a (--appearance exposure); b (--masks ignore); c (leave them out")
+    assert text.startswith("looked at 3 photographs: a (--appearance exposure); b (--masks ignore); c: leave them out")
     assert text.endswith(". --auto takes --appearance exposure --masks ignore")
     answers, config = answered(found, TrainConfig(), given={"appearance"})
     assert (config.appearance, config.masks) == ("none", "transparent")
-    assert "a (--appearance is given)" in paragraph(answers, 3, auto=False)
+    text = paragraph(answers, 3, auto=False)
+    assert "a (--appearance is given)" in text
+    assert text.endswith("c: leave them out where others show the same. --auto would take --masks transparent")
     transparent = TrainConfig(masks="transparent")
     answers, config = answered(found[:1], transparent)
     assert config == transparent

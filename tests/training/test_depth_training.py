@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from clsplat.images.writing import write_image
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run
 from clsplat.scenes.depth import with_depths
+from clsplat.scenes.known_depth import KnownDepth
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.training.depth import Depths, weight_at
 from clsplat.training.health import Incident
@@ -90,6 +92,37 @@ def test_the_weight_falls_and_views_count_alike(scene: Scene) -> None:
     assert nothing.factor == 0
     assert not nothing.planes.any()
     assert Depths(TrainConfig(), views, 3.0).aims(0, camera, 1) is None
+
+
+def test_under_a_mask_no_depth_counts(scene: Scene) -> None:
+    config = TrainConfig(iterations=1000, depth="maps", depth_weight=0.5)
+    views = with_depths(scene, config.depth_use).train_views
+    camera, photograph = views[0].camera, np.ones((HEIGHT, WIDTH, 5), np.uint8)
+    photograph[: HEIGHT // 2, :, 4] = 0
+    whole = Depths(config, views, 3.0).aims(0, camera, 500)
+    masked = Depths(config, views, 3.0).aims(0, camera, 500, photograph)
+    assert whole is not None
+    assert masked is not None
+    assert not masked.planes[:, : HEIGHT // 2].any()
+    np.testing.assert_array_equal(masked.planes[:, HEIGHT // 2 :], whole.planes[:, HEIGHT // 2 :])
+    assert masked.factor * masked.planes[1].sum() == pytest.approx(0.05 * 3.0)
+
+
+def test_a_damaged_map_says_nothing_and_is_named(scene: Scene, tmp_path: Path) -> None:
+    """One over a denormal is more than a float holds, or farther from all else than any camera sees."""
+    config = TrainConfig(depth="maps")
+    views = with_depths(scene, config.depth_use).train_views
+    values = np.full((HEIGHT, WIDTH), 1e-45, np.float32)
+    values[0], values[1] = 1e-30, 4.0
+    np.save(tmp_path / "some.npy", values)
+    np.save(tmp_path / "none.npy", np.minimum(values, 1e-30))
+    for name, known in (("some", WIDTH), ("none", 0)):
+        views[0] = replace(views[0], depth=KnownDepth(np.empty((0, 3)), np.empty(0), tmp_path / f"{name}.npy"))
+        with nullcontext() if known else pytest.warns(UserWarning, match=r"none\.npy: no pixel has a depth"):
+            aims = Depths(config, views, 3.0).aims(0, views[0].camera, 1)
+        assert aims is not None
+        assert np.isfinite(aims.planes).all()
+        assert np.count_nonzero(aims.planes[1]) == known
 
 
 @pytest.mark.slow
