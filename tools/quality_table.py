@@ -116,11 +116,13 @@ TRAININGS: dict[str, Callable[[], list[Row]]] = {"growth": growth_rows, "antiali
 SIZED = ("--iterations", "{iterations}", "--resolution", "{resolution}")
 AUTO = ("--try", "auto:" + ",".join(f"{name}={value}" for name, value in ANSWERS["few views"][0].items()))
 """Settings that --auto takes for few photographs."""
-FEW = ("--views", "3,12", "--seeds", "0,1")
+FEW = ("--views", "3,6,9,12", "--seeds", "0,1")
+EXPOSED = ("--with", "schedule=high-rates,density.growth=mcmc,density.max_gaussians=290000")
+"""Settings that bonsai is trained with, with and without gains."""
 TOOLS: dict[str, tuple[str, ...]] = {
     "masks": ("quality_masks.py", "{scenes}/fox", "{work}", *SIZED),
-    "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED),
-    "exposure of seed 1": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED, "--seed", "1"),
+    "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED, *EXPOSED),
+    "exposure of seed 1": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED, *EXPOSED, "--seed", "1"),
     "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
     "poses": ("quality_poses.py", "{work}", "--width", "320", "--iterations", "{iterations}"),
     "lenses": ("quality_poses.py", "{work}", "--width", "320", "--lens", "2", "--iterations", "{iterations}"),

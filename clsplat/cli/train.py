@@ -221,6 +221,10 @@ def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
         from clsplat.scenes.depth import with_depths
 
         scene = with_depths(scene, config.depth_use)
+    if config.refines:
+        from clsplat.training.cameras import Cameras
+
+        Cameras(config, scene.train_views, scene.extent)
     _check_scene(scene)
     return scene
 

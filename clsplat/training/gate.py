@@ -70,6 +70,11 @@ class Drift:
         position = self.scale * self.rotation @ camera.position + self.shift
         return camera.posed(rotation, -rotation @ position)
 
+    def points(self, points: Float64) -> Float64:
+        """Points (N, 3) of the world as it was in the drifted one."""
+        moved: Float64 = self.scale * points @ self.rotation.T + self.shift
+        return moved
+
 
 def drift(given: Sequence[Camera], refined: Sequence[Camera], extent: float) -> Drift:
     """The similarity that takes the poses as they were given to the refined ones, n of each, as nearly as one can.

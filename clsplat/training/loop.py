@@ -7,7 +7,7 @@ import signal
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -51,7 +51,8 @@ from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
 """Steps between readings of the loss, for which the host waits; the device goes on with the rest of the step."""
-
+HELD = 0.97
+"""Part of --density.max-gaussians from which on growth is taken to have ended there: some are pruned since."""
 
 FAR_DEGREES, FAR_PART = 5.0, 0.1
 """Degrees, and part of the scene's extent, beyond which a refined pose is told of."""
@@ -275,7 +276,14 @@ class Session:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """A warning if the renders show nothing; no look at them if the memory is too small for one."""
+        """Warnings if the renders show nothing, unless the memory is too small for a look at them, and if a limit has
+        held the paper's growth."""
+        density, count = self.trainer.config.density, self.trainer.parameters.count
+        if density.growth == "paper" and density.every > 0 and count >= HELD * density.max_gaussians:
+            warnings.warn(
+                f"--density.max-gaussians {density.max_gaussians:,} has held the growth: --density.growth mcmc, or "
+                "budget with --density.long-axis, shows more with as many Gaussians"
+            )
         with suppress(CapacityError):
             if text := doubts.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
@@ -348,6 +356,7 @@ class Session:
             if trainer.scene.test_views:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
+                _doubt_poses(result["mean"], trainer.config.refine_gate)
                 ample = trainer.device.memory.limit is None and not any(trainer.plan.pieces)
                 if trainer.config.report and ample:
                     with suppress(CapacityError, DriverError):  # a picture less is no failed training
@@ -374,12 +383,16 @@ class Session:
 
 
 def _keep_cameras(run: Run, trainer: Trainer) -> None:
-    """Write the refined cameras, with the poses that are held out as they were given; a warning for any that went
-    far."""
+    """Write the refined cameras, with held-out poses and the points moved as these are on average; a warning for any
+    that went far."""
     scene, poses, lenses = trainer.scene, trainer.cameras.poses, trainer.cameras.lenses
-    refined = {view.name: camera for view, camera in zip(trainer.views, poses.cameras, strict=True)}
-    images = [(view.name, lenses.refined(view.lens), refined.get(view.name, view.camera)) for view in scene.views]
-    write_model(run.refined_path, images, scene.points, scene.point_colors)
+    cameras, points = {view.name: view.camera for view in scene.views}, scene.points
+    if (along := trainer.cameras.drift()) is not None:
+        cameras = {name: along.taken_along(camera) for name, camera in cameras.items()}
+        points = along.points(points)
+    cameras |= {view.name: camera for view, camera in zip(trainer.views, poses.cameras, strict=True)}
+    images = [(view.name, lenses.refined(view.lens), cameras[view.name]) for view in scene.views]
+    write_model(run.refined_path, images, points, scene.point_colors)
     degrees, shifts = poses.motions()
     far = (degrees > FAR_DEGREES) | (shifts > FAR_PART * scene.extent)
     if far.any():
@@ -392,6 +405,17 @@ def _keep_cameras(run: Run, trainer: Trainer) -> None:
         warnings.warn(
             f"--refine-lenses: a focal length or principal point has changed by {most:.1%} of the focal length; look "
             "at the renders, or leave them as they are"
+        )
+
+
+def _doubt_poses(mean: Mapping[str, float], most: float) -> None:
+    """Warn where the model's world has left that of the cameras as they were given, by more than `most` dB."""
+    lost = mean.get("psnr_aligned", 0.0) - mean["psnr"]
+    if 0 < most < lost:
+        warnings.warn(
+            f"--refine-poses: held-out views have {mean['psnr']:.2f} dB where they were given and "
+            f"{mean['psnr_aligned']:.2f} dB where they fit the model best: it has moved with the refined cameras. Use "
+            "those of refined/ with it; where the given ones are good, train without --refine-poses"
         )
 
 

@@ -4,6 +4,7 @@ byte wherever training was stopped, and in pieces."""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,18 @@ CONFIG = short(
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+@pytest.mark.parametrize(("growth", "most"), [("paper", 60), ("paper", 10_000), ("budget", 60)])
+def test_a_limit_that_held_the_growth_is_told_of(scene: Scene, default_device: Device, growth: str, most: int) -> None:
+    keeps = {"min_opacity": 1e-6, "opacity_reset_every": 0, "max_world_fraction": 10.0}
+    config = short(iterations=30, density={"growth": growth, "max_gaussians": most, "gradient_threshold": 1e-6} | keeps)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        train(scene, config, device=default_device)
+    held = [str(one.message) for one in told if "has held the growth" in str(one.message)]
+    assert len(held) == (growth == "paper" and most == 60)
+    assert all(text.startswith("--density.max-gaussians 60 has held the growth: --density.growth") for text in held)
 
 
 def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
