@@ -90,6 +90,21 @@ class Train(Verb):
         return replace(self, config=with_given(Run.open(self.output).config, self.config, given))
 
 
+def _check_used(config: TrainConfig, given: Collection[str]) -> None:
+    """Raise InputError for a flag of something that is not asked for."""
+    for name, used, why, wanted in (
+        ("points_limit", config.points, "no points are given", "points FILE"),
+        ("depth_unit", config.depth == "maps", "no depth maps are used", "depth maps"),
+        ("depth_weight", config.depth != "none", "no depths are used", "depth"),
+        ("pose_reach", config.refine_poses, "poses stay as given", "refine-poses"),
+        ("lens_reach", config.refine_lenses, "lenses stay as given", "refine-lenses"),
+        ("appearance_rate", config.appearance != "none", "no appearance is learnt", "appearance"),
+    ):
+        if name in given and not used and getattr(config, name) != getattr(TrainConfig, name):
+            flag = name.replace("_", "-")
+            raise InputError(f"--{flag} {getattr(config, name)}: {why}, expected --{wanted} too")
+
+
 def run(verb: Train, services: Services) -> int:
     """Train. Everything that can be wrong with the call is found before the run's folder is touched."""
     from clsplat.runs.locks import locked
@@ -115,6 +130,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
 
     verb.device.check()
     verb.config.check()
+    _check_used(verb.config, verb.given)
     page = None
     if verb.view:
         from clsplat.cli.view import training_view
@@ -221,11 +237,11 @@ def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
         from clsplat.scenes.depth import with_depths
 
         scene = with_depths(scene, config.depth_use)
+    _check_scene(scene)
     if config.refines:
         from clsplat.training.cameras import Cameras
 
         Cameras(config, scene.train_views, scene.extent)
-    _check_scene(scene)
     return scene
 
 

@@ -324,8 +324,9 @@ class TrainConfig:
     refine_gate: float = 1.0
     """Decibels by which the mean PSNR of held-out views can be under its best in two measurements in a row; then
     refined cameras return to those of the best and stay. At most 8 views are measured, where refinement begins and
-    every tenth of the training, with poses as given or moved as the refined ones are on average, whichever fits. 0:
-    no gate; nor is there one where no view is held out."""
+    every tenth of the training, with poses as given or moved as the refined ones are on average, whichever fits. A
+    warning tells at the end if views that fit the model best are ahead of those as given by more. 0: neither; nor is
+    there a gate where no view is held out."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -364,7 +365,8 @@ class TrainConfig:
             )
         if self.invert_masks and self.masks == "none":
             raise InputError("--invert-masks: no masks are used, expected --masks ignore or --masks transparent too")
-        self._check_used()
+        if self.points_use != "replace" and not self.points:
+            raise InputError(f"--points-use {self.points_use}: no points are given, expected --points FILE too")
         if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
             raise InputError(
                 f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
@@ -380,25 +382,11 @@ class TrainConfig:
             raise InputError(
                 f"{self._refining}: not with --batch {self.batch}, nor with several devices; expected one view a step"
             )
+        if self.depth != "maps" and self.depth_maps != "metric":
+            raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
         self.optimiser.check()
         self.density.check()
         self.rasterizer.check()
-
-    def _check_used(self) -> None:
-        """Raise InputError for a setting of something that is not asked for."""
-        points, maps = ("no points are given", "points FILE"), ("no depth maps are used", "depth maps")
-        poses, lenses = ("poses stay as given", "refine-poses"), ("lenses stay as given", "refine-lenses")
-        for name, used, (why, wanted) in (
-            ("points_use", self.points, points),
-            ("points_limit", self.points, points),
-            ("depth_maps", self.depth == "maps", maps),
-            ("depth_unit", self.depth == "maps", maps),
-            ("pose_reach", self.refine_poses, poses),
-            ("lens_reach", self.refine_lenses, lenses),
-        ):
-            value = getattr(self, name)
-            if not used and value != getattr(TrainConfig, name):
-                raise InputError(f"--{name.replace('_', '-')} {value}: {why}, expected --{wanted} too")
 
     @property
     def refines(self) -> bool:

@@ -48,8 +48,9 @@ def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
 
 
 def coloured(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The model with a grey for each Gaussian by its distance, along the camera's axis where that has one: 0 to 1
-    between the ENDS of those ahead. A frame of it has depth for colour, by no other kernel than a frame's."""
+    """The model with a grey for each Gaussian by its distance along the camera's axis, of fisheyes and panoramas
+    from the camera: 0 to 1 between the ENDS of those ahead. A frame of it has depth for colour, by no other kernel than
+    a frame's."""
     offsets = gaussians.means + gaussians.origin - camera.position
     depths = np.linalg.norm(offsets, axis=1) if camera.kind.rays else offsets @ camera.rotation[2]
     ahead = depths[depths > gaussians.near]

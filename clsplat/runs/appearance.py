@@ -45,7 +45,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, float, float]:
     if not found:
         near = get_close_matches(photograph, gains, 3, 0.0)
         raise InputError(
-            f"--appearance {photograph}: no photograph in {path}, expected one of its {len(gains)}, such as "
+            f"--appearance {photograph}: is no photograph of {path}, expected one of its {len(gains)}, such as "
             f"{examples(near)}"
         )
     return gains[photograph if photograph in found else found[0]]

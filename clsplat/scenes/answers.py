@@ -40,6 +40,7 @@ SCHEDULED = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate
 """Settings that schedules have, beside the number of steps."""
 ADVICE: Mapping[Kind, str] = {
     "sky": "--sky 1000 starts with points far away for it",
+    "strange masks": "rename or remove what is no mask",
     "blur": "leave them out where others show the same",
     "duplicates": "remove the copies",
 }

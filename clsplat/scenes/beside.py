@@ -37,9 +37,12 @@ def beside(base: Path, names: Sequence[str]) -> Path | None:
     return next((at for parent in (base, base.parent) for name in names if (at := parent / name).is_dir()), None)
 
 
-def owned(folder: Path, paths: Iterable[Path], known: Mapping[str, str], what: str, example: str) -> dict[str, Path]:
+def owned(
+    folder: Path, paths: Iterable[Path], known: Mapping[str, str], what: str, example: str, *, strict: bool = True
+) -> dict[str, Path]:
     """The files of a folder by the photographs that they go with. known: these by the names that a file may have,
-    without its extension; what: a word for such a file; example: a photograph's name.
+    without its extension; what: a word for such a file; example: a photograph's name; strict: whether files that fit no
+    photograph are refused, or passed over.
 
     Raises InputError for a file that fits no photograph, and for two of one.
     """
@@ -54,7 +57,7 @@ def owned(folder: Path, paths: Iterable[Path], known: Mapping[str, str], what: s
             raise InputError(f"{path}: is a second {what} of {owner}, beside {found[owner].name}; remove one of them")
         else:
             found[owner] = path
-    if lost:
+    if lost and strict:
         raise InputError(
             f"{folder}: {len(lost):,} {what}(s) fit no photograph ({examples(lost)}): expected names such as "
             f"{example}.png; rename or remove them"

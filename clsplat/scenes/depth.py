@@ -28,6 +28,9 @@ FOLDERS = ("depths", "depth")
 """Names of the folder of depth maps, beside the photographs' or in it."""
 LEAST_POINTS = 10
 """Points of a photograph that its relative map is fitted to, at least."""
+SEEN = 0.1
+"""Part of the points that are in their photographs at least. A fisheye of 200 degrees keeps 0.4 when it is undistorted;
+of cameras in another frame a thousandth was left."""
 APART = 5.0
 """Factor by which the scale of a relative map may differ from the median of the photographs'."""
 
@@ -63,11 +66,11 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
     tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
     if not tracked:
         raise InputError(f"{model}: no point has a track, and {asked} goes by them; export the model with tracks")
-    known = {}
-    for view in scene.train_views:
-        rows = tracked.get(view.name, tracked.get(view.name.partition("/")[2]))  # images/a.jpg is COLMAP's a.jpg
-        if rows is not None:
-            known[view.name] = KnownDepth(tracks.points[rows], weights[rows])
+    names = {view.name: view.name for view in scene.train_views}
+    if not tracked.keys() & names.keys():  # images/a.jpg is COLMAP's a.jpg
+        names = {name: name.partition("/")[2] for name in names}
+    rows = {name: tracked[theirs] for name, theirs in names.items() if theirs in tracked}
+    known = {name: KnownDepth(tracks.points[which], weights[which]) for name, which in rows.items()}
     if not known:
         raise InputError(
             f"{model}: has photographs such as {examples(sorted(tracked))}, and none of the scene's "
@@ -78,17 +81,18 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
 
 
 def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
-    """Raise InputError where most points are not in the photographs that show them: cameras of another file may be in
+    """Raise InputError where hardly a point is in the photographs that show it: cameras of another file may be in
     another frame."""
     seen = whole = 0
     for view in scene.train_views:
         if view.name in known:
-            seen += int(np.count_nonzero(pixels_of(known[view.name].points, view.camera, view.lens)[2]))
+            camera = view.camera.before(scene.near)
+            seen += int(np.count_nonzero(pixels_of(known[view.name].points, camera, view.lens)[2]))
             whole += len(known[view.name].points)
-    if seen < whole / 2:
+    if seen < SEEN * whole:
         raise InputError(
             f"{model}: of {whole:,} points that its photographs show {seen:,} are in these by the scene's cameras, "
-            "expected most of them; take cameras and points of one model"
+            "expected most of them: take cameras and points of one model"
         )
 
 
@@ -107,7 +111,9 @@ def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
         width, height, whole = map_header(path)
         _check_shape(path, width, height, lenses[name])
         known[name] = KnownDepth(*nothing, path, use.unit if whole else 1.0, whole=whole)
-    return _fitted(scene, known) if use.maps == "relative" else known
+    if use.maps == "relative":
+        return _fitted(scene, known)
+    return {name: one for name, one in known.items() if one.measured(read_map(_path(one))).any()}
 
 
 def _check_shape(path: Path, width: int, height: int, lens: Lens) -> None:

@@ -140,7 +140,7 @@ def _masks(scene: Scene, use: MaskUse) -> Finding | None:
         some = sorted(found)[:: max(len(found) // MOST_MASKS, 1)]
         masks = [read_mask(found[name], orient=False, invert=False)[:, :, 0] for name in some]
     except InputError as error:
-        return Finding("strange masks", f"there are masks that cannot be used, and they are not: {error}")
+        return _strange_masks(scene, str(error).partition("; ")[0])
     if not masks:
         return None
     kept = [(mask.mean(), np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()) for mask in masks]
@@ -149,6 +149,18 @@ def _masks(scene: Scene, use: MaskUse) -> Finding | None:
     if border <= 1 - CUT_OUT and inside < 0.5:
         return Finding("cut out", f"{text}; they cut out a thing that is {100 * inside:.0f} % of the pictures")
     return Finding("masks", f"{text}; they leave out {100 - 100 * inside:.0f} % of the pictures")
+
+
+def _strange_masks(scene: Scene, reason: str) -> Finding | None:
+    """Masks of some photographs, beside what is none; nothing where all there is is something else's."""
+    try:
+        count = len(masks_beside(scene.views, strict=False))
+    except InputError:
+        return None
+    if not count:
+        return None
+    text = f"there are masks for {count:,} of {len(scene.views):,} photographs, which cannot be used ({reason})"
+    return Finding("strange masks", text)
 
 
 def _alpha(scene: Scene, use: MaskUse) -> Finding | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,9 +55,13 @@ class KnownDepth:
         values = sampled(read_map(self.path), camera, lens)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.fit is None:
-                known = (values > 0) & ~(self.whole & (values == NOTHING))
-                return np.where(known, 1 / (values * self.unit), 0.0)
+                return np.where(self.measured(values), 1 / (values * self.unit), 0.0)
             return np.where(np.isfinite(values), self.fit[0] * values + self.fit[1], 0.0)
+
+    def measured(self, values: NDArray[Any]) -> NDArray[np.bool_]:
+        """True where a metric map knows a depth."""
+        known: NDArray[np.bool_] = (values > 0) & np.isfinite(values) & ~(self.whole & (values == NOTHING))
+        return known
 
     @property
     def digest(self) -> str:

@@ -70,10 +70,12 @@ def folder_of(images: Path) -> Path | None:
     return beside(images, FOLDERS)
 
 
-def find_masks(folder: Path, names: Iterable[str], without: Iterable[Path] = ()) -> dict[str, Path]:
+def find_masks(
+    folder: Path, names: Iterable[str], without: Iterable[Path] = (), *, strict: bool = True
+) -> dict[str, Path]:
     """The masks in a folder by the photographs' names, relative to theirs; names: of all the photographs that there
-    are; without: files to pass over. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, or IMAGE_mask.png, in the
-    same sub-folder.
+    are; without: files to pass over; strict: as of `owned`. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, or
+    IMAGE_mask.png, in the same sub-folder.
 
     Raises InputError for a mask that fits no photograph, and for two of one.
     """
@@ -86,7 +88,7 @@ def find_masks(folder: Path, names: Iterable[str], without: Iterable[Path] = ())
     example = next(iter(sorted(names)), "IMAGE.jpg")
     passed = {path.resolve() for path in without}
     files = (path for path in find_images(folder) if path.resolve() not in passed)
-    return owned(folder, files, known, "mask", example)
+    return owned(folder, files, known, "mask", example, strict=strict)
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[str, Mask]:
@@ -116,10 +118,11 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
     return {image.name: Mask(use, found.get(image.name)) for image in images}
 
 
-def masks_beside(images: Sequence[Named], told: Mapping[str, Path] | None = None) -> dict[str, Path]:
+def masks_beside(
+    images: Sequence[Named], told: Mapping[str, Path] | None = None, *, strict: bool = True
+) -> dict[str, Path]:
     """The masks in the folder beside the photographs, or in theirs, by the photographs' names. told: masks that a file
-    names, by the photographs' names; there they are one for all in nerfstudio's scenes. Raises InputError as
-    `find_masks`."""
+    names, by the photographs' names; they are one for all in nerfstudio's scenes. Raises InputError as `find_masks`."""
     told = told or {}
     if all(image.name in told for image in images):
         return {}
@@ -128,7 +131,7 @@ def masks_beside(images: Sequence[Named], told: Mapping[str, Path] | None = None
         if folder is not None:
             names = {str(PurePosixPath(image.path.relative_to(base).as_posix())): image.name for image in images}
             others = (file.relative_to(base).as_posix() for file in find_images(base) if folder not in file.parents)
-            masks = find_masks(folder, {*names, *others}, without=told.values())
+            masks = find_masks(folder, {*names, *others}, told.values(), strict=strict)
             return {names[key]: path for key, path in masks.items() if key in names}
     return {}
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.camera import Camera
+from clsplat.camera import NEAR, Camera
 from clsplat.config.depth import DECAY
 from clsplat.config.training import TrainConfig
-from clsplat.errors import warn
 from clsplat.scenes.scene import View
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.loss import DEPTH_PIXEL_BYTES, DepthAims
@@ -35,8 +34,8 @@ def weight_at(config: TrainConfig, step: int) -> float:
 class Depths:
     """Known depths of all training views at one resolution; nothing where the settings ask for none."""
 
-    def __init__(self, config: TrainConfig, views: list[View], extent: float) -> None:
-        self._config, self._views, self._extent = config, views, extent
+    def __init__(self, config: TrainConfig, views: list[View], extent: float, near: float = NEAR) -> None:
+        self._config, self._views, self._extent, self._near = config, views, extent, near
         self._held: dict[int, tuple[tuple[int, int], tuple[NDArray[np.int64], Float32, Float32]]] = {}
 
     def aims(self, view: int, camera: Camera, step: int, photograph: NDArray[Any] | None = None) -> DepthAims | None:
@@ -63,10 +62,8 @@ class Depths:
         size, held = (width, height), self._held.get(view)
         if held is None or held[0] != size:
             of, nothing = self._views[view], np.empty(0, np.float32)
-            found = None if of.depth is None else of.depth.at(of.camera.resized(*size), of.lens)
+            found = None if of.depth is None else of.depth.at(of.camera.resized(*size).before(self._near), of.lens)
             pixels, nearness, weights = found or (np.empty(0, np.int64), nothing, nothing)
             sane = nearness * self._extent < NEAREST
-            if held is None and of.depth is not None and of.depth.path is not None and not sane.any():
-                warn(f"{of.depth.path}: no pixel has a depth that a camera could see, expected values over 0")
             held = self._held[view] = size, (pixels[sane], nearness[sane], weights[sane])
         return held[1]

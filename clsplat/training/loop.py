@@ -7,7 +7,7 @@ import signal
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.child import TrialInterrupted
-from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError, examples
+from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.depths import keep_depths
 from clsplat.evaluation.held_out import evaluate
 from clsplat.gaussians import Gaussians
@@ -36,7 +36,6 @@ from clsplat.runs.checkpoints import unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
 from clsplat.scenes.cloud import with_points
-from clsplat.scenes.colmap_writing import write_model
 from clsplat.scenes.depth import with_depths
 from clsplat.scenes.initialise import is_colourless, photographed
 from clsplat.scenes.scene import Scene
@@ -46,6 +45,7 @@ from clsplat.training.batch import Losses
 from clsplat.training.cameras import aligned
 from clsplat.training.health import RETURNS, WINDOW
 from clsplat.training.judging import judge
+from clsplat.training.refined import doubt_poses, keep_cameras
 from clsplat.training.repro import write_bundle
 from clsplat.training.trainer import Trainer
 
@@ -54,10 +54,6 @@ REPORT_EVERY = 10
 HELD = 0.97
 """Part of --density.max-gaussians from which on growth is taken to have ended there: some are pruned since."""
 
-FAR_DEGREES, FAR_PART = 5.0, 0.1
-"""Degrees, and part of the scene's extent, beyond which a refined pose is told of."""
-FAR_CHANGE = 0.1
-"""The same of a lens, in focal lengths."""
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
 """A function called before each step, with the trainer and a function that is True once Ctrl-C was pressed: then it
@@ -276,14 +272,7 @@ class Session:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """Warnings if the renders show nothing, unless the memory is too small for a look at them, and if a limit has
-        held the paper's growth."""
-        density, count = self.trainer.config.density, self.trainer.parameters.count
-        if density.growth == "paper" and density.every > 0 and count >= HELD * density.max_gaussians:
-            warnings.warn(
-                f"--density.max-gaussians {density.max_gaussians:,} has held the growth: --density.growth mcmc, or "
-                "budget with --density.long-axis, shows more with as many Gaussians"
-            )
+        """A warning if the renders show nothing; no look at them if the memory is too small for one."""
         with suppress(CapacityError):
             if text := doubts.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
@@ -352,11 +341,11 @@ class Session:
             if (appearance := trainer.appearance.record()) is not None:
                 run.write_appearance(appearance, trainer.appearance.tables())
             if trainer.config.refines:
-                _keep_cameras(run, trainer)
+                keep_cameras(run, trainer)
             if trainer.scene.test_views:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
-                _doubt_poses(result["mean"], trainer.config.refine_gate)
+                doubt_poses(result["mean"], trainer.config.refine_gate)
                 ample = trainer.device.memory.limit is None and not any(trainer.plan.pieces)
                 if trainer.config.report and ample:
                     with suppress(CapacityError, DriverError):  # a picture less is no failed training
@@ -380,42 +369,17 @@ class Session:
             if trainer.step < last:
                 raise Interrupted(interrupted())
             self.doubt()
+            _tell_of_limit(trainer)
 
 
-def _keep_cameras(run: Run, trainer: Trainer) -> None:
-    """Write the refined cameras, with held-out poses and the points moved as these are on average; a warning for any
-    that went far."""
-    scene, poses, lenses = trainer.scene, trainer.cameras.poses, trainer.cameras.lenses
-    cameras, points = {view.name: view.camera for view in scene.views}, scene.points
-    if (along := trainer.cameras.drift()) is not None:
-        cameras = {name: along.taken_along(camera) for name, camera in cameras.items()}
-        points = along.points(points)
-    cameras |= {view.name: camera for view, camera in zip(trainer.views, poses.cameras, strict=True)}
-    images = [(view.name, lenses.refined(view.lens), cameras[view.name]) for view in scene.views]
-    write_model(run.refined_path, images, points, scene.point_colors)
-    degrees, shifts = poses.motions()
-    far = (degrees > FAR_DEGREES) | (shifts > FAR_PART * scene.extent)
-    if far.any():
-        names = [view.name for view, one in zip(trainer.views, far, strict=True) if one]
+def _tell_of_limit(trainer: Trainer) -> None:
+    """Warn where a limit has held the paper's growth, which began under it."""
+    density, scene = trainer.config.density, trainer.scene
+    most, began = HELD * density.max_gaussians, len(scene.points) or trainer.config.random_points
+    if density.growth == "paper" and began < most <= trainer.parameters.count:
         warnings.warn(
-            f"--refine-poses: {examples(names)}: moved by up to {degrees.max():.1f} degrees and {shifts.max():.3g} "
-            "world units; look at their renders, or leave them out"
-        )
-    if (most := lenses.largest) > FAR_CHANGE:
-        warnings.warn(
-            f"--refine-lenses: a focal length or principal point has changed by {most:.1%} of the focal length; look "
-            "at the renders, or leave them as they are"
-        )
-
-
-def _doubt_poses(mean: Mapping[str, float], most: float) -> None:
-    """Warn where the model's world has left that of the cameras as they were given, by more than `most` dB."""
-    lost = mean.get("psnr_aligned", 0.0) - mean["psnr"]
-    if 0 < most < lost:
-        warnings.warn(
-            f"--refine-poses: held-out views have {mean['psnr']:.2f} dB where they were given and "
-            f"{mean['psnr_aligned']:.2f} dB where they fit the model best: it has moved with the refined cameras. Use "
-            "those of refined/ with it; where the given ones are good, train without --refine-poses"
+            f"--density.max-gaussians {density.max_gaussians:,} has held the growth: --density.growth mcmc, or budget "
+            "with --density.long-axis, shows more with as many Gaussians"
         )
 
 

@@ -105,7 +105,7 @@ class Trainer:
         self.rasterizer.antialias(on=config.antialiased)
         self.photographs = Photographs(self.views, device)
         self.judges = Judges(scene, device)
-        self.depths = depth.Depths(config, self.views, scene.extent)
+        self.depths = depth.Depths(config, self.views, scene.extent, scene.near)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = sizes_of(
             config.warmup, config.frequency_steps, len(self.views), lambda index: self.views[index].load()

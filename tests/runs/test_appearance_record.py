@@ -40,7 +40,7 @@ def test_gains_by_name(run: Run) -> None:
     ("photograph", "message"),
     [
         ("b", r"--appearance b: is 2 photographs, x/b.jpg, y/b.jpg; name one of them$"),
-        ("othr.png", r"no photograph in .*appearance.json, expected one of its 5, such as other.png"),
+        ("othr.png", r"is no photograph of .*appearance.json, expected one of its 5, such as other.png"),
         ("", r"expected one of its 5, such as"),
     ],
 )

@@ -184,15 +184,16 @@ def test_relative_maps_are_brought_to_scale(folder: Path) -> None:
 
 def test_a_scene_of_nerfstudio_names_its_maps(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "scene")
-    add_maps(folder, ".png", "far_away")
+    add_maps(folder)
     frames = []
     for index, camera in enumerate(cameras()):
+        (folder / "depths" / f"{index:02d}.png").rename(folder / "depths" / f"of_{index}.png")  # no photograph's name
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0]), camera.position
         frames.append(
             {
                 "file_path": f"images/{index:02d}.png",
-                "depth_file_path": f"far_away/{index:02d}.png",
+                "depth_file_path": f"depths/of_{index}.png",
                 "transform_matrix": pose.tolist(),
             }
         )
@@ -233,34 +234,16 @@ def test_what_is_refused(folder: Path) -> None:
         assert with_depths(scene, MAPS).views[3].depth is None
     with pytest.raises(InputError, match="--depth-maps relative"):
         with_depths(scene, RELATIVE)
-    for config, words in (
-        (
-            TrainConfig(depth_maps="relative"),
-            "--depth-maps relative: no depth maps are used, expected --depth maps too",
-        ),
-        (TrainConfig(depth="points", depth_unit=0.01), "--depth-unit 0.01: no depth maps are used"),
-        (TrainConfig(points_limit=5), "--points-limit 5: no points are given, expected --points FILE too"),
-        (TrainConfig(pose_reach=3.0), "--pose-reach 3.0: poses stay as given, expected --refine-poses too"),
-        (TrainConfig(lens_reach=3.0), "--lens-reach 3.0: lenses stay as given, expected --refine-lenses too"),
-    ):
-        with pytest.raises(InputError, match=words):
-            config.check()
+    with pytest.raises(InputError, match="no depth maps are used, expected --depth maps too"):
+        TrainConfig(depth_maps="relative").check()
 
 
-def test_tracks_of_other_photographs_or_of_another_frame(folder: Path) -> None:
-    add_tracks(folder)
-    scene = load_scene(folder)
-    inside = replace(scene, views=[replace(view, name=f"images/{view.name}") for view in scene.views])
-    depths = [view.depth for view in with_depths(inside, POINTS).train_views]
-    assert all(depth is not None and len(depth.points) for depth in depths)
-    strange = replace(scene, views=[replace(view, name=f"of-{view.name}") for view in scene.views])
-    with pytest.raises(InputError, match=r"has photographs such as 00\.png, 01\.png, .*and none of the scene's \(of-0"):
-        with_depths(strange, POINTS)
-    away = [replace(view, camera=replace(view.camera, translation=view.camera.translation + 9)) for view in scene.views]
-    with pytest.raises(
-        InputError, match=r"points that its photographs show [0-9,]+ are in these by the scene's cameras"
-    ):
-        with_depths(replace(scene, views=away), POINTS)
+def test_maps_in_which_nothing_is_known(folder: Path) -> None:
+    add_maps(folder)
+    for name, level in (("03", 0), ("04", 65535)):
+        write_levels(folder / "depths" / f"{name}.png", np.full((HEIGHT, WIDTH), level, np.uint16))
+    with pytest.warns(UserWarning, match=r"of 2 photograph\(s\) no depths are known \(03\.png, 04\.png\)"):
+        with_depths(load_scene(folder), MAPS)
 
 
 @pytest.mark.parametrize("array", [np.zeros((2, 3, 4)), np.array(["a"]), np.zeros((0, 5))])

@@ -231,7 +231,12 @@ def test_masks_that_are_not_used(tmp_path: Path, part: float, kind: str) -> None
     write_image(folder / "masks" / "stranger.png", mask)
     (found,) = (finding for finding in findings(load_scene(folder)) if "mask" in finding.kind)
     assert found.kind == "strange masks"
-    assert "fit no photograph (stranger.png)" in found.text
+    assert found.text.startswith(f"there are masks for {VIEWS} of {VIEWS} photographs, which cannot be used (")
+    assert "fit no photograph (stranger.png): expected names such as 00.png" in found.text
+    for path in (folder / "masks").iterdir():
+        if path.stem != "stranger":
+            path.unlink()
+    assert not [kind for kind in kinds(load_scene(folder)) if "mask" in kind], "masks of something else"
 
 
 def test_every_answer_is_a_setting_that_can_be() -> None:

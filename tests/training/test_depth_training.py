@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from same_bytes import (  # noqa: F401  # undisturbed is a fixture
 )
 from tiny import HEIGHT, WIDTH, short, write_scene
 
+from clsplat.camera import NEAR
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -108,21 +109,52 @@ def test_under_a_mask_no_depth_counts(scene: Scene) -> None:
     assert masked.factor * masked.planes[1].sum() == pytest.approx(0.05 * 3.0)
 
 
-def test_a_damaged_map_says_nothing_and_is_named(scene: Scene, tmp_path: Path) -> None:
-    """One over a denormal is more than a float holds, or farther from all else than any camera sees."""
+def test_a_step_counts_no_depth_under_its_mask(folder: Path, default_device: Device, tmp_path: Path) -> None:
+    masked = Path(shutil.copytree(folder, tmp_path / "masked"))
+    (masked / "masks").mkdir(exist_ok=True)
+    mask = np.ones((HEIGHT, WIDTH, 3), np.float32)
+    mask[: HEIGHT // 2] = 0
+    for path in sorted((masked / "images").iterdir()):
+        write_image(masked / "masks" / path.name, mask)
+    config = short(iterations=20, depth="maps", masks="ignore", warmup=())
+    scene = with_depths(load_scene(masked, masks=config.mask_use), config.depth_use)
+    depth = Trainer(scene, config, default_device)._sample().known["depth"]
+    assert not depth.planes[1, : HEIGHT // 2].any()
+    assert depth.planes[1].any()
+
+
+def test_a_damaged_map_says_nothing(scene: Scene, tmp_path: Path) -> None:
+    """One over a denormal is more than a float holds, or nearer than any camera sees."""
     config = TrainConfig(depth="maps")
     views = with_depths(scene, config.depth_use).train_views
     values = np.full((HEIGHT, WIDTH), 1e-45, np.float32)
-    values[0], values[1] = 1e-30, 4.0
+    values[0], values[1], values[2] = 1e-30, 4.0, np.inf
     np.save(tmp_path / "some.npy", values)
-    np.save(tmp_path / "none.npy", np.minimum(values, 1e-30))
-    for name, known in (("some", WIDTH), ("none", 0)):
-        views[0] = replace(views[0], depth=KnownDepth(np.empty((0, 3)), np.empty(0), tmp_path / f"{name}.npy"))
-        with nullcontext() if known else pytest.warns(UserWarning, match=r"none\.npy: no pixel has a depth"):
-            aims = Depths(config, views, 3.0).aims(0, views[0].camera, 1)
-        assert aims is not None
-        assert np.isfinite(aims.planes).all()
-        assert np.count_nonzero(aims.planes[1]) == known
+    views[0] = replace(views[0], depth=KnownDepth(np.empty((0, 3)), np.empty(0), tmp_path / "some.npy"))
+    with np.errstate(over="raise"):
+        aims = Depths(config, views, 3.0).aims(0, views[0].camera, 1)
+    assert aims is not None
+    assert np.isfinite(aims.planes).all()
+    assert np.count_nonzero(aims.planes[1]) == WIDTH
+
+
+def test_depths_of_a_scene_in_small_units(scene: Scene) -> None:
+    """Its near plane is before all that it has, and so before what is known."""
+    part = 1e-3
+    views = [
+        replace(
+            view,
+            camera=replace(view.camera, translation=part * view.camera.translation),
+            depth=None if view.depth is None else replace(view.depth, points=part * view.depth.points),
+        )
+        for view in with_depths(scene, CONFIG.depth_use).train_views
+    ]
+    config, camera = replace(CONFIG, depth_weight=1.0), views[0].camera
+    known = [Depths(config, views, 3.0 * part, near).aims(0, camera, 1) for near in (NEAR, part * scene.near)]
+    assert known[0] is not None
+    assert known[1] is not None
+    assert not known[0].planes[1].any()
+    assert known[1].planes[1].any()
 
 
 @pytest.mark.slow

@@ -60,6 +60,11 @@ def test_a_run_starts_from_the_cloud_and_goes_on(
         (("--points", "gone.ply"), "gone.ply: no such file, expected a cloud of points"),
         (("--points-use", "join"), "--points-use join: no points are given, expected --points FILE too"),
         (("--points-limit", "0"), "--points-limit 0: expected at least 1"),
+        (("--points-limit", "5"), "--points-limit 5: no points are given, expected --points FILE too"),
+        (("--depth-unit", "0.01"), "--depth-unit 0.01: no depth maps are used, expected --depth maps too"),
+        (("--pose-reach", "3"), "--pose-reach 3.0: poses stay as given, expected --refine-poses too"),
+        (("--lens-reach", "3"), "--lens-reach 3.0: lenses stay as given, expected --refine-lenses too"),
+        (("--appearance-rate", "0.1"), "--appearance-rate 0.1: no appearance is learnt, expected --appearance too"),
         (("--sky", "-1"), "--sky -1: expected at least 0"),
     ],
 )

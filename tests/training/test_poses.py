@@ -26,8 +26,8 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.cameras import aligned
 from clsplat.training.gate import drift
-from clsplat.training.loop import _doubt_poses
 from clsplat.training.poses import Poses, axes_of, descend
+from clsplat.training.refined import doubt_poses
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, refine_poses=True)
@@ -152,12 +152,12 @@ def test_a_call_that_is_refused_leaves_the_run_as_it_is(folder: Path, tmp_path: 
 
 def test_a_model_that_has_moved_away_is_told_of() -> None:
     with pytest.warns(UserWarning, match=r"20\.00 dB where they were given and 21\.50 dB where they fit"):
-        _doubt_poses({"psnr": 20.0, "psnr_aligned": 21.5}, 1.0)
+        doubt_poses({"psnr": 20.0, "psnr_aligned": 21.5}, 1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        _doubt_poses({"psnr": 20.0, "psnr_aligned": 20.9}, 1.0)
-        _doubt_poses({"psnr": 20.0, "psnr_aligned": 21.5}, 0.0)
-        _doubt_poses({"psnr": 20.0}, 1.0)
+        doubt_poses({"psnr": 20.0, "psnr_aligned": 20.9}, 1.0)
+        doubt_poses({"psnr": 20.0, "psnr_aligned": 21.5}, 0.0)
+        doubt_poses({"psnr": 20.0}, 1.0)
 
 
 def _second(scene: Scene) -> str:
