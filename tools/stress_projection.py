@@ -77,11 +77,8 @@ def exact(gaussians: Gaussians) -> dict[str, Array]:
     return {name: array.astype(np.longdouble) for name, array in parameters(gaussians).items()}
 
 
-def wanted_gradients(
-    arrays: Mapping[str, Array], camera: Camera, wanted: Projected, sums: Array
-) -> tuple[dict[str, Array], Array]:
-    """Gradients by the parameters and by the mean on the image, from the sums: eqs. (50), (29), then the twin's way
-    back."""
+def on_image(wanted: Projected, sums: Array) -> tuple[Array, Array, Array]:
+    """Gradients by means2d, covariances and opacities from the sums: eqs. (50), (29)."""
     g, gu, gv, uu, uv, vv = sums[:, :6].astype(np.longdouble).T
     l11, l12, l22 = wanted.whitening.T  # the sums are of u' = -k u
     k = np.sqrt(np.longdouble(WHITEN2))
@@ -92,6 +89,15 @@ def wanted_gradients(
     d_covariances = np.stack([xx, xy, yy], axis=1) / (2 * k * k)
     with np.errstate(all="ignore"):
         d_opacities = np.where(wanted.visible, g / wanted.opacities, 0)
+    return d_means2d, d_covariances, d_opacities
+
+
+def wanted_gradients(
+    arrays: Mapping[str, Array], camera: Camera, wanted: Projected, sums: Array
+) -> tuple[dict[str, Array], Array]:
+    """Gradients by the parameters and by the mean on the image, from the sums, by the twin's way back."""
+    d_means2d, d_covariances, d_opacities = on_image(wanted, sums)
+    g = sums[:, 0].astype(np.longdouble)
     of = (camera, DEGREE, wanted, d_means2d, d_covariances, d_opacities, sums[:, 6:9].astype(np.longdouble))
     with np.errstate(all="ignore"):
         by = project_grad(*(arrays[name] for name in GROUPS), *of)

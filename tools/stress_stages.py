@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 from measuring import Result
 from numpy.typing import NDArray
+from stress_learnt import BOUNDS as LEARNT
+from stress_learnt import learnt
+from stress_pictures import padded, pictures
 
 from clsplat.config.exploring import Exploration, step_key
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
-from clsplat.device.layout import READBACK, TILE
+from clsplat.device.layout import READBACK
 from clsplat.gaussians import GROUPS, group_shapes
 from clsplat.reference.adam import adam as exact_adam
 from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
@@ -42,6 +45,7 @@ BOUNDS = {
     "alpha gradient": 1e-6,
     "adam": 1e-4,
     "noise": 5e-6,
+    **LEARNT,
 }
 """exp, sigmoid: 2 and 3 ulp; exp2: 0.8e-7 of its polynomial and rounding. log2: absolute under 1. loss: relative to at
 least 1, a sum of partial sums. loss gradient: in norm; differences of pixels are exact to 1e-7 of the brightness, up to
@@ -73,30 +77,13 @@ def elementary(device: Device, rng: np.random.Generator, count: int) -> Result:
     }
 
 
-def _pictures(rng: np.random.Generator) -> tuple[Array, Array]:
-    """A render and a photograph: noise, flat, dark, nearly the same."""
-    height, width = (int(rng.choice([1, 5, 16, 17, 40])) for _ in range(2))
-    y = rng.random((height, width, 3)) ** rng.choice([0.2, 1.0, 8.0])
-    if rng.random() < 0.3:
-        y[:] = rng.random(3)
-    apart = 10 ** rng.uniform(-4, 0)
-    x = np.clip(y + rng.normal(0, apart, y.shape), 0, 1.5)
-    return x.astype(np.float32), np.clip(y, 0, 1).astype(np.float32)
-
-
 def losses(device: Device, rng: np.random.Generator, many: int) -> Result:
     """Largest errors over many pairs of pictures: the loss's, and its gradient's in norm."""
     worst = {"loss": 0.0, "loss gradient": 0.0}
     work = Workspace(device)
 
-    def padded(image: Array) -> Array:
-        height, width, _ = image.shape
-        planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
-        planes[:, :height, :width] = image.transpose(2, 0, 1)
-        return planes
-
     for _ in range(many):
-        x, y = _pictures(rng)
+        x, y = pictures(rng)
         height, width, _ = x.shape
         result = loss(device, work, upload(device, padded(x)), upload(device, padded(y)), width, height, 0.2)
         wanted, gradient = l1_dssim(x.astype(float), y.astype(float), 0.2)
@@ -115,7 +102,7 @@ def masked_losses(device: Device, rng: np.random.Generator, many: int) -> Result
     work, weight, behind = Workspace(device), 0.5, np.array([0.1, 0.5, 0.9], np.float32)
     background = upload(device, behind)
     for _ in range(many):
-        x, y = _pictures(rng)
+        x, y = pictures(rng)
         height, width, _ = x.shape
         rows, stride = padded_size(width, height)
         counts = (rng.random((height, width, 1)) < rng.choice([0.0, 0.1, 0.5, 1.0])).astype(np.float32)
@@ -209,6 +196,7 @@ def stages(device: Device, seed: int, many: int) -> Result:
         **masked_losses(device, rng, many),
         **steps(device, rng, many),
         **exploration(device, rng, many),
+        **learnt(device, rng, many),
     }
     faults = [f"{name} {error:.2g} over {BOUNDS[name]:g}" for name, error in found.items() if not error <= BOUNDS[name]]
     return {"errors": found, "faults": faults}

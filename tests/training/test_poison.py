@@ -122,6 +122,12 @@ MASKED = short(iterations=24, warmup=(2, 4), masks="ignore", alpha="transparent"
 DEEP = short(iterations=16, warmup=(2, 4), depth="maps")
 """Depth maps at every size of the warm-up."""
 
+REFINED = short(iterations=24, warmup=(2, 4), refine_poses=True, refine_lenses=True, thinning=0.2, penalty=0.02)
+"""Poses, lenses, thinning and penalties."""
+
+RAYS = short(iterations=16, warmup=(2, 4), perspective="rays", antialiased=True)
+"""Along rays, with the sampling filter."""
+
 MANY = short(
     iterations=32,
     random_points=400,
@@ -134,7 +140,7 @@ MANY = short(
 @pytest.mark.parametrize(
     "how",
     quick(
-        ["at once", "mcmc", "exposure", "grid", "masked", "depths", "in pieces", "in vectors of 1"],
+        ["at once", "mcmc", "exposure", "grid", "masked", "depths", "cameras", "rays", "in pieces", "in vectors of 1"],
         "at once",
         "grid",
         "depths",
@@ -153,7 +159,7 @@ def test_training_in_poisoned_memory(
     device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
     pieces = how == "in pieces"
     settings = {"in pieces": MANY, "mcmc": EXPLORING, "exposure": EXPOSED, "grid": WITH_GRIDS, "masked": MASKED}
-    config = {**settings, "depths": DEEP}.get(how, EVERYTHING)
+    config = {**settings, "depths": DEEP, "cameras": REFINED, "rays": RAYS}.get(how, EVERYTHING)
     scene = {"masked": masked, "depths": deep}.get(how, scene)
     found = []
     for value in ("", WORDS[word]):
