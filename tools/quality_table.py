@@ -122,7 +122,6 @@ EXPOSED = ("--with", "schedule=high-rates,density.growth=mcmc,density.max_gaussi
 TOOLS: dict[str, tuple[str, ...]] = {
     "masks": ("quality_masks.py", "{scenes}/fox", "{work}", *SIZED),
     "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED, *EXPOSED),
-    "exposure of seed 1": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED, *EXPOSED, "--seed", "1"),
     "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
     "poses": ("quality_poses.py", "{work}", "--width", "320", "--iterations", "{iterations}"),
     "lenses": ("quality_poses.py", "{work}", "--width", "320", "--lens", "2", "--iterations", "{iterations}"),
@@ -131,7 +130,8 @@ TOOLS: dict[str, tuple[str, ...]] = {
     "few views of fox": ("quality_views.py", "{scenes}/fox", "{work}", *SIZED, *FEW, *AUTO),
     "few views of bonsai": ("quality_views.py", "{scenes}/bonsai", "{work}", *SIZED, *FEW, *AUTO),
 }
-"""Tables that tools of their own print: the commands, with the folder of scenes, one to work in, steps and size."""
+"""Tables that tools of their own print: the commands, with the folder of scenes, one to work in, steps and size. They
+are run for each seed, but for those that take several."""
 
 
 class Book:
@@ -182,15 +182,22 @@ class Book:
         return float(json.loads(told)["mean"]["psnr"])
 
     def printed(self, table: str) -> str:
-        """The words of a tool with a table of its own."""
-        done = self.folder / f"{table}.md"
+        """The words of a tool with a table of its own, of each seed."""
+        if "--seeds" in TOOLS[table]:
+            return self._said(table, table)
+        parts = (
+            f"Seed {seed}\n\n{self._said(table, f'{table}-{seed}', '--seed', str(seed))}" for seed in range(self.seeds)
+        )
+        return "\n".join(parts)
+
+    def _said(self, table: str, name: str, *more: str) -> str:
+        done = self.folder / f"{name}.md"
         if not done.exists():
-            print(f"{table}: {TOOLS[table][0]}", file=sys.stderr, flush=True)
-            known = {"scenes": self.scenes, "work": self.folder / table}
+            print(f"{table}: {' '.join([TOOLS[table][0], *more])}", file=sys.stderr, flush=True)
+            known = {"scenes": self.scenes, "work": self.folder / name}
             known |= {"iterations": self.iterations, "resolution": self.resolution}
-            name, *more = (word.format(**known) for word in TOOLS[table])
-            words = _run([sys.executable, str(ROOT / "tools" / name), *more])
-            atomic_write(done, words.encode())
+            tool, *words = (word.format(**known) for word in TOOLS[table])
+            atomic_write(done, _run([sys.executable, str(ROOT / "tools" / tool), *words, *more]).encode())
         return done.read_text("utf-8")
 
 
