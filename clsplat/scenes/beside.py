@@ -38,17 +38,25 @@ def beside(base: Path, names: Sequence[str]) -> Path | None:
 
 
 def owned(
-    folder: Path, paths: Iterable[Path], known: Mapping[str, str], what: str, example: str, *, strict: bool = True
+    folder: Path,
+    paths: Iterable[Path],
+    known: Mapping[str, str],
+    what: str,
+    example: str,
+    *,
+    without: Iterable[Path] = (),
+    strict: bool = True,
 ) -> dict[str, Path]:
     """The files of a folder by the photographs that they go with. known: these by the names that a file may have,
-    without its extension; what: a word for such a file; example: a photograph's name; strict: whether files that fit no
-    photograph are refused, or passed over.
+    without its extension; what: a word for such a file; example: a photograph's name; without: files to pass over;
+    strict: whether files that fit no photograph are refused, or passed over too.
 
     Raises InputError for a file that fits no photograph, and for two of one.
     """
     found: dict[str, Path] = {}
     lost: list[str] = []
-    for path in paths:
+    passed = {path.resolve() for path in without}
+    for path in (path for path in paths if path.resolve() not in passed):
         relative = path.relative_to(folder).as_posix()
         owner = known.get(str(PurePosixPath(relative).with_suffix("")))
         if owner is None:

@@ -163,7 +163,6 @@ def _beside(views: Sequence[View], told: Mapping[str, Path]) -> dict[str, Path]:
     """Maps in the folder beside the photographs, or in theirs, by the views' names. A map is called as its photograph,
     with or without that one's extension, or with _depth behind. told: maps that a file names, to pass over. Raises
     InputError for one that fits no photograph, and for two of one."""
-    passed = {path.resolve() for path in told.values()}
     if all(view.name in told for view in views):
         return {}
     for base in bases_of(views):
@@ -176,8 +175,8 @@ def _beside(views: Sequence[View], told: Mapping[str, Path]) -> dict[str, Path]:
             stem = str(plain.with_suffix(""))
             for key in (str(plain), stem, f"{stem}_depth", f"{stem}.depth"):
                 known.setdefault(key, view.name)
-        files = (path for path in _maps_in(folder) if path.resolve() not in passed)
-        return owned(folder, files, known, "depth map", next(iter(sorted(known))))
+        example = next(iter(sorted(known)))
+        return owned(folder, _maps_in(folder), known, "depth map", example, without=told.values())
     return {}
 
 

@@ -74,7 +74,7 @@ def find_masks(
     folder: Path, names: Iterable[str], without: Iterable[Path] = (), *, strict: bool = True
 ) -> dict[str, Path]:
     """The masks in a folder by the photographs' names, relative to theirs; names: of all the photographs that there
-    are; without: files to pass over; strict: as of `owned`. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, or
+    are; without, strict: as of `owned`. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, or
     IMAGE_mask.png, in the same sub-folder.
 
     Raises InputError for a mask that fits no photograph, and for two of one.
@@ -86,9 +86,7 @@ def find_masks(
         for key in (name, stem, f"{stem}_mask", f"{stem}.mask", str(plain.with_name(f"mask_{plain.stem}"))):
             known.setdefault(key, name)
     example = next(iter(sorted(names)), "IMAGE.jpg")
-    passed = {path.resolve() for path in without}
-    files = (path for path in find_images(folder) if path.resolve() not in passed)
-    return owned(folder, files, known, "mask", example, strict=strict)
+    return owned(folder, find_images(folder), known, "mask", example, without=without, strict=strict)
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[str, Mask]:

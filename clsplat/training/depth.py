@@ -44,10 +44,7 @@ class Depths:
         if not self._config.depth_use:
             return None
         width, height = camera.width, camera.height
-        pixels, nearness, weights = self._known(view, width, height)
-        if photograph is not None and photograph.shape[2] == 5:
-            counts = photograph[:, :, 4].ravel()[pixels] > 0
-            pixels, nearness, weights = pixels[counts], nearness[counts], weights[counts]
+        pixels, nearness, weights = self._known(view, width, height, photograph)
         rows, stride = padded_size(width, height)
         planes = np.zeros((2, rows, stride), np.float32)
         at = pixels // width, pixels % width
@@ -58,12 +55,16 @@ class Depths:
         factor = weight_at(self._config, step) * self._extent / total if total > 0 else 0.0
         return DepthAims(planes, factor)
 
-    def _known(self, view: int, width: int, height: int) -> tuple[NDArray[np.int64], Float32, Float32]:
+    def _known(
+        self, view: int, width: int, height: int, photograph: NDArray[Any] | None
+    ) -> tuple[NDArray[np.int64], Float32, Float32]:
         size, held = (width, height), self._held.get(view)
         if held is None or held[0] != size:
             of, nothing = self._views[view], np.empty(0, np.float32)
             found = None if of.depth is None else of.depth.at(of.camera.resized(*size).before(self._near), of.lens)
             pixels, nearness, weights = found or (np.empty(0, np.int64), nothing, nothing)
-            sane = nearness * self._extent < NEAREST
-            held = self._held[view] = size, (pixels[sane], nearness[sane], weights[sane])
+            counts = nearness * self._extent < NEAREST
+            if photograph is not None and photograph.shape[2] == 5:
+                counts &= photograph[:, :, 4].ravel()[pixels] > 0
+            held = self._held[view] = size, (pixels[counts], nearness[counts], weights[counts])
         return held[1]
