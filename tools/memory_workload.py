@@ -226,6 +226,7 @@ def methods(device: Device) -> None:
     columns, readback = upload(device, np.ones((3, 16), np.float32)), upload(device, np.zeros(len(READBACK), np.uint32))
     step_gains(device, gains, 2, columns, 1, 1e-3, readback)
     gains.logs.get()
+    _train(device, replace(short, appearance="ppisp"), 3, LOW)
     _train(device, replace(short, appearance="grid"), 3, LOW)
     _train(device, replace(short, masks="transparent"), 5, LOW)
     # One view is not held; sums of more than POSE_ROWS Gaussians take two kernels.

@@ -119,9 +119,12 @@ AUTO = ("--try", "auto:" + ",".join(f"{name}={value}" for name, value in ANSWERS
 FEW = ("--views", "3,6,9,12", "--seeds", "0,1")
 EXPOSED = ("--with", "schedule=high-rates,density.growth=mcmc,density.max_gaussians=290000")
 """Settings that bonsai is trained with, with and without gains."""
+CAMERAS = ("--appearance", "ppisp", "--mixes", "0.15", "--corners", "0.8")
+"""Photographs whose channels mix, through a lens that takes light from the corners."""
 TOOLS: dict[str, tuple[str, ...]] = {
     "masks": ("quality_masks.py", "{scenes}/fox", "{work}", *SIZED),
     "exposure": ("quality_exposure.py", "{scenes}/bonsai", "{work}", *SIZED, *EXPOSED),
+    "cameras": ("quality_exposure.py", "{scenes}/fox", "{work}", "--iterations", "{iterations}", *CAMERAS),
     "fisheye": ("quality_fisheye.py", "{work}", "--iterations", "{iterations}"),
     "poses": ("quality_poses.py", "{work}", "--width", "320", "--iterations", "{iterations}"),
     "lenses": ("quality_poses.py", "{work}", "--width", "320", "--lens", "2", "--iterations", "{iterations}"),

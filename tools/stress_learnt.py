@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages of what is learnt beside the model, or compared with it: gains, grids, depths, poses and lenses."""
+"""Stages of what is learnt beside the model, or compared with it: gains, mixes, vignettes, grids, depths, poses and
+lenses."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from stress_projection import exact, on_image, random_sums
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.reference import appearance, grid
+from clsplat.reference import appearance, grid, ppisp
 from clsplat.reference.depth import depth_loss
 from clsplat.reference.pose import pose_gradient
 from clsplat.reference.project import lens_grad, project
@@ -26,12 +27,15 @@ from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussia
 from clsplat.stages.grid import SHAPE, Grids, apply_grid, grid_gradient
 from clsplat.stages.loss import DepthAims, loss
 from clsplat.stages.pose import LENS, lens_rows, pose_rows, sum_of, sums_of
+from clsplat.stages.ppisp import COLOURS, VIGNETTE, Taken, camera_gradient, develop
 
 Array = NDArray[Any]
 
 BOUNDS = {
     "exposed": 3e-7,
     "by gains": 1e-6,
+    "developed": 1e-5,
+    "by cameras": 2e-6,
     "grid colours": 2e-6,
     "by grid": 1e-5,
     "through grid": 1e-5,
@@ -40,10 +44,14 @@ BOUNDS = {
     "by pose": 1e-6,
     "by lens": 1e-5,
 }
-"""exposed: two roundings, of 2^log and of the quotient. by gains, by pose, by lens: relative to the sum of the terms'
-magnitudes, a few roundings of partial sums; a lens's terms have the error of the shape on the screen too. grid colours:
-relative to the largest, a dozen roundings. by grid, through grid: in norm, where the level's slope is sure; a hundred
-terms of either sign. nearness loss: relative, a sum of partial sums. by nearness: a product."""
+"""exposed: two roundings, of 2^log and of the quotient. developed: relative to the pixel's largest, some roundings of
+an exponent of up to 16, of 5e-7 each. by gains, by cameras, by pose, by lens: relative to the sum of the terms'
+magnitudes, a few roundings of partial sums, and for cameras of a distance's third power; a lens's terms have the error
+of the shape on the screen too. grid colours: relative to the largest, a dozen roundings. by grid, through grid: in
+norm, where the level's slope is sure; a hundred terms of either sign. nearness loss: relative, a sum of partial sums.
+by nearness: a product."""
+MOST_FALLOFF = 16.0
+"""Octaves to which kernels hold a vignette."""
 LEVEL = 1e-4
 """Distance from a level of luminance under which a rounding decides the slope."""
 KINDS = (ordinary, anisotropy, edge_on, off_centre, focal_lengths)
@@ -69,6 +77,41 @@ def exposures(device: Device, rng: np.random.Generator, many: int) -> Result:
         size = np.log(2) * np.abs(wide[0] * wide[1]).sum(axis=(0, 1))
         apart = np.abs(got - appearance.gradient(*wide)) / np.maximum(size, 1e-30)
         worst["by gains"] = max(worst["by gains"], float(apart.max()))
+    return worst
+
+
+def by_cameras(device: Device, rng: np.random.Generator, many: int) -> Result:
+    """Gains of 1/256 to 256, any mixes and vignettes to an eighth of the light taken from a photograph, and the
+    gradient by them, with principal points beside the picture."""
+    worst, work = {"developed": 0.0, "by cameras": 0.0}, Workspace(device)
+    for _ in range(many):
+        image, photograph = pictures(rng)
+        height, width, _ = image.shape
+        centre = (float(rng.uniform(-0.5, 1.5)), float(rng.uniform(-0.5, 1.5)))
+        gains, mixes = rng.uniform(-8, 8, (3, 3)), rng.uniform(-0.2, 0.2, (3, 6))
+        entries = np.concatenate([gains, mixes], axis=1).astype(np.float32)
+        lenses = rng.uniform(-1, 0.2, (2, VIGNETTE)).astype(np.float32)
+        taken = Taken(1, 1, centre)
+        squared = ppisp.spread(width, height, (centre[0] * width, centre[1] * height))
+        target = upload(device, padded(photograph))
+        develop(device, Gains.on(device, entries), Gains.on(device, lenses), taken, target, width, height)
+        exponents = squared * (lenses[1, 0] + squared * (lenses[1, 1] + squared * lenses[1, 2].astype(float)))
+        within = np.abs(exponents) < MOST_FALLOFF
+        wanted = ppisp.developed(photograph.astype(float), entries[1].astype(float), lenses[1].astype(float), squared)
+        off = np.abs(cropped(target.get(), height, width) - wanted).max(axis=2)
+        largest = np.maximum(
+            np.abs(wanted).max(axis=2), (photograph / np.exp2(entries[1, :3].astype(float))).max(axis=2)
+        )
+        worst["developed"] = max(worst["developed"], float((off / np.maximum(largest, 1e-30))[within].max(initial=0.0)))
+        by_image = (rng.standard_normal(image.shape) * 10 ** rng.uniform(-9, 4)).astype(np.float32)
+        planes = upload(device, padded(image)), upload(device, padded(by_image))
+        got = camera_gradient(device, work, taken, *planes, width, height).get().astype(float).sum(axis=1)
+        got *= np.where((np.arange(12) < 3) | (np.arange(12) >= COLOURS), np.log(2), 1.0)
+        wide = image.astype(float), by_image.astype(float)
+        size = ppisp.gradient(wide[0], np.abs(wide[1]), squared)
+        size[3:COLOURS] = np.repeat(np.abs(wide[1]).sum(axis=(0, 1)) * np.abs(wide[0]).max(), 2)
+        apart = np.abs(got - ppisp.gradient(*wide, squared)) / np.maximum(size, 1e-30)
+        worst["by cameras"] = max(worst["by cameras"], float(apart.max()))
     return worst
 
 
@@ -173,6 +216,6 @@ def cameras(device: Device, rng: np.random.Generator, many: int) -> Result:
 def learnt(device: Device, rng: np.random.Generator, many: int) -> Result:
     """Largest errors of all of these."""
     found: Result = {}
-    for each in (exposures, grids, depths, cameras):
+    for each in (exposures, by_cameras, grids, depths, cameras):
         found |= each(device, rng, many)
     return found

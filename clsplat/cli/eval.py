@@ -65,7 +65,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     from clsplat.report import NAME
     from clsplat.report.page import write_last
     from clsplat.runs import scene_record
-    from clsplat.runs.appearance import gains_of_run
+    from clsplat.runs.appearance import looks_of_run
     from clsplat.runs.refined import through_refined
     from clsplat.runs.run import model_file, run_of
     from clsplat.scenes import doubts
@@ -105,10 +105,10 @@ def _evaluate(verb: Eval, services: Services) -> int:
         warnings.append(doubts.of_pictures(draw, views, "held-out"))
     for text in filter(None, warnings):
         warn(text)
-    gains = gains_of_run(trained)
+    seen = looks_of_run(trained)
     model_record = given_run.model_record() if given_run else {}
     result = evaluate(
-        lambda view: draw(view.camera)[0] * gains(view.name),
+        lambda view: seen(view, draw(view.camera)[0]),
         views,
         background,
         given_run.test_path if given_run else None,

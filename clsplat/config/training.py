@@ -22,7 +22,7 @@ Background = Literal["black", "white", "random"]
 Lenses = Literal["undistort", "native"]
 Perspective = Literal["auto", "plane", "rays"]
 Growth = Literal["paper", "budget", "mcmc"]
-AppearanceKind = Literal["none", "exposure", "grid"]
+AppearanceKind = Literal["none", "exposure", "ppisp", "grid"]
 
 
 @dataclass(frozen=True)
@@ -303,9 +303,10 @@ class TrainConfig:
     """Write report.html at the end."""
     appearance: AppearanceKind = "none"
     """exposure: learn a gain for each colour channel of each photograph, whose exposure and white balance then do not
-    go into the model; it has their mean. grid: a bilateral grid of colour maps for each photograph, which also takes
-    what changes by place and brightness, as where photographs are of several cameras or were edited. none: photographs
-    are taken as they are."""
+    go into the model; it has their mean. ppisp: also how its channels mix, where cameras make colours in other ways,
+    and a vignette for each lens, where corners are darker. grid: a bilateral grid of colour maps for each photograph,
+    which also takes what changes by place and brightness, as where photographs were edited. none: photographs are taken
+    as they are."""
     appearance_rate: float = 2e-3
     """Learning rate of appearance, as logarithms to base 2 of the gains, or as coefficients of a grid; times the
     root of the photographs' number, and for gains in trainings of fewer than 10,000 steps by as much more as they are

@@ -71,8 +71,11 @@ def without_empty_bands(gaussians: Gaussians) -> Gaussians:
 
 
 def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
-    """The model with each channel of its colours times a gain, (3,), at least 0."""
+    """The model with each channel of its colours times a gain, at least 0, or with its colours times a matrix, of which
+    `gains` are the nine numbers by rows."""
     factors = np.asarray(gains, np.float64)
+    if len(factors) == 9:
+        return graded(gaussians, factors.reshape(3, 3), np.zeros(3))
     sh = gaussians.sh * factors
     sh[:, 0] += 0.5 * (factors - 1) / C0  # colours are SH plus a half
     return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))

@@ -31,10 +31,18 @@ def pull(logs: Float64, start: Float64, weights: Float64) -> Float64:
 
 
 def step(
-    logs: Float64, first: Float64, second: Float64, by_logs: Float64, number: int, rate: float
+    logs: Float64,
+    first: Float64,
+    second: Float64,
+    by_logs: Float64,
+    number: int,
+    rate: float | Float64,
+    *,
+    centred: bool = True,
 ) -> tuple[Float64, Float64, Float64]:
-    """Logs and moments (photographs, 3) after Adam's step along by_logs and the removal of each channel's mean."""
+    """Logs and moments (photographs, entries) after Adam's step along by_logs and, if they are centred, the removal of
+    each entry's mean. rate: of all entries, or of each."""
     first, second = 0.9 * first + 0.1 * by_logs, 0.999 * second + 0.001 * by_logs**2
     change = rate * (first / (1 - 0.9**number)) / (np.sqrt(second / (1 - 0.999**number)) + 1e-15)
     moved = logs - change
-    return moved - moved.mean(axis=0), first, second
+    return moved - moved.mean(axis=0) if centred else moved, first, second

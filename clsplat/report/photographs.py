@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from markupsafe import Markup
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, examples
 from clsplat.files import parse_json, read_document
 from clsplat.images.colour import displayed, photos_space
 from clsplat.report.figures import number
@@ -67,14 +67,23 @@ def exposure_chart(run: Run) -> Markup:
     try:
         photographs = parse_json(read_document(path, "the appearance of a run's photographs"))["photographs"]
         rows = [_gains(photographs[name]) for name in sorted(photographs)]
+        corners = _corners(photographs)
     except (InputError, ValueError, KeyError, TypeError, AttributeError):
         return Markup("")
     series = [
         Series(name, [(float(place), row[channel]) for place, row in enumerate(rows, 1)], color=color)
         for channel, (name, color) in enumerate((("red", 1), ("green", 2), ("blue", 0)))
     ]
-    note = "what the model's colours are multiplied by; +1 is twice as bright as the mean"
+    note = "what the model's colours are multiplied by; +1 is twice as bright as the mean" + corners
     return chart("Exposure of the photographs", series, "training photograph, by name", "gain, stops", note=note)
+
+
+def _corners(photographs: Mapping[str, Any]) -> str:
+    """The light that the lenses leave in the corners, by the vignettes that were learnt; "" where none were."""
+    vignettes = {tuple(row["vignette"]) for row in photographs.values() if "vignette" in row}
+    octaves = sorted(min(sum(number(value) or 0.0 for value in vignette), 16.0) for vignette in vignettes)
+    left = dict.fromkeys(f"{2.0**value:.0%}" for value in octaves)
+    return f". Corners have {examples(left)} of the light of the middle" if left else ""
 
 
 def _gains(record: Any) -> Sequence[float]:

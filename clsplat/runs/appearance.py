@@ -11,56 +11,99 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float32
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
 from clsplat.files import parse_json, read_document
+from clsplat.images.alpha import Image
 from clsplat.runs.run import Run, run_of
+from clsplat.scenes.scene import View
 
 MAX_BYTES = 1 << 28
 MOST_LOG = 16.0
-ONES = (1.0, 1.0, 1.0)
-EXPECTED = "what clsplat train --appearance exposure writes"
+MOST_MIX = 0.25
+"""Under which any six mixes can be undone."""
+EXPECTED = "what clsplat train --appearance writes"
+
+Row = Mapping[str, Any]
+"""A photograph's entry of appearance.json."""
 
 
-def gains_of(model: Path, photograph: str) -> tuple[float, float, float]:
-    """The gains by which colours of a run's model become the photograph's; of a held-out one those that EXIF tells, or
-    1. model: the run's folder, or a file there; photograph: its name in the data set, or the end of that from a folder
-    on, with or without extension. Raises InputError."""
+def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
+    """The three gains by which colours of a run's model become the photograph's, or the nine numbers of a matrix, by
+    rows, where channels mix; of a held-out one those that EXIF tells, or 1. model: the run's folder, or a file there;
+    photograph: its name in the data set, or the end of that from a folder on, with or without extension. Raises
+    InputError."""
     run = run_of(model)
     path = run.appearance_path if run is not None else None
     if run is None or path is None or not path.exists():
         raise InputError(
             f"--appearance {photograph}: {model} has learnt no appearances (no appearance.json), expected a run of "
-            "clsplat train --appearance exposure"
+            "clsplat train --appearance exposure or ppisp"
         )
     if _kind(path) == "grid":
         raise InputError(
             f"--appearance {photograph}: {path} is of bilateral grids, which are for training alone; expected a run of "
-            "clsplat train --appearance exposure"
+            "clsplat train --appearance exposure or ppisp"
         )
-    gains = _read(path, "photographs") | _read(path, "held_out")
-    found = [name for name in gains if photograph in (name, *_ends(name))]
+    rows = _read(path, "photographs") | _read(path, "held_out")
+    found = [name for name in rows if photograph in (name, *_ends(name))]
     if len(found) > 1 and photograph not in found:
         raise InputError(f"--appearance {photograph}: is {len(found)} photographs, {examples(found)}; name one of them")
     if not found:
-        near = get_close_matches(photograph, gains, 3, 0.0)
+        near = get_close_matches(photograph, rows, 3, 0.0)
         raise InputError(
-            f"--appearance {photograph}: is no photograph of {path}, expected one of its {len(gains)}, such as "
+            f"--appearance {photograph}: is no photograph of {path}, expected one of its {len(rows)}, such as "
             f"{examples(near)}"
         )
-    return gains[photograph if photograph in found else found[0]]
+    row = rows[photograph if photograph in found else found[0]]
+    if "mixes" not in row:
+        return tuple(row["gains"].tolist())
+    matrix = row["gains"][:, None] * np.linalg.inv(unmixing(row["mixes"]))
+    return tuple(matrix.ravel().tolist())
 
 
-def gains_of_run(run: Run | None) -> Callable[[str], Float32]:
-    """The gains (3,) of a run's held-out photographs by name, 1 where none are known. Raises InputError."""
-    known = _read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {}
-    return lambda name: np.array(known.get(name, ONES), np.float32)
+def looks_of_run(run: Run | None) -> Callable[[View, Image], Image]:
+    """`held_out_looks` of a run, where it has an appearance.json. Raises InputError."""
+    return _looks(_read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {})
 
 
-def held_out_gains(record: Mapping[str, Any] | None) -> Callable[[str], Float32]:
-    """The same of the content of an appearance.json."""
-    known = _gains_in(record, "held_out") if record is not None else {}
-    return lambda name: np.array(known.get(name, ONES), np.float32)
+def held_out_looks(record: Mapping[str, Any] | None) -> Callable[[View, Image], Image]:
+    """Makes renders (H, W, 3) what the cameras of held-out views show of them, as far as the content of an
+    appearance.json tells."""
+    return _looks(_rows_in(record, "held_out") if record is not None else {})
+
+
+def _looks(rows: Mapping[str, Row]) -> Callable[[View, Image], Image]:
+    def seen(view: View, image: Image) -> Image:
+        row = rows.get(view.name)
+        if row is None:
+            return image
+        factors = row["gains"].astype(np.float32)
+        if "vignette" in row:
+            factors = (factors * _light(row["vignette"], view.camera)[:, :, None]).astype(np.float32)
+        exposed: Image = image * factors
+        return exposed
+
+    return seen
+
+
+def unmixing(mixes: Float64) -> Float64:
+    """The matrix (3, 3) that takes the mixes (6,) from colours (docs/gradients.md, "Colours and vignettes")."""
+    matrix = np.eye(3)
+    for c, (next_share, last_share) in enumerate(mixes.reshape(3, 2)):
+        matrix[c, c] += next_share + last_share
+        matrix[c, (c + 1) % 3] -= next_share
+        matrix[c, (c + 2) % 3] -= last_share
+    return matrix
+
+
+def _light(vignette: Float64, camera: Camera) -> Float64:
+    """The share of light (H, W) that a lens leaves, by its vignette (3,)."""
+    across, down = np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy
+    s = 4 * (across**2 + down[:, None] ** 2) / (camera.width**2 + camera.height**2)
+    light: Float64 = np.exp2(np.clip(s * (vignette[0] + s * (vignette[1] + s * vignette[2])), -MOST_LOG, MOST_LOG))
+    return light
 
 
 def _kind(path: Path) -> Any:
@@ -70,15 +113,15 @@ def _kind(path: Path) -> Any:
         return None
 
 
-def _read(path: Path, key: str) -> dict[str, tuple[float, float, float]]:
+def _read(path: Path, key: str) -> dict[str, Row]:
     try:
-        return _gains_in(parse_json(read_document(path, EXPECTED, MAX_BYTES)), key)
+        return _rows_in(parse_json(read_document(path, EXPECTED, MAX_BYTES)), key)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED}") from None
 
 
-def _gains_in(record: Any, key: str) -> dict[str, tuple[float, float, float]]:
-    return {str(name): _gains(row["log2_gains"]) for name, row in record[key].items()}
+def _rows_in(record: Any, key: str) -> dict[str, Row]:
+    return {str(name): _row(row) for name, row in record[key].items()}
 
 
 def _ends(name: str) -> list[str]:
@@ -88,8 +131,17 @@ def _ends(name: str) -> list[str]:
     return whole + [end.rpartition(".")[0] for end in whole if "." in end]
 
 
-def _gains(logs: Any) -> tuple[float, float, float]:
-    red, green, blue = (float(value) for value in logs)
-    if not all(math.isfinite(value) and abs(value) <= MOST_LOG for value in (red, green, blue)):
-        raise ValueError(f"log2_gains of {logs}")
-    return 2.0**red, 2.0**green, 2.0**blue
+def _row(record: Any) -> Row:
+    """Gains (3,), and mixes (6,) and a vignette (3,) where there are such. Raises ValueError or TypeError."""
+    row = {"gains": np.exp2(_numbers("log2_gains", record["log2_gains"], 3, MOST_LOG))}
+    for name, count, most in (("mixes", 6, MOST_MIX), ("vignette", 3, MOST_LOG)):
+        if name in record:
+            row[name] = _numbers(name, record[name], count, most)
+    return row
+
+
+def _numbers(name: str, values: Any, count: int, most: float) -> Float64:
+    numbers = [float(value) for value in values]
+    if len(numbers) != count or not all(math.isfinite(value) and abs(value) <= most for value in numbers):
+        raise ValueError(f"{name} of {values}")
+    return np.array(numbers)

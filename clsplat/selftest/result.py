@@ -19,7 +19,12 @@ MASKS = ("masks",)
 """Stages that photographs with masks or alpha to learn need beside TRAINING."""
 BACKWARD = ("loss", "blend_grad", "project_grad", "adam", "statistics")
 """Stages that training needs beside a frame's."""
-APPEARANCE: dict[str, tuple[str, ...]] = {"none": (), "exposure": ("appearance",), "grid": ("grid",)}
+APPEARANCE: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "exposure": ("appearance",),
+    "ppisp": ("appearance", "ppisp"),
+    "grid": ("grid",),
+}
 """Stages of what is learnt of each photograph, which training needs beside TRAINING, by the setting."""
 DEPTH = ("depth",)
 """Stages of known depths, which training needs where they are compared."""
@@ -32,7 +37,7 @@ LIBRARY = ("ewa", "harmonics", "splats", "values")
 TRAINING = (*FORWARD, *BACKWARD)
 STAGES = (
     *(*FORWARD, *CHANNELS, *DEEP, *HOLDOUT, *RAYS, *MASKS, *BACKWARD),
-    *("appearance", "grid", *DEPTH, *POSES, *LENSES, *LIBRARY),
+    *("appearance", "ppisp", "grid", *DEPTH, *POSES, *LENSES, *LIBRARY),
 )
 INDICES = ("project", "duplicate", "sort", "ranges")
 """Stages by whose counts and lists the next ones find their way."""
@@ -56,6 +61,7 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "adam": (32, "2 found; one root and one division"),
     "statistics": (32, "1 found; one root"),
     "appearance": (1024, "202 found; beta2 in float32 is 1e-5 off in 1 - beta2, 84 ulp, and a picture is added up"),
+    "ppisp": (1024, "as appearance"),
     "grid": (1024, "227 found; as appearance"),
     "depth": (1024, "as blend_grad"),
     "pose": (1024, "as appearance; terms of either sign are added up"),

@@ -34,6 +34,7 @@ from clsplat.selftest.made_up import COLOUR, MadeUpSlots, slot_sums
 from clsplat.selftest.mask_stages import MASKS
 from clsplat.selftest.picture_stages import PICTURES
 from clsplat.selftest.pose_stage import of_lens, of_pose
+from clsplat.selftest.ppisp_stage import of_ppisp
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.stages.adam import adam
 from clsplat.stages.blend import blend, blend_grad
@@ -423,6 +424,7 @@ RUN: dict[str, Callable[[Bench], Outcome]] = {
     "adam": _adam,
     "statistics": _statistics,
     "appearance": of_appearance,
+    "ppisp": of_ppisp,
     "grid": of_grid,
     "depth": of_depth,
     "pose": of_pose,

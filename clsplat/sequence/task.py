@@ -226,8 +226,8 @@ class MatteNames:
 class RenderOptions:
     """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
     header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
-    deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the
-    model's colours, none where they are taken as they are; holdout: how hold-outs are read, None where there are none;
+    deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the model's colours, three, or nine of
+    a matrix, none where they are taken as they are; holdout: how hold-outs are read, None where there are none;
     mattes: those among the channels; ids_from: the property of the models' files that semantic ids are of."""
 
     channels: tuple[str, ...] = ("rgb",)

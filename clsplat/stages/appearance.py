@@ -22,9 +22,10 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of all photographs, (photographs, 3) float32 each: logs to base 2, where they started, Adam's moments,
-    2^logs; moved: scratch. begins (photographs + 1,), others, weights (n,): rows of a matrix, as a `csr_array` has.
-    Times the distances from where the gains started, it is added to the gradient."""
+    """Gains of all photographs, (photographs, entries) float32 each: logs to base 2, and mixes where there are more
+    than three entries, where they started, Adam's moments, 2^logs; moved: scratch. begins (photographs + 1,), others,
+    weights (n,): rows of a matrix, as a `csr_array` has. Times the distances from where the gains started, it is added
+    to the gradient."""
 
     logs: DeviceArray
     start: DeviceArray
@@ -99,12 +100,18 @@ def step_gains(
     step: int,
     rate: float,
     readback: DeviceArray,
+    *,
+    at: int = 0,
+    slow: float = 1.0,
+    centred: bool = True,
 ) -> None:
-    """Adam's step number `step` (from 1), and the mean of each channel's logs made 0. A step by capacity that has
-    stopped changes nothing."""
-    kernels, count = device.kernels("appearance", LANES=1), gains.logs.size
-    constants = (rate / (1 - BETA1**step), (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
-    sizes, matrix = (count, photograph, columns.shape[1]), (gains.begins, gains.others, gains.weights)
+    """Adam's step number `step` (from 1), and the mean of each entry made 0 if `centred`. A step by capacity that has
+    stopped changes nothing. at: the entries' first row of `columns`; slow: part of the rate that mixes have."""
+    kernels, (photographs, entries) = device.kernels("appearance", LANES=1), gains.logs.shape
+    count = photographs * entries
+    constants = (rate / (1 - BETA1**step), slow, (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
+    sizes, matrix = (count, entries, photograph, columns.shape[1], at), (gains.begins, gains.others, gains.weights)
     read = (readback, columns, gains.start, *matrix, gains.logs)
     launch_items(device, kernels.move_gains, count, *sizes, *constants, *read, gains.moved, gains.first, gains.second)
-    launch_items(device, kernels.centre_gains, count, count, readback, gains.moved, gains.logs, gains.gains)
+    settled = (gains.moved, gains.logs, gains.gains)
+    launch_items(device, kernels.centre_gains, count, count, entries, int(centred), readback, *settled)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -14,6 +14,7 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.training.gains import GainsOfAll
 from clsplat.training.grids import GridsOfAll
+from clsplat.training.ppisp import PpispOfAll
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
@@ -110,4 +111,9 @@ def appearance_of(config: TrainConfig, device: Device, scene: Scene) -> Appearan
     """The appearances that the settings ask for."""
     if config.appearance == "none":
         return ModelsOwn()
-    return (GridsOfAll if config.appearance == "grid" else GainsOfAll)(config, device, scene)
+    of_all: dict[str, Callable[[TrainConfig, Device, Scene], Appearance]] = {
+        "exposure": GainsOfAll,
+        "ppisp": PpispOfAll,
+        "grid": GridsOfAll,
+    }
+    return of_all[config.appearance](config, device, scene)

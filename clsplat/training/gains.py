@@ -112,6 +112,8 @@ def _rows(names: Sequence[str], logs: NDArray[np.float64]) -> dict[str, Any]:
 class GainsOfAll:
     """The gains of all training views."""
 
+    entries = 3
+
     def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
         self._config, self._device, self._scene = config, device, scene
         self._told = [exposure_of(view.path) for view in scene.train_views]
@@ -124,7 +126,8 @@ class GainsOfAll:
         by_exif = curve * np.nan_to_num(_from_mean(self._told, self._told))
         by_points = {name: np.round(told / STEP) * STEP for name, told in Looked(scene).exposures.items()}
         views = zip(scene.train_views, by_exif, strict=True)
-        start = np.array([by_points.get(view.name, np.full(3, told)) for view, told in views])
+        start = np.zeros((len(scene.train_views), self.entries))
+        start[:, :3] = [by_points.get(view.name, np.full(3, told)) for view, told in views]
         self._by_points = np.array([view.name in by_points for view in scene.train_views])
         return Gains.on(self._device, (start - start.mean(axis=0)).astype(np.float32), self._pull)
 
@@ -152,7 +155,7 @@ class GainsOfAll:
         Nothing is learnt of held-out photographs. Where EXIF tells their exposure, they get the gains that go with it
         on average over the training's.
         """
-        logs, scene = self._gains.logs.get().astype(np.float64), self._scene
+        logs, scene = self._gains.logs.get()[:, :3].astype(np.float64), self._scene
         told = _from_mean(self._told, self._told)
         known = ~np.isnan(told)
         spread = np.square(told[known]).sum()
@@ -172,11 +175,12 @@ class GainsOfAll:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""
         held = saved({name: getattr(self._gains, name) for name in KEPT})
-        return {**held, "appearance/told": np.repeat(self._by_points[:, None], 3, axis=1).astype(np.float32)}
+        told = np.repeat(self._by_points[:, None], self.entries, axis=1)
+        return {**held, "appearance/told": told.astype(np.float32)}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Take the arrays of a checkpoint. Raises ValueError where one is missing, or of other photographs."""
-        shape = (len(self._scene.train_views), 3)
+        shape = (len(self._scene.train_views), self.entries)
         values = loaded(self._device, arrays, (*KEPT, "told"), shape)
         self._by_points = values.pop("told").get()[:, 0] > 0
         moved = allocate(self._device, shape, np.float32)

@@ -31,7 +31,7 @@ from clsplat.process import Interrupted, endings, handled
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
-from clsplat.runs.appearance import held_out_gains
+from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import unusable
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes import doubts
@@ -233,9 +233,9 @@ class Session:
         """The held-out views; their renders are kept in the run's test/ if asked for."""
         trainer = self.trainer
         trainer.settle()
-        gains = held_out_gains(trainer.appearance.record())
+        seen = held_out_looks(trainer.appearance.record())
         return evaluate(
-            lambda view: self.draw(view.camera)[0] * gains(view.name),
+            lambda view: seen(view, self.draw(view.camera)[0]),
             trainer.cameras.lenses.of_views(trainer.scene.test_views),
             background_colour(trainer.config.background),
             self.run.test_path if keep and self.run is not None else None,

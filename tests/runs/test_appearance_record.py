@@ -57,9 +57,7 @@ def test_a_photograph_that_is_not_there(run: Run, photograph: str, message: str)
 )
 def test_a_damaged_record(run: Run, text: str) -> None:
     run.appearance_path.write_text(text, "utf-8")
-    with pytest.raises(
-        InputError, match=r"appearance.json: .*expected what clsplat train --appearance exposure writes"
-    ):
+    with pytest.raises(InputError, match=r"appearance.json: .*expected what clsplat train --appearance writes"):
         gains_of(run.path, "a.jpg")
 
 

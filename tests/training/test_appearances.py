@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains and grids of photographs: trainings with them repeat to the last byte however they are done."""
+"""What is learnt of photographs: trainings with it repeat to the last byte however they are done."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.scene import Scene, load_scene
 from clsplat.training.trainer import Trainer
 
-LEARNT = {"exposure": "appearance/logs", "grid": "appearance/first"}
+LEARNT = {"exposure": "appearance/logs", "ppisp": "appearance/lenses_logs", "grid": "appearance/first"}
 """An array of each kind's checkpoint that is 0 before anything is learnt."""
 
 

@@ -21,7 +21,7 @@ from clsplat.errors import InputError
 from clsplat.evaluation import metrics
 from clsplat.images.exif import exposure_of
 from clsplat.images.reading import read_image
-from clsplat.runs.appearance import held_out_gains
+from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.looked import Looked
@@ -183,10 +183,11 @@ def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_pat
         got = record["photographs" if view.split == "train" else "held_out"][view.name]["log2_gains"]
         np.testing.assert_allclose(got, 3 * [wanted], atol=1e-6)  # of 32 bits
     assert sum(view.split == "test" and exposures[view.name] is not None for view in scene.views)
-    expected = held_out_gains(record)
-    name = scene.test_views[0].name
-    np.testing.assert_allclose(expected(name), 2.0 ** np.array(record["held_out"][name]["log2_gains"]), rtol=1e-6)
-    assert (expected("elsewhere") == 1).all()
+    seen, view = held_out_looks(record), scene.test_views[0]
+    white = np.ones((view.camera.height, view.camera.width, 3), np.float32)
+    gains = 2.0 ** np.array(record["held_out"][view.name]["log2_gains"])
+    np.testing.assert_allclose(seen(view, white), white * gains, rtol=1e-6)
+    assert (seen(replace(view, name="elsewhere"), white) == 1).all()
 
 
 def test_switched_off_there_is_nothing_of_it(default_device: Device, scene: Scene) -> None:

@@ -115,6 +115,7 @@ EXPLORING = short(
 """Moves, growth, penalties and noise."""
 
 EXPOSED = short(iterations=16, warmup=(2, 4), appearance="exposure")
+THROUGH_CAMERAS = short(iterations=16, warmup=(2, 4), appearance="ppisp")
 WITH_GRIDS = short(iterations=24, warmup=(2, 4), appearance="grid")
 MASKED = short(iterations=24, warmup=(2, 4), masks="ignore", alpha="transparent")
 """Masks at every size of the warm-up, and the alpha loss."""
@@ -140,7 +141,19 @@ MANY = short(
 @pytest.mark.parametrize(
     "how",
     quick(
-        ["at once", "mcmc", "exposure", "grid", "masked", "depths", "cameras", "rays", "in pieces", "in vectors of 1"],
+        [
+            "at once",
+            "mcmc",
+            "exposure",
+            "ppisp",
+            "grid",
+            "masked",
+            "depths",
+            "cameras",
+            "rays",
+            "in pieces",
+            "in vectors of 1",
+        ],
         "at once",
         "grid",
         "depths",
@@ -158,7 +171,14 @@ def test_training_in_poisoned_memory(
 ) -> None:
     device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
     pieces = how == "in pieces"
-    settings = {"in pieces": MANY, "mcmc": EXPLORING, "exposure": EXPOSED, "grid": WITH_GRIDS, "masked": MASKED}
+    settings = {
+        "in pieces": MANY,
+        "mcmc": EXPLORING,
+        "exposure": EXPOSED,
+        "ppisp": THROUGH_CAMERAS,
+        "grid": WITH_GRIDS,
+        "masked": MASKED,
+    }
     config = {**settings, "depths": DEEP, "cameras": REFINED, "rays": RAYS}.get(how, EVERYTHING)
     scene = {"masked": masked, "depths": deep}.get(how, scene)
     found = []

@@ -37,6 +37,7 @@ CONFIGS = {
     "frequency": short(iterations=60, warmup="frequency", frequency_steps=12, background="random"),
     "thinning": replace(PLAIN, thinning=0.5),
     "exposure": replace(PLAIN, appearance="exposure"),
+    "ppisp": replace(PLAIN, appearance="ppisp"),
     "grid": replace(PLAIN, appearance="grid"),
     "MCMC": short(iterations=60, density=MCMC),
     "long axis": short(density={"growth": "budget", "max_gaussians": 120, "long_axis": True, "edge_views": 2}),
