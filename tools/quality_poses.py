@@ -26,6 +26,7 @@ from clsplat.device.context import open_device
 from clsplat.evaluation.held_out import evaluate
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.renderer import Renderer
+from clsplat.runs.appearance import held_out_looks
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.cameras import aligned
 from clsplat.training.poses import Poses
@@ -101,7 +102,10 @@ def main() -> None:
         trainer.finish()
         renderer = Renderer(trainer.device, config=config.rasterizer)
         means = []
-        for camera_of in (lambda view: view.camera, lambda view, trainer=trainer: aligned(trainer, view)):
+        for camera_of in (
+            lambda view: view.camera,
+            lambda view, trainer=trainer: aligned(trainer, view, held_out_looks(None)),
+        ):
             background = background_colour(config.background)
 
             def draw(view, camera_of=camera_of, trainer=trainer, background=background, renderer=renderer):

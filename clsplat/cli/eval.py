@@ -108,7 +108,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
     seen = looks_of_run(trained)
     model_record = given_run.model_record() if given_run else {}
     result = evaluate(
-        lambda view: seen(view, draw(view.camera)[0]),
+        lambda view: seen(view.name, draw(view.camera)[0]),
         views,
         background,
         given_run.test_path if given_run else None,

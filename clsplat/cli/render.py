@@ -107,8 +107,8 @@ class Render(Verb):
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
-    """Expose the model as this photograph of its scene is, by the run's appearance.json; if not given, as all are on
-    average. The background is taken as it is."""
+    """Give the model exposure and colours of this photograph of its scene, by the run's appearance.json, not its lens's
+    vignette; if not given, those that all have on average. The background is taken as it is."""
     alpha: Flag = False
     """Write alpha too, as --channels rgb,alpha does, and no background: premultiplied in EXR and TIFF, straight in
     PNG."""

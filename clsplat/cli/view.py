@@ -43,8 +43,8 @@ class View(Verb):
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians. If not given: the run's setting, else black."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
-    """Expose the model as this photograph of its scene is, by the run's appearance.json; if not given, as all are on
-    average."""
+    """Give the model exposure and colours of this photograph of its scene, by the run's appearance.json, not its lens's
+    vignette; if not given, those that all have on average."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
 

@@ -100,6 +100,7 @@ _UPDATED = {
     "join_view": 1,
     "add_noise": 1,
     "remove_gains": 1,
+    "develop": 1,
 }
 """Kernels that read and write some arrays in place: how many of their last ones."""
 

@@ -80,15 +80,20 @@ def exposure_chart(run: Run) -> Markup:
 
 def _corners(photographs: Mapping[str, Any]) -> str:
     """The light that the lenses leave in the corners, by the vignettes that were learnt; "" where none were."""
-    vignettes = {tuple(row["vignette"]) for row in photographs.values() if "vignette" in row}
-    octaves = sorted(min(sum(number(value) or 0.0 for value in vignette), 16.0) for vignette in vignettes)
+    vignettes = {tuple(_three(row["vignette"])) for row in photographs.values() if "vignette" in row}
+    octaves = sorted(min(sum(vignette), 16.0) for vignette in vignettes if any(vignette))
     left = dict.fromkeys(f"{2.0**value:.0%}" for value in octaves)
     return f". Corners have {examples(left)} of the light of the middle" if left else ""
 
 
 def _gains(record: Any) -> Sequence[float]:
     """Three numbers. Raises ValueError, KeyError or TypeError for what is none."""
-    gains = [number(value) for value in record["log2_gains"]]
-    if len(gains) != 3 or None in gains:
-        raise ValueError("not three gains")
-    return [float(value) for value in gains if value is not None]
+    return _three(record["log2_gains"])
+
+
+def _three(values: Any) -> list[float]:
+    """Three numbers. Raises ValueError or TypeError for what is none."""
+    numbers = [number(value) for value in values]
+    if len(numbers) != 3 or None in numbers:
+        raise ValueError("not three numbers")
+    return [float(value) for value in numbers if value is not None]

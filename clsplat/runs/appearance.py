@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
 from clsplat.files import parse_json, read_document
 from clsplat.images.alpha import Image
 from clsplat.runs.run import Run, run_of
-from clsplat.scenes.scene import View
 
 MAX_BYTES = 1 << 28
 MOST_LOG = 16.0
@@ -25,15 +23,20 @@ MOST_MIX = 0.25
 """Under which any six mixes can be undone."""
 EXPECTED = "what clsplat train --appearance writes"
 
+MOST_PART = 100.0
+"""Pictures that a principal point is beside its own, at most."""
+
 Row = Mapping[str, Any]
 """A photograph's entry of appearance.json."""
+Look = Callable[[str, Image], Image]
+"""Makes a render (H, W, 3) what the camera of a held-out photograph, by its name, shows of it."""
 
 
 def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
     """The three gains by which colours of a run's model become the photograph's, or the nine numbers of a matrix, by
-    rows, where channels mix; of a held-out one those that EXIF tells, or 1. model: the run's folder, or a file there;
-    photograph: its name in the data set, or the end of that from a folder on, with or without extension. Raises
-    InputError."""
+    rows, where channels mix; of a held-out one the gains that EXIF tells, or 1, and no mixes. model: the run's folder,
+    or a file there; photograph: its name in the data set, or the end of that from a folder on, with or without
+    extension. Raises InputError."""
     run = run_of(model)
     path = run.appearance_path if run is not None else None
     if run is None or path is None or not path.exists():
@@ -59,29 +62,28 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
     row = rows[photograph if photograph in found else found[0]]
     if "mixes" not in row:
         return tuple(row["gains"].tolist())
-    matrix = row["gains"][:, None] * np.linalg.inv(unmixing(row["mixes"]))
-    return tuple(matrix.ravel().tolist())
+    return tuple((row["gains"][:, None] * inverse(unmixing(row["mixes"]))).ravel().tolist())
 
 
-def looks_of_run(run: Run | None) -> Callable[[View, Image], Image]:
+def looks_of_run(run: Run | None) -> Look:
     """`held_out_looks` of a run, where it has an appearance.json. Raises InputError."""
     return _looks(_read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {})
 
 
-def held_out_looks(record: Mapping[str, Any] | None) -> Callable[[View, Image], Image]:
-    """Makes renders (H, W, 3) what the cameras of held-out views show of them, as far as the content of an
-    appearance.json tells."""
+def held_out_looks(record: Mapping[str, Any] | None) -> Look:
+    """The looks of held-out photographs, as far as the content of an appearance.json tells."""
     return _looks(_rows_in(record, "held_out") if record is not None else {})
 
 
-def _looks(rows: Mapping[str, Row]) -> Callable[[View, Image], Image]:
-    def seen(view: View, image: Image) -> Image:
-        row = rows.get(view.name)
+def _looks(rows: Mapping[str, Row]) -> Look:
+    def seen(name: str, image: Image) -> Image:
+        row = rows.get(name)
         if row is None:
             return image
         factors = row["gains"].astype(np.float32)
         if "vignette" in row:
-            factors = (factors * _light(row["vignette"], view.camera)[:, :, None]).astype(np.float32)
+            height, width = image.shape[:2]
+            factors = (factors * _light(row["vignette"], row["centre"], width, height)[:, :, None]).astype(np.float32)
         exposed: Image = image * factors
         return exposed
 
@@ -98,10 +100,18 @@ def unmixing(mixes: Float64) -> Float64:
     return matrix
 
 
-def _light(vignette: Float64, camera: Camera) -> Float64:
-    """The share of light (H, W) that a lens leaves, by its vignette (3,)."""
-    across, down = np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy
-    s = 4 * (across**2 + down[:, None] ** 2) / (camera.width**2 + camera.height**2)
+def inverse(matrix: Float64) -> Float64:
+    """The inverse of a matrix (3, 3), with the same bits on every processor, as frames are known by them."""
+    columns = np.stack([np.cross(matrix[(row + 1) % 3], matrix[(row + 2) % 3]) for row in range(3)], axis=1)
+    first, second, third = (matrix[0] * columns[:, 0]).tolist()
+    result: Float64 = columns / (first + second + third)
+    return result
+
+
+def _light(vignette: Float64, centre: Float64, width: int, height: int) -> Float64:
+    """The share of light (H, W) that a lens leaves, by its vignette (3,) and its centre in parts of the picture."""
+    across, down = np.arange(width) + 0.5 - centre[0] * width, np.arange(height) + 0.5 - centre[1] * height
+    s = 4 * (across**2 + down[:, None] ** 2) / (width**2 + height**2)
     light: Float64 = np.exp2(np.clip(s * (vignette[0] + s * (vignette[1] + s * vignette[2])), -MOST_LOG, MOST_LOG))
     return light
 
@@ -116,7 +126,7 @@ def _kind(path: Path) -> Any:
 def _read(path: Path, key: str) -> dict[str, Row]:
     try:
         return _rows_in(parse_json(read_document(path, EXPECTED, MAX_BYTES)), key)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED}") from None
 
 
@@ -132,16 +142,22 @@ def _ends(name: str) -> list[str]:
 
 
 def _row(record: Any) -> Row:
-    """Gains (3,), and mixes (6,) and a vignette (3,) where there are such. Raises ValueError or TypeError."""
-    row = {"gains": np.exp2(_numbers("log2_gains", record["log2_gains"], 3, MOST_LOG))}
-    for name, count, most in (("mixes", 6, MOST_MIX), ("vignette", 3, MOST_LOG)):
-        if name in record:
-            row[name] = _numbers(name, record[name], count, most)
+    """Gains (3,), mixes (6,) where there are any, and a vignette (3,) with its centre (2,). Raises ValueError,
+    TypeError, KeyError or OverflowError."""
+    logs = _numbers("log2_gains", record["log2_gains"], 3, MOST_LOG).tolist()
+    row = {"gains": np.array([2.0**log for log in logs])}  # which NumPy's processors round in several ways
+    if "mixes" in record:
+        row["mixes"] = _numbers("mixes", record["mixes"], 6, MOST_MIX)
+    if "vignette" in record:
+        row |= {
+            "vignette": _numbers("vignette", record["vignette"], 3, MOST_LOG),
+            "centre": _numbers("centre", record["centre"], 2, MOST_PART),
+        }
     return row
 
 
 def _numbers(name: str, values: Any, count: int, most: float) -> Float64:
-    numbers = [float(value) for value in values]
+    numbers = [float(value) for value in values] if isinstance(values, list) else []
     if len(numbers) != count or not all(math.isfinite(value) and abs(value) <= most for value in numbers):
         raise ValueError(f"{name} of {values}")
     return np.array(numbers)

@@ -19,6 +19,7 @@ from clsplat.device.launch import only_tried
 from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.runs.appearance import Look
 from clsplat.scenes.scene import Scene, View
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.stages.pose import LENS, POSE, lens_rows, pose_rows, sum_of, sums_of
@@ -168,11 +169,14 @@ class InTraining(Protocol):
         ...
 
 
-def aligned(trainer: InTraining, view: View) -> Camera:
-    """The camera of a held-out view, moved from where it is to where the model fits its photograph best. The model
-    stays as it is: its world may have drifted."""
+def aligned(trainer: InTraining, view: View, look: Look) -> Camera:
+    """The camera of a held-out view, moved from where it is to where the model fits its photograph best, whose look is
+    taken from it. The model stays as it is: its world may have drifted."""
     config, rasterizer, model = replace(trainer.config, thinning=0.0), trainer.rasterizer, trainer.parameters
     photograph = np.ascontiguousarray(view.load_masked())
+    white = np.ones((*photograph.shape[:2], 3), np.float32)
+    if (factors := look(view.name, white)) is not white:
+        photograph = np.concatenate([photograph[:, :, :3] / factors, photograph[:, :, 3:]], axis=2, dtype=np.float32)
     kept, background = kept_pixels(photograph), np.array(background_colour(config.background), np.float32)
     room, scale = view_gradients(rasterizer.work, model), np.repeat([1.0, trainer.scene.extent], 3)
     first, second = np.zeros(6), np.zeros((6, 6))
@@ -180,9 +184,9 @@ def aligned(trainer: InTraining, view: View) -> Camera:
     least = np.inf
     for step in range(1, ALIGNING + 1):
         sums = CameraSums(rasterizer.work, model.count)
-        look = _Look(trainer.device, rasterizer, config, 1, trainer.rates(), PLAIN_SLOTS, seen=sums)
+        probe = _Look(trainer.device, rasterizer, config, 1, trainer.rates(), PLAIN_SLOTS, seen=sums)
         pixels = (photograph, trainer.local(camera), background)
-        loss, _ = look.run((model,), *pixels, StepProbe(), room, reads_loss=True, kept=kept).read()
+        loss, _ = probe.run((model,), *pixels, StepProbe(), room, reads_loss=True, kept=kept).read()
         if loss < least:
             best, least = camera, loss
         by = sums.by_pose() * scale

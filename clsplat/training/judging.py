@@ -16,8 +16,10 @@ from clsplat.evaluation import metrics
 from clsplat.images.alpha import background_colour, composite
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
+from clsplat.runs.appearance import held_out_looks
 from clsplat.scenes.scene import Scene, View
 from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.training.appearance import Appearance
 from clsplat.training.cameras import Cameras
 from clsplat.training.gate import spread
 from clsplat.training.photographs import Photographs
@@ -31,6 +33,7 @@ class InTraining(Protocol):
     rasterizer: Rasterizer
     parameters: AnyGaussians
     cameras: Cameras
+    appearance: Appearance
     judges: Judges
     step: int
 
@@ -52,10 +55,12 @@ class Judges:
         self._photographs = Photographs(self.views, device)
 
     def psnr(self, trainer: InTraining, cameras: Sequence[Camera]) -> float:
-        """Mean PSNR in dB of the views through these cameras, after the fit of their colours where appearance is
-        learnt. A photograph that its mask leaves nothing of does not count; 0 where none does."""
+        """Mean PSNR in dB of the views through these cameras, with what is known of their looks and after the fit of
+        their colours where appearance is learnt. A photograph that its mask leaves nothing of does not count; 0 where
+        none does."""
         config, background = trainer.config, background_colour(trainer.config.background)
         measure = metrics.psnr if config.appearance == "none" else metrics.psnr_corrected
+        look = held_out_looks(trainer.appearance.record())
         renderer, found = Renderer(trainer.device, trainer.rasterizer), []
         for index, camera in enumerate(cameras):
             pixels, counts = self._photographs.load(index, 1.0), None
@@ -64,7 +69,8 @@ class Judges:
                 if not counts.any():
                     continue
             image = renderer.render(trainer.parameters, trainer.local(camera), background).image
-            found.append(measure(np.nan_to_num(image), composite(pixels, background), counts))
+            image = look(self.views[index].name, np.nan_to_num(image))
+            found.append(measure(image, composite(pixels, background), counts))
         return float(np.mean(found)) if found else 0.0
 
 

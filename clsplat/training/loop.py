@@ -235,7 +235,7 @@ class Session:
         trainer.settle()
         seen = held_out_looks(trainer.appearance.record())
         return evaluate(
-            lambda view: seen(view, self.draw(view.camera)[0]),
+            lambda view: seen(view.name, self.draw(view.camera)[0]),
             trainer.cameras.lenses.of_views(trainer.scene.test_views),
             background_colour(trainer.config.background),
             self.run.test_path if keep and self.run is not None else None,
@@ -243,7 +243,9 @@ class Session:
             gaussians=trainer.parameters.count,
             seconds=self.seconds,
             corrected=trainer.config.appearance != "none",
-            aligned=(lambda view: self.draw(aligned(trainer, view))[0]) if trainer.cameras.poses.on and keep else None,
+            aligned=(lambda view: seen(view.name, self.draw(aligned(trainer, view, seen))[0]))
+            if trainer.cameras.poses.on and keep
+            else None,
             space=photos_space(view.path for view in trainer.scene.views),
         )
 

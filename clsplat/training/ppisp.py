@@ -86,6 +86,17 @@ class ViewColours:
         step_gains(self.device, self.vignettes, lens, *of_step, self.lens_rate, readback, **of_lens)
 
 
+def centre(view: View) -> tuple[float, float]:
+    """The principal point, in parts of the picture's width and height."""
+    camera = view.camera
+    return camera.cx / camera.width, camera.cy / camera.height
+
+
+def panorama(view: View) -> bool:
+    """True for pictures that have no lens's corners."""
+    return view.camera.projection == "equirectangular"
+
+
 class PpispOfAll(GainsOfAll):
     """Gains and mixes of all training views, and vignettes of their lenses. Views through one lens share its vignette.
 
@@ -102,9 +113,7 @@ class PpispOfAll(GainsOfAll):
 
     @staticmethod
     def _of(row: int, view: View, lenses: Mapping[Any, int]) -> Taken:
-        camera = view.camera
-        centre = (camera.cx / camera.width, camera.cy / camera.height)
-        return Taken(row, lenses[view.lens], centre, camera.projection != "equirectangular")
+        return Taken(row, lenses[view.lens], centre(view), not panorama(view))
 
     @property
     def pixel_bytes(self) -> int:
@@ -130,15 +139,18 @@ class PpispOfAll(GainsOfAll):
 
     def record(self) -> dict[str, Any]:
         """The content of appearance.json, by the names of the views. Held-out photographs have the vignette of their
-        lens, if a training photograph has it."""
+        lens, or if no training photograph has it the mean of all lenses; centres are parts of the picture."""
         record, colours = super().record(), self._gains.logs.get().astype(np.float64)
-        vignettes = self._vignettes.logs.get().astype(np.float64).tolist()
+        vignettes = self._vignettes.logs.get().astype(np.float64)
+        usual = vignettes.mean(axis=0)
         for view, taken in zip(self._scene.train_views, self._taken, strict=True):
             row = record["photographs"][view.name]
-            row |= {"mixes": colours[taken.photograph, 3:].tolist(), "vignette": vignettes[taken.lens]}
+            row |= {"mixes": colours[taken.photograph, 3:].tolist()}
+            row |= {"vignette": vignettes[taken.lens].tolist(), "centre": list(taken.centre)}
         for view in self._scene.test_views:
-            if view.lens in self._lenses:
-                record["held_out"][view.name]["vignette"] = vignettes[self._lenses[view.lens]]
+            lens = self._lenses.get(view.lens)
+            vignette = np.zeros(3) if panorama(view) else usual if lens is None else vignettes[lens]
+            record["held_out"][view.name] |= {"vignette": vignette.tolist(), "centre": list(centre(view))}
         return record
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -81,6 +81,10 @@ def test_exposures_are_a_chart(reported: Path, tmp_path: Path) -> None:
     (run / "appearance.json").write_text(json.dumps({"kind": "ppisp", "photographs": gains}))
     assert main(["report", str(run)]) == 0
     assert "Corners have 50% of the light of the middle" in (run / "report.html").read_text("utf-8")
+    gains["00.png"]["vignette"] = [0.0, 0.0, 0.0]  # of a panorama
+    (run / "appearance.json").write_text(json.dumps({"kind": "ppisp", "photographs": gains}))
+    assert main(["report", str(run)]) == 0
+    assert "Corners have" not in (run / "report.html").read_text("utf-8")
     bad = '{"photographs": {"a": {"log2_gains": [1, 2, 3], "vignette": 1}}}'
     for text in ("{}", '{"photographs": {"a": {"log2_gains": [1, 2]}}}', bad, "no JSON"):
         (run / "appearance.json").write_text(text)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.errors import InputError
+from clsplat.evaluation import metrics
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import exposed
 from clsplat.reference.ppisp import light, spread, unmixing
+from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import gains_of
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
@@ -97,41 +100,61 @@ def test_a_model_with_the_colours_of_a_photograph(scene: Scene, learnt: Run, tmp
     assert list(tmp_path.rglob("*.png"))
 
 
-def test_held_out_views_are_seen_through_their_lens(scene: Scene, learnt: Run) -> None:
-    """By `eval` as at the end of training, though nothing is learnt of these views."""
-    before = json.loads(learnt.eval_path.read_text("utf-8"))["mean"]
-    record = learnt.appearance_path.read_text("utf-8")
-    folder = str(scene.train_views[0].path.parents[1])
+def test_held_out_views_are_seen_through_their_lens(scene: Scene, learnt: Run, default_device: Device) -> None:
+    """By `eval` as at the end of training, though nothing is learnt of these views; and through another lens."""
+    before = json.loads(learnt.eval_path.read_text("utf-8"))["mean"]["psnr"]
+    record = json.loads(learnt.appearance_path.read_text("utf-8"))
+    folder, (vignette, centre) = str(scene.train_views[0].path.parents[1]), ([-4.0, 1.0, 0.0], (0.25, 0.75))
     assert main(["eval", str(learnt.path), "--scene", folder]) == 0
-    again = json.loads(learnt.eval_path.read_text("utf-8"))["mean"]
-    assert again["psnr"] == pytest.approx(before["psnr"], abs=1e-3)  # of a model in a file, activated once more
-    learnt.appearance_path.write_text(record.replace("vignette", "of another version"), "utf-8")
+    again = json.loads(learnt.eval_path.read_text("utf-8"))["mean"]["psnr"]
+    assert again == pytest.approx(before, abs=1e-3)  # of a model in a file, activated once more
+    rows = {view.name: {"log2_gains": [0.5] * 3, "vignette": vignette, "centre": centre} for view in scene.test_views}
+    learnt.appearance_path.write_text(json.dumps(record | {"held_out": rows}), "utf-8")
     assert main(["eval", str(learnt.path), "--scene", folder]) == 0
-    without = json.loads(learnt.eval_path.read_text("utf-8"))["mean"]
-    learnt.appearance_path.write_text(record, "utf-8")
-    assert abs(without["psnr"] - before["psnr"]) > 0.03  # little, as the corners are nearly black
+    got = json.loads(learnt.eval_path.read_text("utf-8"))["mean"]["psnr"]
+    learnt.appearance_path.write_text(json.dumps(record), "utf-8")
+    model, found = Gaussians.load(learnt.model_path), []
+    for view in scene.test_views:
+        width, height = view.camera.width, view.camera.height
+        left = light(np.array(vignette), spread(width, height, (centre[0] * width, centre[1] * height)))
+        image = Renderer(default_device).render(model, view.camera).image * 2**0.5 * left[:, :, None]
+        found.append(metrics.psnr(image, view.load()[:, :, :3]))
+    assert got == pytest.approx(np.mean(found), abs=1e-3)
+    assert got < before - 1
 
 
 @pytest.mark.parametrize(
-    "change", [{"mixes": [0.0] * 5}, {"mixes": [0.3] * 6}, {"vignette": [1.0, "x", 0.0]}, {"vignette": None}]
+    "change",
+    [
+        {"mixes": [0.0] * 5},
+        {"mixes": [0.3] * 6},
+        {"vignette": [1.0, "x", 0.0]},
+        {"vignette": None},
+        {"centre": [0.5]},
+        {"log2_gains": "123"},
+        {"log2_gains": [10**400, 0, 0]},
+    ],
+    ids=["five", "large", "no number", "none", "one", "text", "huge"],
 )
 def test_a_damaged_row(tmp_path: Path, change: dict[str, object]) -> None:
     run = Run.create(tmp_path / "run", OF_CAMERAS)
-    row = {"log2_gains": [0.0] * 3, "mixes": [0.0] * 6, "vignette": [0.0] * 3} | change
+    row = {"log2_gains": [0.0] * 3, "mixes": [0.0] * 6, "vignette": [0.0] * 3, "centre": [0.5, 0.5]} | change
     run.write_appearance({"kind": "ppisp", "photographs": {"a.jpg": row}, "held_out": {}})
     with pytest.raises(InputError, match=r"appearance.json: .*expected what clsplat train --appearance"):
         gains_of(run.path, "a.jpg")
 
 
-def test_lenses_move_by_themselves(default_device: Device, scene: Scene) -> None:
-    """A photograph's step moves its own lens's vignette alone."""
+def with_two_lenses(scene: Scene) -> Scene:
+    """The scene, of which the first training photograph and the held-out ones are taken through a lens of their own."""
     first, *others = scene.train_views
     focal, *rest = first.lens.params
     other = replace(first.lens, params=(np.nextafter(focal, 0), *rest))
-    views = [replace(view, lens=other) for view in others]
-    held = [view for view in scene.views if view.split == "test"]
-    scene = replace(scene, views=[first, *views, *held])
-    trainer = Trainer(scene, replace(OF_CAMERAS, batch=1), default_device)
+    return replace(scene, views=[first, *(replace(view, lens=other) for view in others), *scene.test_views])
+
+
+def test_lenses_move_by_themselves(default_device: Device, scene: Scene) -> None:
+    """A photograph's step moves its own lens's vignette alone."""
+    trainer = Trainer(with_two_lenses(scene), OF_CAMERAS, default_device)
     appearance = trainer.appearance
     assert isinstance(appearance, PpispOfAll)
     assert appearance.arrays()["appearance/lenses_logs"].shape == (2, 3)
@@ -144,6 +167,10 @@ def test_a_checkpoint_of_other_lenses_is_refused(default_device: Device, scene: 
     trainer.train_step()
     with pytest.raises(InputError, match="appearance/lenses_logs"):
         Trainer(scene, OF_CAMERAS, default_device).restore(Checkpoint(1, *trainer.checkpoint()))
+    of_two = Trainer(with_two_lenses(scene), OF_CAMERAS, default_device)
+    of_two.train_step()
+    with pytest.raises(InputError, match=r"appearance/lenses_logs of shape \(1, 3\)"):
+        Trainer(scene, OF_CAMERAS, default_device).restore(Checkpoint(1, *of_two.checkpoint()))
 
 
 def test_photographs_that_are_alike_are_left_so(default_device: Device, scene: Scene) -> None:
@@ -155,3 +182,57 @@ def test_photographs_that_are_alike_are_left_so(default_device: Device, scene: S
     assert_close(arrays["appearance/logs"].mean(axis=0), np.zeros(9), absolute=1e-6)
     assert np.abs(arrays["appearance/logs"][:, 3:]).max() < 0.05  # of 0.2, the bound
     assert arrays["appearance/lenses_logs"].shape == (1, 3)
+
+
+def test_where_a_photograph_was_taken(default_device: Device, scene: Scene) -> None:
+    """The principal point in parts of an oblong picture, none for a panorama, and the mean of all lenses for a
+    held-out photograph through another."""
+    first, second, *others = with_two_lenses(scene).train_views
+    camera = replace(first.camera, cx=0.25 * first.camera.width, cy=0.75 * first.camera.height)
+    around = replace(second.camera, projection="equirectangular")
+    views = [replace(first, camera=camera), replace(second, camera=around), *others]
+    held = [replace(view, lens=replace(view.lens, model="unknown")) for view in scene.test_views]
+    appearance = PpispOfAll(OF_CAMERAS, default_device, replace(scene, views=[*views, *held]))
+    taken = [view.taken for view in appearance.of_views([0, 1], 2)]
+    assert [(each.photograph, each.lens, each.flat) for each in taken] == [(0, 0, True), (1, 1, False)]
+    assert taken[0].centre == (0.25, 0.75)
+    lenses = np.array([[-1.0, 0.5, 0.25], [0.5, 0.25, -0.5]], np.float32)
+    held_arrays = {name.removeprefix("appearance/"): array for name, array in appearance.arrays().items()}
+    appearance.load(held_arrays | {"lenses_logs": lenses})
+    record = appearance.record()
+    assert record["photographs"][first.name]["vignette"] == lenses[0].tolist()
+    assert record["photographs"][first.name]["centre"] == [0.25, 0.75]
+    for view in held:
+        assert record["held_out"][view.name]["vignette"] == lenses.mean(axis=0).tolist()
+
+
+def test_refined_cameras_are_judged_through_the_lens(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A render that is right comes to what its photograph shows; without the lens's look it would be far off."""
+    trainer = Trainer(scene, replace(OF_CAMERAS, refine_poses=True), default_device)
+    vignette = {"vignette": [CORNERS, 0.0, 0.0], "centre": [0.5, 0.5], "log2_gains": [0.0] * 3}
+    cameras = [view.camera for view in trainer.judges.views]
+    found = {}
+    for name, row in (("through", vignette), ("without", {"log2_gains": [0.0] * 3})):
+        record = {"held_out": {view.name: row for view in scene.test_views}}
+        monkeypatch.setattr(trainer.appearance, "record", lambda record=record: record)
+        with monkeypatch.context() as patch:
+            patch.setattr(Photographs, "load", dark(trainer))
+            found[name] = trainer.judges.psnr(trainer, cameras)
+    assert found["through"] > 60  # rounded to float32
+    assert found["without"] < found["through"] - 10
+
+
+def dark(trainer: Trainer) -> Callable[..., np.ndarray]:
+    """Loads what the model shows of a judge's view, dark in the corners."""
+
+    def load(self: Photographs, index: int, factor: float) -> np.ndarray:
+        camera = trainer.judges.views[index].camera
+        renderer = Renderer(trainer.device, trainer.rasterizer)
+        image = renderer.render(trainer.parameters, trainer.local(camera), (0, 0, 0)).image[:, :, :3]
+        middle = camera.width / 2, camera.height / 2
+        left = light(np.array([CORNERS, 0, 0]), spread(camera.width, camera.height, middle))
+        return np.ascontiguousarray(image * left[:, :, None], np.float32)
+
+    return load

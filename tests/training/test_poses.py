@@ -22,6 +22,7 @@ from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
+from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene, View, load_scene
 from clsplat.training.cameras import aligned
@@ -97,7 +98,7 @@ def test_a_held_out_view_is_aligned(scene: Scene, default_device: Device) -> Non
     before = trainer.gaussians().arrays()
     view = scene.test_views[0]
     away = replace(view, camera=view.camera.moved(np.array([0.02, 0.02, 0.02, 0, 0, 0])))
-    found = aligned(trainer, away)
+    found = aligned(trainer, away, held_out_looks(None))
     still = {name: np.array_equal(values, before[name]) for name, values in trainer.gaussians().arrays().items()}
     assert all(still.values()), still
     assert pixels_off(away.camera, view.camera, scene.points) > 1
