@@ -1,9 +1,9 @@
 // Photographs by several cameras: gains and mixes of colours for each photograph, a vignette for each lens, taken from
 // a photograph; their gradient. appearance.cl has Adam's step.
 //
-// Owner: A work-item owns a pixel (develop), or sixteen pixels below each other (camera_sums). Sums have one order on
-//   every device. Built with one lane.
-// Launch: Grids of stride x rows and stride x tiles_y.
+// Owner: A work-item owns LANES pixels beside each other (develop), or a tile's rows of these (camera_sums). Sums have
+//   one order on every device and in every shape.
+// Launch: Grids of stride / LANES x rows and stride / LANES x tiles_y.
 // Buffers: Planes (3, rows, stride) of colour, or the loss by it; gains, logs (photographs, COLOURS): three gains, and
 //   of logs six mixes behind them, for channel c those of c + 1 and c + 2, modulo 3; vignettes (lenses, VIGNETTE);
 //   partials (COLOURS + VIGNETTE, tiles_y, stride). Shapes of the kernels are above each.
@@ -15,55 +15,57 @@
 #define VIGNETTE 3
 #define MOST_FALLOFF 16.0f
 
-// The squared distance of a pixel from (across, down), times scale.
-static inline float spread(const int x, const int y, const float across, const float down, const float scale) {
-  const float from_x = (float)x + 0.5f - across, from_y = (float)y + 0.5f - down;
-  return fma1(from_x, from_x, from_y * from_y) * scale;
+// The squared distances of pixels from (across, down), times scale.
+static inline floatL spread(const int x, const int y, const float across, const float down, const float scale) {
+  const floatL from_x = (floatL)((float)x + 0.5f) + LANE_INDEX - across;
+  const float from_y = (float)y + 0.5f - down;
+  return fmaL(from_x, from_x, (floatL)(from_y * from_y)) * scale;
 }
 
 // gains, logs, vignettes, target -> target, the photograph as the model is to be seen.
 __kernel void develop(const int photograph, const int lens, const int stride, const int plane, const float across,
                       const float down, const float scale, __global const float *gains, __global const float *logs,
                       __global const float *vignettes, __global float *target) {
-  const int x = get_global_id(0), y = get_global_id(1);
-  const size_t at = (size_t)stride * y + x;
-  const float s = spread(x, y, across, down, scale);
+  const int x = LANES * get_global_id(0), y = get_global_id(1);
+  const size_t at = (size_t)stride * y + x, next = plane + at, last = (size_t)plane * 2 + at;
+  const floatL s = spread(x, y, across, down, scale);
   __global const float *vignette = vignettes + VIGNETTE * lens;
-  const float falloff = s * fma1(s, fma1(s, vignette[2], vignette[1]), vignette[0]);
-  const float lens_light = exp2L(clamp(falloff, -MOST_FALLOFF, MOST_FALLOFF));
-  float light[3];
-  for (int c = 0; c < 3; ++c)
-    light[c] = target[(size_t)plane * c + at] / (gains[COLOURS * photograph + c] * lens_light);
-  __global const float *mixes = logs + COLOURS * photograph + 3;
-  for (int c = 0; c < 3; ++c) {
-    float colour = light[c];
-    for (int k = 0; k < 2; ++k) colour = fma1(mixes[2 * c + k], light[c] - light[(c + 1 + k) % 3], colour);
-    target[(size_t)plane * c + at] = colour;
-  }
+  const floatL falloff = s * fmaL(s, fmaL(s, (floatL)(vignette[2]), (floatL)(vignette[1])), (floatL)(vignette[0]));
+  const floatL lens_light = exp2L(clamp(falloff, (floatL)(-MOST_FALLOFF), (floatL)(MOST_FALLOFF)));
+  __global const float *gain = gains + COLOURS * photograph, *mix = logs + COLOURS * photograph + 3;
+  const floatL r = LOADL(target + at) / (gain[0] * lens_light), g = LOADL(target + next) / (gain[1] * lens_light),
+               b = LOADL(target + last) / (gain[2] * lens_light);
+  STOREL(fmaL((floatL)(mix[1]), r - b, fmaL((floatL)(mix[0]), r - g, r)), target + at);
+  STOREL(fmaL((floatL)(mix[3]), g - r, fmaL((floatL)(mix[2]), g - b, g)), target + next);
+  STOREL(fmaL((floatL)(mix[5]), b - g, fmaL((floatL)(mix[4]), b - r, b)), target + last);
 }
 
 // image, gradient by image -> partials of the gradient by gains and vignette, over ln 2, and by mixes.
 __kernel void camera_sums(const int height, const int stride, const int plane, const int tiles_y, const float across,
                           const float down, const float scale, __global const float *image,
                           __global const float *gradient, __global float *partials) {
-  const int x = get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
-  float sums[COLOURS + VIGNETTE];
-  for (int k = 0; k < COLOURS + VIGNETTE; ++k) sums[k] = 0.0f;
+  const int x = LANES * get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
+  const floatL zero = (floatL)(0.0f);
+  floatL red = zero, green = zero, blue = zero, falloff1 = zero, falloff2 = zero, falloff3 = zero;
+  floatL red_green = zero, red_blue = zero, green_blue = zero, green_red = zero, blue_red = zero, blue_green = zero;
   for (int y = y0; y < y1; ++y) {
-    const size_t at = (size_t)stride * y + x;
-    float colours[3], brighter = 0.0f;
-    for (int c = 0; c < 3; ++c) colours[c] = image[(size_t)plane * c + at];
-    for (int c = 0; c < 3; ++c) {
-      const float g = gradient[(size_t)plane * c + at];
-      sums[c] = fma1(colours[c], g, sums[c]);
-      for (int k = 0; k < 2; ++k)
-        sums[3 + 2 * c + k] = fma1(colours[(c + 1 + k) % 3] - colours[c], g, sums[3 + 2 * c + k]);
-      brighter = fma1(colours[c], g, brighter);
-    }
-    const float s = spread(x, y, across, down, scale);
-    float power = s;
-    for (int k = 0; k < VIGNETTE; ++k, power *= s) sums[COLOURS + k] = fma1(power, brighter, sums[COLOURS + k]);
+    const size_t at = (size_t)stride * y + x, next = plane + at, last = (size_t)plane * 2 + at;
+    const floatL r = LOADL(image + at), g = LOADL(image + next), b = LOADL(image + last);
+    const floatL by_r = LOADL(gradient + at), by_g = LOADL(gradient + next), by_b = LOADL(gradient + last);
+    red = fmaL(r, by_r, red), green = fmaL(g, by_g, green), blue = fmaL(b, by_b, blue);
+    red_green = fmaL(g - r, by_r, red_green), red_blue = fmaL(b - r, by_r, red_blue);
+    green_blue = fmaL(b - g, by_g, green_blue), green_red = fmaL(r - g, by_g, green_red);
+    blue_red = fmaL(r - b, by_b, blue_red), blue_green = fmaL(g - b, by_b, blue_green);
+    const floatL brighter = fmaL(b, by_b, fmaL(g, by_g, r * by_r)), s = spread(x, y, across, down, scale), s2 = s * s;
+    falloff1 = fmaL(s, brighter, falloff1), falloff2 = fmaL(s2, brighter, falloff2);
+    falloff3 = fmaL(s2 * s, brighter, falloff3);
   }
-  for (int k = 0; k < COLOURS + VIGNETTE; ++k)
-    partials[((size_t)tiles_y * k + get_global_id(1)) * stride + x] = sums[k];
+  const size_t of_sum = (size_t)tiles_y * stride;
+  partials += (size_t)stride * get_global_id(1) + x;
+  STOREL(red, partials), STOREL(green, partials + of_sum), STOREL(blue, partials + 2 * of_sum);
+  STOREL(red_green, partials + 3 * of_sum), STOREL(red_blue, partials + 4 * of_sum);
+  STOREL(green_blue, partials + 5 * of_sum), STOREL(green_red, partials + 6 * of_sum);
+  STOREL(blue_red, partials + 7 * of_sum), STOREL(blue_green, partials + 8 * of_sum);
+  STOREL(falloff1, partials + 9 * of_sum), STOREL(falloff2, partials + 10 * of_sum);
+  STOREL(falloff3, partials + 11 * of_sum);
 }

@@ -36,7 +36,6 @@ BUILT_WITH: dict[str, dict[str, object]] = {
     "grid": {"LANES": 1},
     "noise": {"LANES": 1},
     "pose": {"LANES": 1},
-    "ppisp": {"LANES": 1},
     "project_rays": {"LANES": 1, "RAYS": 1},
     "sampling": {"LANES": 1},
     "splats_grad": {"LANES": 1, "VALUES": 3},

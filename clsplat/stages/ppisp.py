@@ -41,9 +41,18 @@ def develop(
     """Take gains, mixes and vignette from planes (3 or more, rows, stride) of a photograph of width x height pixels, of
     which three are colours. colours: (photographs, COLOURS); vignettes: (lenses, VIGNETTE)."""
     _, rows, stride = target.shape
-    kernel = device.kernels("ppisp", LANES=1).develop
+    kernel = device.kernels("ppisp").develop
     of_view = (taken.photograph, taken.lens, stride, rows * stride, *taken.place(width, height))
-    launch_grid(device, kernel, (stride, rows), *of_view, colours.gains, colours.logs, vignettes.logs, target)
+    launch_grid(
+        device,
+        kernel,
+        (stride // device.shape.lanes, rows),
+        *of_view,
+        colours.gains,
+        colours.logs,
+        vignettes.logs,
+        target,
+    )
 
 
 @stage("appearance")
@@ -64,8 +73,8 @@ def camera_gradient(
     partials = work.array("appearance_partials", (sums, down, stride))
     columns = work.array(f"appearance_columns_{place}", (sums, stride))
     sizes = (height, stride, rows * stride, down, *taken.place(width, height))
-    kernel = device.kernels("ppisp", LANES=1).camera_sums
-    launch_grid(device, kernel, (stride, down), *sizes, image, gradient, partials)
+    kernel = device.kernels("ppisp").camera_sums
+    launch_grid(device, kernel, (stride // device.shape.lanes, down), *sizes, image, gradient, partials)
     kernel = device.kernels("appearance", LANES=1).column_sums
     launch_grid(device, kernel, (stride, sums), stride, down, partials, columns)
     return columns
