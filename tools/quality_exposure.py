@@ -37,7 +37,7 @@ from clsplat.evaluation import metrics
 from clsplat.files import atomic_write
 from clsplat.images.alpha import Image, composite
 from clsplat.images.writing import write_image
-from clsplat.reference.ppisp import spread
+from clsplat.reference.ppisp import light, spread
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import unmixing
 from clsplat.runs.run import Run
@@ -63,7 +63,7 @@ class Changes:
         if self.corners:
             camera = view.camera
             s = spread(camera.width, camera.height, (camera.cx, camera.cy))[:, :, None]
-            changed = changed * 2.0 ** (-self.corners * s * (1 + s) / 2)
+            changed = changed * light(np.array([-self.corners / 2, -self.corners / 2, 0]), s)
         return np.ascontiguousarray(changed, np.float32)
 
     @property
@@ -109,8 +109,8 @@ def further(found: Any, own: Any, mixes: dict[str, Float64], corners: float, put
         apart -= np.array([own["mixes"][name] for name in found["mixes"]])
     off = np.sqrt(np.square(apart - apart.mean(axis=0)).mean())
     size = np.sqrt(np.mean([np.square(value * put) for value in mixes.values()]))
-    light = sum(found["vignette"]) - (sum(own["vignette"]) if own is not None else 0.0)
-    told = f"corners {light:+.3f} octaves, put on {-corners * put:+.3f}"
+    octaves = sum(found["vignette"]) - (sum(own["vignette"]) if own is not None else 0.0)
+    told = f"corners {octaves:+.3f} octaves, put on {-corners * put:+.3f}"
     return f"| | mixes off by {off:.4f} of {size:.4f} | {told} | | | | |"
 
 

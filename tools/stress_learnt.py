@@ -81,8 +81,8 @@ def exposures(device: Device, rng: np.random.Generator, many: int) -> Result:
 
 
 def by_cameras(device: Device, rng: np.random.Generator, many: int) -> Result:
-    """Gains of 1/256 to 256, any mixes and vignettes to an eighth of the light taken from a photograph, and the
-    gradient by them, with principal points beside the picture."""
+    """Gains of 1/256 to 256, any mixes, and vignettes to where they are held, taken from a photograph, and the gradient
+    by them, with principal points beside the picture."""
     worst, work = {"developed": 0.0, "by cameras": 0.0}, Workspace(device)
     for _ in range(many):
         image, photograph = pictures(rng)
@@ -95,8 +95,7 @@ def by_cameras(device: Device, rng: np.random.Generator, many: int) -> Result:
         squared = ppisp.spread(width, height, (centre[0] * width, centre[1] * height))
         target = upload(device, padded(photograph))
         develop(device, Gains.on(device, entries), Gains.on(device, lenses), taken, target, width, height)
-        exponents = squared * (lenses[1, 0] + squared * (lenses[1, 1] + squared * lenses[1, 2].astype(float)))
-        within = np.abs(exponents) < MOST_FALLOFF
+        within = np.abs(np.log2(ppisp.light(lenses[1].astype(float), squared))) < MOST_FALLOFF
         wanted = ppisp.developed(photograph.astype(float), entries[1].astype(float), lenses[1].astype(float), squared)
         off = np.abs(cropped(target.get(), height, width) - wanted).max(axis=2)
         largest = np.maximum(

@@ -108,12 +108,12 @@ class PpispOfAll(GainsOfAll):
     def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
         super().__init__(config, device, scene)
         lenses = {lens: row for row, lens in enumerate(dict.fromkeys(view.lens for view in scene.train_views))}
-        self._lenses, self._taken = lenses, [self._of(row, view, lenses) for row, view in enumerate(scene.train_views)]
+        self._lenses = lenses
+        self._taken = [
+            Taken(row, lenses[view.lens], centre(view), not panorama(view))
+            for row, view in enumerate(scene.train_views)
+        ]
         self._vignettes = Gains.on(device, np.zeros((len(lenses), VIGNETTE), np.float32))
-
-    @staticmethod
-    def _of(row: int, view: View, lenses: Mapping[Any, int]) -> Taken:
-        return Taken(row, lenses[view.lens], centre(view), not panorama(view))
 
     @property
     def pixel_bytes(self) -> int:
@@ -144,9 +144,11 @@ class PpispOfAll(GainsOfAll):
         vignettes = self._vignettes.logs.get().astype(np.float64)
         usual = vignettes.mean(axis=0)
         for view, taken in zip(self._scene.train_views, self._taken, strict=True):
-            row = record["photographs"][view.name]
-            row |= {"mixes": colours[taken.photograph, 3:].tolist()}
-            row |= {"vignette": vignettes[taken.lens].tolist(), "centre": list(taken.centre)}
+            record["photographs"][view.name] |= {
+                "mixes": colours[taken.photograph, 3:].tolist(),
+                "vignette": vignettes[taken.lens].tolist(),
+                "centre": list(taken.centre),
+            }
         for view in self._scene.test_views:
             lens = self._lenses.get(view.lens)
             vignette = np.zeros(3) if panorama(view) else usual if lens is None else vignettes[lens]

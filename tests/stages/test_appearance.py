@@ -6,20 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
+from planes import padded
 from scipy.sparse import csr_array
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK, TILE
+from clsplat.device.layout import READBACK
 from clsplat.reference import appearance as reference
 from clsplat.stages.appearance import Gains, gain_gradient, remove_gains, step_gains
-
-
-def padded(image: np.ndarray) -> np.ndarray:
-    height, width, _ = image.shape
-    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
-    planes[:, :height, :width] = image.transpose(2, 0, 1)
-    return planes
 
 
 @pytest.mark.slow_in_groups

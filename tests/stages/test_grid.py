@@ -6,19 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
+from planes import padded
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK, TILE
+from clsplat.device.layout import READBACK
 from clsplat.reference import grid as reference
 from clsplat.stages.grid import SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
-
-
-def padded(image: np.ndarray) -> np.ndarray:
-    height, width, _ = image.shape
-    planes = np.full((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.nan, np.float32)
-    planes[:, :height, :width] = image.transpose(2, 0, 1)
-    return planes
 
 
 def some_grids(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -49,11 +43,11 @@ def test_a_grid_and_its_gradient(shaped_device: Device, width: int, height: int)
     by_seen = rng.normal(0.3, 1, image.shape).astype(np.float32)
     values = some_grids(rng, 3)
     work, grids = Workspace(shaped_device), Grids.on(shaped_device, values)
-    planes = upload(shaped_device, padded(image))
+    planes = upload(shaped_device, padded(image, np.nan))
     wide, held = image.astype(np.float64), values[1].astype(np.float64)
     seen = apply_grid(shaped_device, work, grids, 1, planes, width, height)
     assert_close(seen.get()[:, :height, :width].transpose(1, 2, 0), reference.apply(wide, held), absolute=2e-6)
-    gradient = upload(shaped_device, padded(by_seen))
+    gradient = upload(shaped_device, padded(by_seen, np.nan))
     by_grid = grid_gradient(shaped_device, work, grids, 1, planes, gradient, width, height, 10.0)
     wanted_image, wanted_grid = reference.gradient(wide, held, by_seen.astype(np.float64))
     assert_close_gradient(gradient.get()[:, :height, :width].transpose(1, 2, 0), wanted_image, 1e-5)
@@ -65,15 +59,15 @@ def test_a_grid_of_identities_changes_nothing(shaped_device: Device) -> None:
     image = np.random.default_rng(3).random((20, 30, 3)).astype(np.float32)
     work = Workspace(shaped_device)
     grids = Grids.on(shaped_device, reference.identity(SHAPE[:3])[None].astype(np.float32))
-    seen = apply_grid(shaped_device, work, grids, 0, upload(shaped_device, padded(image)), 30, 20)
+    seen = apply_grid(shaped_device, work, grids, 0, upload(shaped_device, padded(image, np.nan)), 30, 20)
     assert_close(seen.get()[:, :20, :30].transpose(1, 2, 0), image, relative=3e-7)
 
 
 def test_the_variations_gradient_alone(shaped_device: Device) -> None:
     values = some_grids(np.random.default_rng(4), 2)
     work, grids = Workspace(shaped_device), Grids.on(shaped_device, values)
-    planes = upload(shaped_device, padded(np.full((8, 8, 3), 0.4, np.float32)))
-    none = upload(shaped_device, padded(np.zeros((8, 8, 3), np.float32)))
+    planes = upload(shaped_device, padded(np.full((8, 8, 3), 0.4, np.float32), np.nan))
+    none = upload(shaped_device, padded(np.zeros((8, 8, 3), np.float32), np.nan))
     by_grid = grid_gradient(shaped_device, work, grids, 1, planes, none, 8, 8, 10.0)
     assert_close_gradient(by_grid.get(), 10 * reference.variation_gradient(values[1].astype(np.float64)), 1e-6)
 

@@ -9,10 +9,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
+from planes import padded
 
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import TILE
 from clsplat.images.reading import read_image
 from clsplat.reference.loss import l1_dssim
 from clsplat.stages.loss import loss, scratch_bytes
@@ -20,13 +20,6 @@ from clsplat.stages.target import target
 
 SIZES = ((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65))
 """Below and over the window's 11, vectors of 16 columns, blocks of 32 columns or rows."""
-
-
-def padded(image: np.ndarray) -> np.ndarray:
-    height, width, _ = image.shape
-    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
-    planes[:, :height, :width] = image.transpose(2, 0, 1)
-    return planes
 
 
 @pytest.mark.parametrize(

@@ -8,23 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
+from planes import padded
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK, TILE
+from clsplat.device.layout import READBACK
 from clsplat.reference import appearance, ppisp
 from clsplat.runs.appearance import held_out_looks, unmixing
 from clsplat.stages.appearance import Gains, step_gains
 from clsplat.stages.ppisp import COLOURS, VIGNETTE, Taken, camera_gradient, develop
 
 Array = np.ndarray
-
-
-def padded(image: Array) -> Array:
-    height, width, _ = image.shape
-    planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
-    planes[:, :height, :width] = image.transpose(2, 0, 1)
-    return planes
 
 
 def made_up(rng: np.random.Generator, photographs: int, lenses: int) -> tuple[Array, Array]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is learnt of photographs: trainings with it repeat to the last byte however they are done."""
+"""Appearances of photographs: trainings with them repeat to the last byte however they are done."""
 
 from __future__ import annotations
 

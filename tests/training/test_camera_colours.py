@@ -174,7 +174,7 @@ def test_a_checkpoint_of_other_lenses_is_refused(default_device: Device, scene: 
 
 
 def test_photographs_that_are_alike_are_left_so(default_device: Device, scene: Scene) -> None:
-    """What photographs have in common is the model's: the mean of all is 0 after each step, and no mix is large."""
+    """A common part of photographs is the model's: the mean of all is 0 after each step, and no mix is large."""
     trainer = Trainer(scene, replace(OF_CAMERAS, appearance_rate=1e-4), default_device)
     for _ in range(40):
         trainer.train_step()

@@ -114,9 +114,6 @@ EXPLORING = short(
 )
 """Moves, growth, penalties and noise."""
 
-EXPOSED = short(iterations=16, warmup=(2, 4), appearance="exposure")
-THROUGH_CAMERAS = short(iterations=16, warmup=(2, 4), appearance="ppisp")
-WITH_GRIDS = short(iterations=24, warmup=(2, 4), appearance="grid")
 MASKED = short(iterations=24, warmup=(2, 4), masks="ignore", alpha="transparent")
 """Masks at every size of the warm-up, and the alpha loss."""
 
@@ -137,28 +134,23 @@ MANY = short(
 """Gaussians that become so many that memory is a matter of them and not of the planes."""
 
 
+HOW = {
+    "at once": EVERYTHING,
+    "mcmc": EXPLORING,
+    "exposure": short(iterations=16, warmup=(2, 4), appearance="exposure"),
+    "ppisp": short(iterations=16, warmup=(2, 4), appearance="ppisp"),
+    "grid": short(iterations=24, warmup=(2, 4), appearance="grid"),
+    "masked": MASKED,
+    "depths": DEEP,
+    "cameras": REFINED,
+    "rays": RAYS,
+    "in pieces": MANY,
+    "in vectors of 1": EVERYTHING,
+}
+
+
 @pytest.mark.parametrize("word", quick(["NaN", "garbage"], "NaN"))
-@pytest.mark.parametrize(
-    "how",
-    quick(
-        [
-            "at once",
-            "mcmc",
-            "exposure",
-            "ppisp",
-            "grid",
-            "masked",
-            "depths",
-            "cameras",
-            "rays",
-            "in pieces",
-            "in vectors of 1",
-        ],
-        "at once",
-        "grid",
-        "depths",
-    ),
-)
+@pytest.mark.parametrize("how", quick(list(HOW), "at once", "grid", "depths"))
 def test_training_in_poisoned_memory(
     scene: Scene,
     many_points: Scene,
@@ -171,15 +163,7 @@ def test_training_in_poisoned_memory(
 ) -> None:
     device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
     pieces = how == "in pieces"
-    settings = {
-        "in pieces": MANY,
-        "mcmc": EXPLORING,
-        "exposure": EXPOSED,
-        "ppisp": THROUGH_CAMERAS,
-        "grid": WITH_GRIDS,
-        "masked": MASKED,
-    }
-    config = {**settings, "depths": DEEP, "cameras": REFINED, "rays": RAYS}.get(how, EVERYTHING)
+    config = HOW[how]
     scene = {"masked": masked, "depths": deep}.get(how, scene)
     found = []
     for value in ("", WORDS[word]):
