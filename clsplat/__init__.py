@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from clsplat.gaussians import Gaussians as Gaussians
     from clsplat.library.rasterize import rasterize as rasterize
     from clsplat.rendering.renderer import render as render
-    from clsplat.scenes.scene import load_scene as load_scene
+    from clsplat.scenes.loading import load_scene as load_scene
 
     __version__: str
 
@@ -33,7 +33,7 @@ _MODULES = {
     "Camera": "clsplat.camera",
     "Gaussians": "clsplat.gaussians",
     "TrainConfig": "clsplat.config.training",
-    "load_scene": "clsplat.scenes.scene",
+    "load_scene": "clsplat.scenes.loading",
     "rasterize": "clsplat.library.rasterize",
     "render": "clsplat.rendering.renderer",
     "train": "clsplat.api",

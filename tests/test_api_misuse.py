@@ -19,7 +19,8 @@ from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 FEW = short(iterations=2, report=False, density={"every": 0})
 

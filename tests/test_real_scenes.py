@@ -21,7 +21,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference.render import render as reference
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 BACKGROUND = (0.1, 0.2, 0.3)
 CAMERAS = {

@@ -38,7 +38,8 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.progress import aligned
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.limit import measure_limits
 from clsplat.training.trainer import Trainer
 

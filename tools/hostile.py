@@ -7,15 +7,18 @@ import json
 import os
 import random
 import struct
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from hostile_meshes import make_obj, make_usd_mesh, read_volume
+from other_pictures import KINDS, other_picture
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
 from clsplat.config.training import TrainConfig
@@ -27,8 +30,8 @@ from clsplat.models.formats import ply
 from clsplat.models.info import model_info
 from clsplat.runs import run as runs_run
 from clsplat.runs import settings as runs_settings
-from clsplat.scenes import colmap, sfm, sfm_photos, transforms
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes import colmap, point_files, sfm, sfm_photos
+from clsplat.scenes.loading import load_scene
 from clsplat.shots.read import choose_shot
 from clsplat.training import repro
 
@@ -84,6 +87,15 @@ def make_cloud(folder: Path, form: str) -> None:
 def make_model(folder: Path, name: str, **options: Any) -> None:
     """A model file of another format; options of its writer."""
     formats.save(folder / name, _gaussians(), **options)
+
+
+def make_zip(folder: Path, name: str) -> None:
+    """model.zip with a model of this name in a folder, compressed as downloads are."""
+    with zipfile.ZipFile(folder / "model.zip", "w", zipfile.ZIP_DEFLATED) as archive, TemporaryDirectory() as made:
+        make_model(Path(made), name)
+        for file in sorted(Path(made).iterdir()):
+            archive.write(file, f"model/{file.name}")
+        archive.writestr("__MACOSX/model/._x.ply", b"x")
 
 
 def make_ksplat(folder: Path) -> None:
@@ -231,6 +243,19 @@ def make_camera_path(folder: Path) -> None:
     (folder / "camera_path.json").write_text(json.dumps(document, indent=1))
 
 
+def make_cameras_json(folder: Path) -> None:
+    """The cameras that the 3DGS authors' code writes of a training, two of them."""
+    rows = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    lens = {"width": 24, "height": 18, "fy": 20.5, "fx": 20.5}
+    cameras = [
+        {"id": index, "img_name": f"{index:05d}", "position": [0.5, -2.0, index], "rotation": rows, **lens}
+        for index in range(2)
+    ]
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+
+
+UNREAD = ("pcx",)
+"""Of `other_pictures.KINDS` what OpenImageIO does not open."""
 FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
 
 
@@ -245,6 +270,11 @@ def make_image(folder: Path, extension: str) -> None:
     output = oiio.ImageOutput.create(str(path))
     if output is None or not output.open(str(path), spec) or not output.write_image(pixels) or not output.close():
         raise RuntimeError(f"{path}: cannot be written: {oiio.geterror()}")
+
+
+def make_other_image(folder: Path, kind: str) -> None:
+    """A picture of a kind that its name does not say."""
+    (folder / "picture.png").write_bytes(other_picture(kind))
 
 
 def make_run(folder: Path) -> None:
@@ -411,7 +441,7 @@ _ALL = (
         Reader(
             f"cloud-{form[:6]}",
             partial(make_cloud, form=form),
-            lambda f: transforms.read_point_cloud(f / "cloud.ply"),
+            lambda f: point_files.read_point_cloud(f / "cloud.ply"),
             ("cloud.ply",),
             (*BYTES, *LINES, *PLACES),
             2,
@@ -438,6 +468,7 @@ _ALL = (
             ("keys", make_camera_keys, "cameras.json"),
             ("path", make_camera_path, "camera_path.json"),
             ("poses", make_transforms, "transforms.json"),
+            ("inria", make_cameras_json, "cameras.json"),
         )
     ),
     *(
@@ -449,6 +480,18 @@ _ALL = (
             BYTES,
         )
         for extension in FORMATS
+    ),
+    *(
+        Reader(
+            f"other-{kind}",
+            partial(make_other_image, kind=kind),
+            partial(read_picture, extension="png"),
+            ("picture.png",),
+            BYTES,
+            0.3,
+        )
+        for kind in KINDS
+        if kind not in UNREAD
     ),
     Reader("config", make_run, read_run, ("run/config.toml",), (*BYTES, *LINES, *PLACES), 3),
     Reader("records", make_run, read_run, ("run/metrics.jsonl", "run/eval.json"), (*BYTES, *LINES, "json", *PLACES), 3),
@@ -510,6 +553,13 @@ _ALL += (
 )
 _ALL += (
     Reader("ksplat", make_ksplat, lambda f: read_model(f / "model.ksplat"), ("model.ksplat",), (*BYTES, *PLACES), 2),
+    *(
+        Reader(
+            f"zip-{name}", partial(make_zip, name=name), lambda f: read_model(f / "model.zip"), ("model.zip",), kinds, 1
+        )
+        for name in ("model.ply", "meta.json")
+        for kinds in ((*BYTES, "archive", *PLACES),)
+    ),
 )
 _ALL += tuple(
     Reader(f"mesh-{name[5:]}", make, lambda f, n=name: read_volume(f / n), (name,), (*BYTES, *LINES, *PLACES), weight)

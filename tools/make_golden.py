@@ -44,7 +44,7 @@ def write_loss_curve(path: Path) -> None:
     from tiny import loss_curve, write_scene
 
     from clsplat.device.context import open_device
-    from clsplat.scenes.scene import load_scene
+    from clsplat.scenes.loading import load_scene
 
     device = open_device()
     with tempfile.TemporaryDirectory() as folder:

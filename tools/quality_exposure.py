@@ -41,7 +41,8 @@ from clsplat.reference.ppisp import light, spread
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import unmixing
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene, View
 
 ROWS = {"clean": (False, False), "gains": (True, False), "clean, learnt": (False, True), "gains, learnt": (True, True)}
 """Rows of the table: whether gains are on the photographs, and whether appearance is learnt."""

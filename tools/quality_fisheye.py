@@ -39,7 +39,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.reference.cameras import cam_from_pixel, pixel_grid
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 
 RADIAL = (0.03, -0.012, 0.003, -0.0004)
 """Of the fisheye: a lens that is bent by a few pixels."""

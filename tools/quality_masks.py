@@ -42,7 +42,7 @@ from clsplat.images.alpha import composite
 from clsplat.images.reading import downscale, read_image
 from clsplat.images.writing import write_image
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 
 POINTS = (1000, 20_000)
 """Sparse and dense points of the turntable; training starts from the sparse ones."""

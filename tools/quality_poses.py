@@ -27,7 +27,8 @@ from clsplat.evaluation.held_out import evaluate
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import held_out_looks
-from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene, View
 from clsplat.training.cameras import aligned
 from clsplat.training.poses import Poses
 from clsplat.training.trainer import Trainer

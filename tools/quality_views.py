@@ -30,7 +30,8 @@ from clsplat.evaluation.held_out import evaluate
 from clsplat.images.writing import write_image
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.answers import changed
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 
 def picked(scene: Scene, count: int) -> Scene:

@@ -18,7 +18,7 @@ from clsplat.models.formats import is_model_name
 from clsplat.progress import Progress
 from clsplat.runs.run import run_of
 from clsplat.scenes.initialise import from_scene
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +70,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             resolution=config.resolution,
             test_every=config.test_every,
             lenses=config.lenses,
+            missing=config.missing,
             masks=masks,
             progress=progress,
         )

@@ -52,6 +52,9 @@ class Convert(Verb):
     """The file to write."""
     overwrite: Flag = False
     """Replace a file that is there, the source too."""
+    activated: Annotated[Literal["opacities", "scales", "both"] | None, arg(metavar="opacities|scales|both")] = None
+    """Take the source's opacities, 0 to 1 or 0 to 255, or its scales as they are, for a file that has them in place of
+    the logits and logs that belong there: a warning says where that seems so."""
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
@@ -110,7 +113,7 @@ def run(verb: Convert, services: Services) -> int:
     for companion in target_format.side_files(verb.target):
         check_new(companion, overwrite=verb.overwrite)
     options = _of_format(verb, target_format)
-    original, space = load(source), colour_space(source)
+    original, space = load(source, activated=verb.activated), colour_space(source)
     edited = _edited(verb, services, (source, original), [(path, load(path)) for path in merged], matrix)
     if not target_format.floats:
         edited = edit.without_empty_bands(edited)
@@ -326,7 +329,7 @@ def _measured(
     run = run_of(verb.source)
     own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
     masks = run.config.mask_use if run is not None and own else NO_MASKS
-    scene = load_scene(services, verb.scene, verb.resolution, verb.test_every, masks)
+    scene = load_scene(services, verb.scene, verb.resolution, verb.test_every, masks, missing="skip")
     renderer = services.renderer(services.require(device, FORWARD))
     background = background_colour(verb.background)
 

@@ -13,7 +13,7 @@ from tyro.conf import arg
 
 from clsplat.cli.options import DeviceOptions, Flag, OptionalInt, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, load_scene
-from clsplat.config.training import TrainConfig
+from clsplat.config.training import Missing, TrainConfig
 from clsplat.errors import CapacityError, InputError, warn
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ class Eval(Verb):
     """Every n-th view by name is held out, and measured. If not given: the run's setting, else 8."""
     resolution: OptionalInt = None
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
+    missing: Annotated[Missing | None, arg(metavar="few|skip|error")] = None
+    """Pictures that the scene lists and that are not there, as of train. If not given: the run's setting, else few."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians and behind images with alpha. If not given: the run's setting, else black."""
     corrected: Flag = False
@@ -83,7 +85,8 @@ def _evaluate(verb: Eval, services: Services) -> int:
     resolution = config.resolution if verb.resolution is None else verb.resolution
     test_every = config.test_every if verb.test_every is None else verb.test_every
     device = verb.device.open(services)
-    scene = load_scene(services, source, resolution, test_every, config.mask_use, config.lenses)
+    missing = verb.missing or config.missing
+    scene = load_scene(services, source, resolution, test_every, config.mask_use, config.lenses, missing)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")

@@ -75,8 +75,8 @@ class Render(Verb):
     or right."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder of a COLMAP model (cameras and images, bin or txt), or of a scene that holds one; a transforms.json, a
-    nerfstudio camera_path.json, a clsplat camera file (.json) or a USD stage. docs/cameras.md describes each. Not
-    needed with --path turntable or spiral."""
+    nerfstudio camera_path.json, a cameras.json of 3DGS, a clsplat camera file (.json) or a USD stage. docs/cameras.md
+    describes each. Not needed with --path turntable or spiral."""
     transform: Annotated[str | None, arg(metavar="FILE|STEPS|M00,M01,...")] = None
     """Place the model by a 4 x 4 matrix of rotation, one scale and translation: 16 numbers row by row, a file of them,
     steps in their order such as 'rotate=0,90,0 scale=2 translate=1,0,0', or a JSON file with key frames or a matrix a

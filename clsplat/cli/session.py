@@ -14,7 +14,7 @@ from clsplat.errors import warn
 from clsplat.progress import StageProgress
 
 if TYPE_CHECKING:
-    from clsplat.config.training import Lenses
+    from clsplat.config.training import Lenses, Missing
     from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
@@ -37,7 +37,7 @@ def imported(name: str) -> Callable[..., Any]:
 class Services:
     """The functions of the package that compute for the verbs. Tests hand in others."""
 
-    load_scene: Callable[..., Scene] = imported("clsplat.scenes.scene.load_scene")
+    load_scene: Callable[..., Scene] = imported("clsplat.scenes.loading.load_scene")
     findings: Callable[..., list[Finding]] = imported("clsplat.scenes.findings.findings")
     open_device: Callable[..., Device] = imported("clsplat.device.context.open_device")
     open_devices: Callable[..., list[Device]] = imported("clsplat.device.context.open_devices")
@@ -56,9 +56,10 @@ def load_scene(
     test_every: int,
     masks: MaskUse = NO_MASKS,
     lenses: Lenses = "undistort",
+    missing: Missing = "few",
 ) -> Scene:
     """The scene, with its warnings printed."""
-    how = {"resolution": resolution, "test_every": test_every, "masks": masks, "lenses": lenses}
+    how = {"resolution": resolution, "test_every": test_every, "masks": masks, "lenses": lenses, "missing": missing}
     scene = services.load_scene(path, **how, progress=StageProgress())
     for text in scene.warnings:
         warn(text)

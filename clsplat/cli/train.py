@@ -93,7 +93,6 @@ class Train(Verb):
 def _check_used(config: TrainConfig, given: Collection[str]) -> None:
     """Raise InputError for a flag of something that is not asked for."""
     for name, used, why, wanted in (
-        ("points_limit", config.points, "no points are given", "points FILE"),
         ("depth_unit", config.depth == "maps", "no depth maps are used", "depth maps"),
         ("depth_weight", config.depth != "none", "no depths are used", "depth"),
         ("pose_reach", config.refine_poses, "poses stay as given", "refine-poses"),
@@ -228,7 +227,9 @@ def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
     if config.points:  # structure from motion may come first, which takes its time
         with open_input(Path(config.points), "a cloud of points"):
             pass
-    scene = load_scene(services, source, config.resolution, config.test_every, config.mask_use, config.lenses)
+    scene = load_scene(
+        services, source, config.resolution, config.test_every, config.mask_use, config.lenses, config.missing
+    )
     if config.start_points:
         from clsplat.scenes.cloud import with_points
 

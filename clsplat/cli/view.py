@@ -134,7 +134,7 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
         return None
     try:
         how = {"resolution": config.resolution, "test_every": config.test_every, "lenses": config.lenses}
-        return services.load_scene(path, masks=config.mask_use, **how)
+        return services.load_scene(path, masks=config.mask_use, missing=config.missing, **how)
     except (InputError, OSError) as error:
         if given:
             raise

@@ -13,13 +13,14 @@ from typing import Literal
 from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
 from clsplat.config.depth import DepthSource, DepthUse, MapKind
 from clsplat.config.masks import AlphaMeaning, MaskMeaning, MaskUse
-from clsplat.config.points import PointsUse, StartPoints
+from clsplat.config.points import POINTS_OF_FILE, PointsUse, StartPoints
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
 Lenses = Literal["undistort", "native"]
+Missing = Literal["few", "skip", "error"]
 Perspective = Literal["auto", "plane", "rays"]
 Growth = Literal["paper", "budget", "mcmc"]
 AppearanceKind = Literal["none", "exposure", "ppisp", "grid"]
@@ -263,6 +264,9 @@ class TrainConfig:
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, the first too; 0 holds out none. A data set's own split goes first."""
+    missing: Missing = "few"
+    """Pictures that the scene lists and that are not there. few: up to a tenth of them are left out, with a warning,
+    and more are an error; skip: any number is left out; error: none may be missing. What is held out stays the same."""
     lenses: Lenses = "undistort"
     """Photographs of fisheyes: undistort, to the pinhole pictures that they hold; native: trained through their own
     lens, which sees all of them, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) always are."""
@@ -270,12 +274,13 @@ class TrainConfig:
     """Number of Gaussians to start from, at random places, where a scene has no points."""
     points: str = ""
     """File of points to start from, in the scene's frame: PLY (COLMAP's fused.ply too), or with the extra las LAS and
-    LAZ. Points without colours take those of the photographs that show them."""
+    LAZ. Points without colours take those of the photographs that show them. Of a scene without points a cloud beside
+    it is taken, such as points3d.ply."""
     points_use: PointsUse = "replace"
     """replace: the file's points stand in for the scene's own; join: they come in addition."""
-    points_limit: int = 200_000
-    """Most points to keep of the file: one for each voxel that has some, the mean of their places and colours, with
-    voxels as small as that leaves."""
+    points_limit: int = 0
+    """Most points to keep, of the file or else of the scene's own: one for each voxel that has some, the mean of their
+    places and colours, with voxels as small as that leaves. 0 keeps 200,000 of a file, and all of the scene's own."""
     sky: int = 0
     """Points of a sky to start from, at most, on a sphere around the scene, where photographs show nothing above the
     scene's points; 0 for none."""
@@ -348,9 +353,17 @@ class TrainConfig:
             (("lens_reach",), lambda value: 0 < value <= 50, "over 0 and at most 50 hundredths"),
             (("depth_unit",), lambda value: 0 < value < inf, "a finite number, more than 0"),
             (("iterations", "batch", "sh_degree_every", "random_points"), lambda value: value >= 1, "at least 1"),
-            (("points_limit",), lambda value: value >= 1, "at least 1"),
             (
-                ("seed", "frequency_steps", "resolution", "test_every", "checkpoint_every", "stages_every", "sky"),
+                (
+                    "seed",
+                    "frequency_steps",
+                    "resolution",
+                    "test_every",
+                    "checkpoint_every",
+                    "stages_every",
+                    "sky",
+                    "points_limit",
+                ),
                 lambda value: value >= 0,
                 "at least 0",
             ),
@@ -411,7 +424,8 @@ class TrainConfig:
     @property
     def start_points(self) -> StartPoints:
         """The points to start from beside or in place of the scene's own."""
-        return StartPoints(self.points, self.points_use, self.points_limit if self.points else 0, self.sky)
+        limit = self.points_limit or (POINTS_OF_FILE if self.points else 0)
+        return StartPoints(self.points, self.points_use, limit, self.sky)
 
     @property
     def random_background(self) -> bool:

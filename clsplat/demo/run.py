@@ -23,7 +23,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes import sfm
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 from clsplat.shots.generated import turntable
 
 PHOTOS = 40

@@ -16,6 +16,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from clsplat.config.checks import device_names
+from clsplat.device import forks
 from clsplat.device.account import Memory
 from clsplat.device.child import TIMEOUT, patience
 from clsplat.device.known import tell_once
@@ -51,7 +52,8 @@ class DeviceInfo:
 
 
 def all_devices() -> list[cl.Device]:
-    """Every OpenCL device that is visible, in the order of its index."""
+    """Every OpenCL device that is visible, in the order of its index. Raises DeviceError in a fork (`forks`)."""
+    forks.claim()
     try:
         platforms = cl.get_platforms()
     except cl.Error:
@@ -138,7 +140,7 @@ class Device:
         self.context = cl.Context([device])
         self.profile = profile
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
-        self.queue = cl.CommandQueue(self.context, device, properties)
+        self._queue = cl.CommandQueue(self.context, device, properties)
         self.calls = Calls()
         self.tapes: list[Tape] = []
         self.under_way: list[object] = []
@@ -147,10 +149,16 @@ class Device:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
-        self.recorder = Recorder(self.queue)
+        self.recorder = Recorder(self._queue)
         self.rehearsal = Rehearsal(device, self.index, self.shape.label)
         self._fma: list[dict[str, object]] = [] if traits.contraction else [{}]
         self._subgroups: list[dict[str, object]] = []
+
+    @property
+    def queue(self) -> cl.CommandQueue:
+        """The in-order queue. Raises DeviceError in a fork (`forks`)."""
+        forks.check()
+        return self._queue
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
         """The kernels of `stem`.cl in this device's shape, built at the first call."""

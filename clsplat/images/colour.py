@@ -55,6 +55,8 @@ CHROMATICITIES: dict[str, tuple[float, ...]] = {
 }
 """x and y of red, green, blue and white, of linear spaces, for EXR files: AP1 and AP0 by SMPTE ST 2065-1 and
 the Academy's S-2014-004, the others by their own standards."""
+MAX_LINE = 1 << 20
+"""Bytes of a line of a PLY's header."""
 _LINEAR_PHOTOS = (".exr", ".hdr")
 
 
@@ -66,9 +68,11 @@ def comment(space: str) -> str:
 def recorded_space(path: str | os.PathLike[str]) -> str:
     """The space that a model file's header records, sRGB where it records none."""
     with open(path, "rb") as file:
-        for line in iter(lambda: file.readline(4097), b""):  # not `in file`: other formats have no lines
+        if file.readline(16).strip() != b"ply":
+            return SRGB
+        for line in iter(lambda: file.readline(MAX_LINE + 1), b""):  # not `in file`: what is behind a header has none
             words = line.decode("ascii", "replace").strip()
-            if words == "end_header" or len(line) > 4096:
+            if words == "end_header" or len(line) > MAX_LINE:
                 break
             kind, _, rest = words.partition(" ")
             if kind in ("comment", "obj_info") and rest.startswith(_COMMENT):

@@ -14,10 +14,11 @@ import struct
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import OpenImageIO as oiio
+from numpy.typing import NDArray
 from scipy import sparse
 
 from clsplat.arrays import Float32
@@ -27,6 +28,8 @@ from clsplat.images.alpha import associate, unassociate
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
 """Extensions of pictures when a folder is searched, in lower case. Named files may be anything OpenImageIO reads."""
+
+T = TypeVar("T", bound=np.generic)
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_PIXELS = 1 << 28
@@ -57,9 +60,9 @@ _COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
 def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
     """Those of `paths` that go with one of the pictures and are none: masks, depths, normals and the like.
 
-    Their names tell. Such a word stands behind a picture's name (r_0_depth_0001.png), before it (mask_r_0.png) or in
-    place of "color" (frame-1.color.jpg, frame-1.depth.png). COLMAP's masks have .png behind the picture's extension.
-    Whatever is in a sub-folder of `folder` that is called by such a word counts too.
+    Their names tell, in any case. Such a word stands behind a picture's name (r_0_depth_0001.png), before it
+    (mask_r_0.png) or in place of "color" (frame-1.color.jpg, frame-1.depth.png). COLMAP's masks have .png behind the
+    picture's extension. Whatever is in a sub-folder of `folder` that is called by such a word counts too.
     """
     pictures = list(pictures)
 
@@ -70,24 +73,25 @@ def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) ->
     folders = {picture.parent for picture in pictures}
     others = [picture for picture in pictures if not is_beside(picture)]
     pictures, alone = others or pictures, not others
-    names = {picture.name for picture in pictures}
-    stems = {picture.stem for picture in pictures} | names
+    names = {picture.name.casefold() for picture in pictures}
+    stems = {picture.stem.casefold() for picture in pictures} | names
     stems |= {_COLOUR.sub("", stem) for stem in stems}
     return {
         path
         for path in paths
-        if (is_beside(path) and not (path.parent in folders and (alone or path.stem not in stems)))
+        if (is_beside(path) and not (path.parent in folders and (alone or path.stem.casefold() not in stems)))
         or _goes_with(path, names, stems)
     }
 
 
 def _goes_with(path: Path, names: set[str], stems: set[str]) -> bool:
-    if path.stem in names and path.suffix.lower() == ".png":
+    stem = path.stem.casefold()
+    if stem in names and path.suffix.lower() == ".png":
         return True
-    before = _COMPANION_BEFORE.match(path.stem)
-    if before and path.stem[before.end() :] in stems:
+    before = _COMPANION_BEFORE.match(stem)
+    if before and stem[before.end() :] in stems:
         return True
-    return any(path.stem[:at] in stems and _COMPANION_AFTER.fullmatch(path.stem, at) for at in range(1, len(path.stem)))
+    return any(stem[:at] in stems and _COMPANION_AFTER.fullmatch(stem, at) for at in range(1, len(stem)))
 
 
 def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
@@ -117,12 +121,6 @@ def cannot_be_searched(error: OSError) -> None:
     raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
 
-def require_images(paths: Iterable[Path], listed_in: Path) -> None:
-    """Raise InputError that names the files of `paths` that do not exist; `listed_in` names the list."""
-    if missing := [path for path in paths if not is_file(path)]:
-        raise InputError(f"{listed_in}: lists {len(missing)} image(s) that are missing: {examples(missing)}")
-
-
 def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
     """Width and height from the header, without decoding the pixels, as `read_image` would give them.
 
@@ -137,6 +135,15 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
     if source.format_name() == "png":
         _check_png_is_whole(path)
     return (height, width) if orient and _orientation(spec) >= 5 else (width, height)
+
+
+def stored_range(path: Path) -> tuple[int, bool]:
+    """Largest whole number that a file's pixels can hold, 0 for floats, and whether these numbers are what was written:
+    JPEG's are about that. Raises InputError."""
+    source = open_image(path)
+    dtype, kind = np.dtype(str(source.spec().format)), source.format_name()
+    source.close()
+    return (int(np.iinfo(dtype).max) if dtype.kind == "u" else 0), kind not in ("jpeg", "jpeg2000", "webp")
 
 
 def read_image(path: Path, *, orient: bool = True) -> Float32:
@@ -159,7 +166,10 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     source.close()
     if pixels is None or (reason and not any(harmless in reason for harmless in HARMLESS)):
         raise InputError(f"{path}: does not decode: {one_line(reason)}; copy the picture again or leave it out")
-    pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
+    pixels = np.asarray(pixels, np.float32)
+    if pixels.size != spec.height * spec.width * spec.nchannels:
+        raise InputError(f"{path}: does not decode: its header and its pixels are of different sizes; save it again")
+    pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     image = _as_rgb(path, pixels, spec)
     if not np.isfinite(image).all():
         count = int(np.count_nonzero(~np.isfinite(image).all(axis=2)))
@@ -168,7 +178,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
         image = _display_window(image, spec)
     if image.shape[2] == 4 and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
         image = unassociate(image)
-    return np.ascontiguousarray(_reorient(image, _orientation(spec)) if orient else image)
+    return np.ascontiguousarray(turned(image, _orientation(spec)) if orient else image)
 
 
 def downscale(image: Float32, width: int, height: int) -> Float32:
@@ -188,6 +198,34 @@ def downscale(image: Float32, width: int, height: int) -> Float32:
     result = (_resampling(columns, width) @ half).reshape(width, height, channels).transpose(1, 0, 2)
     result = np.ascontiguousarray(result, np.float32)
     return unassociate(result) if has_alpha else result
+
+
+def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
+    """The image turned by EXIF orientations 1 to 8: from 5 on rows and columns change places, then the axes are
+    flipped."""
+    if orientation >= 5:
+        image = image.transpose(1, 0, 2)
+    if orientation in (3, 4, 7, 8):
+        image = image[::-1]
+    if orientation in (2, 3, 6, 7):
+        image = image[:, ::-1]
+    return image
+
+
+def channels_of(spec: Any) -> list[str]:
+    """Names of the channels in upper case, one each; a decoder's list may be shorter or longer than its pixels are
+    deep."""
+    names = [name.upper() for name in spec.channelnames][: spec.nchannels]
+    return names + [""] * (spec.nchannels - len(names))
+
+
+def alpha_of(spec: Any) -> int:
+    """Index of the alpha channel, -1 for none. That of a decoder may be no channel (OpenImageIO's of GIF is 4 of 4),
+    or one of colour; then names tell."""
+    names, index = channels_of(spec), int(spec.alpha_channel)
+    if 0 <= index < len(names) and names[index] not in ("R", "G", "B", "Y", "I"):
+        return index
+    return names.index("A") if index >= 0 and "A" in names else -1
 
 
 def open_image(path: Path) -> Any:
@@ -259,21 +297,8 @@ def _orientation(spec: Any) -> int:
     return value if 1 <= value <= 8 else 1
 
 
-def _reorient(image: Float32, orientation: int) -> Float32:
-    """The image turned by EXIF orientations 1 to 8: from 5 on rows and columns change places, then the axes are
-    flipped."""
-    if orientation >= 5:
-        image = image.transpose(1, 0, 2)
-    if orientation in (3, 4, 7, 8):
-        image = image[::-1]
-    if orientation in (2, 3, 6, 7):
-        image = image[:, ::-1]
-    return image
-
-
 def _as_rgb(path: Path, pixels: Float32, spec: Any) -> Float32:
-    names = [name.upper() for name in spec.channelnames]
-    alpha = int(spec.alpha_channel)
+    names, alpha = channels_of(spec), alpha_of(spec)
     if all(name in names for name in "RGB"):
         colour = [names.index(name) for name in "RGB"]
     else:

@@ -152,8 +152,12 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILAR) ->
     upright = np.allclose(turn, np.eye(3), rtol=0, atol=1e-12)  # what float64 makes of no rotation
     linear = scale * turn
     origin = linear @ gaussians.origin + shift
-    means = gaussians.means.astype(np.float64) @ linear.T
-    if np.linalg.norm(origin) <= FAR * float(means.std(axis=0).max()):
+    with np.errstate(invalid="ignore"):  # of a file's values that are not finite, whose Gaussians will be left out
+        means = gaussians.means.astype(np.float64) @ linear.T
+        spread = float(means.std(axis=0).max())
+        if np.isnan(spread) and (finite := np.isfinite(means).all(axis=1)).any():
+            spread = float(means[finite].std(axis=0).max())
+    if np.linalg.norm(origin) <= FAR * spread:
         means, origin = means + origin, np.zeros(3)
     return Gaussians(
         means.astype(np.float32),

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import NEAR
+from clsplat.errors import warn
 from clsplat.files import is_file
 from clsplat.gaussians import Gaussians
+from clsplat.models.codec import soundness
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import Format, resolve
 
@@ -30,10 +32,10 @@ def model_info(path: Path) -> dict[str, Any]:
     else:
         model = form.read(path)
         blocks = iter([replace(model, means=packing.world_means(model).astype(np.float32))])
-    result |= form.describe(path)
-    result |= _summary(blocks)
+    result |= {"loses": form.loses} | form.describe(path)
+    result |= _summary(blocks, path)
     result["colorspace"] = form.space(path)
-    result["loses"] = form.loses
+    result["loses"] = result.pop("loses")  # the last
     return result
 
 
@@ -42,14 +44,14 @@ def size(path: Path, form: Format) -> int:
     return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 
-def _summary(blocks: Iterator[Gaussians]) -> dict[str, Any]:
-    """Everything but SH is held for the percentiles, 28 bytes a Gaussian."""
+def _summary(blocks: Iterator[Gaussians], path: Path) -> dict[str, Any]:
+    """Everything but SH is held for the percentiles, 28 bytes a Gaussian. Warns of doubtful values, as loading does."""
     parts: list[list[Float32]] = []
     not_finite = degree = used = 0
     for block in blocks:
         degree, origin = block.sh_degree, block.origin
-        finite = [np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in block.arrays().values()]
-        good = np.logical_and.reduce(finite)
+        soundness.mend(block)
+        good = soundness.finite_rows(block)
         not_finite += int((~good).sum())
         used = max([used, *(band for band in range(1, degree + 1) if block.sh[:, band**2 : (band + 1) ** 2].any())])
         parts.append([array[good] for array in (block.means, block.log_scales, block.opacity_logits)])
@@ -57,6 +59,8 @@ def _summary(blocks: Iterator[Gaussians]) -> dict[str, Any]:
     result: dict[str, Any] = {"gaussians": len(m) + not_finite, "not_finite": not_finite}
     result |= {"sh_degree": degree, "sh_degree_used": used}
     if len(m):
+        for doubt in soundness.doubts(o, s):
+            warn(f"{path}: {doubt}")
         low, high = m.min(axis=0).astype(np.float64), m.max(axis=0).astype(np.float64)
         inner = np.percentile(m, (1, 99), axis=0)
         result["bounds"] = {"min": low.tolist(), "max": high.tolist(), "extent": float(np.linalg.norm(high - low))}
@@ -84,7 +88,12 @@ def text(info: dict[str, Any]) -> str:
         ("format", ", ".join([info["format"], *details])),
         ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian"),
     ]
-    lines.append(("Gaussians", f"{count:,}" + (f", {info['not_finite']:,} not finite" if info["not_finite"] else "")))
+    lines.append(
+        (
+            "Gaussians",
+            f"{count:,}" + (f", {info['not_finite']:,} not finite, which are left out" if info["not_finite"] else ""),
+        )
+    )
     used = info["sh_degree_used"]
     only = "" if used == info["sh_degree"] else f", zero beyond {used}"
     lines.append(("SH degree", f"{info['sh_degree']}{only}"))

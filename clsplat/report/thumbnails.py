@@ -25,8 +25,10 @@ from clsplat.images.colour import displayed, photos_space
 from clsplat.images.reading import downscale, read_image
 from clsplat.images.writing import write_spec
 from clsplat.runs.run import Run
+from clsplat.scenes.layouts import detect
+from clsplat.scenes.loading import load_scene
 from clsplat.scenes.masks import after_sfm
-from clsplat.scenes.scene import Scene, View, detect, load_scene
+from clsplat.scenes.scene import Scene, View
 
 MAX_SIDE = 640
 """Pixels of the longer side in a page."""
@@ -79,6 +81,7 @@ def scene_of(run: Run) -> Scene | str:
             test_every=run.config.test_every,
             masks=masks,
             lenses=run.config.lenses,
+            missing=run.config.missing,
         )
     except (InputError, OSError) as error:
         return f"the scene cannot be read ({str(error).replace(str(source), source.name)})"

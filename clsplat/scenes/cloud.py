@@ -1,24 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds of points to start from: read from PLY, LAS and LAZ, checked against the cameras, thinned by voxels."""
+"""Clouds of points to start from: checked against the cameras, thinned by voxels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float64
 from clsplat.config.points import StartPoints
-from clsplat.errors import InputError
-from clsplat.files import open_input
-from clsplat.images.reading import one_line
+from clsplat.errors import InputError, warn
 from clsplat.scenes.data_set import pixels_of
-from clsplat.scenes.initialise import UNSEEN, of_one_colour
+from clsplat.scenes.initialise import UNSEEN
+from clsplat.scenes.point_files import Cloud, read_cloud
 from clsplat.scenes.sky import sky_points
-from clsplat.scenes.transforms import read_point_cloud
+from clsplat.scenes.strays import FACTOR, MOST_POINTS, strays
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
@@ -35,15 +34,6 @@ CLOSE = 0.02
 """Part by which the voxel is at most larger than it need be."""
 CELLS = 1 << 20
 """Voxels along the longest side of the box, at most: three such numbers are one of 64 bits."""
-LAS = (".las", ".laz")
-
-
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """points (N, 3) float64 in the world; colors (N, 3) float32 in [0, 1], None where the file has none."""
-
-    points: Float64
-    colors: Float32 | None
 
 
 def with_points(scene: Scene, start: StartPoints) -> Scene:
@@ -58,6 +48,9 @@ def with_points(scene: Scene, start: StartPoints) -> Scene:
         path = Path(start.file)
         cloud = read_cloud(path)
         check_place(cloud.points, scene, path)
+        kept = without_stray_points(cloud.points, scene, path)
+        if not kept.all():
+            cloud = Cloud(cloud.points[kept], None if cloud.colors is None else cloud.colors[kept])
         cloud = thinned(cloud, start.limit)
         own_colors = np.full(cloud.points.shape, UNSEEN, np.float32) if cloud.colors is None else cloud.colors
         own_grey = np.full(len(cloud.points), cloud.colors is None)
@@ -66,6 +59,10 @@ def with_points(scene: Scene, start: StartPoints) -> Scene:
         else:
             points, colors = np.concatenate([points, cloud.points]), np.concatenate([colors, own_colors])
             grey = np.concatenate([grey, own_grey])
+    elif start.limit:
+        own = thinned(Cloud(points, colors), start.limit)
+        assert own.colors is not None
+        points, colors, grey = own.points, own.colors, np.zeros(len(own.points), np.bool_)
     if start.sky:
         sky, shade = sky_points(scene, start.sky)
         points, colors = np.concatenate([points, sky]), np.concatenate([colors, shade])
@@ -73,50 +70,35 @@ def with_points(scene: Scene, start: StartPoints) -> Scene:
     return replace(scene, points=points, point_colors=colors, colourless=grey if grey.any() else None, start=start)
 
 
-def read_cloud(path: Path) -> Cloud:
-    """Read a PLY (ascii or binary), LAS or LAZ. Raises InputError for what is none, or has no points."""
-    if path.suffix.lower() in LAS:
-        cloud = _read_las(path)
-    else:
-        with open_input(path, "a cloud of points") as file:
-            head = file.read(4)
-        if head == b"LASF":
-            cloud = _read_las(path)
-        elif not head.startswith(b"ply"):
-            raise InputError(f"{path}: begins as no PLY, LAS or LAZ, expected a cloud of points in one of these")
-        else:
-            points, colors = read_point_cloud(path)
-            cloud = Cloud(points, None if of_one_colour(colors) else colors)
-    if len(cloud.points) == 0:
-        raise InputError(f"{path}: holds no points, expected at least one")
-    return cloud
+def with_cloud_beside(scene: Scene) -> Scene:
+    """A scene without points, with those of the first file beside it that has some where its cameras look; itself where
+    there is none. Warns of files that do not read, or lie elsewhere."""
+    for index, path in enumerate(scene.clouds):
+        try:
+            cloud = read_cloud(path)
+            check_place(cloud.points, scene, path)
+        except InputError as error:
+            warn(f"{error}; it is not used")
+            continue
+        warn(f"{path}: its {len(cloud.points):,} points are started from, as the scene names none")
+        colors = np.full(cloud.points.shape, UNSEEN, np.float32) if cloud.colors is None else cloud.colors
+        return replace(scene, points=cloud.points, point_colors=colors, clouds=scene.clouds[index + 1 :])
+    return scene
 
 
-def _read_las(path: Path) -> Cloud:
-    """A LAS or LAZ, through laspy."""
-    with open_input(path, "a cloud of points") as file:
-        if file.read(4) != b"LASF":
-            raise InputError(f"{path}: begins as no LAS or LAZ, expected one by its name")
-    try:
-        import laspy
-    except ImportError:
-        raise InputError(f"{path}: LAS needs laspy, expected it installed: pip install 'clsplat[las]'") from None
-    try:
-        las: Any = laspy.read(path)
-        points = np.stack([np.asarray(las[axis], np.float64) for axis in "xyz"], axis=1)
-        names = set(las.point_format.dimension_names)
-        colors = None
-        if {"red", "green", "blue"} <= names:
-            levels = np.stack([np.asarray(las[name], np.float32) for name in ("red", "green", "blue")], axis=1)
-            most = levels.max(initial=0)
-            if most > 0 and not of_one_colour(levels):
-                colors = np.asarray(levels / np.float32(255 if most < 256 else 65535), np.float32)
-    except Exception as error:  # noqa: BLE001  # laspy raises its own, those of struct and NumPy, and LAZ's decoder panics
-        why = one_line(f"{type(error).__name__}: {error}")
-        raise InputError(f"{path}: does not read as LAS or LAZ ({why}); export it again") from None
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: holds positions that are not finite")
-    return Cloud(points, colors)
+def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArray[np.bool_]:
+    """(N,): False for points (N, 3) that are strays beside the others and the scene's cameras. Warns of them; where:
+    what they are of."""
+    middle, spread, _ = scene.spread
+    kept = ~strays(points, MOST_POINTS, spread, middle)
+    if not kept.all():
+        far = points[~kept]
+        first = " ".join(f"{value:.4g}" for value in far[0])
+        warn(
+            f"{where}: {len(far):,} of {len(points):,} points lie over {FACTOR:g} times as far off as the others, such "
+            f"as {first}, and are left out"
+        )
+    return kept
 
 
 def check_place(points: Float64, scene: Scene, path: Path) -> None:

@@ -7,6 +7,7 @@ takes a cut cameras.bin for a good one and goes on with what it did not read. He
 
 from __future__ import annotations
 
+import codecs
 import io
 import math
 import os
@@ -15,7 +16,7 @@ import struct
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
@@ -28,8 +29,20 @@ from clsplat.camera import Camera
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
+from clsplat.models.codec.values import full_scale
 from clsplat.rotations import rotation_from_quaternion
-from clsplat.scenes.data_set import MAX_NUMBER, DataSet, Lens, PosedImage, cameras_of, check_lens, models
+from clsplat.scenes.camera_checks import cameras_of
+from clsplat.scenes.data_set import (
+    MAX_NUMBER,
+    DataSet,
+    Lens,
+    PosedImage,
+    check_lens,
+    given_in_parts,
+    in_pixels,
+    models,
+)
+from clsplat.scenes.picture_names import is_legible, legible, slashed
 
 STEMS = ("cameras", "images", "points3D")
 COUNT = struct.Struct("<Q")
@@ -43,6 +56,7 @@ NEWER = 60.0
 and programs that copy them, are done with the second sooner."""
 ANNOUNCED = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
 POSE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+POINT = "POINT3D_ID X Y Z R G B ERROR TRACK"
 EXPECTED = "a file of a COLMAP model"
 
 
@@ -95,7 +109,7 @@ def read_images(folder: Path) -> list[PosedImage]:
     model = find_model(Path(folder))
     if model is None:
         raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
-    return _read_posed_images(model)
+    return [replace(image, name=legible(image.name)) for image in _read_posed_images(model)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +127,7 @@ def read_tracks(folder: Path) -> Tracks:
     as `read_model`."""
     path = _require(folder, "images")
     rows = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
-    names = {key: name for key, name, *_ in rows}
+    names = {key: _named(path, name) for key, name, *_ in rows}
     path = _require(folder, "points3D")
     places, errors, images, lengths = array("d"), array("d"), array("q"), array("q")
     for place, error, seen in _binary_tracks(path) if path.suffix == ".bin" else _text_tracks(path):
@@ -134,7 +148,16 @@ def safe_name(name: str) -> bool:
     """True if a name from a file stays inside the folder it is relative to."""
     path, windows = PurePosixPath(name), PureWindowsPath(name)
     inside = not path.is_absolute() and not windows.anchor and ".." not in windows.parts
-    return bool(path.parts) and inside and name.isprintable()
+    return bool(path.parts) and inside and is_legible(name)
+
+
+def _named(path: Path, name: str) -> str:
+    """A picture's name; of an absolute one what is behind the drive or the root, which is found by its ending. Raises
+    InputError for one that leads out of the images' folder."""
+    inner = name if safe_name(name) else slashed(name)
+    if not safe_name(inner):
+        raise corrupt(path, f"an image has the name {name[:80]!r}, expected a path inside the images' folder")
+    return inner
 
 
 class _Binary:
@@ -168,10 +191,7 @@ class _Binary:
         if len(raw) == min(MAX_NAME_BYTES, self.left):
             raise corrupt(self.path, f"{self.doing} has a name without an end")
         self.left -= len(raw) + 1
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise corrupt(self.path, f"{self.doing} has the name {raw[:40]!r}, expected UTF-8") from None
+        return raw.decode("utf-8", "surrogateescape")  # the system's code page on Windows: `picture_names`
 
 
 def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
@@ -252,10 +272,14 @@ def _check_count(path: Path, count: int) -> None:
 def _read_cameras(folder: Path) -> dict[int, Lens]:
     path = _require(folder, "cameras")
     lenses: dict[int, Lens] = {}
+    in_parts = []
     for key, lens in _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path):
         if key in lenses:
             raise corrupt(path, f"camera {key} is there twice")
-        lenses[key] = check_lens(lens, f"{path}: camera {key}")
+        lenses[key], parts = in_pixels(check_lens(lens, f"{path}: camera {key}"))
+        in_parts += [key] if parts else []
+    if in_parts:
+        warn(f"{path}: {given_in_parts(f'camera {key}' for key in in_parts)}")
     _check_count(path, len(lenses))
     return lenses
 
@@ -283,11 +307,10 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
     path = _require(folder, "images")
     images: dict[str, PosedImage] = {}
-    for _, name, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
+    for _, given, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
         if camera not in lenses:
-            raise corrupt(path, f"image {name[:80]!r} has the camera {camera}, which is not in the model")
-        if not safe_name(name):
-            raise corrupt(path, f"an image has the name {name[:80]!r}, expected a path inside the images' folder")
+            raise corrupt(path, f"image {given[:80]!r} has the camera {camera}, which is not in the model")
+        name = _named(path, given)
         if name in images:
             raise corrupt(path, f"image {name} is there twice")
         quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
@@ -348,12 +371,15 @@ def _read_points(folder: Path) -> tuple[Float64, Float32]:
     table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
     _check_count(path, len(table))
     near = (np.abs(table[:, :3]) < MAX_NUMBER).all(axis=1)
-    good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all(axis=1)
+    good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 65535)).all(axis=1)
     if not good.all():
         index = int(np.argmin(good))
         trouble = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
         raise corrupt(path, f"{trouble}, expected finite numbers and colours 0 to 255")
-    return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3:] / 255, np.float32)
+    levels = table[:, 3:]
+    whole = bool((levels == np.rint(levels)).all())  # text may have parts of 1, or 16 bits
+    white = full_scale(levels.astype(np.int64) if whole else levels)
+    return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(levels / white, np.float32)
 
 
 def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
@@ -366,11 +392,11 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
     for number, line in _lines(path):
-        with _parsing(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
-            _, x, y, z, red, green, blue, _, *track = line.split(maxsplit=8)
-            if track and len(track[0].split()) % 2:
+        with _parsing(path, number, POINT):
+            _, x, y, z, red, green, blue, *others = line.split(maxsplit=8)  # some tools leave error and track out
+            if len(others) == 2 and len(others[1].split()) % 2:
                 raise ValueError("a track is of pairs")
-            yield float(x), float(y), float(z), float(int(red)), float(int(green)), float(int(blue))
+            yield float(x), float(y), float(z), float(red), float(green), float(blue)
 
 
 def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
@@ -385,15 +411,19 @@ def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple
 
 def _text_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
     for number, line in _lines(path):
-        with _parsing(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK"):
-            _, x, y, z, _, _, _, error, *track = line.split()
-            yield (float(x), float(y), float(z)), float(error), tuple(map(int, track[::2]))
+        with _parsing(path, number, POINT):
+            _, x, y, z, _, _, _, *others = line.split()
+            error = float(others[0]) if others else 0.0
+            yield (float(x), float(y), float(z)), error, tuple(map(int, others[1::2]))
 
 
 def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Line numbers and lines, without comments."""
     with open_input(path, EXPECTED) as opened:
-        file, number = io.TextIOWrapper(opened, encoding="utf-8-sig"), 0
+        wide = opened.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # as PowerShell redirects
+        opened.seek(0)
+        encoding, errors = ("utf-16", "strict") if wide else ("utf-8-sig", "surrogateescape")
+        file, number = io.TextIOWrapper(opened, encoding=encoding, errors=errors), 0
         try:
             while line := file.readline(MAX_LINE):
                 number += 1
@@ -403,7 +433,7 @@ def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]
                 if not text.startswith("#") and (text or keep_empty):
                     yield number, text
         except UnicodeDecodeError:
-            raise corrupt(path, "is not text in UTF-8") from None
+            raise corrupt(path, "is not text in UTF-8 or UTF-16") from None
 
 
 @contextmanager

@@ -8,7 +8,7 @@ The models and their formulas are COLMAP's, evaluated by pycolmap (`Camera.img_f
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from scipy import ndimage
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
-from clsplat.errors import InputError, examples, warn
+from clsplat.errors import InputError, examples
 from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
@@ -38,13 +38,25 @@ RADIAL: dict[str, int] = {
 }
 """Models of fisheyes that a camera can be without undistortion, and their numbers of coefficients."""
 PANORAMA = "EQUIRECTANGULAR"
+TWO_FOCAL = {
+    "SIMPLE_PINHOLE": ("PINHOLE", 0),
+    "SIMPLE_RADIAL": ("OPENCV", 4),
+    "RADIAL": ("OPENCV", 4),
+    "SIMPLE_DIVISION": ("DIVISION", 1),
+    "SIMPLE_FISHEYE": ("FISHEYE", 0),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 4),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 4),
+}
+"""Models with one focal length: that which has two, and its number of coefficients, of which these have the first."""
 
 MAX_SIZE = 1 << 20
 """Pixels a side; larger is a damaged file. Also keeps width times height far from overflow."""
 MAX_NUMBER = 1e30
 """Coordinates beyond it are damage; their squares are still finite."""
-BENT = 0.5
-"""Half widths or heights of the picture by which a lens may move what is at its edge."""
+SHORTEST = 1 / 20
+"""Focal length, in the picture's longer side, under which no lens is: a fisheye of 220 degrees has 1/4."""
+SMALLEST = 16
+"""Pixels of the shorter side from which on a principal point in the first pixel is odd."""
 
 
 @cache
@@ -79,6 +91,17 @@ class Lens:
         camera = self._camera()
         bends = self.model in ("FOV", "EUCM", PANORAMA) or "FISHEYE" in self.model
         return not bends and not any(self.params[index] for index in camera.extra_params_idxs())
+
+    @property
+    def focal(self) -> float:
+        """The shortest focal length in pixels."""
+        return min(float(self.params[index]) for index in self._camera().focal_length_idxs())
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """The principal point in pixels."""
+        x, y = (self.params[index] for index in self._camera().principal_point_idxs())
+        return x, y
 
     def pinhole(self, rotation: Float64, translation: Float64) -> Camera:
         """The pinhole camera that the picture becomes once undistorted, with the pose of the original.
@@ -124,11 +147,16 @@ class Lens:
         return Camera(self.width, self.height, *focal, *centre, rotation, translation)
 
     def resized(self, width: int, height: int) -> Lens:
-        """The same lens on another pixel grid."""
+        """The same lens on another pixel grid; where that is uneven, of the model with two focal lengths."""
         if self.model == PANORAMA:
             return Lens(self.model, width, height, (float(width), float(height)))
-        camera = self._camera()
         sx, sy = width / self.width, height / self.height
+        if self.model in TWO_FOCAL and abs(sx - sy) * max(self.width, self.height) > 1:
+            model, rest = TWO_FOCAL[self.model]
+            coefficients = [*self.params[3:], *[0.0] * rest][:rest]
+            both = (self.params[0], *self.params[:3], *coefficients)
+            return replace(self, model=model, params=both).resized(width, height)
+        camera = self._camera()
         params = list(self.params)
         focal, principal = list(camera.focal_length_idxs()), list(camera.principal_point_idxs())
         for indices in (focal, principal):
@@ -182,25 +210,15 @@ class PosedImage:
 @dataclass(eq=False)
 class DataSet:
     """points (N, 3) float64 in the world; colors (N, 3) float32 in [0, 1]; box: instant-ngp's volume, the corners
-    (low, high), world units, or None."""
+    (low, high), world units, or None; missing: names of pictures that are listed and left out, as they are not there;
+    clouds: files of points that the data set does not name, the first to be taken where there are no points."""
 
     images: list[PosedImage]
     points: Float64 = field(default_factory=lambda: np.empty((0, 3)))
     colors: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
     box: tuple[Float64, Float64] | None = None
-
-
-def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """The cameras that the images become, as of `Lens.camera`, at full size, by name. Warns of lenses beyond reason."""
-    if doubt := absurd([(image.name, image.lens) for image in images]):
-        warn(doubt)
-    by_lens = {
-        lens: lens.camera(np.eye(3), np.zeros(3), lenses) for lens in dict.fromkeys(image.lens for image in images)
-    }
-    return {
-        image.name: replace(by_lens[image.lens], rotation=image.rotation, translation=image.translation)
-        for image in images
-    }
+    missing: list[str] = field(default_factory=list)
+    clouds: list[Path] = field(default_factory=list)
 
 
 def check_lens(lens: Lens, where: str) -> Lens:
@@ -229,32 +247,30 @@ def check_lens(lens: Lens, where: str) -> Lens:
     return lens
 
 
-def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
-    """A warning of the pictures whose lens bends beyond reason, or nothing. lenses: with the pictures' names."""
-    bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
-    bent = [(name, lens) for name, lens in lenses if bend[lens]]
-    if not bent:
-        return ""
-    lens = bent[0][1]
-    params = " ".join(f"{value:g}" for value in lens.params)
+def in_pixels(lens: Lens) -> tuple[Lens, bool]:
+    """The lens in pixels, and whether it was given in parts of the picture's width and height: a principal point in the
+    first pixel is none of a photograph, and one in the middle is 0.5 0.5 in parts. Focal lengths then are in parts too
+    if they are under SHORTEST of the picture."""
+    camera = lens._camera()  # noqa: SLF001
+    sides, params = (lens.width, lens.height), list(lens.params)
+    centre = list(camera.principal_point_idxs())
+    if lens.model == PANORAMA or min(sides) < SMALLEST or not all(0 < params[index] <= 1 for index in centre):
+        return lens, False
+    focal = list(camera.focal_length_idxs())
+    if all(params[index] < SHORTEST * max(sides) for index in focal):
+        for index, side in zip(focal, sides if len(focal) == 2 else (max(sides),), strict=True):
+            params[index] *= side
+    for index, side in zip(centre, sides, strict=True):
+        params[index] *= side
+    return replace(lens, params=tuple(params)), True
+
+
+def given_in_parts(names: Iterable[object]) -> str:
+    """The warning of cameras of these names whose lenses `in_pixels` has changed."""
     return (
-        f"the lens of {examples(name for name, _ in bent)} bends the picture beyond reason ({lens.model} {params}): "
-        "check its coefficients, and their order"
+        f"the principal point (cx cy) of {examples(names)} is given in parts of the picture's width and height and not "
+        "in pixels; it is read so, and focal lengths of under a twentieth of the picture with it"
     )
-
-
-def _bends(lens: Lens) -> bool:
-    """True if the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
-    Fisheyes and the like are meant to, and count as False."""
-    if lens.is_pinhole or lens.model in ("FOV", "EUCM", PANORAMA) or "FISHEYE" in lens.model:
-        return False
-    pinhole = lens.pinhole(np.eye(3), np.zeros(3))
-    half = np.array([lens.width, lens.height]) / 2
-    edge = half * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    rays = np.concatenate([edge / [pinhole.fx, pinhole.fy], np.ones((len(edge), 1))], axis=1)
-    pixels = lens.img_from_cam(rays)
-    moved = pixels - pixels[len(pixels) // 2] - edge
-    return not bool((np.abs(moved) <= BENT * half).all())
 
 
 def pixels_of(

@@ -19,6 +19,7 @@ from clsplat.scenes import colmap
 from clsplat.scenes.beside import bases_of, beside, owned
 from clsplat.scenes.data_set import pixels_of
 from clsplat.scenes.known_depth import KnownDepth, sampled
+from clsplat.scenes.picture_names import match
 
 if TYPE_CHECKING:
     from clsplat.scenes.data_set import Lens
@@ -66,10 +67,8 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
     tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
     if not tracked:
         raise InputError(f"{model}: no point has a track, and {asked} goes by them; export the model with tracks")
-    names = {view.name: view.name for view in scene.train_views}
-    if not tracked.keys() & names.keys():  # images/a.jpg is COLMAP's a.jpg
-        names = {name: name.partition("/")[2] for name in names}
-    rows = {name: tracked[theirs] for name, theirs in names.items() if theirs in tracked}
+    names = match([view.name for view in scene.train_views], tracked).names
+    rows = {name: tracked[theirs] for name, theirs in names.items()}
     known = {name: KnownDepth(tracks.points[which], weights[which]) for name, which in rows.items()}
     if not known:
         raise InputError(

@@ -5,6 +5,7 @@ step, and in the pictures after some. A line each, which says what to do."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.config.training import Background
-from clsplat.errors import examples
+from clsplat.errors import InputError, examples
 from clsplat.images.alpha import background_colour, composite
-from clsplat.scenes.data_set import absurd
+from clsplat.scenes.camera_checks import absurd
+from clsplat.scenes.point_files import count_points
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene, View
@@ -25,6 +27,9 @@ LOOKED_AT = 8
 """Views that are looked at, spread evenly."""
 SMALLER = 4
 """Factor by which the pictures are made smaller to be looked at."""
+MANY_POINTS = 1_000_000
+"""Points beyond which trainings hardly gain: published models of whole rooms and gardens have 1 to 6 million Gaussians
+at their end, from 50,000 to 200,000 points."""
 COINCIDENT = 0.05
 """Part of the points that may lie where another one does."""
 BEYOND = 0.5
@@ -41,6 +46,8 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
     looked = spread(scene.train_views, LOOKED_AT)
     pictures = [_pixels(view) for view in looked]
     doubts = (
+        _many_points(scene),
+        _other_clouds(scene),
         _coincident(scene),
         _principal_points(scene),
         lenses,
@@ -88,6 +95,34 @@ def _pixels(view: View) -> NDArray[np.float32]:
 def _is_flat(image: NDArray[Any]) -> bool:
     """True if no pixel differs by a step of 8 bits from another."""
     return bool(np.ptp(image.reshape(-1, image.shape[2]), axis=0).max() < 1 / 255)
+
+
+def _many_points(scene: Scene) -> str:
+    if len(scene.points) <= MANY_POINTS:
+        return ""
+    return (
+        f"{len(scene.points):,} points to start from are a Gaussian each, which takes memory and time from the first "
+        "step on: --points-limit 200000 keeps as many, evenly"
+    )
+
+
+def _other_clouds(scene: Scene) -> str:
+    """Clouds beside the scene that are not copies of its points."""
+    if scene.start.file or not scene.clouds:
+        return ""
+    counts = {path: _count(path) for path in scene.clouds}
+    others = [f"{path} ({count:,} points)" for path, count in counts.items() if count not in (0, len(scene.points))]
+    if not others:
+        return ""
+    return f"{examples(others)} is not used, as the scene has points of its own: --points FILE starts from it"
+
+
+def _count(path: Path) -> int:
+    """Points of a cloud by its header, 0 where that does not read."""
+    try:
+        return count_points(path)
+    except InputError:
+        return 0
 
 
 def _coincident(scene: Scene) -> str:

@@ -4,7 +4,7 @@ cloud without colours each has the mean of what the training photographs have wh
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,8 +15,11 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import composite
 from clsplat.scenes.data_set import pixels_of
-from clsplat.scenes.scene import Scene
+from clsplat.scenes.point_files import UNCOLOURED, of_one_colour
 from clsplat.spherical_harmonics import C0
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
 
 INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
@@ -29,7 +32,7 @@ rounding may keep it there for good."""
 NEIGHBOURS = 3
 LONGEST = 400
 """Pixels of the photographs' longer side here: a point stands for a few of the full size."""
-UNSEEN = 0.5
+UNSEEN = UNCOLOURED
 """Grey, for points that no photograph shows."""
 
 
@@ -120,11 +123,6 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
 def is_colourless(scene: Scene) -> bool:
     """True if points have no colours, as a cloud of --points, or all the same, as clouds without colours are read."""
     return scene.colourless is not None or of_one_colour(scene.point_colors)
-
-
-def of_one_colour(colors: Float32) -> bool:
-    """True if several points (N, 3) have the same colour, as a file without colours is read."""
-    return len(colors) > 1 and bool((colors == colors[0]).all())
 
 
 def photographed(scene: Scene, background: ArrayLike) -> Float32:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.scenes.data_set import PANORAMA, RADIAL, pixels_of
-from clsplat.scenes.initialise import of_one_colour
+from clsplat.scenes.point_files import of_one_colour
 from clsplat.scenes.scene import Scene, View
 
 MAX_POINTS = 4000

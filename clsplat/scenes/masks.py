@@ -12,15 +12,17 @@ import numpy as np
 from clsplat.arrays import Float32
 from clsplat.config.masks import NO_MASKS, MaskMeaning, MaskUse
 from clsplat.errors import InputError, examples, warn
-from clsplat.images.reading import find_images, image_size, read_image
+from clsplat.images.reading import EXTENSIONS, find_images, image_size, read_image, stored_range
 from clsplat.images.writing import write_image
-from clsplat.scenes.beside import Named, bases_of, beside, owned
+from clsplat.scenes.beside import Named, bases_of, beside, inside, owned
 from clsplat.scenes.data_set import PosedImage
 
-FOLDERS = ("masks", "mask")
-"""Names of the folder of masks, beside the photographs' or in it."""
+FOLDERS = ("masks", "mask", ".masks", ".mask")
+"""Names of the folder of masks, beside the photographs' or in it; RealityScan's is hidden."""
 HALF = 0.5
 """Least value of a mask's pixel that counts, and least share of a pixel's area that counts where sizes differ."""
+SOME = 12
+"""Masks that are looked at, at most, to tell whether others reach a half."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +58,45 @@ class Mask:
 
 def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
     """(H, W, 1), 1 where a pixel counts and 0 where not: grey of a half or more does, or alpha where all is of one
-    grey. Raises InputError where it does not decode."""
+    grey; where the largest whole number in the file is 1, that does. Raises InputError where it does not decode, and
+    where all values are dark: of two, or of more in masks that are all so."""
     image = read_image(path, orient=orient)
     values = image[:, :, :3].mean(axis=2, keepdims=True)
     if image.shape[2] == 4 and values.min() == values.max():
         values = image[:, :, 3:]
+    if 0 < values.max() < HALF:
+        values = _from_labels(path, values)
     counts: Float32 = ((values >= HALF) != invert).astype(np.float32)
     return counts
+
+
+def _from_labels(path: Path, values: Float32) -> Float32:
+    """Values of a mask that has none of a half or more, 1 for labels of 1. Raises InputError for other labels; a soft
+    mask may be dark where another of its folder is not."""
+    most, exact = stored_range(path)
+    levels = np.unique(np.rint(values * most)).astype(int).tolist()
+    if not most or levels[-1] < 1:
+        return values
+    if exact and levels[-1] == 1:
+        return np.asarray(values * most, np.float32)
+    if (len(levels) > 2 or not exact) and any(_reaches_half(other) for other in _like(path)):
+        return values
+    listed = " and ".join(map(str, levels)) if len(levels) < 3 else f"{len(levels)} from {levels[0]} to {levels[-1]}"
+    raise InputError(
+        f"{path}: the mask's values are {listed}, all of them dark, expected 0 and {most}, where a half or more counts "
+        "(or 0 and 1); make white what counts"
+    )
+
+
+def _like(path: Path) -> list[Path]:
+    """Some of the masks in a mask's folder, where photographs may be too."""
+    named = "mask" in path.stem.lower()
+    others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
+    return others[:: max(len(others) // SOME, 1)]
+
+
+def _reaches_half(path: Path) -> bool:
+    return bool(read_image(path)[:, :, :3].mean(axis=2).max() >= HALF)
 
 
 def folder_of(images: Path) -> Path | None:
@@ -74,19 +108,28 @@ def find_masks(
     folder: Path, names: Iterable[str], without: Iterable[Path] = (), *, strict: bool = True
 ) -> dict[str, Path]:
     """The masks in a folder by the photographs' names, relative to theirs; names: of all the photographs that there
-    are; without, strict: as of `owned`. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, or
-    IMAGE_mask.png, in the same sub-folder.
+    are; without, strict: as of `owned`. A mask is called IMAGE.jpg.png as COLMAP's, IMAGE.png, IMAGE_mask.png, or
+    IMAGE.jpg.mask.png as RealityScan's, in the same sub-folder.
 
     Raises InputError for a mask that fits no photograph, and for two of one.
     """
+    names = sorted(names)
+    example = next(iter(names), "IMAGE.jpg")
+    return owned(folder, find_images(folder), _known(names), "mask", example, without=without, strict=strict)
+
+
+def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
+    """Photographs by the names, without the extension, that their masks may have; plain: also that of the photograph
+    alone."""
     known: dict[str, str] = {}
-    for name in sorted(names):
-        plain = PurePosixPath(name)
-        stem = str(plain.with_suffix(""))
-        for key in (name, stem, f"{stem}_mask", f"{stem}.mask", str(plain.with_name(f"mask_{plain.stem}"))):
+    for name in names:
+        path = PurePosixPath(name)
+        stem = str(path.with_suffix(""))
+        own = (name, stem) if plain else (name,)
+        marked = (f"{stem}_mask", f"{stem}.mask", str(path.with_name(f"mask_{path.stem}")))
+        for key in (*own, *marked, f"{name}.mask", f"{name}_mask"):
             known.setdefault(key, name)
-    example = next(iter(sorted(names)), "IMAGE.jpg")
-    return owned(folder, find_images(folder), known, "mask", example, without=without, strict=strict)
+    return known
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[str, Mask]:
@@ -119,8 +162,9 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path) -> dict[st
 def masks_beside(
     images: Sequence[Named], told: Mapping[str, Path] | None = None, *, strict: bool = True
 ) -> dict[str, Path]:
-    """The masks in the folder beside the photographs, or in theirs, by the photographs' names. told: masks that a file
-    names, by the photographs' names; they are one for all in nerfstudio's scenes. Raises InputError as `find_masks`."""
+    """The masks in the folder beside the photographs, or in theirs, else beside each, by the photographs' names. told:
+    masks that a file names, by the photographs' names; they are one for all in nerfstudio's scenes. Raises InputError
+    as `find_masks`."""
     told = told or {}
     if all(image.name in told for image in images):
         return {}
@@ -130,8 +174,33 @@ def masks_beside(
             names = {str(PurePosixPath(image.path.relative_to(base).as_posix())): image.name for image in images}
             others = (file.relative_to(base).as_posix() for file in find_images(base) if folder not in file.parents)
             masks = find_masks(folder, {*names, *others}, told.values(), strict=strict)
-            return {names[key]: path for key, path in masks.items() if key in names}
-    return {}
+            if found := {names[key]: path for key, path in masks.items() if key in names}:
+                return found
+    return _beside_each(images, told, strict=strict)
+
+
+def _beside_each(images: Sequence[Named], told: Mapping[str, Path], *, strict: bool) -> dict[str, Path]:
+    """Masks in a folder in that of each photograph, or in that itself, where only names that say mask, or have two
+    extensions, are masks."""
+    by_parent: dict[Path, dict[str, str]] = {}
+    for image in images:
+        by_parent.setdefault(image.path.parent, {})[image.path.name] = image.name
+    found: dict[str, Path] = {}
+    for parent, names in by_parent.items():
+        masks: dict[str, Path] = {}
+        present = [path.name for path in find_images(parent, deep=False)]
+        if (folder := inside(parent, FOLDERS)) is not None:
+            masks = find_masks(folder, {*names, *present}, told.values(), strict=strict)
+        if not masks:
+            paths = [parent / name for name in present if name not in names and _says_mask(name)]
+            masks = owned(parent, paths, _known(sorted(names), plain=False), "mask", "", strict=False)
+        found.update({names[key]: path for key, path in masks.items() if key in names})
+    return found
+
+
+def _says_mask(name: str) -> bool:
+    stem = PurePosixPath(name.lower()).stem
+    return "mask" in stem or PurePosixPath(stem).suffix in EXTENSIONS
 
 
 def stage_mask(

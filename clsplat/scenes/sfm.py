@@ -14,6 +14,7 @@ import sys
 import tempfile
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -22,8 +23,8 @@ from clsplat.errors import ClsplatError, InputError, examples, warn
 from clsplat.files import is_file, replace
 from clsplat.process import apart
 from clsplat.progress import Progress, no_progress
-from clsplat.scenes import sfm_photos
-from clsplat.scenes.masks import find_masks, folder_of, stage_mask
+from clsplat.scenes import sfm_copies, sfm_photos
+from clsplat.scenes.masks import masks_beside, stage_mask
 from clsplat.scenes.transforms import load_document
 
 Matching = Literal["auto", "exhaustive", "sequential"]
@@ -74,9 +75,12 @@ def reconstruct(
     other photos. masks: leave features out where the photos' masks, or their alpha, do; the output gets them too, as
     `masks/IMAGE.jpg.png`, white where a pixel counts. progress(text, fraction or None) is called in every stage.
 
-    Warns of photos that could not be placed, are of a kind that cannot be read, or lost their alpha. Raises InputError
-    for a folder without photos, a photo that does not decode, an output that is something else, and photos that no
-    cameras can be recovered from; ClsplatError where pycolmap itself fails. KeyboardInterrupt leaves nothing behind.
+    Of photos that are there twice one is used (`clsplat.scenes.sfm_copies`).
+
+    Warns of these, and of photos that could not be placed, are of a kind that cannot be read, or lost their alpha.
+    Raises InputError for a folder without photos, a photo that does not decode, an output that is something else, and
+    photos that no cameras can be recovered from; ClsplatError where pycolmap itself fails. KeyboardInterrupt leaves
+    nothing behind.
     """
     report = progress or no_progress
     if matching not in ("auto", "exhaustive", "sequential"):
@@ -84,6 +88,8 @@ def reconstruct(
     if camera_model not in CAMERA_MODELS:
         raise InputError(f"camera model {camera_model!r}: expected one of {', '.join(CAMERA_MODELS)}")
     paths, left_out = sfm_photos.find_photos(images, excluded=output)
+    copies = sfm_copies.told_by_names(images, [sfm_photos.photo_name(images, path) for path in paths])
+    paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
     settings = f"{matching} {camera_model} {shared_camera} {max_image_size} {max_features} {seed}"
     shapes = _masks(images, paths, masks)
     if masks is not None:
@@ -93,8 +99,7 @@ def reconstruct(
     if _is_finished(output, images, fingerprint, overwrite=overwrite):
         report("using the cameras recovered before", 1.0)
         return output
-    if len(paths) < MINIMUM_PHOTOS:
-        raise InputError(f"{images}: only {len(paths)} photo(s) found, expected at least {MINIMUM_PHOTOS}")
+    _require_enough(images, len(paths))
     for why, others in left_out.items():
         names = [sfm_photos.photo_name(images, path) for path in others]
         warn(f"{images}: {_listed(names)} left out: {why}")
@@ -107,6 +112,12 @@ def reconstruct(
         photos = sfm_photos.stage_photos(
             images, paths, work / "photos", lambda fraction: report("reading photos", fraction), workers
         )
+        copies = sfm_copies.resolved({**copies, **sfm_copies.told_by_pictures(photos)})
+        photos = [photo for photo in photos if photo.name not in copies]
+        if copies:
+            again = f"{len(copies):,} photo(s) are others again and left out ({sfm_copies.listed(copies)})"
+            warn(f"{images}: {again}; to use them, give their folder alone")
+        _require_enough(images, len(photos))
         masked = []
         for photo in photos:
             cut = photo.transparent and masks is not None and masks.alpha != "blend"
@@ -148,18 +159,25 @@ def reconstruct(
     return output
 
 
+@dataclass(frozen=True)
+class _Found:
+    """A photo in the folder: its name below that, and its file."""
+
+    name: str
+    path: Path
+
+
+def _require_enough(images: Path, count: int) -> None:
+    if count < MINIMUM_PHOTOS:
+        raise InputError(f"{images}: only {count} photo(s) found, expected at least {MINIMUM_PHOTOS}")
+
+
 def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
     """The masks by the photos' names. Raises InputError where they are asked for, and there are none or one fits no
     photo."""
     if use is None or use.masks == "none":
         return {}
-    found: dict[str, Path] = {}
-    parents = {sfm_photos.photo_name(images, path).partition("/")[0] for path in paths if path.parent != images}
-    alone = len(parents) == 1 and all(path.parent != images for path in paths)
-    for base in (*(images / parent for parent in parents if alone), images):
-        if not found and (folder := folder_of(base)) is not None:
-            names = {sfm_photos.photo_name(base, path): sfm_photos.photo_name(images, path) for path in paths}
-            found = {names[name]: mask for name, mask in find_masks(folder, names).items()}
+    found = masks_beside([_Found(sfm_photos.photo_name(images, path), path) for path in paths])
     if not found:
         raise InputError(
             f"{images}: there are no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder"

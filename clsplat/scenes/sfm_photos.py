@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files import WINDOWS, is_file, native_name, require_room, room_error, write_error
-from clsplat.images.reading import cannot_be_searched, companions, error_of, open_image, opened
+from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_image, opened, turned
 from clsplat.images.writing import jpeg_room
+from clsplat.scenes.sfm_copies import Thumb, thumb_of, to_compare
 
 EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 """Extensions that pycolmap's wheel reads and writes; its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
@@ -34,7 +35,7 @@ class Photo:
     """A photo as staged for pycolmap: its name (path below the folder, with slashes) and what tells its camera.
 
     width, height: pixels, upright; lens: make, model and focal length from EXIF, empty strings where it has none;
-    transparent: whether any pixel is, in an alpha channel.
+    transparent: whether any pixel is, in an alpha channel; thumb: `sfm_copies.thumb_of`, of those that may be copies.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Photo:
     height: int
     lens: tuple[str, ...]
     transparent: bool = False
+    thumb: Thumb | None = None
 
 
 def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
@@ -112,8 +114,9 @@ def stage_photos(
     raises InputError with the name of the first that does not decode.
     """
     staged: list[Photo] = []
+    compared = to_compare([photo_name(folder, path) for path in photos])
     with ThreadPoolExecutor(threads) as pool:
-        work = pool.map(partial(_stage, folder, target), photos)
+        work = pool.map(partial(_stage, folder, target, compared), photos)
         try:
             for photo in work:
                 staged.append(photo)
@@ -124,7 +127,7 @@ def stage_photos(
     return staged
 
 
-def _stage(folder: Path, target: Path, path: Path) -> Photo:
+def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) -> Photo:
     if not is_file(path):
         raise InputError(f"{path}: cannot be decoded as an image: is no regular file")
     source = open_image(path)
@@ -156,7 +159,9 @@ def _stage(folder: Path, target: Path, path: Path) -> Photo:
             shutil.copyfile(path, copy)
     focal = spec.get_float_attribute("Exif:FocalLength", 0.0)
     lens = (spec.get_string_attribute("Make"), spec.get_string_attribute("Model"), f"{focal:.3f}" if focal else "")
-    return Photo(name, width, height, lens, _is_transparent(pixels, spec.alpha_channel))
+    alpha = alpha_of(spec)
+    thumb = thumb_of(turned(pixels, orientation), alpha) if name in compared else None
+    return Photo(name, width, height, lens, _is_transparent(pixels, alpha), thumb)
 
 
 def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
@@ -170,7 +175,7 @@ def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
 def has_alpha(path: Path) -> bool:
     """True if an image file has an alpha channel; reads its header alone."""
     with opened(path) as source:
-        return source is not None and source.spec().alpha_channel >= 0
+        return source is not None and alpha_of(source.spec()) >= 0
 
 
 def _write_upright(path: Path, copy: Path, spec: Any) -> None:

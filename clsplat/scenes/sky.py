@@ -42,7 +42,7 @@ def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
             f"{scene.name}: --sky: the scene has no points to tell the sky by, expected some; leave it out"
         )
     cameras = [view.camera for view in scene.train_views]
-    middle = np.stack([camera.position for camera in cameras]).mean(axis=0)
+    middle, *_ = scene.spread
     up = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
     if (length := float(np.linalg.norm(up))) < 0.1:
         raise InputError(f"{scene.name}: --sky: the cameras have no common up, expected one; leave it out")

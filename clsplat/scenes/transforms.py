@@ -11,20 +11,34 @@ import math
 import os
 import posixpath
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from clsplat.arrays import Float32, Float64, numbers
+from clsplat.arrays import Float64, numbers
 from clsplat.camera import Camera, Projection, focal_length
-from clsplat.config.training import Lenses
+from clsplat.config.training import Lenses, Missing
 from clsplat.errors import InputError, examples, warn
-from clsplat.files import is_file, open_input, parse_json, read_document
-from clsplat.images.reading import EXTENSIONS, image_size, require_images
-from clsplat.models.formats import ply
-from clsplat.scenes.data_set import MAX_NUMBER, MAX_SIZE, PANORAMA, DataSet, Lens, PosedImage, cameras_of, check_lens
+from clsplat.files import is_file, parse_json, read_document
+from clsplat.images.reading import EXTENSIONS, image_size
+from clsplat.scenes.camera_checks import cameras_of
+from clsplat.scenes.data_set import (
+    MAX_NUMBER,
+    MAX_SIZE,
+    PANORAMA,
+    DataSet,
+    Lens,
+    PosedImage,
+    check_lens,
+    given_in_parts,
+    in_pixels,
+)
+from clsplat.scenes.picture_files import find_pictures, or_smaller
+from clsplat.scenes.picture_names import match
+from clsplat.scenes.point_files import clouds_beside, read_point_cloud
 
 DRIVE = re.compile(r"\A[A-Za-z]:/")
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -34,38 +48,78 @@ LAST_ROW = 1e-6
 """Most that a pose's last row may differ from 0 0 0 1: products of float32's matrices are that exact."""
 PERSPECTIVE = ("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-RGB = ("red", "green", "blue")
 AGREE = 0.02
 """Part by which a focal length may differ from what the angle of view beside it makes of it: tools round angles, and
 some take them before they refine the lens."""
 EXPORT_AGAIN = "export the data set anew or add it"
 
 
-def read_transforms(path: Path, *, masks: bool = False) -> DataSet:
+def read_transforms(
+    path: Path, *, masks: bool = False, images: Path | None = None, missing: Missing = "few"
+) -> DataSet:
     """Read one transforms.json.
 
     docs/conventions.md (Scenes) has the keys that are read, in the file or in each frame. `file_path` is relative to
     the file. nerfstudio's `ply_file_path` and its `train_filenames`, `val_filenames` and `test_filenames` are honoured:
-    what is in the last two, or not in the first, is held out. Warns of what is ignored and of what contradicts itself.
-    Raises InputError that names the file and the key for JSON that does not parse, a key that is missing or of the
-    wrong kind, and listed pictures that are missing.
+    what is in the last two, or not in the first, is held out. images: another folder of the same pictures; missing: as
+    of `find_pictures`. Warns of what is ignored and of what contradicts itself. Raises InputError that names the file
+    and the key for JSON that does not parse, a key that is missing or of the wrong kind, and for missing pictures.
     """
     document = load_document(path)
     readers = _readers(path, document)
-    require_images([_find_file(keys) for keys in readers], path)
-    data = DataSet(_images(path, readers))
+    files = _pictures(path, readers, images, missing)
+    there = [(keys, file) for keys, file in zip(readers, files, strict=True) if file is not None]
+    gone = [_plain(keys.text("file_path")) for keys, file in zip(readers, files, strict=True) if file is None]
+    data = DataSet(_images(path, there, gone), missing=gone)
     if not masks and any("mask_path" in keys.frame for keys in readers):
         warn(f"{path}: 'mask_path' is ignored; --masks ignore or --masks transparent uses it")
     data.box = _ngp_box(Keys(path, None, {}, document))
+    data.clouds = clouds_beside([path.parent])
     cloud = document.get("ply_file_path")
     if isinstance(cloud, str) and cloud:
         _inside(path.parent, cloud, f"{path}: 'ply_file_path'")
         file = path.parent / cloud.replace("\\", "/")
         if is_file(file):
             data.points, data.colors = read_point_cloud(file)
+            data.clouds = [other for other in data.clouds if not other.samefile(file)]
         else:
-            warn(f"{path}: its points 'ply_file_path' are missing: {file}; using random ones")
+            instead = data.clouds[0].name if data.clouds else "random ones"
+            warn(f"{path}: its points 'ply_file_path' are missing: {file}; using {instead}")
     return data
+
+
+def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Missing) -> list[Path | None]:
+    """The picture of each frame, None for those that are left out. Warns of, and raises InputError, as
+    `find_pictures`, and for a name that leads out of the folder and is of nothing in it."""
+    listed, folder = [_plain(keys.text("file_path")) for keys in readers], path.parent
+    if images is not None:
+        return find_pictures(listed, [None] * len(listed), images, path, missing)
+    exact = [_find_file(keys) if is_inside(folder, keys.text("file_path")) else None for keys in readers]
+    lost = [file for file in exact if file is not None and not is_file(file)]
+    if lost and (copies := _smaller_folders(lost, folder)):
+        for usual, copy in copies.items():
+            warn(f"{path}: the pictures are taken from {copy}, as there are none in {usual}")
+        exact = [_moved(file, copies) for file in exact]
+    try:
+        return find_pictures(listed, exact, folder, path, missing)
+    except InputError:
+        for keys, file in zip(readers, exact, strict=True):
+            if file is None:
+                _inside(folder, keys.text("file_path"), keys.where)
+        raise
+
+
+def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
+    """Folders of missing pictures that have none at all, with those of their smaller copies."""
+    names = {parent for file in lost for parent in file.parents if folder in parent.parents}
+    found = {name: or_smaller(name) for name in sorted(names)}
+    return {name: copy for name, copy in found.items() if copy != name}
+
+
+def _moved(file: Path | None, copies: dict[Path, Path]) -> Path | None:
+    """A file, in the copy of its folder if there is one."""
+    usual = next((parent for parent in copies if file is not None and parent in file.parents), None)
+    return file if file is None or usual is None else copies[usual] / file.relative_to(usual)
 
 
 def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses = "undistort") -> dict[str, Camera]:
@@ -80,46 +134,60 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
 
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
     """The images of a transforms.json, in its order, whose pictures need not be there, as of `read_poses`."""
-    return _images(path, _readers(path, load_document(path)), size)
+    readers = _readers(path, load_document(path))
+    for keys in readers:
+        _inside(path.parent, keys.text("file_path"), keys.where)
+    return _images(path, [(keys, _find_file(keys)) for keys in readers], size=size)
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
     if not (frames := objects(document, "frames")):
         raise InputError(f"{path}: has no 'frames' (a list of pictures with their poses); {EXPORT_AGAIN}")
-    readers = [Keys(path, f"frame {index}", frame, document) for index, frame in enumerate(frames)]
-    for keys in readers:
-        _inside(path.parent, keys.text("file_path"), keys.where)
-    return readers
+    return [Keys(path, f"frame {index}", frame, document) for index, frame in enumerate(frames)]
 
 
-def _images(path: Path, readers: list[Keys], size: tuple[int, int] | None = None) -> list[PosedImage]:
-    """The images. Warns of what contradicts itself."""
+def _images(
+    path: Path, frames: list[tuple[Keys, Path]], missing: Sequence[str] = (), *, size: tuple[int, int] | None = None
+) -> list[PosedImage]:
+    """The images of frames with their files. missing: names of other frames' pictures; size: as of `read_poses`. Warns
+    of what contradicts itself."""
     images: dict[str, PosedImage] = {}
-    for keys in readers:
-        file, listed = _find_file(keys), _plain(keys.text("file_path"))
-        name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the extension of the file
-        lens = _lens(keys, file, size)
+    in_parts = []
+    for keys, file in frames:
+        listed = _plain(keys.text("file_path"))
+        if _find_file(keys) == file or not file.is_relative_to(path.parent):
+            name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the extension of the file
+        else:
+            name = file.relative_to(path.parent).as_posix()
+        lens, parts = _lens(keys, file, size)
+        in_parts += [name] if parts else []
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
         if name in images:
             raise InputError(f"{path}: lists {name} twice, expected each picture once; remove one of the frames")
         mask, depth = (_file_of(keys, key) for key in ("mask_path", "depth_file_path"))
         images[name] = PosedImage(name, lens, rotation, translation, file, mask=mask, depth=depth)
+    readers = [keys for keys, _ in frames]
+    if in_parts:
+        warn(f"{path}: {given_in_parts(in_parts)}")
     _warn_of_contradictions(path, readers, list(images.values()))
-    return _split(path, readers, list(images.values()))
+    return _split(path, readers, list(images.values()), missing)
 
 
-def _split(path: Path, readers: list[Keys], images: list[PosedImage]) -> list[PosedImage]:
+def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: Sequence[str]) -> list[PosedImage]:
     """The images with nerfstudio's own split, where the file has one."""
-    known = {image.name: image.name for image in images}
+    names = [*(image.name for image in images), *missing]
+    known = dict(zip(names, names, strict=True))
     known |= {_plain(keys.text("file_path")): image.name for keys, image in zip(readers, images, strict=True)}
     listed = []
     for key in ("train_filenames", "test_filenames", "val_filenames"):
-        names = readers[0].document.get(key) or []
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise InputError(f"{path}: '{key}' is {short(names)}, expected a list of file names; correct or remove it")
-        if lost := [name for name in names if _plain(name) not in known]:
+        given = readers[0].document.get(key) or []
+        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+            raise InputError(f"{path}: '{key}' is {short(given)}, expected a list of file names; correct or remove it")
+        found = {name: known[name] for name in map(_plain, given) if name in known}
+        found |= match([name for name in map(_plain, given) if name not in known], names).names
+        if lost := [name for name in given if _plain(name) not in found]:
             warn(f"{path}: '{key}' lists {examples(lost)}, and no frame has that as its 'file_path'")
-        listed.append({known[_plain(name)] for name in names if _plain(name) in known})
+        listed.append(set(found.values()))
     train, held_out = listed[0], listed[1] | listed[2]
     if not (train or held_out):
         return images
@@ -152,22 +220,23 @@ def _warn_of_contradictions(path: Path, readers: list[Keys], images: list[PosedI
         warn(f"{path}: 'rolling_shutter' is ignored, pictures are taken as exposed at once")
 
 
-def read_blender(folder: Path) -> DataSet:
+def read_blender(folder: Path, *, images: Path | None = None, missing: Missing = "few") -> DataSet:
     """Read transforms_train.json and, if there, transforms_test.json, the data set's own split (val is left out).
 
-    Raises InputError as `read_transforms`.
+    images, missing: as of `read_transforms`. Raises InputError as that.
     """
-    train = read_transforms(folder / "transforms_train.json")
+    train = read_transforms(folder / "transforms_train.json", images=images, missing=missing)
     held_out = folder / "transforms_test.json"
     if not held_out.is_file():
         return train
-    test = read_transforms(held_out)
+    test = read_transforms(held_out, images=images, missing=missing)
     names = {image.name for image in train.images}
     for image in test.images:
         if image.name in names:
             raise InputError(f"{held_out}: lists {image.name}, which is a training picture too; remove one of them")
-    images = [replace(image, split="train") for image in train.images]
-    return replace(train, images=images + [replace(image, split="test") for image in test.images])
+    both = [replace(image, split="train") for image in train.images]
+    both += [replace(image, split="test") for image in test.images]
+    return replace(train, images=both, missing=train.missing + test.missing)
 
 
 class Keys:
@@ -285,18 +354,24 @@ def _file_of(keys: Keys, key: str) -> Path | None:
     return Path(os.path.normpath(keys.path.parent / listed.replace("\\", "/")))
 
 
-def _inside(folder: Path, listed: str, where: str) -> None:
-    """Raise InputError for the name of a file that is not below the folder of the file that lists it."""
+def is_inside(folder: Path, listed: str) -> bool:
+    """True for the name of a file that is below the folder of the file that lists it."""
     root = folder.absolute()  # not resolve: a link in the scene's folder may lead anywhere
     path = Path(os.path.normpath(root / listed.replace("\\", "/")))
-    if not listed.isprintable() or not path.is_relative_to(os.path.normpath(root)):
+    return listed.isprintable() and path.is_relative_to(os.path.normpath(root))
+
+
+def _inside(folder: Path, listed: str, where: str) -> None:
+    """Raise InputError for the name of a file that is not below the folder of the file that lists it."""
+    if not is_inside(folder, listed):
         raise InputError(
             f"{where}: {short(listed)} is no path inside the scene's folder {folder}; move what it names into it, or "
             "put a link there"
         )
 
 
-def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
+def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, bool]:
+    """The lens of a frame, and whether it was given in parts of the picture."""
     width, height = keys.number("w"), keys.number("h")
     if width is None or height is None:
         if not file.is_file():
@@ -317,7 +392,7 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
     assert height is not None
     if keys.get("camera_model") == PANORAMA:
         sides = round(width), round(height)
-        return check_lens(Lens(PANORAMA, *sides, tuple(map(float, sides))), keys.where)
+        return check_lens(Lens(PANORAMA, *sides, tuple(map(float, sides))), keys.where), False
     fx = _focal(keys, "fl_x", "camera_angle_x", width)
     fy = _focal(keys, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
@@ -333,7 +408,7 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> Lens:
     ]
     model, extra = _distortion(keys)
     params = tuple(float(value) for value in (*core, *extra) if value is not None)
-    return check_lens(Lens(model, round(width), round(height), params), keys.where)
+    return in_pixels(check_lens(Lens(model, round(width), round(height), params), keys.where))
 
 
 def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:
@@ -353,6 +428,12 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
         keys.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
     )
     if model in FISHEYE or keys.get("is_fisheye") is True:
+        if k5 or k6:
+            raise InputError(
+                f"{keys.where}: has 'k5' or 'k6' of a fisheye, expected k1 to k4 alone; undistort the pictures first"
+            )
+        if p1 or p2:  # COLMAP's fisheye with tangential terms, which is the other one where they are 0
+            return "THIN_PRISM_FISHEYE", [k1, k2, p1, p2, k3, k4, 0.0, 0.0]
         return "OPENCV_FISHEYE", [k1, k2, k3, k4]
     if model not in PERSPECTIVE:
         listed = ", ".join(name for name in (*PERSPECTIVE, *FISHEYE, PANORAMA) if name)
@@ -411,35 +492,3 @@ def _ngp_box(keys: Keys) -> tuple[Float64, Float64] | None:
     if not (1 / MAX_NUMBER < factor < MAX_NUMBER and (np.abs(shift) < MAX_NUMBER).all()):
         raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' {shift.tolist()}, expected a scale above 0")
     return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor
-
-
-def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
-    """Positions (N, 3) float64 and colours (N, 3) float32 in [0, 1] of a PLY, grey where it has no colours.
-
-    Raises InputError for a file that is none, cut short, without x y z, or with positions that are not finite.
-    """
-    with open_input(path, "a PLY of points") as file:
-        header = ply.read_header(file, path)
-        vertex = header.elements[0] if header.elements else None
-        if vertex is None or vertex.name != "vertex" or vertex.has_list:
-            raise InputError(f"{path}: begins with no plain vertices, expected a point cloud")
-        kinds = dict(vertex.properties)
-        if missing := [name for name in "xyz" if name not in kinds]:
-            raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
-        coloured = all(name in kinds for name in RGB)
-        parts: list[tuple[Float64, Float32]] = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
-        for block in ply.read_vertices(file, header, "point"):
-            points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
-            colors: Float32 = np.full(points.shape, 0.5, np.float32)
-            if coloured:
-                with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, refused below
-                    colors = np.stack([block[name] for name in RGB], axis=1).astype(np.float32)
-            parts.append((points, colors))
-    points, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: holds positions that are not finite")
-    if not np.isfinite(colors).all():
-        raise InputError(f"{path}: holds colours that are not finite")
-    if coloured:
-        colors = np.clip(colors / np.float32(255 if kinds["red"][0] in "iu" else 1), 0, 1)
-    return points, colors

@@ -6,16 +6,21 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
-from clsplat.errors import InputError, examples, warn
+from clsplat.errors import InputError, examples
+from clsplat.files import is_file, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.scenes import colmap, transforms
+from clsplat.scenes.camera_checks import cameras_of
 from clsplat.scenes.colmap import find_model, read_cameras
-from clsplat.scenes.data_set import PANORAMA, PosedImage, absurd
-from clsplat.scenes.transforms import load_document, read_poses
+from clsplat.scenes.data_set import PANORAMA, PosedImage
+from clsplat.scenes.strays import FACTOR, stray_cameras
+from clsplat.scenes.transforms import read_poses
 from clsplat.shots.around import cameras_around, parse_up
+from clsplat.shots.cameras_json import NAME, read_cameras_json
 from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
 from clsplat.shots.generated import PATHS
 from clsplat.shots.nerfstudio import read_camera_path
@@ -28,8 +33,8 @@ COUNT = 120
 """Frames of a generated path: five seconds at 24 a second."""
 USD = (".usd", ".usda", ".usdc", ".usdz")
 EXPECTED = (
-    "a COLMAP model's folder, a transforms.json, a nerfstudio camera_path.json, a clsplat camera file (.json) or a USD "
-    "stage"
+    "a COLMAP model's folder, a transforms.json, a nerfstudio camera_path.json, a cameras.json of a 3DGS training, a "
+    "clsplat camera file (.json) or a USD stage"
 )
 
 
@@ -94,10 +99,21 @@ def choose_shot(
             )
         shot = shot.without_optics()
         unapplied = (*shot.unapplied, *window_named(shot.window))
-        shot = Shot(_path(path, shot.cameras, count), shot.warnings, unapplied=unapplied)
+        near, told = _without_strays(shot.frames, cameras)
+        shot = Shot(_path(path, near, count), (*shot.warnings, *told), unapplied=unapplied)
     if applied:
         shot = replace(shot, unapplied=tuple(text for text in shot.unapplied if text.partition(" (")[0] not in applied))
     return shot
+
+
+def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera], tuple[str, ...]]:
+    """The cameras of frames but for strays, and the warning that names these."""
+    far = stray_cameras([frame.camera for frame in frames])
+    near = [frame.camera for frame, stray in zip(frames, far, strict=True) if not stray]
+    if not far.any():
+        return near, ()
+    names = examples(frame.name for frame, stray in zip(frames, far, strict=True) if stray)
+    return near, (f"{source}: {names} stand over {FACTOR:g} times as far off as the others; the path is of these",)
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
@@ -111,14 +127,13 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
             images = colmap.read_images(path)
         elif listed == ["transforms.json"]:
             images = transforms.read_images(path / listed[0], _both(size))
-    elif path.suffix.lower() == ".json" and "frames" in load_document(path, "a transforms.json"):
+    elif path.suffix.lower() == ".json" and "frames" in _parsed(path):
         images = transforms.read_images(path, _both(size))
     if images is None:
         raise InputError(f"{path}: has no lenses of photographs, expected a COLMAP model's folder or a transforms.json")
     if wrong := [image.name for image in images if image.lens.model == PANORAMA]:
         raise InputError(f"{path}: {examples(wrong)} are panoramas, which no straight picture is bent to")
-    if doubt := absurd([(image.name, image.lens) for image in images]):
-        warn(doubt)
+    cameras_of(images)  # warns of those that cannot be right
     return images
 
 
@@ -173,6 +188,8 @@ def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses
             if listed != ["transforms.json"]:
                 raise InputError(f"{path}: holds {examples(listed)}, expected one of them to be named by --cameras")
             return _read_json(path / listed[0], size, lenses)
+    if is_file(path / NAME) and find_model(path) is None:
+        return _read_json(path / NAME, size, lenses)
     cameras = read_cameras(path, lenses)
     if not cameras:
         raise InputError(f"{path}: has no images, expected at least one")
@@ -180,7 +197,9 @@ def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses
 
 
 def _read_json(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
-    document = load_document(path, "a file of cameras", f"'frames', 'camera_path' or '{VERSION_KEY}'")
+    document = _parsed(path)
+    if isinstance(document, list):
+        return read_cameras_json(path, document, size)
     if VERSION_KEY in document:
         return read_keyed(path, document)
     if "camera_path" in document or "keyframes" in document:
@@ -191,3 +210,15 @@ def _read_json(path: Path, size: tuple[int | None, int | None], lenses: Lenses) 
             "'frames' (a transforms.json), expected one of them"
         )
     return Shot(named(read_poses(path, _both(size), lenses)))
+
+
+def _parsed(path: Path) -> dict[str, Any] | list[Any]:
+    """The JSON object or list in a file. Raises InputError."""
+    try:
+        document = parse_json(read_document(path, "a file of cameras"), once=True)
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON: {error}; expected a file of cameras") from None
+    if not isinstance(document, dict | list):
+        keys = f"'frames', 'camera_path' or '{VERSION_KEY}'"
+        raise InputError(f"{path}: holds no JSON object, expected one with {keys}, or a list of cameras")
+    return document

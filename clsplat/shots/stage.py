@@ -17,7 +17,7 @@ import numpy as np
 
 from clsplat.errors import examples, warn
 from clsplat.gaussians import Gaussians
-from clsplat.models.codec.values import require_finite
+from clsplat.models.codec.soundness import sound
 from clsplat.models.formats.usd import gaussians_of, open_stage, readable, space_of, splats_of, survive
 from clsplat.models.placed import IDENTITY, Placement, checked, rows_of
 
@@ -99,9 +99,8 @@ def read_here(path: Path) -> StageModels | None:
         space, sums = space_of(path, prims), hashlib.sha256()
         models = []
         for prim in prims:
-            model = gaussians_of(f"{path}: {prim.GetPath()}", prim, time, space)
-            require_finite(path, model)
-            models.append(model)
+            where = f"{path}: {prim.GetPath()}"
+            models.append(sound(gaussians_of(where, prim, time, space), where))
             _add(sums, prim, time)
         tracks = [StageTrack(f"{path}: {prim.GetPath()}", prim, stage) for prim in prims]
     del diagnostics

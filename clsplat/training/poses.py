@@ -14,6 +14,7 @@ from clsplat.camera import NO_ROTATION
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.scenes.scene import View
+from clsplat.scenes.strays import stray_cameras
 
 BETA1, BETA2 = 0.9, 0.99
 FLATTEST, TINY = 1e-2, 1e-30
@@ -92,8 +93,8 @@ def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64
 class Poses:
     """The cameras of the training views, which move where poses are refined.
 
-    Adam has moments for each view. Two views stay as they are, the first and the one that is farthest from it: they
-    keep the model's place and size.
+    Adam has moments for each view. Two views stay as they are, the first and the one that is farthest from it, strays
+    aside: they keep the model's place and size.
     """
 
     def __init__(self, config: TrainConfig, views: Sequence[View], extent: float) -> None:
@@ -106,8 +107,10 @@ class Poses:
         if len(views) < 3:
             raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two are held")
         places = np.array([camera.position for camera in self.cameras])
-        distances = np.linalg.norm(places - places[0], axis=1)
-        self.held = (0, int(distances.argmax()) or len(views) - 1)
+        near = ~stray_cameras(self.cameras)
+        first = int(near.argmax())
+        distances = np.where(near, np.linalg.norm(places - places[first], axis=1), 0.0)
+        self.held = (first, int(distances.argmax()) or len(views) - 1)
         self._start = first_step(config)
         self._first, self._second = np.zeros((len(views), 6)), np.zeros((len(views), 6, 6))
         self._visits = np.zeros(len(views), np.int64)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from clsplat.arrays import Float64
 from clsplat.camera import Camera, focal_length
 from clsplat.rotations import quaternion_of, rotation_from_quaternion
+from clsplat.scenes.strays import stray_cameras
 from clsplat.shots.viewpoints import COLMAP_UP, extent_of, focus_point, look_at, up_axis
 
 MOST_PIXELS = 4096 * 2304
@@ -84,9 +85,10 @@ class Start:
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
-    """The start at the first of the cameras, about the point that all of them look at. Without cameras: before the
-    points (N, 3) as a COLMAP scene would be seen, y down, looking along z. All vectors are in the world."""
+    """The start at the first of the cameras that is no stray, about the point that the others look at. Without cameras:
+    before the points (N, 3) as a COLMAP scene would be seen, y down, looking along z. All vectors are in the world."""
     if cameras:
+        cameras = [camera for camera, far in zip(cameras, stray_cameras(cameras), strict=True) if not far]
         first, focus, up = cameras[0], focus_point(cameras), up_axis(cameras)
         ahead = first.rotation[2]
         distance = float((focus - first.position) @ ahead)

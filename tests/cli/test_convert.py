@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from clsplat.cli.main import main
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images import colour
-from clsplat.models import edit, formats
+from clsplat.models import difference, edit, formats
 
 
 @pytest.fixture
@@ -343,20 +345,65 @@ def test_info_of_every_format(suffix: str, model: Path, capsys: Capture) -> None
     assert "\nGaussians     300\n" in said
 
 
-def test_info_counts_what_a_reader_refuses(model: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr("clsplat.models.codec.values.require_finite", lambda *_, **__: None)
-    gaussians = Gaussians.load(model)
-    gaussians.means[3, 1] = np.nan
-    gaussians.opacity_logits[[3, 7]] = np.inf
-    gaussians.sh[200, 8, 2] = np.nan
-    gaussians.save(model, comments=["made by hand"])
+def spoilt(path: Path, change: Callable[[Any], None]) -> None:
+    """Change the vertices, a record array, of a PLY that clsplat wrote, which does not write what is not finite."""
+    head, data = path.read_bytes().split(b"end_header\n")
+    names = [line.split()[2].decode() for line in head.split(b"\n") if line.startswith(b"property float ")]
+    rows = np.frombuffer(data, [(name, "<f4") for name in names]).copy()
+    change(rows)
+    path.write_bytes(head + b"end_header\n" + rows.tobytes())
+
+
+def test_info_counts_what_a_reader_leaves_out(model: Path, capsys: Capture) -> None:
+    Gaussians.load(model).save(model, comments=["made by hand"])
+
+    def change(rows: Any) -> None:
+        rows["y"][3] = rows["f_rest_21"][200] = rows["opacity"][7] = np.nan
+        rows["opacity"][[3, 8]], rows["scale_1"][9] = np.inf, -np.inf  # 1 and 0: these are no trouble
+
+    spoilt(model, change)
     assert main(["info", str(model)]) == 0
     said = capsys.readouterr().out
-    assert "300, 3 not finite" in said
+    assert "300, 3 not finite, which are left out" in said
     assert "made by hand" in said
-    assert main(["render", str(model), "--cameras", "x", "-o", "y.png"]) == 2
     assert main(["info", str(model.with_name("none.ply"))]) == 2
     assert "none.ply: no such file" in capsys.readouterr().err
+    target = model.with_name("whole.ply")
+    assert convert(model, target) == 0
+    error = capsys.readouterr().err
+    assert "3 of 300 Gaussians have a value that is not finite, the first is Gaussian 3 with a position" in error
+    assert len(Gaussians.load(target)) == 297
+
+
+@pytest.mark.parametrize("which", ["opacities", "scales", "both"])
+def test_values_that_are_activated_already(model: Path, which: str, capsys: Capture) -> None:
+    """The warning names the flag that writes a right model, which gives none."""
+    wanted = Gaussians.load(model)
+
+    def change(rows: Any) -> None:
+        if which != "scales":
+            rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
+        if which != "opacities":
+            for name in ("scale_0", "scale_1", "scale_2"):
+                rows[name] = np.exp(rows[name])
+
+    spoilt(model, change)
+    target = model.with_name("right.ply")
+    for verb in (["info", str(model)], ["convert", str(model), str(target.with_name("wrong.ply"))]):
+        assert main(verb) == 0
+        lines = [line for line in capsys.readouterr().err.splitlines() if f"--activated {which}`" in line]
+        warned = [name for name in ("opacities", "scales") if any(f": all {name} lie in 0.0" in line for line in lines)]
+        assert warned == (["opacities", "scales"] if which == "both" else [which])
+    assert convert(model, target, "--activated", which) == 0
+    assert "warning" not in capsys.readouterr().err
+    found = difference.errors(wanted, Gaussians.load(target))
+    # float32's rounding of the opacity and the scale, the logarithm of which it is once more
+    assert found["opacity"]["largest"] < 1e-6
+    assert found["scale"]["largest"] < 1e-6
+    other = {"opacities": "scales", "scales": "opacities"}.get(which)
+    if other:
+        assert convert(model, target, "--activated", other, "--overwrite") == 2
+        assert "model.ply: Gaussian" in error_line(capsys)
 
 
 @pytest.mark.smoke

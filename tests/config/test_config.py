@@ -183,7 +183,7 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
     from clsplat.cli.render import Render
     from clsplat.cli.render_job import bits_of
     from clsplat.config.pictures import Encoding
-    from clsplat.scenes.scene import load_scene
+    from clsplat.scenes.loading import load_scene
     from clsplat.viewer.server import Address
 
     def default(owner: type, name: str) -> object:

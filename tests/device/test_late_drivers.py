@@ -19,7 +19,7 @@ from clsplat.device.context import Device
 from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 from clsplat.training import loop as training
 from clsplat.training import watched
 

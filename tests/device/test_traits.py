@@ -13,7 +13,8 @@ from clsplat.device.context import Device, open_device
 from clsplat.device.traits import PRETEND, traits_of
 from clsplat.errors import DeviceError
 from clsplat.gaussians import Gaussians
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.trainer import Trainer
 
 

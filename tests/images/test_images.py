@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from other_pictures import HEIGHT, KINDS, WIDTH, other_picture
 from PIL import Image as Pillow
 from PIL import ImageOps
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.images import writing
-from clsplat.images.reading import downscale, image_size, read_image
+from clsplat.images.reading import alpha_of, channels_of, downscale, image_size, read_image
 from clsplat.images.writing import write_image
 
 RNG = np.random.default_rng(1)
@@ -195,3 +196,67 @@ def test_transparent_colour_does_not_bleed() -> None:
     image[0, 0] = [1, 0.5, 0.25, 1]
     image[1, 1] = [0, 1, 0, 0]  # green, but nothing of it
     np.testing.assert_allclose(downscale(image, 1, 1), [[[1, 0.5, 0.25, 0.25]]], atol=1e-6)
+
+
+UNREAD = ("pcx",)
+CLOSE = {"tiff-palette": 1, "jpeg": 1, "jpeg-cmyk": 2, "tiff-cmyk": 1}
+"""Levels that decoders may differ by: a palette of 16 bits in 8, and the arithmetic of JPEG's and CMYK's colours."""
+
+
+@pytest.mark.brings("browsers, converters", "GIF, WebP and others under the name of a PNG", "the first frame")
+@pytest.mark.parametrize("extension", ["png", "JPG", "tif", "exr"])
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in UNREAD])
+def test_pictures_of_any_kind_under_any_name(kind: str, extension: str, tmp_path: Path) -> None:
+    """The first frame, with the colours that Pillow reads."""
+    path = tmp_path / f"a.{extension}"
+    path.write_bytes(other_picture(kind))
+    image = read_image(path)
+    with Pillow.open(path) as picture:
+        if kind == "tiff-16":
+            wanted = np.repeat(np.asarray(picture, np.float64)[:, :, None], 3, axis=2) * 255 / 65535
+        else:
+            wanted = np.asarray(picture.convert("RGBA" if image.shape[2] == 4 else "RGB"), np.float64)
+    assert image_size(path) == (wanted.shape[1], wanted.shape[0])
+    assert wanted.shape[:2] == ((13, 16) if kind == "ico" else (HEIGHT, WIDTH))
+    assert image.shape[2] == 4 if "alpha" in kind or kind == "gif-transparent" else image.shape[2] in (3, 4)
+    difference = np.abs(image.astype(np.float64) * 255 - wanted)
+    if image.shape[2] == 4:
+        difference[wanted[:, :, 3] == 0, :3] = 0  # the colour of nothing
+    # beyond levels, what float32 makes of them
+    assert difference.max() <= CLOSE.get(kind, 0) + 1e-4
+
+
+@pytest.mark.parametrize("kind", UNREAD)
+def test_pictures_that_cannot_be_read_are_named(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(other_picture(kind))
+    with pytest.raises(InputError, match=r"a\.png: does not decode: .*; expected an image") as caught:
+        read_image(tmp_path / "a.png")
+    assert "\n" not in str(caught.value)
+
+
+class Header:
+    """What a decoder says."""
+
+    def __init__(self, names: tuple[str, ...], alpha: int, count: int) -> None:
+        self.channelnames, self.alpha_channel, self.nchannels = names, alpha, count
+
+
+@pytest.mark.parametrize(
+    ("names", "alpha", "count", "wanted"),
+    [
+        (("R", "G", "B", "A"), 3, 4, 3),
+        (("R", "G", "B", "A"), 4, 4, 3),  # OpenImageIO's GIF
+        (("R", "G", "B"), 3, 3, -1),
+        (("R", "G", "B", "A"), -1, 4, -1),
+        (("R", "G", "B", "A"), -7, 4, -1),
+        (("R", "G", "B"), 2**31 - 1, 3, -1),
+        (("R", "G", "B", "A"), 0, 4, 3),
+        (("Y", "A"), 1, 2, 1),
+        (("Y",), 1, 2, 1),
+        (("R", "G", "B", "A", "Z"), 3, 4, 3),
+    ],
+)
+def test_no_index_of_a_decoder_is_believed(names: tuple[str, ...], alpha: int, count: int, wanted: int) -> None:
+    header = Header(names, alpha, count)
+    assert alpha_of(header) == wanted
+    assert len(channels_of(header)) == count

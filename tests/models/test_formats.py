@@ -208,6 +208,7 @@ def test_scales_count_as_a_part_of_the_gaussians_largest(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*(they are left out|bytes after|by its content):UserWarning")
 @pytest.mark.parametrize("name", WRITTEN)
 @pytest.mark.parametrize("way", ["cut", "flip", "zeros", "ones", "empty"])
 def test_a_spoilt_file_is_one_line_in_bounded_memory(name: str, way: str, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from systems import links
 
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.models import formats
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.palette import codebook, nearest, palette
 from clsplat.models.formats import format_of, sog
@@ -238,6 +239,74 @@ def test_lies(tmp_path: Path, lie: str) -> None:
     (tmp_path / "quats.webp").write_bytes((folder / "quats.webp").read_bytes())
     change(folder, LIES[lie])
     assert assert_refused_or_sound(sog.read, folder / "meta.json")
+
+
+@pytest.mark.brings("splat-transform", "SOG with null in codebooks", "a scale of 0, or left out")
+def test_null_is_what_json_has_no_number_for(tmp_path: Path) -> None:
+    """splat-transform writes it for -inf, the log of a scale of 0, and for NaN."""
+    path, model = tmp_path / "meta.json", lopsided(300, degree=1)
+    sog.write(path, model)
+    plain = formats.load(path)
+    meta = json.loads(path.read_text())
+    code = int(np.abs(np.array(meta["scales"]["codebook"]) - plain.log_scales[5, 2]).argmin())
+    change(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(code, None))
+    read = formats.load(path)
+    flat = plain.log_scales == plain.log_scales[5, 2]
+    assert flat.any(axis=1).sum() < 30
+    wanted = np.where(flat, np.float32(np.log(packing.LEAST_SCALE)), plain.log_scales)
+    np.testing.assert_array_equal(read.log_scales, wanted)
+    colour = int(np.abs(np.array(meta["sh0"]["codebook"]) - plain.sh[7, 0, 1]).argmin())
+    change(tmp_path, lambda meta: meta["sh0"]["codebook"].__setitem__(colour, None))
+    gone = (plain.sh[:, 0] == plain.sh[7, 0, 1]).any(axis=1)
+    with pytest.warns(UserWarning, match=rf"{gone.sum()} of 300 .* first is Gaussian {gone.argmax()} with a colour"):
+        np.testing.assert_array_equal(formats.load(path).means, plain.means[~gone])
+
+
+def test_null_in_the_ranges_of_version_1(tmp_path: Path) -> None:
+    """A least scale of -inf: step 0 is a scale of 0; step 255 the largest."""
+    sog.write(tmp_path / "meta.json", lopsided(100, degree=2))
+    meta = as_version_1(tmp_path)
+    plain = formats.load(tmp_path)
+    change(tmp_path, lambda meta: meta["scales"]["mins"].__setitem__(0, None))
+    read = formats.load(tmp_path)
+    top = np.float32(meta["scales"]["maxs"][0])
+    wanted = np.where(plain.log_scales[:, 0] == top, top, np.float32(np.log(packing.LEAST_SCALE)))
+    np.testing.assert_array_equal(read.log_scales[:, 0], wanted)
+    np.testing.assert_array_equal(read.log_scales[:, 1:], plain.log_scales[:, 1:])
+
+
+NULLS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
+    "all": (
+        lambda meta: meta["scales"].update(codebook=[None] * 256),
+        r"codebook of scales in meta\.json has nothing but null in place of numbers",
+    ),
+    "none": (
+        lambda meta: meta["sh0"].update(codebook=[]),
+        r"codebook of sh0 in meta\.json has 0 numbers, expected 1 to 256",
+    ),
+    "of means": (
+        lambda meta: meta["means"].update(mins=[0, None, 1]),
+        r"mins of means in meta\.json has null in place of numbers",
+    ),
+    "missing": (lambda meta: meta["scales"].pop("codebook"), r"scales in meta\.json has no codebook"),
+    "words": (
+        lambda meta: meta["shN"].update(codebook=["x", None]),
+        r"codebook of shN in meta\.json has other values than numbers, expected 1 to 256",
+    ),
+    "too many": (
+        lambda meta: meta["means"].update(maxs=[1.0] * 4),
+        r"maxs of means in meta\.json has 4 numbers, expected 3",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NULLS)
+def test_no_numbers(tmp_path: Path, name: str) -> None:
+    path, (edit, message) = tmp_path / "meta.json", NULLS[name]
+    sog.write(path, lopsided(20, degree=1))
+    change(tmp_path, edit)
+    with pytest.raises(InputError, match=message):
+        formats.load(path)
 
 
 @links

@@ -122,7 +122,10 @@ def test_morton_order_interleaves_the_bits() -> None:
         (lambda data: data.replace(b"binary_little_endian", b"ascii"), "in ascii"),
         (lambda data: data.replace(b"element chunk", b"element lumps"), "0 elements 'chunk'"),
         (lambda data: data[:-1], "truncated: its header promises"),
-        (lambda data: data.replace(struct.pack("<f", 5.0), struct.pack("<f", np.nan)), "chunk 0 has bounds"),
+        (
+            lambda data: data.replace(struct.pack("<f", -2.0), struct.pack("<f", np.nan)),
+            "2 of 2 Gaussians have a value",
+        ),
     ],
 )
 def test_spoilt_compressed_plys_are_named(change: object, message: str, tmp_path: Path) -> None:
@@ -151,10 +154,10 @@ def test_a_splat_by_hand(tmp_path: Path) -> None:
     for data, message in (
         (record[:-1], "31 bytes"),
         (b"", "0 bytes"),
-        (record + struct.pack("<6f8B", 1, np.nan, 3, 1, 1, 1, *TURN), "Gaussian 1 has a position"),
-        (record + struct.pack("<6f8B", 1, 2, 3, 1, -1, 1, *TURN), "Gaussian 1 has the scales 1 -1 1"),
+        (struct.pack("<6f8B", 1, np.nan, 3, 1, 1, 1, *TURN), "Gaussian 0 with a position; expected some that"),
+        (record * 100 + struct.pack("<6f8B", 1, 2, 3, 1, -1, 1, *TURN), "Gaussian 100 has the scales 1 -1 1"),
         (bytes(64), r"not a \.splat file \(rotations of length 2\.00"),
-        (struct.pack("<6f8B", 1, 2, 3, 1, np.inf, 1, *TURN), "Gaussian 0 has a scale that is not finite"),
+        (struct.pack("<6f8B", 1, 2, 3, 1, np.inf, 1, *TURN), "Gaussian 0 with a scale; expected some that"),
     ):
         path.write_bytes(data)
         with pytest.raises(InputError, match=message):
@@ -227,6 +230,32 @@ def test_ksplat_of_every_level_and_degree(level: int, degree: int, tmp_path: Pat
         np.testing.assert_allclose(getattr(read, name), getattr(wanted, name), rtol=1e-5, atol=1e-5, err_msg=name)
 
 
+def test_records_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
+    """A record of a .splat; a bucket's middle of a .ksplat, and a bound of a chunk, which are of many Gaussians."""
+    path = tmp_path / "a.splat"
+    good, bad = (struct.pack("<6f8B", x, 2, 3, 1, 1, 1, *TURN) for x in (1, np.nan))
+    path.write_bytes(good + bad + good + bad)
+    with pytest.warns(
+        UserWarning, match=r"2 of 4 Gaussians have .*, the first is Gaussian 1 with a position; they are"
+    ):
+        np.testing.assert_array_equal(formats.load(path).means, [[1, 2, 3]] * 2)
+    data, wanted = ksplat(random_gaussians(40, 1), 1, (17, 23))
+    spoilt = bytearray(data)
+    spoilt[4112:4116] = struct.pack("<f", np.nan)  # the size of the first section's blocks
+    path = tmp_path / "a.ksplat"
+    path.write_bytes(spoilt)
+    with pytest.warns(
+        UserWarning, match=r"17 of 40 Gaussians have .*, the first is Gaussian 0 with a position; they are"
+    ):
+        read = formats.load(path)
+    np.testing.assert_allclose(read.means, wanted.means[17:], atol=1e-5)  # as in the test of whole files
+    path = tmp_path / "a.compressed.ply"
+    both = compressed([(0, 0, 0, 0xFF00FF80), (2047 << 21, 0, 0, 0x00FF0080)], BOUNDS)
+    path.write_bytes(both.replace(struct.pack("<f", 0.5), struct.pack("<f", -np.inf)))  # the least blue
+    with pytest.warns(UserWarning, match=r"1 of 2 Gaussians have .*, the first is Gaussian 1 with a colour; they are"):
+        np.testing.assert_allclose(0.5 + C0 * formats.load(path).sh[:, 0], [[1, 0.25, 1.5]], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("at", "value", "message"),
     [
@@ -238,7 +267,6 @@ def test_ksplat_of_every_level_and_degree(level: int, degree: int, tmp_path: Pat
         (4096, b"\xff\xff\xff\xff", "section 0 ends at byte"),
         (4100, b"\xff\xff\xff\xff", "section 0 ends at byte"),
         (4108, b"\xff\xff\xff\xff", "section 0 ends at byte"),
-        (4112, struct.pack("<f", np.nan), "Gaussian 0 has a position that is not finite"),
         (4116, b"\5", "buckets of 5 bytes"),
         (4128, b"\xff\xff\xff\x7f", "2147483647 full and 2 other buckets"),
         (4104, b"\1", "its buckets have fewer"),

@@ -30,7 +30,8 @@ from clsplat.rendering.memory_plan import Need, plan
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.density import new_statistics
 from clsplat.stages.device_gaussians import HostGaussians, upload_gaussians
 from clsplat.stages.loss import loss

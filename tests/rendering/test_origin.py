@@ -24,7 +24,8 @@ from clsplat.models.formats import ply
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import FAR, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import FAR
 
 OFFSET = np.array([5e5, -4.2e6, 333.3])
 """As UTM coordinates are: metres, far from their zero."""

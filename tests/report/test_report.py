@@ -26,7 +26,7 @@ from clsplat.reference.render import render_grad
 from clsplat.report import page as report_page
 from clsplat.report import thumbnails
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 from clsplat.training import telemetry
 from clsplat.training.trainer import Trainer
 

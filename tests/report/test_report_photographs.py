@@ -21,8 +21,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.report.photographs import SHOWN, masked_photographs
 from clsplat.runs.run import Run, owned_files
+from clsplat.scenes.loading import load_scene
 from clsplat.scenes.marked import CLEAR, IGNORED, STRENGTH, masked
-from clsplat.scenes.scene import load_scene
 
 
 def with_masks(folder: Path) -> Path:

@@ -24,7 +24,8 @@ from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ from clsplat.config.points import StartPoints
 from clsplat.errors import InputError
 from clsplat.scenes.cloud import Cloud, check_place, read_cloud, thinned, with_points
 from clsplat.scenes.initialise import from_scene, is_colourless, photographed
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.scenes.sky import half_sphere, sky_points
 
 RNG = np.random.default_rng(5)

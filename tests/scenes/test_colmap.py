@@ -160,7 +160,7 @@ def test_flipped_bytes_are_read_or_refused_but_never_crash(tmp_path: Path, stem:
     whole = path.read_bytes()
     chance = random.Random(5)
     refused = []
-    for _ in range(400):
+    for _ in range(600):
         damaged = bytearray(whole)
         damaged[chance.randrange(len(whole))] ^= chance.randrange(1, 256)
         path.write_bytes(damaged)

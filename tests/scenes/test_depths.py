@@ -21,7 +21,8 @@ from clsplat.images.depth_maps import map_header, read_map
 from clsplat.scenes.colmap import read_tracks
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.depth import KnownDepth, with_depths
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 POINTS, MAPS, RELATIVE = DepthUse("points"), DepthUse("maps"), DepthUse("maps", "relative")
 

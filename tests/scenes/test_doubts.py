@@ -23,7 +23,8 @@ from clsplat.reference.cameras import pixel_from_world
 from clsplat.scenes import doubts
 from clsplat.scenes.data_set import pixels_of
 from clsplat.scenes.initialise import LEAST_COLOUR, from_points, is_colourless, photographed
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.spherical_harmonics import C0
 
 

@@ -24,7 +24,8 @@ from clsplat.scenes.answers import ADVICE, ANSWERS, SCHEDULED, answered, paragra
 from clsplat.scenes.data_set import Lens
 from clsplat.scenes.findings import FEW, Finding, findings
 from clsplat.scenes.glance import Glance, glance_at, sharpness_of
-from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene, View
 
 ACROSS, DOWN = 96, 64
 

@@ -19,7 +19,8 @@ from clsplat.models import edit
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.initialise import MIN_SQUARED_DISTANCE, squared_floor
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 

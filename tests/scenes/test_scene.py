@@ -21,7 +21,8 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.images.reading import companions, read_image
 from clsplat.images.writing import write_image
-from clsplat.scenes.scene import camera_bounds, detect, load_scene
+from clsplat.scenes.layouts import detect
+from clsplat.scenes.loading import camera_bounds, load_scene
 
 RNG = np.random.default_rng(2)
 WIDTH, HEIGHT = 48, 32
@@ -114,8 +115,8 @@ def test_pictures_of_another_scale_than_the_camera(tmp_path: Path) -> None:
 
 def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
     make_colmap(tmp_path)
-    write_image(tmp_path / "images" / "3.png", np.zeros((30, 50, 3), np.float32))
-    with pytest.raises(InputError, match=r"3\.png: is 50 x 30 pixels, expected its camera's 48 x 32"):
+    write_image(tmp_path / "images" / "3.png", np.zeros((30, 70, 3), np.float32))
+    with pytest.raises(InputError, match=r"3\.png: is 70 x 30 pixels, expected its camera's 48 x 32"):
         load_scene(tmp_path)
 
 
@@ -157,7 +158,8 @@ def test_of_many_missing_pictures_three_are_named(tmp_path: Path) -> None:
         load_scene(tmp_path)
     assert "lists 17 image(s) that are missing: " in str(caught.value)
     assert str(caught.value).count("/images/") == 3
-    assert str(caught.value).endswith(" and 14 more")
+    assert " and 14 more; " in str(caught.value)
+    assert str(caught.value).endswith("3 are in " + f"{tmp_path / 'images'}; --missing skip trains on the others")
 
 
 def test_depths_and_normals_beside_the_pictures_are_silent(tmp_path: Path) -> None:
@@ -216,7 +218,9 @@ def test_links_that_lead_nowhere_are_no_pictures(tmp_path: Path) -> None:
     assert load_scene(tmp_path).warnings == []
     (tmp_path / "images" / "2.png").unlink()
     (tmp_path / "images" / "2.png").symlink_to(tmp_path / "gone.png")
-    with pytest.raises(InputError, match=r"lists 1 image\(s\) that are missing: .*2\.png$"):
+    with pytest.raises(
+        InputError, match=r"lists 1 image\(s\) that are missing: .*2\.png; 8 are in .*images; --missing skip"
+    ):
         load_scene(tmp_path)
 
 
@@ -356,7 +360,7 @@ def test_photos_go_through_sfm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         warnings.warn("b.png could not be placed", stacklevel=1)
         return make_colmap(output)
 
-    monkeypatch.setattr("clsplat.scenes.scene.reconstruct", reconstruct)
+    monkeypatch.setattr("clsplat.scenes.loading.reconstruct", reconstruct)
     scene = load_scene(photos)
     assert calls == [(photos, tmp_path / "photos_colmap", None)]
     assert len(scene.views) == 9
@@ -381,8 +385,9 @@ def test_transforms_unlisted_and_bounds(tmp_path: Path) -> None:
     side = 0.05 / 0.33
     np.testing.assert_allclose(scene.bounds, [[-side] * 3, [side, side, 0]])  # instant-ngp's, and ahead (z < 0) only
     assert len(load_scene(tmp_path / "transforms.json").views) == 7
-    with pytest.raises(InputError, match="can be chosen only for a COLMAP one"):
-        load_scene(tmp_path, images="images")
+    assert [view.name for view in load_scene(tmp_path, images="images").views] == [view.name for view in scene.views]
+    with pytest.raises(InputError, match="photos: no such folder"):
+        load_scene(tmp_path, images="photos")
 
 
 def ring(facing: float, count: int = 12) -> list[Camera]:

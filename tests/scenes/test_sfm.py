@@ -19,7 +19,7 @@ from clsplat.config.masks import MaskUse
 from clsplat.demo import ray_caster
 from clsplat.errors import ClsplatError, InputError
 from clsplat.scenes import sfm, sfm_photos
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
 # EXIF orientation: what a viewer does to stored pixels to show the photo; here its inverse, shown to stored
@@ -214,6 +214,24 @@ def test_photos_that_lose_their_alpha_are_named(pictures, tmp_path):
     )
     assert copied == []
     assert oiio.ImageInput.open(str(tmp_path / "copied/images/00.png")).spec().nchannels == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "begin"), [("view_03.jpg", "GIF", b"\xff\xd8\xff"), ("view_03.png", "GIF", b"\x89PNG")]
+)
+def test_a_gif_under_another_name_is_written_anew(name, form, begin, photos, tmp_path, monkeypatch):
+    folder = tmp_path / "photos"
+    shutil.copytree(photos, folder)
+    picture = read_image(folder / "view_03.jpg")
+    (folder / "view_03.jpg").unlink()
+    Pillow.fromarray(picture).save(folder / name, form)
+    tasks = task_of(monkeypatch)
+    assert warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "out")) == []
+    assert name in tasks[0]["groups"][0]
+    assert tasks[1][name].startswith(begin)
+    (tmp_path / name).write_bytes(tasks[1][name])
+    # a palette of 256 colours, and JPEG
+    assert np.abs(np.asarray(Pillow.open(tmp_path / name).convert("RGB"), float) - picture).mean() < 6
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])

@@ -14,7 +14,7 @@ from models import random_gaussians
 from clsplat.cli.main import main
 from clsplat.errors import warn
 from clsplat.images.writing import write_image
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 
 CLOUD = """ply
 format ascii 1.0

@@ -281,7 +281,7 @@ def test_own_files_that_cannot_be(changes: dict[str, Any], message: str, tmp_pat
     ("name", "content", "message"),
     [
         ("a.json", "{", "is not JSON"),
-        ("a.json", "[1]", "holds no JSON object, expected one with 'frames', 'camera_path' or 'clsplat_cameras'"),
+        ("a.json", "1", "holds no JSON object, expected one with 'frames', 'camera_path' or 'clsplat_cameras'"),
         ("a.json", "{}", "has neither 'clsplat_cameras' (a clsplat camera file) nor 'camera_path'"),
         ("a.json", '{"frames": []}', "has no 'frames'"),
         ("a.abc", "", "has the extension '.abc', expected a COLMAP model's folder, a transforms.json"),
@@ -356,7 +356,7 @@ def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
     for block in blocks:
         (tmp_path / "example.json").write_text(block)
         shots.append(read_shot(tmp_path / "example.json"))
-    assert [[len(shot.frames), shot.frames[0].number] for shot in shots] == [[1, 1], [1, 1], [73, 1001]]
+    assert [[len(shot.frames), shot.frames[0].number] for shot in shots] == [[1, 1], [1, 1], [1, 1], [73, 1001]]
     for shot in shots:  # each looks from y = -4 along +y, the world's z up
         np.testing.assert_allclose(shot.cameras[0].position[:2], [0, -4])
         np.testing.assert_allclose(shot.cameras[0].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-8)

@@ -19,7 +19,7 @@ from clsplat.config.channels import CHANNELS
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions, Task
 

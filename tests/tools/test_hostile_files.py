@@ -41,10 +41,11 @@ from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
 from clsplat.images import reading, writing
 from clsplat.images.reading import find_images, image_size, read_image
+from clsplat.models.codec import ply_file
 from clsplat.models.formats import ply
 from clsplat.runs import run as runs
-from clsplat.scenes import colmap, sfm, transforms
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes import colmap, point_files, sfm, transforms
+from clsplat.scenes.loading import load_scene
 
 
 def refusal(read: Callable[[], object]) -> str:
@@ -248,7 +249,7 @@ def test_one_long_word_is_no_table_of_long_words(tmp_path: Path) -> None:
 
 
 def test_text_cannot_claim_more_rows_than_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ply, "BLOCK_ROWS", 4)
+    monkeypatch.setattr(ply_file, "BLOCK_ROWS", 4)
     row = " ".join(["0.5"] * len(ply.REQUIRED))
     path = model(tmp_path, ascii_model([row] * 9, 10**8))
     assert peak_of(lambda: ply.read(path)) < 1e6
@@ -257,10 +258,10 @@ def test_text_cannot_claim_more_rows_than_bytes(tmp_path: Path, monkeypatch: pyt
 def test_wide_rows_are_read_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_ply(tmp_path)
     whole = ply.read(tmp_path / "model.ply")
-    monkeypatch.setattr(ply, "MAX_BLOCK_BYTES", 200)
+    monkeypatch.setattr(ply_file, "MAX_BLOCK_BYTES", 200)
     np.testing.assert_array_equal(ply.read(tmp_path / "model.ply").sh, whole.sh)
     make_ply(tmp_path, "ascii")
-    monkeypatch.setattr(ply, "MAX_BLOCK_WORDS", 70)
+    monkeypatch.setattr(ply_file, "MAX_BLOCK_WORDS", 70)
     np.testing.assert_array_equal(ply.read(tmp_path / "model.ply").sh, whole.sh)
 
 
@@ -268,14 +269,14 @@ def test_a_clouds_property_twice(tmp_path: Path) -> None:
     names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "x"))
     for form in ("binary_little_endian", "ascii"):
         path = model(tmp_path, f"ply\nformat {form} 1.0\nelement vertex 1\n{names}end_header\n1 2 3 4 5 6 7 8".encode())
-        assert "property x twice" in refusal(lambda path=path: transforms.read_point_cloud(path))
+        assert "property x twice" in refusal(lambda path=path: point_files.read_point_cloud(path))
 
 
 def test_a_cloud_claims_at_most_what_it_has(tmp_path: Path) -> None:
     names = "".join(f"property float {name}\n" for name in "xyz")
     for form in ("binary_little_endian", "ascii"):
         path = model(tmp_path, f"ply\nformat {form} 1.0\nelement vertex {10**15}\n{names}end_header\n1 2 3\n".encode())
-        assert peak_of(lambda path=path: transforms.read_point_cloud(path)) < 2e6
+        assert peak_of(lambda path=path: point_files.read_point_cloud(path)) < 2e6
 
 
 @settings(max_examples=60, deadline=None)

@@ -13,7 +13,7 @@ from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 
 from clsplat.demo.ray_caster import Floor, Wall, cameras, still_life
 from clsplat.images.reading import read_image
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 
 LEVEL = 1 / 255
 """The largest distance of two 8 bit pictures of the same values."""

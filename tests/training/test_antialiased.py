@@ -21,7 +21,8 @@ from clsplat.models.formats import load
 from clsplat.reference.sampling import sampling_limits
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training import sampling
 from clsplat.training.sampling import SamplingFilter

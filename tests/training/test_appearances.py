@@ -14,7 +14,8 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_devices
 from clsplat.errors import DeviceError
 from clsplat.runs.checkpoints import Checkpoint
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.trainer import Trainer
 
 LEARNT = {"exposure": "appearance/logs", "ppisp": "appearance/lenses_logs", "grid": "appearance/first"}

@@ -24,7 +24,8 @@ from clsplat.gaussians import GROUPS, Gaussians
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.adam import corrected
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.training.batch import Batch, Outcome, Replica, scaled, scaled_rates, shares

@@ -21,7 +21,8 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import load
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.trainer import Trainer
 
 ALONG_RAYS = replace(CONFIG, perspective="rays")

@@ -25,7 +25,8 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.runs.appearance import gains_of
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.photographs import Photographs
 from clsplat.training.ppisp import PpispOfAll
 from clsplat.training.trainer import Trainer

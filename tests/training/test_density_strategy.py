@@ -17,7 +17,8 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import GROUPS
 from clsplat.runs.checkpoints import Checkpoint
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.trainer import Trainer

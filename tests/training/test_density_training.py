@@ -26,7 +26,8 @@ from clsplat.device.context import Device
 from clsplat.gaussians import GROUPS
 from clsplat.reference.render import render_grad
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.density import CONTRIBUTIONS, RowList
 from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training.density import ModelState, RowPlan, adaptive

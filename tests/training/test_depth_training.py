@@ -28,7 +28,8 @@ from clsplat.runs import scene_record
 from clsplat.runs.run import Run
 from clsplat.scenes.depth import with_depths
 from clsplat.scenes.known_depth import KnownDepth
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.depth import Depths, weight_at
 from clsplat.training.health import Incident
 from clsplat.training.pending import VARIABLE

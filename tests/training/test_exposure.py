@@ -24,8 +24,9 @@ from clsplat.images.reading import read_image
 from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
+from clsplat.scenes.loading import load_scene
 from clsplat.scenes.looked import Looked
-from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.scenes.scene import Scene, View
 from clsplat.training import gains
 from clsplat.training.gains import GainsOfAll
 from clsplat.training.photographs import Photographs

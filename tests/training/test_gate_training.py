@@ -21,7 +21,8 @@ from clsplat.images.alpha import background_colour
 from clsplat.rendering.renderer import Renderer
 from clsplat.report.figures import read_figures
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.loop import StepReport
 from clsplat.training.poses import Poses
 from clsplat.training.trainer import Trainer

@@ -12,7 +12,8 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import GROUPS
 from clsplat.rendering.rasterizer import Frame, Rasterizer
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.stages.project import Slots

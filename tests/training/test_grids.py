@@ -15,7 +15,8 @@ from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.grid import SHAPE
 from clsplat.training.photographs import Photographs
 from clsplat.training.trainer import Trainer

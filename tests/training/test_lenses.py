@@ -31,7 +31,8 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.data_set import pixels_of
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.shots import choose_shot
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.training.step import GradientStep, StepProbe

@@ -17,7 +17,8 @@ from clsplat.config.training import DensityConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.reference.render import render_grad
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.density.adaptive import edge_scores, long_halves
 from clsplat.training.edges import edge_contributions, edge_strength
 from clsplat.training.pending import VARIABLE

@@ -12,7 +12,8 @@ from compare import assert_close
 from tiny import loss_curve, write_scene
 
 from clsplat.device.context import Device
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "loss_curve.json"
 

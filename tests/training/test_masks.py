@@ -27,7 +27,7 @@ from clsplat.reference.loss import alpha_loss, masked_l1_dssim
 from clsplat.reference.project import project
 from clsplat.reference.render import forward, parameters, render_grad
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians
 from clsplat.stages.loss import loss
 from clsplat.stages.target import target

@@ -22,7 +22,8 @@ from clsplat.device.context import Device
 from clsplat.errors import ClsplatError
 from clsplat.gaussians import GROUPS
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.density import HALVED, RowPlan
 from clsplat.training.density.adaptive import long_halves
 from clsplat.training.density.mcmc import MOST, Mcmc, draw, last_growth, shared, strongest, wanted

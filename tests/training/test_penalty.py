@@ -16,7 +16,8 @@ from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.density.choice import strategy_of
 
 CONFIG = replace(short(iterations=40), penalty=0.5)

@@ -19,7 +19,8 @@ from clsplat.device.profile import Calls
 from clsplat.device.uploads import SLOTS, Uploads
 from clsplat.errors import CapacityError
 from clsplat.rendering.memory_plan import Need, plan
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training import photographs
 from clsplat.training.photographs import Photographs
 from clsplat.training.trainer import Trainer

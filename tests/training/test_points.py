@@ -18,7 +18,7 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.models.formats import ply
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.loop import begin

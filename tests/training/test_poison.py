@@ -24,7 +24,8 @@ from clsplat.errors import InputError
 from clsplat.gaussians import GROUPS
 from clsplat.images.writing import write_image
 from clsplat.scenes.depth import with_depths
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.training import step as step_module
 from clsplat.training.step import GradientStep, StepRows

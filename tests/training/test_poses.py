@@ -24,7 +24,8 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, View, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene, View
 from clsplat.training.cameras import aligned
 from clsplat.training.gate import drift
 from clsplat.training.poses import Poses, axes_of, descend

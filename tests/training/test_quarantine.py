@@ -27,7 +27,8 @@ from clsplat.device.source import kernel_source
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import GROUPS, SH_LIMIT, group_shapes
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.training import repro
 from clsplat.training.health import PATIENCE, RETURNS, SMALLER, WINDOW, Patience, examine, finite_or_zero, lost

@@ -13,7 +13,8 @@ from tiny import short, write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 
 REFINED = {"poses": ("refine_poses",), "lenses": ("refine_lenses",), "both": ("refine_poses", "refine_lenses")}
 

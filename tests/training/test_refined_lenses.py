@@ -22,7 +22,8 @@ from clsplat.evaluation.metrics import psnr
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.data_set import Lens
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.lenses import RefinedLenses
 from clsplat.training.trainer import Trainer
 

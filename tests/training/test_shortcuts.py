@@ -17,7 +17,8 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.scenes.initialise import from_points
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import download_gaussians
 from clsplat.training.trainer import Trainer
 

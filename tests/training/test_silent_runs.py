@@ -29,7 +29,7 @@ from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
 from clsplat.scenes import doubts
-from clsplat.scenes.scene import load_scene
+from clsplat.scenes.loading import load_scene
 from clsplat.training.loop import late_settings
 
 

@@ -24,7 +24,8 @@ from clsplat.errors import InputError
 from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
 from clsplat.scenes.depth import with_depths
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages import project
 from clsplat.stages.scan import scan
 from clsplat.training.pending import VARIABLE

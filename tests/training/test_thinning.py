@@ -25,7 +25,8 @@ from clsplat.gaussians import Gaussians
 from clsplat.reference.render import forward, render_grad
 from clsplat.reference.thinning import factors, logit_grad, thinned_logits
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
 

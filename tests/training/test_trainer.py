@@ -23,7 +23,8 @@ from clsplat.device.context import Device
 from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import GROUPS
 from clsplat.runs.run import Run
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import DeviceGaussians, upload_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.training.density import ModelState, RowPlan, adaptive

@@ -17,7 +17,8 @@ from clsplat.errors import CapacityError, InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR, SRGB, displayed
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.scene import Scene, load_scene
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
 from clsplat.training.trainer import Trainer
 from clsplat.viewer.appearance import Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
 from clsplat.viewer.models import HeldModel, LiveModel, draft

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import C0
 
@@ -22,6 +22,9 @@ BLOCK_ROWS = 1 << 15
 """Rows that are read or written at once: whole chunks of the compressed PLY."""
 LEAST_SCALE = 2.0**-149
 """Value for a scale of 0, whose log has to be finite: float32's least."""
+LOGS = 0.01
+"""The part of linear scales that has to be negative for all of them to be logs. Of a model in metres nearly all are; a
+file of scales with a damaged one is none of logs."""
 FREE_COUNT = 1 << 20
 """Gaussians that a compressed file may have whatever its length is; beyond them it may have one for each byte of it.
 That is more than any model of a scene, whose positions alone take several bytes each, and less than what a bomb would
@@ -29,6 +32,10 @@ ask for."""
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Row i: the components of a quaternion but for number i."""
 MORTON_BITS = 21
+BEYOND_WHITE = 2.0
+"""Colours of floats that are up to here, and no whole numbers, are parts of 1, some of them brighter than white."""
+ROUNDING = 1e-3
+"""By how much, in parts of it, a colour of floats may pass white, or an opacity 1: that of half floats and averages."""
 NAMES = ("a position", "a rotation", "a scale", "an opacity", "a colour")
 """The arrays of `Gaussians`, for messages."""
 _SPREAD = (
@@ -84,15 +91,44 @@ def byte_logits() -> Float32:
     return logits(steps / 255)
 
 
-def log_scales(linear: NDArray[Any], path: Path | str, first: int) -> Float64:
-    """(n, 3) of standard deviations, those of the Gaussians from `first` on. Raises InputError for negative ones."""
+def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
+    """Take logs of linear scales, standard deviations that a file has in place of logs, in place.
+
+    Those of which `LOGS` or more are negative are logs, and stay, with a warning: splat-transform's .glb of before 22
+    June 2026, and the review draft of KHR_gaussian_splatting, had such. All that are given at once decide together.
+    `where` begins messages. Raises InputError for fewer negative ones.
+    """
+    scales = gaussians.log_scales
     with np.errstate(invalid="ignore"):
-        bad = ~(linear >= 0).all(axis=1)
+        negative = (scales < 0).any(axis=1)
+    if count := int(negative.sum()):
+        at = int(negative.argmax())
+        found = f"Gaussian {at} has the scales {' '.join(f'{value:g}' for value in scales[at])}"
+        if count < LOGS * len(scales):
+            raise InputError(
+                f"{where}: {found}, expected numbers of at least 0; {count:,} of {len(scales):,} have a negative one"
+            )
+        warn(
+            f"{where}: {found}, and {count:,} of {len(scales):,} have a negative one: all are read as logs of scales, "
+            "though this format holds scales themselves"
+        )
+        return
+    for rows in row_blocks(len(scales)):
+        scales[rows] = np.log(np.maximum(scales[rows], LEAST_SCALE, dtype=np.float64))
+
+
+def logits_of(opacity: NDArray[Any], where: Path | str, first: int = 0) -> Float32:
+    """Logits of a file's opacities; NaN is passed on. `first`: the number of the first of them. Raises
+    InputError for what is outside [0, 1] by more than rounding."""
+    with np.errstate(invalid="ignore"):
+        bad = (opacity < -ROUNDING) | (opacity > 1 + ROUNDING)
     if bad.any():
         at = int(bad.argmax())
-        scales = " ".join(f"{value:g}" for value in linear[at])
-        raise InputError(f"{path}: Gaussian {first + at} has the scales {scales}, expected numbers of at least 0")
-    return np.asarray(np.log(np.maximum(linear, LEAST_SCALE, dtype=np.float64)))
+        raise InputError(
+            f"{where}: Gaussian {first + at} has an opacity outside [0, 1], {float(opacity[at]):g}; if these are "
+            "logits, expected 1 / (1 + exp(-logit))"
+        )
+    return logits(opacity)
 
 
 def colours(dc: Float32) -> Float64:
@@ -103,6 +139,27 @@ def colours(dc: Float32) -> Float64:
 def coefficients(rgb: NDArray[Any]) -> Float64:
     """SH coefficients 0 of colours."""
     return (np.asarray(rgb, np.float64) - 0.5) / C0
+
+
+def full_scale(levels: NDArray[Any]) -> float:
+    """White of stored colours of any shape and numeric dtype, by their values: 1, 255 or 65535.
+
+    8-bit integers have 255. Wider ones have 255 if the largest is at most that, as programs store bytes in them, and
+    else 65535. Floats have 1 if the largest is at most 1, or at most `BEYOND_WHITE` with fractions among them; else as
+    wider integers. Values that are not finite do not count; no values at all have 255 as integers, 1 as floats.
+    """
+    values = np.asarray(levels)
+    integer = values.dtype.kind in "iub"
+    if integer and values.dtype.itemsize == 1:
+        return 255.0
+    values = values[np.isfinite(values)]
+    largest = float(values.max(initial=0))
+    if integer:
+        return 255.0 if largest <= 255 else 65535.0
+    slack = 1 + ROUNDING
+    if largest <= slack or (largest <= BEYOND_WHITE and bool((values != np.rint(values)).any())):
+        return 1.0
+    return 255.0 if largest <= 255 * slack else 65535.0
 
 
 def unit_quaternions(quaternions: NDArray[Any]) -> Float64:
@@ -129,6 +186,17 @@ def leave_out_largest(unit: Float64) -> tuple[NDArray[np.intp], Float64]:
     return which, np.take_along_axis(unit, OTHERS[which], axis=1) * sign
 
 
+def at_ends(between: NDArray[Any], low: NDArray[Any], high: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
+    """`between`, the values at a part, 0 to 1, of the way between two bounds; but where a bound is infinite those at
+    the ends are the bounds themselves and the others the infinite one, which arithmetic would make NaN."""
+    finite = np.isfinite(low) & np.isfinite(high)
+    if finite.all():
+        return between
+    with np.errstate(invalid="ignore"):  # of infinities of both signs, which say nothing
+        ends = np.where(part == 0, low, np.where(part == 1, high, low + high))
+    return np.where(finite, between, ends)
+
+
 def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
     """The next `count` records of the file, whose size has been checked. Raises InputError where it shrank since."""
     data = file.read(count * kind.itemsize)
@@ -137,22 +205,20 @@ def read_rows(file: BinaryIO, kind: np.dtype[Any], count: int, path: Path) -> ND
     return np.frombuffer(data, kind)
 
 
-def require_finite(path: Path, gaussians: Gaussians, *, writing: bool = False) -> None:
-    """Raise InputError naming the first value that is not finite."""
-    for name, array in zip(NAMES, gaussians.arrays().values(), strict=True):
-        with np.errstate(invalid="ignore"):  # of infinities of both signs
-            total = array.sum(dtype=np.float64)  # a single pass; that of finite float32 is finite
-        if not np.isfinite(total):
-            row = int((~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).argmax())
-            verb = "cannot be written: " if writing else ""
-            raise InputError(f"{path}: {verb}Gaussian {row} has {name} that is not finite")
+def all_finite(array: NDArray[Any]) -> bool:
+    """True if every value is, by a single pass: the sum of float32 in float64 is finite if they are."""
+    with np.errstate(invalid="ignore"):  # of infinities of both signs
+        return bool(np.isfinite(array.sum(dtype=np.float64)))
 
 
 def check_writable(path: Path, gaussians: Gaussians, *, least: int = 0) -> None:
     """Raise ValueError for arrays that are not as `Gaussians` says; InputError for values that are not finite, and for
     fewer than `least` Gaussians."""
     gaussians.check()
-    require_finite(path, gaussians, writing=True)
+    for name, array in zip(NAMES, gaussians.arrays().values(), strict=True):
+        if not all_finite(array):
+            row = int((~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).argmax())
+            raise InputError(f"{path}: cannot be written: Gaussian {row} has {name} that is not finite")
     if len(gaussians) < least:
         raise InputError(f"{path}: cannot be written: the model has no Gaussians")
 

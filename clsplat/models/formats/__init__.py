@@ -22,7 +22,10 @@ from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.colour import recorded_space
-from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd
+from clsplat.models.codec import soundness
+from clsplat.models.codec.ply_file import MAX_HEADER_BYTES
+from clsplat.models.codec.soundness import Activated
+from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd, zipped
 
 HEAD_BYTES = 1 << 16
 SAMPLED = 10_000
@@ -62,7 +65,13 @@ class Format:
     space: Callable[[Path], str] = recorded_space
 
 
+ZIP = ".zip"
 UNIT_QUATERNIONS = "nothing but the quaternions' lengths and the logits of opacities next to 0 and 1"
+
+_IN_ZIP = zipped.Inside(
+    lambda path: is_model_name(path) and path.suffix.lower() != ZIP,
+    lambda path: resolve(path),  # noqa: PLW0108  # which goes by the table
+)
 
 FORMATS: tuple[Format, ...] = (
     Format("compressed PLY", (".compressed.ply",), compressed_ply.read, compressed_ply.write, compressed_ply.recognises,
@@ -83,6 +92,8 @@ FORMATS: tuple[Format, ...] = (
            describe=spz.describe),
     Format("OpenUSD", (".usda", ".usdc", ".usdz", ".usd"), usd.read, usd.write, usd.recognises,
            loses=UNIT_QUATERNIONS, floats=True, describe=usd.describe, space=usd.recorded_space),
+    Format("zipped model", (ZIP,), _IN_ZIP.read, recognises=zipped.recognises, loses="not written here",
+           describe=_IN_ZIP.describe, space=_IN_ZIP.space),
 )  # fmt: skip
 """All formats. Of two that recognise the same first bytes the earlier counts."""
 
@@ -124,6 +135,8 @@ def format_of(path: Path) -> Format:
         return named
     with open_input(path, f"a model file, its ending one of {' '.join(suffixes())}") as file:
         head = file.read(HEAD_BYTES)
+        if head.startswith(b"ply") and b"end_header" not in head:  # long comments: the properties are further on
+            head += file.read(MAX_HEADER_BYTES)
     # of a format without a beginning of its own another's counts, but for JSON's, which says too little
     fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
     others = () if fits else (row for row in FORMATS if row.recognises and row.recognises(head))
@@ -151,10 +164,16 @@ def model_path(path: Path) -> Path:
     return next((path / name for name in names if is_file(path / name)), path)
 
 
-def load(path: str | os.PathLike[str]) -> Gaussians:
-    """Read a model file of any format. Raises InputError naming the file and the trouble."""
+def load(path: str | os.PathLike[str], *, activated: Activated | None = None) -> Gaussians:
+    """Read a model file of any format; `soundness.sound` of it. activated: what the file has in place of its logits or
+    logs, which are taken of it; else a warning says where this seems to be needed. Raises InputError naming the file
+    and the trouble."""
     path, row = resolve(Path(path))
-    gaussians = row.read(path)
+    gaussians = soundness.sound(row.read(path), path)
+    if activated:
+        gaussians = soundness.deactivated(gaussians, activated, path)
+    for text in soundness.doubts(gaussians.opacity_logits, gaussians.log_scales):
+        warn(f"{path}: {text}")
     if gaussians.near == NEAR:
         gaussians.near = _near_of(gaussians)
     return gaussians

@@ -13,6 +13,9 @@ write-compressed-ply). Frame, quaternion order, log scales and signs are the PLY
 - element `sh`, where there are higher coefficients: f_rest_*, channel-major, bytes for -4 to 4: the middle of one of
   256 steps, but 0 and 255 are the ends.
 
+An infinite bound is that of the Gaussians at that end of the steps, and of those between the ends: writers that let one
+pass, as for a scale of 0 whose log is -inf, lose what is between.
+
 A chunk's Gaussians share its bounds, so that they are sorted to lie near each other when written.
 """
 
@@ -29,6 +32,7 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError
 from clsplat.files import atomic_writer, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
+from clsplat.models.codec import ply_file
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import ply
 
@@ -52,10 +56,9 @@ def recognises(head: bytes) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read it. Raises InputError: not a compressed PLY, elements or properties missing, truncated, values that are
-    not finite."""
+    """Read it. Raises InputError: not a compressed PLY, elements or properties missing, truncated."""
     with open_input(path, "a compressed PLY") as file:
-        header = ply.read_header(file, path)
+        header = ply_file.read_header(file, path)
         chunks, vertex, sh = _elements(header)
         end, have = header.start(len(header.elements)), os.fstat(file.fileno()).st_size
         if have < end:
@@ -72,16 +75,15 @@ def read(path: Path) -> Gaussians:
                 steps = np.where(columns == 0, 0, np.where(columns == 255, 256, columns + np.float32(0.5)))
                 values = (steps / 256 - 0.5) * 8
                 result.sh[rows, 1:] = values.reshape(len(values), 3, -1).transpose(0, 2, 1)
-    packing.require_finite(path, result)
-    result.antialiased, result.by_rays = header.antialiased, header.by_rays
+    result.antialiased, result.by_rays = header.is_antialiased(), header.by_rays
     return result
 
 
 def describe(path: Path) -> dict[str, Any]:
     """The format's part of `clsplat info`: comments, `antialiased`, `by_rays`."""
     with open_input(path, "a compressed PLY") as file:
-        header = ply.read_header(file, path)
-    return {"comments": header.comments, "antialiased": header.antialiased, "by_rays": header.by_rays}
+        header = ply_file.read_header(file, path)
+    return {"comments": header.comments, "antialiased": header.is_antialiased(), "by_rays": header.by_rays}
 
 
 def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> None:
@@ -92,8 +94,8 @@ def write(path: Path, gaussians: Gaussians, *, comments: Sequence[str] = ()) -> 
     rest = 3 * (gaussians.sh.shape[1] - 1)
     lines = ["ply", "format binary_little_endian 1.0", "comment clsplat"]
     lines += [f"comment {line}" for line in comments]
-    lines += [" ".join(ply.MIP)] if gaussians.antialiased else []
-    lines += [" ".join(ply.ALONG_RAYS)] if gaussians.by_rays else []
+    lines += [" ".join(ply_file.MIP)] if gaussians.antialiased else []
+    lines += [" ".join(ply_file.ALONG_RAYS)] if gaussians.by_rays else []
     lines += [f"element chunk {-(-count // CHUNK)}", *(f"property float {name}" for name in BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
     lines += [f"element sh {count}", *(f"property uchar f_rest_{index}" for index in range(rest))] if rest else []
@@ -115,7 +117,7 @@ def order(gaussians: Gaussians) -> NDArray[np.int64]:
     return packing.morton_order(gaussians.means)
 
 
-def _elements(header: ply.Header) -> tuple[ply.Element, ply.Element, ply.Element | None]:
+def _elements(header: ply_file.Header) -> tuple[ply_file.Element, ply_file.Element, ply_file.Element | None]:
     """chunk, vertex and sh, if there is one, their properties checked."""
     path, names = header.path, [element.name for element in header.elements]
     if header.format == "ascii":
@@ -148,13 +150,13 @@ def _elements(header: ply.Header) -> tuple[ply.Element, ply.Element, ply.Element
     return chunks, vertex, sh
 
 
-def _rows(file: BinaryIO, header: ply.Header, element: ply.Element, rows: slice) -> NDArray[Any]:
+def _rows(file: BinaryIO, header: ply_file.Header, element: ply_file.Element, rows: slice) -> NDArray[Any]:
     kind = header.row_type(element)
     file.seek(header.start(header.elements.index(element)) + rows.start * kind.itemsize)
     return packing.read_rows(file, kind, rows.stop - rows.start, header.path)
 
 
-def _bounds(file: BinaryIO, header: ply.Header, chunks: ply.Element) -> NDArray[np.float32]:
+def _bounds(file: BinaryIO, header: ply_file.Header, chunks: ply_file.Element) -> NDArray[np.float32]:
     """(chunks, 3, 2, 3): of position, log scale and colour, the least and the largest."""
     table = _rows(file, header, chunks, slice(0, chunks.count))
     bounds = np.zeros((chunks.count, 18), np.float32)
@@ -162,9 +164,6 @@ def _bounds(file: BinaryIO, header: ply.Header, chunks: ply.Element) -> NDArray[
     for index, name in enumerate(BOUNDS):
         if name in (table.dtype.names or ()):
             bounds[:, index] = table[name]
-    if not np.isfinite(bounds).all():
-        at_chunk = int((~np.isfinite(bounds).all(axis=1)).argmax())
-        raise InputError(f"{header.path}: chunk {at_chunk} has bounds that are not finite")
     return bounds.reshape(-1, 3, 2, 3)
 
 
@@ -179,12 +178,14 @@ def _unpack(block: NDArray[Any], bounds: NDArray[np.float32], result: Gaussians,
 
     def between(words: NDArray[Any], layout: tuple[tuple[int, int], ...], what: int) -> NDArray[np.float32]:
         part = _fields(words, layout)
-        return bounds[:, what, 0] * (1 - part) + bounds[:, what, 1] * part
+        low, high = bounds[:, what, 0], bounds[:, what, 1]
+        with np.errstate(invalid="ignore"):  # of infinite bounds
+            return packing.at_ends(low * (1 - part) + high * part, low, high, part)
 
     words = {name: block[name].astype(np.uint32) for name in PACKED}
     result.means[rows] = between(words["packed_position"], _111011, 0)
     result.log_scales[rows] = between(words["packed_scale"], _111011, 1)
-    with np.errstate(over="ignore"):  # refused below
+    with np.errstate(over="ignore"):
         result.sh[rows, 0] = packing.coefficients(between(words["packed_color"], _8888, 2))
     result.opacity_logits[rows] = packing.byte_logits()[words["packed_color"] & 255]
     others = (_fields(words["packed_rotation"], _ROTATION) - np.float32(0.5)) * np.float32(np.sqrt(2))

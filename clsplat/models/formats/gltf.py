@@ -92,9 +92,7 @@ def read(path: Path) -> Gaussians:
         parts.append(axes.place(part, turn @ matrix @ turn, f"{path}: {name}"))
     if not parts:
         raise InputError(f"{path}: has no primitive with {EXTENSION} in its scene, expected at least one")
-    model = merge(parts)
-    values.require_finite(path, model)
-    return model
+    return merge(parts)
 
 
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
@@ -102,7 +100,10 @@ def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
     said = as_object(primitive["extensions"][EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
     if kernel != "ellipse":
-        raise InputError(f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse")
+        warn(
+            f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse; it is drawn as one, as the "
+            "extension says of kernels that a reader does not know"
+        )
     if space != COLOR_SPACES[0]:
         warn(f"{asset.path}: the colours are in {str(space)[:40]}, kept as they are")
     nested = as_object(said.get("extensions", {}))
@@ -132,17 +133,15 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
     for attribute in (rotation, scale, opacity, *coefficients):
         if len(attribute) != count:
             raise InputError(f"{asset.path}: {name} has {len(attribute)} values of an attribute, expected {count}")
-    result = values.empty(count, degree)
+    result, where = values.empty(count, degree), f"{asset.path}: {name}"
     for rows in values.row_blocks(count):
         result.means[rows] = real(position[rows])
         result.quaternions[rows] = real(rotation[rows])[:, [3, 0, 1, 2]]
-        result.log_scales[rows] = values.log_scales(real(scale[rows]), f"{asset.path}: {name}", rows.start)
-        opacities = real(opacity[rows])[:, 0]
-        if not ((opacities >= 0) & (opacities <= 1)).all():
-            raise InputError(f"{asset.path}: {name} has an opacity outside [0, 1]")
-        result.opacity_logits[rows] = values.logits(opacities)
+        result.log_scales[rows] = real(scale[rows])
+        result.opacity_logits[rows] = values.logits_of(real(opacity[rows])[:, 0], where, rows.start)
         for index, coefficient in enumerate(coefficients):
             result.sh[rows, index] = real(coefficient[rows])
+    values.to_log_scales(result, where)
     axes.flip(result, LEFT_UP)
     return result
 

@@ -65,8 +65,8 @@ class Section:
 
 
 def read(path: Path) -> Gaussians:
-    """Read it. Raises InputError: another version or level, truncated, counts that do not fit each other, values that
-    are not finite."""
+    """Read it. Raises InputError: another version or level, truncated, counts that do not fit each other, a few
+    negative scales."""
     with open_input(path, "a .ksplat file") as file:
         size = os.fstat(file.fileno()).st_size
         if size < HEADER.itemsize:
@@ -89,15 +89,15 @@ def read(path: Path) -> Gaussians:
             for part in packing.row_blocks(section.count):
                 block = packing.read_rows(file, section.kind, part.stop - part.start, path)
                 rows = slice(first + part.start, first + part.stop)
-                with np.errstate(invalid="ignore", over="ignore"):  # refused below
+                with np.errstate(invalid="ignore", over="ignore"):
                     gaussians.means[rows] = _means(section, block, part)
-                    gaussians.log_scales[rows] = packing.log_scales(block["scales"], path, rows.start)
+                    gaussians.log_scales[rows] = block["scales"]
                     _higher_sh(gaussians, rows, section.degree, block["sh"], (low, high))
                 gaussians.quaternions[rows] = block["quaternions"]
                 gaussians.sh[rows, 0] = packing.coefficients(block["rgba"][:, :3] / 255)
                 gaussians.opacity_logits[rows] = packing.byte_logits()[block["rgba"][:, 3]]
             first += section.count
-    packing.require_finite(path, gaussians)
+    packing.to_log_scales(gaussians, path)
     return gaussians
 
 

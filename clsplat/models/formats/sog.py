@@ -31,7 +31,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64, numbers
-from clsplat.errors import InputError, plain
+from clsplat.errors import InputError, plain, warn
 from clsplat.files import (
     MAX_DOCUMENT,
     atomic_write,
@@ -46,6 +46,7 @@ from clsplat.files import (
 )
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.reading import error_of, open_image
+from clsplat.models.codec import antialias
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.palette import codebook, nearest, palette
 from clsplat.progress import Progress, no_progress
@@ -72,8 +73,16 @@ def recognises(head: bytes) -> bool:
 
 def describe(path: Path) -> dict[str, Any]:
     """Version and antialiasing in meta.json."""
-    with _opened(path) as (_, meta, _):
-        return {"version": meta.get("version", 1), "antialiased": bool(meta.get("antialias", False))}
+    with _opened(path) as (file, meta, _):
+        return {"version": meta.get("version", 1), "antialiased": _is_antialiased(file, meta)}
+
+
+def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
+    """True if meta.json says so, as `antialias` or as `model`. Warns where they contradict each other."""
+    said = antialias.of_object(meta)
+    if said.contradiction:
+        warn(f"{path}: {META} {said.contradiction}")
+    return said.antialiased
 
 
 def side_files(path: Path) -> list[Path]:
@@ -87,8 +96,7 @@ def read(path: Path) -> Gaussians:
     with _opened(path) as opened:
         meta = _Meta(*opened)
         model = meta.gaussians()
-        model.antialiased = bool(meta.meta.get("antialias", False))
-    packing.require_finite(path, model)
+        model.antialiased = _is_antialiased(path, meta.meta)
     return model
 
 
@@ -175,10 +183,24 @@ class _Meta:
         return value
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
-        value = self.section(section).get(key)
-        array = numbers(value if isinstance(value, list) else [value])
-        if array.ndim != 1 or not least <= len(array) <= most or not np.isfinite(array).all():
-            raise InputError(f"{self.path}: {key} of {section} in {META} are not {least} numbers")
+        """A list of numbers. null stands for what JSON has no number for: of scales, which are logs, for -inf, the
+        scale 0; else for NaN."""
+        where = f"{self.path}: {key} of {section} in {META}"
+        if key not in self.section(section):
+            raise InputError(f"{self.path}: {section} in {META} has no {key}")
+        value = self.section(section)[key]
+        value = value if isinstance(value, list) else [value]
+        count = f"{least}" if least == most else f"{least} to {most}"
+        if not least <= len(value) <= most:
+            raise InputError(f"{where} has {len(value)} numbers, expected {count}")
+        nulls = [number is None for number in value]
+        if all(nulls) or (any(nulls) and section == "means"):
+            found = "nothing but null" if all(nulls) else "null"
+            raise InputError(f"{where} has {found} in place of numbers; is the model it was made from damaged?")
+        null = -np.inf if section == "scales" else np.nan
+        array = numbers([null if empty else number for empty, number in zip(nulls, value, strict=True)])
+        if array.shape != (len(value),) or not np.isfinite(array[~np.array(nulls)]).all():
+            raise InputError(f"{where} has other values than numbers, expected {count} of them")
         return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
@@ -239,7 +261,9 @@ class _Meta:
             return entries[values]
         width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
         low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
-        return (low + (high - low) * (values / 255)).astype(np.float32)
+        part = values / 255
+        with np.errstate(invalid="ignore"):  # of infinite bounds
+            return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
     def rest(self) -> Float32:
         """Coefficients above 0, (n, K - 1, 3)."""
@@ -331,7 +355,8 @@ def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, p
         "scales": {"codebook": scale_codes.tolist(), "files": [scales]},
         "quats": {"files": [picture("quats.webp", [quats])]},
         "sh0": {"codebook": colour_codes.tolist(), "files": [colours]},
-        **({"antialias": True} if gaussians.antialiased else {}),
+        # the specification's key, and the one that splat-transform reads
+        **({"antialias": True, "model": "antialiased"} if gaussians.antialiased else {}),
     }
     if gaussians.sh_degree:
         rest = gaussians.sh[order, 1:]

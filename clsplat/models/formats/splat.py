@@ -28,7 +28,7 @@ ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("
 
 
 def read(path: Path) -> Gaussians:
-    """Read it. Raises InputError: no whole number of records, none, values that are not finite, negative scales."""
+    """Read it. Raises InputError: no whole number of records, none, a few negative scales."""
     with open_input(path, "a .splat file") as file:
         size = os.fstat(file.fileno()).st_size
         count, over = divmod(size, ROW.itemsize)
@@ -40,11 +40,11 @@ def read(path: Path) -> Gaussians:
         for rows in values.row_blocks(count):
             block = values.read_rows(file, ROW, rows.stop - rows.start, path)
             result.means[rows] = block["means"]
-            result.log_scales[rows] = values.log_scales(block["scales"], path, rows.start)
+            result.log_scales[rows] = block["scales"]
             result.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
             result.opacity_logits[rows] = values.byte_logits()[block["rgba"][:, 3]]
             result.quaternions[rows] = block["quaternions"].astype(np.float32) / 128 - 1
-    values.require_finite(path, result)
+    values.to_log_scales(result, path)
     return result
 
 

@@ -165,9 +165,7 @@ def read_here(path: Path) -> Gaussians:
             # USD's vectors are rows, so its matrices are the transposes of ours
             matrix = np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T
             parts.append(axes.place(part, matrix, where))
-    model = merge(parts)
-    packing.require_finite(path, model)
-    return model
+    return merge(parts)
 
 
 def splats_of(path: Path, stage: Any) -> list[Any]:
@@ -246,15 +244,15 @@ def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussia
         return np.tile(np.array(default, np.float32), (count, 1)) if array is None else array
 
     # what the schema says where an attribute is absent: no rotation, unit scale, opaque
-    quaternions = optional("orientations", 0, 0, 0, 1)[:, [3, 0, 1, 2]]
-    log_scales = packing.log_scales(optional("scales", 1, 1, 1), where, 0).astype(np.float32)
+    quaternions = np.ascontiguousarray(optional("orientations", 0, 0, 0, 1)[:, [3, 0, 1, 2]])
+    scales = optional("scales", 1, 1, 1)
     shown = _array(where, prim, "opacities", time, 1, count)
     if shown is None and not _coefficients(prim):
         shown = _primvar(where, prim, "primvars:displayOpacity", time, 1, count)
     opacity = np.ones(count, np.float32) if shown is None else shown[:, 0]
-    if not ((opacity >= 0) & (opacity <= 1)).all():
-        raise InputError(f"{where}: has an opacity outside [0, 1]")
-    return Gaussians(means, quaternions, log_scales, packing.logits(opacity), sh)
+    result = Gaussians(means, quaternions, scales, packing.logits_of(opacity, where), sh)
+    packing.to_log_scales(result, where)
+    return result
 
 
 def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:

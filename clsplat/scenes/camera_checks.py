@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras of pictures, and warnings of those that cannot be right: by their numbers, and by what they see of the
+points. A line each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+from clsplat.config.training import Lenses
+from clsplat.errors import examples, warn
+from clsplat.scenes.data_set import PANORAMA, SHORTEST, SMALLEST, Lens, PosedImage, pixels_of
+
+Named = tuple[str, Camera, Lens]
+FEWEST = 4
+"""Cameras without which nothing is said of their poses."""
+LOOKED_AT = 40
+"""Cameras that are looked through, spread evenly."""
+POINTS = 1000
+"""Points that are looked for, spread evenly; with fewer than LEAST_POINTS poses are judged by the cameras alone."""
+LEAST_POINTS = 30
+SEEN, TIMES = 0.25, 4.0
+"""Share of the points that the mean picture shows at least if poses are taken another way, and how many times as much
+as the poses as given. Pictures of a survey show a hundredth each, either way."""
+FACING, MEETING = 0.2, 0.9
+"""Shares of the cameras that face one point: at most as given, and at least with the poses turned round."""
+AIM = np.cos(np.deg2rad(20.0))
+"""Cosine of the angle to its axis within which a camera faces a point."""
+BENT = 0.5
+"""Half widths or heights of the picture by which a lens may move what is at its edge."""
+FLIP = np.array([1.0, -1.0, -1.0])
+"""Signs between COLMAP's camera axes and OpenGL's."""
+
+
+def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> dict[str, Camera]:
+    """The cameras that the images become, as of `Lens.camera`, at full size, by name. Warns of cameras that cannot be
+    right."""
+    by_lens = {
+        lens: lens.camera(np.eye(3), np.zeros(3), lenses) for lens in dict.fromkeys(image.lens for image in images)
+    }
+    cameras = {
+        image.name: replace(by_lens[image.lens], rotation=image.rotation, translation=image.translation)
+        for image in images
+    }
+    named = [(image.name, cameras[image.name], image.lens) for image in images]
+    for doubt in filter(None, (absurd([(name, lens) for name, _, lens in named]), *camera_checks(named))):
+        warn(doubt)
+    return cameras
+
+
+def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
+    """Warnings about the cameras of pictures, at any size, by name. points: (N, 3) of the world, if there are any."""
+    cameras = [camera for _, camera, _ in views]
+    found = (_focal(views), _corner(views), _poses(cameras, np.empty((0, 3)) if points is None else points))
+    return [text for text in found if text]
+
+
+def _focal(views: Sequence[Named]) -> str:
+    short = [
+        (name, lens)
+        for name, _, lens in views
+        if lens.model != PANORAMA and lens.focal < SHORTEST * max(lens.width, lens.height)
+    ]
+    if not short:
+        return ""
+    lens = short[0][1]
+    return (
+        f"the focal length of {examples(name for name, _ in short)} is {lens.focal:g} pixels in {lens.width} x "
+        f"{lens.height}, which no lens has: is it in millimetres, or a part of the width? Give it in pixels"
+    )
+
+
+def _corner(views: Sequence[Named]) -> str:
+    odd = []
+    for name, _, lens in views:
+        x, y = (0.5 * lens.width, 0.5 * lens.height) if lens.model == PANORAMA else lens.centre
+        near = abs(x) < SHORTEST * lens.width and abs(y) < SHORTEST * lens.height
+        if near and min(lens.width, lens.height) >= SMALLEST:
+            odd.append((name, x, y, lens))
+    if not odd:
+        return ""
+    _, x, y, lens = odd[0]
+    return (
+        f"the principal point (cx cy) of {examples(name for name, *_ in odd)} lies in the corner, at {x:g} {y:g} of "
+        f"{lens.width} x {lens.height} pixels: is it the distance from the middle? Give it from the upper left corner"
+    )
+
+
+def _poses(cameras: Sequence[Camera], points: Float64) -> str:
+    """A doubt whether the poses mean what they are taken for: by the points that the pictures show if they are taken
+    another way, or without points by the cameras that face one place."""
+    flat = [camera for camera in cameras if camera.projection == "perspective"]
+    flat = flat[:: -(-len(flat) // LOOKED_AT) or 1]
+    if len(flat) < FEWEST:
+        return ""
+    shown = points[:: -(-len(points) // POINTS) or 1]
+    if len(shown) >= LEAST_POINTS:
+        given = _seen(flat, shown)
+        best, words = max(((_seen(list(map(how, flat)), shown), words) for words, how in OTHER_WAYS), key=_first)
+        if best < SEEN or best < TIMES * given:
+            return ""
+        evidence = (
+            f"the pictures show {100 * given:.0f} % of the points, and {100 * best:.0f} % if the poses are {words}"
+        )
+    else:
+        ways = OTHER_WAYS[:2]  # turned axes alone move no camera
+        best, words = max(((_facing(list(map(how, flat))), words) for words, how in ways), key=_first)
+        if best < MEETING or _facing(flat) > FACING:
+            return ""
+        evidence = f"the cameras face nothing in common, and {100 * best:.0f} % face one place if the poses are {words}"
+    return f"{evidence}: is that how they were exported? Export them again, or correct the file"
+
+
+def _first(pair: tuple[float, str]) -> float:
+    return pair[0]
+
+
+def _inverted(camera: Camera) -> Camera:
+    turn = camera.rotation.T
+    return replace(camera, rotation=turn, translation=-turn @ camera.translation)
+
+
+def _flipped(camera: Camera) -> Camera:
+    return replace(camera, rotation=FLIP[:, None] * camera.rotation, translation=FLIP * camera.translation)
+
+
+def _inverted_opengl(camera: Camera) -> Camera:
+    """The pose of a camera whose matrix in OpenGL's axes was taken the wrong way round."""
+    turned = _inverted(camera)
+    return replace(turned, rotation=FLIP[:, None] * turned.rotation * FLIP, translation=FLIP * turned.translation)
+
+
+INVERTED = "inverted (camera from world in place of world from camera, or the other way round)"
+OTHER_WAYS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
+    (INVERTED, _inverted),
+    (INVERTED, _inverted_opengl),
+    ("in the other camera axes (COLMAP's and OpenCV's have y down and z ahead, OpenGL's y up and z back)", _flipped),
+)
+"""Ways in which poses are mistaken for others, in words and as a change of the camera."""
+
+
+def _seen(cameras: Sequence[Camera], points: Float64) -> float:
+    """Share of the points that a picture shows, the mean over the cameras."""
+    return float(np.mean([pixels_of(points, camera)[2].mean() for camera in cameras]))
+
+
+def _facing(cameras: Sequence[Camera]) -> float:
+    """Share of the cameras that face the point nearest to all optical axes, from as far as they are spread."""
+    centres = np.stack([camera.position for camera in cameras])
+    axes = np.stack([camera.rotation[2] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] < 1e-3:  # parallel axes meet nowhere
+        return 0.0
+    focus = np.linalg.solve(across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0])
+    away = focus - centres
+    distances = np.linalg.norm(away, axis=1)
+    spread = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    if spread == 0:
+        return 0.0
+    return float(((away * axes).sum(axis=1) > AIM * np.maximum(distances, 0.5 * spread)).mean())
+
+
+def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
+    """A warning of the pictures whose lens bends beyond reason, or nothing. lenses: with the pictures' names."""
+    bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
+    bent = [(name, lens) for name, lens in lenses if bend[lens]]
+    if not bent:
+        return ""
+    lens = bent[0][1]
+    params = " ".join(f"{value:g}" for value in lens.params)
+    return (
+        f"the lens of {examples(name for name, _ in bent)} bends the picture beyond reason ({lens.model} {params}): "
+        "check its coefficients, and their order"
+    )
+
+
+def _bends(lens: Lens) -> bool:
+    """True if the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
+    Fisheyes and the like are meant to, and count as False."""
+    if lens.is_pinhole or lens.model in ("FOV", "EUCM", PANORAMA) or "FISHEYE" in lens.model:
+        return False
+    pinhole = lens.pinhole(np.eye(3), np.zeros(3))
+    half = np.array([lens.width, lens.height]) / 2
+    edge = half * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    rays = np.concatenate([edge / [pinhole.fx, pinhole.fy], np.ones((len(edge), 1))], axis=1)
+    pixels = lens.img_from_cam(rays)
+    moved = pixels - pixels[len(pixels) // 2] - edge
+    return not bool((np.abs(moved) <= BENT * half).all())

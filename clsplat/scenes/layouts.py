@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layouts of data sets: what a folder is, where its pictures are, which of them are held out, which are missing."""
+
+from __future__ import annotations
+
+import codecs
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from clsplat.config.training import Missing
+from clsplat.errors import InputError, examples, warn
+from clsplat.files import is_file, open_input
+from clsplat.images.reading import companions, find_images
+from clsplat.scenes import colmap, transforms
+from clsplat.scenes.data_set import DataSet, PosedImage
+from clsplat.scenes.picture_files import SMALLER, called, find_pictures, has_pictures, or_smaller
+from clsplat.scenes.picture_names import legible, match
+from clsplat.scenes.point_files import clouds_beside
+
+Kind = Literal["colmap", "blender", "transforms", "photos"]
+
+IMAGES = "images"
+"""Name of the folder of a COLMAP model's pictures."""
+FOLDERS = ("input", "image", "rgb", "color", "frames", "photos")
+"""Names of it in other programs' data sets, in the order in which they are tried: 3DGS' convert.py reads input/."""
+HELD_OUT = "test.txt"
+"""The file beside a COLMAP model (3DGS authors' code, hierarchical-3d-gaussians) or a transforms.json (LichtFeld)
+with the names of the held-out pictures, a line each."""
+MAX_NAMES = 64 << 20
+"""Bytes of it."""
+
+
+def detect(path: Path) -> Kind:
+    """Layout of a scene's folder (or transforms.json). Raises InputError if it has none, naming what was looked for."""
+    path = Path(path)
+    if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise InputError(f"{path}: is a file, expected a scene's folder or a transforms.json")
+        return "blender" if path.name == "transforms_train.json" else "transforms"
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder, expected a scene")
+    if (path / "transforms_train.json").is_file():
+        return "blender"
+    model = colmap.find_model(path)
+    # nerfstudio keeps the COLMAP model that its transforms.json was made from, of larger pictures, below colmap/
+    if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
+        return "colmap"
+    if (path / "transforms.json").is_file():
+        return "transforms"
+    if find_images(path):
+        return "photos"
+    raise InputError(
+        f"{path}: no images found, nor sparse/, transforms_train.json or transforms.json; expected a COLMAP, Blender, "
+        "nerfstudio or instant-ngp scene, or a folder of photos"
+    )
+
+
+def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tuple[DataSet, list[Path]]:
+    """The data set of a COLMAP model, and the folders of downscaled pictures that may stand in. Raises InputError."""
+    model_path = colmap.find_model(path)
+    assert model_path is not None  # detect has found it
+    model = colmap.read_model(model_path)
+    folder = _picture_folder(path, chosen, model_path, model.images)
+    present = find_images(folder)
+    if not present:
+        raise InputError(f"{folder}: no images found, expected the {len(model.images)} of {model_path}")
+    listed = [image.name for image in model.images]
+    files = find_pictures(listed, [folder / name for name in listed], folder, model_path, missing, present)
+    names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]
+    posed = zip(model.images, names, files, strict=True)
+    model.images = [replace(image, name=name, path=file) for image, name, file in posed if file is not None]
+    model.missing = [name for name, file in zip(names, files, strict=True) if file is None]
+    _warn_of_unlisted(present, model, model_path, folder)
+    model.images = _held_out(model, model_path / HELD_OUT)
+    model.clouds = clouds_beside([model_path, path])
+    smaller = [] if chosen is not None else [folder.with_name(f"{folder.name}_{factor}") for factor in SMALLER]
+    return model, [candidate for candidate in smaller if candidate.is_dir()]
+
+
+def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:
+    """The data set of a transforms.json, or of Blender's two. Raises InputError."""
+    folder = path.parent if path.is_file() else path
+    images = None if chosen is None else folder / chosen
+    if images is not None and not images.is_dir():
+        raise InputError(f"{images}: no such folder, expected the images of {path}")
+    if kind == "blender":
+        listed_in = folder / "transforms_*.json"
+        data = transforms.read_blender(folder, images=images, missing=missing)
+    else:
+        listed_in = path if path.is_file() else folder / "transforms.json"
+        data = transforms.read_transforms(listed_in, masks=masks, images=images, missing=missing)
+    if not any(image.split for image in data.images):
+        data.images = _held_out(data, folder / HELD_OUT)
+    parents = {image.path.parent for image in data.images}
+    present = [file for parent in parents for file in find_images(parent, deep=False)]
+    _warn_of_unlisted(present, data, listed_in, folder)
+    return data
+
+
+def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
+    """The folder of a COLMAP model's pictures: images/, its smaller copies, or the first of FOLDERS that has any of the
+    listed pictures. Warns where it is not images/. Raises InputError where there is none."""
+    if chosen is not None:
+        if not (folder := path / chosen).is_dir():
+            raise InputError(f"{folder}: no such folder, expected the images of {model_path}")
+        return folder
+    # The model's own folder may be what was given: then the pictures are beside one of those above it.
+    above = [path, *path.resolve().parents[:2]] if model_path == path else [path]
+    usual = [parent / IMAGES for parent in above]
+    if own := next((folder for folder in usual if has_pictures(folder)), None):
+        return own
+    copies = [copy for folder in usual if (copy := or_smaller(folder)) != folder]
+    others = [parent / name for parent in above for name in FOLDERS if has_pictures(parent / name)]
+    bare = [parent for parent in above if find_images(parent, deep=False)]  # RealityScan writes all in one folder
+    found = [*copies, *others, *bare]
+    listed = [folder for folder in found if any(is_file(folder / image.name) for image in images)]
+    if listed or found:
+        folder = (listed or found)[0]
+        warn(f"{model_path}: the pictures are taken from {folder}, as there are none in {usual[0]}")
+        return folder
+    if not (empty := [folder for folder in usual if folder.is_dir()]):
+        raise InputError(f"{usual[0]}: no such folder, expected the {len(images)} images of {model_path}")
+    return empty[0]
+
+
+def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, folder: Path) -> None:
+    listed = {image.path for image in data.images}
+    unlisted = sorted(path for path in present if path not in listed)
+    known = companions(unlisted, listed, folder) if unlisted else set()
+    if unlisted := [path for path in unlisted if path not in known]:
+        warn(
+            f"{listed_in}: does not list {len(unlisted):,} image(s) that are there, and they are not used: "
+            f"{examples(unlisted)}"
+        )
+
+
+def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
+    """The images with the split that a file of held-out names makes, if there is one. Names may differ as those of
+    pictures may. Warns of names that are no picture's. Raises InputError where nothing is left to train on."""
+    if not is_file(path):
+        return data.images
+    lines = [line.strip("\ufeff \t").strip("\"',").strip() for line in _text(path).splitlines()]
+    names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
+    found = match(names, [*(image.name for image in data.images), *data.missing])
+    if lost := [legible(name) for name in names if name not in found.names]:
+        none = ", so that it is not used" if not found.names else ""
+        warn(f"{path}: lists {examples(lost)} to hold out, and no picture is called so{none}")
+    held_out = set(found.names.values())
+    if not held_out:
+        return data.images
+    images = [replace(image, split="test" if image.name in held_out else "train") for image in data.images]
+    if all(image.split == "test" for image in images):
+        raise InputError(
+            f"{path}: holds out all {len(images)} pictures, expected some to train on; remove it for a split of "
+            "--test-every"
+        )
+    return images
+
+
+def _text(path: Path) -> str:
+    """A text file in UTF-8 or UTF-16; bytes of another encoding are surrogates (`picture_names.match`)."""
+    with open_input(path, "a list of pictures") as file:
+        raw = file.read(MAX_NAMES + 1)
+    if len(raw) > MAX_NAMES:
+        raise InputError(f"{path}: has more than {MAX_NAMES} bytes, expected a list of pictures")
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return raw.decode("utf-16", "replace")
+    return raw.decode("utf-8-sig", "surrogateescape")

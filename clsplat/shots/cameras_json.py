@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""cameras.json, which the 3DGS authors' train.py writes beside its models: a list with an object for each photograph.
+
+Its values are those of `camera_to_JSON` in utils/camera_utils.py of graphdeco-inria/gaussian-splatting: `position` is
+the camera's centre, `rotation` the rows of world_from_camera in COLMAP's axes, `fx` and `fy` are pixels of a picture of
+`width` times `height`, whose middle is the principal point. SuperSplat imports the same (src/json-types.ts), where all
+but position and rotation may be missing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clsplat.arrays import Float64, numbers
+from clsplat.camera import LARGEST_FOCAL, Camera
+from clsplat.errors import InputError
+from clsplat.scenes.transforms import Keys, short
+from clsplat.shots.shot import MOST_FRAMES, Frame, Shot
+
+NAME = "cameras.json"
+"""The file's name in the folder of a training."""
+EXACT = 1e-2
+"""Most that the axes of a rotation may be off right angles and unit length."""
+
+
+def read_cameras_json(path: Path, entries: list[Any], size: tuple[int | None, int | None]) -> Shot:
+    """Frames from 1 on, one for each entry, called by `img_name`; of a Blender scene two may have one name, as pictures
+    of both splits have. size: for entries that have none.
+
+    Raises InputError, with the file and the entry, for a list of something else, and values that are missing or cannot
+    be.
+    """
+    if not entries or not all(
+        isinstance(entry, dict) and {"position", "rotation"} <= entry.keys() for entry in entries
+    ):
+        what = f"a list that begins with {short(entries[0])}" if entries else "an empty list"
+        raise InputError(
+            f"{path}: is {what}, expected the cameras of a 3DGS training, each an object with 'position', 'rotation', "
+            "'width', 'height', 'fx' and 'fy'"
+        )
+    if len(entries) > MOST_FRAMES:
+        raise InputError(f"{path}: has {len(entries):,} cameras, expected at most {MOST_FRAMES:,}")
+    frames = []
+    for number, entry in enumerate(entries, 1):
+        name = entry.get("img_name")
+        keys = Keys(path, f"camera {number - 1}" + (f" ({name[:80]})" if isinstance(name, str) else ""), entry, {})
+        if not isinstance(name, str) or not name.strip():
+            name = f"{number:04d}"
+        frames.append(Frame(number, _camera(keys, size), name.replace("\\", "/")))
+    return Shot(tuple(frames))
+
+
+def _is_camera(entry: object) -> bool:
+    return isinstance(entry, dict) and "position" in entry and "rotation" in entry
+
+
+def _camera(keys: Keys, size: tuple[int | None, int | None]) -> Camera:
+    for key, side in zip(("width", "height"), size, strict=True):
+        if keys.frame.get(key) is None and side is not None:
+            keys.frame = {**keys.frame, key: side}
+    width, height = keys.side("width"), keys.side("height")
+    fx = keys.require("fx", keys.number("fy"))
+    fy = keys.require("fy", fx)
+    for key, focal in (("fx", fx), ("fy", fy)):
+        if not 0 < focal <= LARGEST_FOCAL:
+            raise keys.wrong(key, f"pixels above 0, at most {LARGEST_FOCAL:g}")
+    rotation = _rotation(keys)
+    translation = -rotation @ keys.vector("position", 3)
+    return Camera(width, height, fx, fy, width / 2, height / 2, rotation, translation)
+
+
+def _rotation(keys: Keys) -> Float64:
+    """`cam_from_world` (3, 3)."""
+    rows = numbers(keys.frame["rotation"])
+    if rows.shape != (3, 3) or not np.isfinite(rows).all():
+        raise keys.wrong("rotation", "three rows of three numbers")
+    if np.abs(rows.T @ rows - np.eye(3)).max() > EXACT or np.linalg.det(rows) < 0:
+        raise InputError(
+            f"{keys.where}: 'rotation' is no rotation (determinant {np.linalg.det(rows):.3g}), expected the rows of "
+            "world_from_camera; check how it was exported"
+        )
+    u, _, v = np.linalg.svd(rows)
+    cam_from_world: Float64 = (u @ v).T
+    return cam_from_world

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras that mean something else than the layout says: read right where that can be known, else named."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ring import FOCAL, HEIGHT, WIDTH, matrix_of, points, poses, write_cloud, write_colmap, write_transforms
+from tiny import write_scene
+
+from clsplat.cli.main import main
+from clsplat.errors import InputError
+from clsplat.scenes.colmap import read_cameras
+from clsplat.scenes.data_set import Lens
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.transforms import read_poses
+
+NO_POINTS = (np.empty((0, 3)), np.empty((0, 3), np.uint8))
+
+
+# Intrinsics
+
+
+@pytest.mark.brings("pixelSplat's data sets, exporters of parts", "`cx cy` (and `fl_x fl_y`) as parts of the picture",
+                    "in pixels, with a warning")  # fmt: skip
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"cx": 0.5, "cy": 0.5},
+        {"cx": 0.5, "cy": 0.5, "fl_x": FOCAL / WIDTH, "fl_y": FOCAL / HEIGHT},
+        {"cx": 0.5, "cy": 0.5, "fl_x": None, "fl_y": None, "camera_angle_x": 2 * np.arctan(WIDTH / 2 / FOCAL)},
+        {"cx": 0.5, "cy": 0.5, "k1": 0.0, "camera_model": "OPENCV"},
+    ],
+)
+def test_parts_of_the_picture_are_read_as_such(keys: dict[str, Any], tmp_path: Path) -> None:
+    scene = load_scene(write_transforms(tmp_path, **keys))
+    camera = scene.views[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
+    (warning,) = scene.warnings
+    assert "the principal point (cx cy) of images/view00.png, images/view01.png, " in warning
+    assert "in parts of the picture's width and height" in warning
+
+
+def test_those_of_a_colmap_model_too(tmp_path: Path) -> None:
+    write_colmap(tmp_path, camera=f"PINHOLE {WIDTH} {HEIGHT} {FOCAL / WIDTH} {FOCAL / HEIGHT} 0.5 0.5")
+    with pytest.warns(UserWarning, match="of camera 1 is given in parts of the picture"):
+        camera = next(iter(read_cameras(tmp_path).values()))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"fl_x": 2.0, "fl_y": 2.0}, "and 17 more is 2 pixels in 48 x 32"),  # in millimetres
+        ({"fl_x": 0.83, "fl_y": 0.83, "cx": None, "cy": None}, "is 0.83 pixels in 48 x 32"),
+        ({"cx": 0.0, "cy": 0.0}, "lies in the corner, at 0 0 of 48 x 32 pixels"),  # from the middle
+        ({"cx": -0.4, "cy": 1.2}, "lies in the corner, at -0.4 1.2"),
+    ],
+)  # fmt: skip
+def test_intrinsics_that_no_lens_has_are_told(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
+    folder = write_transforms(tmp_path, **keys)
+    assert any(words in text for text in load_scene(folder).warnings)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        read_poses(folder / "transforms.json")
+    assert any(words in str(each.message) for each in caught)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        f"PINHOLE {WIDTH} {HEIGHT} 40 40 5 4",  # a part of a larger picture
+        f"PINHOLE {WIDTH} {HEIGHT} 40 40 -20 16",
+        f"OPENCV_FISHEYE {WIDTH} {HEIGHT} 12 12 24 16 0 0 0 0",  # 220 degrees
+        f"PINHOLE {WIDTH} {HEIGHT} 4000 4000 24 16",
+    ],
+)
+def test_odd_lenses_that_may_be_are_not_told(camera: str, tmp_path: Path) -> None:
+    assert not [text for text in load_scene(write_colmap(tmp_path, camera=camera)).warnings if "pixels" in text]
+
+
+@pytest.mark.brings("Metashape, nerfstudio", "fisheyes with `p1 p2`", "COLMAP's THIN_PRISM_FISHEYE")
+@pytest.mark.parametrize(("p1", "p2"), [(0.01, 0.0), (0.0, -0.02), (0.003, 0.004)])
+def test_tangential_terms_of_fisheyes_are_read(p1: float, p2: float, tmp_path: Path) -> None:
+    keys = {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": -0.001}
+    lens = load_scene(write_transforms(tmp_path, **keys, p1=p1, p2=p2)).views[0].lens
+    plain = load_scene(write_transforms(tmp_path / "plain", **keys)).views[0].lens
+    assert (lens.model, plain.model) == ("THIN_PRISM_FISHEYE", "OPENCV_FISHEYE")
+    ray = np.array([[0.4, -0.3, 1.0]])
+    # OpenCV's tangential terms, at the point that the angle moves the ray to
+    radius = np.hypot(0.4, 0.3)
+    u, v = np.arctan(radius) / radius * ray[0, :2]
+    square = u * u + v * v
+    shift = [2 * p1 * u * v + p2 * (square + 2 * u * u), p1 * (square + 2 * v * v) + 2 * p2 * u * v]
+    np.testing.assert_allclose(lens.img_from_cam(ray) - plain.img_from_cam(ray), [FOCAL * np.array(shift)], atol=1e-9)
+
+
+def test_the_same_lens_without_them(tmp_path: Path) -> None:
+    """So that a fisheye whose terms are 0 is still trained natively."""
+    keys = {"camera_model": "FISHEYE", "k1": 0.05, "p1": 0.0, "p2": 0}
+    assert load_scene(write_transforms(tmp_path, **keys)).views[0].lens.model == "OPENCV_FISHEYE"
+    twin = Lens("THIN_PRISM_FISHEYE", WIDTH, HEIGHT, (40, 40, 24, 16, 0.05, 0, 0, 0, 0, 0, 0, 0))
+    ray = np.array([[0.4, -0.3, 1.0]])
+    here = load_scene(tmp_path).views[0].lens.img_from_cam(ray)
+    np.testing.assert_allclose(twin.img_from_cam(ray), here, atol=1e-12)
+
+
+def test_terms_that_are_not_known_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'k5' or 'k6' of a fisheye, expected k1 to k4"):
+        load_scene(write_transforms(tmp_path, is_fisheye=True, k5=0.1))
+
+
+# Poses
+
+
+def inverted(matrix: list[list[float]]) -> list[list[float]]:
+    return np.linalg.inv(np.array(matrix)).tolist()
+
+
+def opencv(matrix: list[list[float]]) -> list[list[float]]:
+    return (np.array(matrix) * [1, -1, -1, 1]).tolist()
+
+
+WRONG = {
+    "inverted": ([inverted(matrix_of(pose)) for pose in poses()], "inverted (camera from world"),
+    "inverted, in OpenCV's axes": ([inverted(opencv(matrix_of(pose))) for pose in poses()], "inverted (camera from"),
+    "in OpenCV's axes": ([opencv(matrix_of(pose)) for pose in poses()], "in the other camera axes"),
+}
+
+
+@pytest.mark.brings("exporters of view matrices", "inverted poses, or OpenCV's axes, in `transform_matrix`", "named")
+@pytest.mark.parametrize("kind", WRONG)
+def test_poses_that_are_taken_the_wrong_way_are_told(kind: str, tmp_path: Path) -> None:
+    matrices, words = WRONG[kind]
+    write_transforms(tmp_path, matrices=matrices, ply_file_path="a.ply")
+    write_cloud(tmp_path / "a.ply", *points())
+    (warning,) = [text for text in load_scene(tmp_path).warnings if "the poses are" in text]
+    assert words in warning
+    assert "% of the points" in warning
+
+
+@pytest.mark.parametrize("kind", ["inverted", "inverted, in OpenCV's axes"])
+def test_without_points_by_the_cameras_alone(kind: str, tmp_path: Path) -> None:
+    write_transforms(tmp_path, matrices=WRONG[kind][0])
+    found = [text for text in load_scene(tmp_path).warnings if "the poses are inverted" in text]
+    assert len(found) == 1
+    assert "face nothing in common, and 100 % face one place" in found[0]
+    with pytest.warns(UserWarning, match="the poses are inverted"):
+        read_poses(tmp_path / "transforms.json")
+
+
+@pytest.mark.parametrize("cloud", [points(), NO_POINTS])
+def test_inverted_poses_of_a_colmap_model_are_told(cloud: Any, tmp_path: Path) -> None:
+    turned = [(rotation.T, -rotation.T @ translation) for rotation, translation in poses()]
+    scene = load_scene(write_colmap(tmp_path, posed=turned, cloud=cloud))
+    assert [text for text in scene.warnings if "if the poses are inverted" in text]
+
+
+def away(count: int = 20) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Cameras that turn on the spot and look outward, moved a little as a hand does."""
+    rng = np.random.default_rng(0)
+    turned = [rotation @ np.diag([-1.0, 1.0, -1.0]) for rotation, _ in poses(count)]
+    return [(rotation, -rotation @ rng.normal(0, 0.1, 3)) for rotation in turned]
+
+
+def along(count: int = 20) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Cameras that walk ahead, swaying."""
+    rng = np.random.default_rng(0)
+    found = []
+    for index in range(count):
+        sway = 0.1 * rng.normal(size=2)
+        rotation = np.array([[1, 0, sway[0]], [0, 1, sway[1]], [-sway[0], -sway[1], 1]])
+        u, _, v = np.linalg.svd(rotation)
+        found.append((u @ v, -(u @ v) @ np.array([0.0, 0, index])))
+    return found
+
+
+def around(count: int = 20) -> list[tuple[np.ndarray, np.ndarray]]:
+    rng = np.random.default_rng(5)
+    return [(rotation, translation + rng.normal(0, 0.5, 3)) for rotation, translation in poses(count)]
+
+
+@pytest.mark.parametrize("posed", [poses(), around(), away(), along()], ids=["ring", "by hand", "outward", "ahead"])
+@pytest.mark.parametrize("cloud", [points(), NO_POINTS], ids=["points", "none"])
+def test_captures_are_not_told(posed: Any, cloud: Any, tmp_path: Path) -> None:
+    if posed[0][1][2] != pytest.approx(poses()[0][1][2], abs=2) and len(cloud[0]):  # points where those look
+        cloud = (np.concatenate([p @ r for p, r in ((np.array([[0, 0, 3.0]] * 20) - t, r) for r, t in posed)]),
+                 np.resize(points()[1], (400, 3)))  # fmt: skip
+    scene = load_scene(write_colmap(tmp_path, posed=posed, cloud=cloud))
+    assert not [text for text in scene.warnings if "poses" in text]
+
+
+def test_the_verbs_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """train, eval and render."""
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
+    assert main(["train", str(scene), "-o", str(run), "--iterations", "2", "--warmup", "", "--no-report"]) == 0
+    write_transforms(tmp_path / "wrong", matrices=WRONG["inverted"][0], cx=0.0, cy=0.0)
+    wrong = tmp_path / "wrong"
+    for words in (
+        [
+            "train",
+            str(wrong),
+            "-o",
+            str(tmp_path / "other"),
+            "--iterations",
+            "1",
+            "--random-points",
+            "50",
+            "--no-report",
+        ],
+        ["eval", str(run / "model.ply"), "--scene", str(wrong)],
+        ["render", str(run / "model.ply"), "--cameras", str(wrong), "-o", str(tmp_path / "out" / "{name}.png")],
+    ):
+        capsys.readouterr()
+        assert main(words) == 0
+        told = capsys.readouterr().err
+        assert "lies in the corner, at 0 0" in told, words[0]
+        assert "the poses are inverted" in told, words[0]
+    assert json.loads((wrong / "transforms.json").read_text())["cx"] == 0

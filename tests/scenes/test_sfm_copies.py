@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same photograph twice in a folder for structure from motion: which one is used, and what is said."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calls import warnings_of
+from numpy.typing import NDArray
+from PIL import Image as Pillow
+
+from clsplat.config.masks import MaskUse
+from clsplat.demo import ray_caster
+from clsplat.errors import InputError
+from clsplat.scenes import sfm, sfm_copies, sfm_photos
+
+COUNT, WIDTH, HEIGHT = 4, 240, 180
+Picture = NDArray[np.uint8]
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[Picture]:
+    """Neighbouring views, (180, 240, 3)."""
+    surfaces = ray_caster.still_life()
+    ray_caster.bake(surfaces, seed=0)
+    cameras = ray_caster.cameras(40, WIDTH, HEIGHT, seed=0)[:COUNT]
+    return [np.rint(ray_caster.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras]
+
+
+def write(path: Path, picture: Picture, side: int = WIDTH, **how: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Pillow.fromarray(picture)
+    if side != WIDTH:
+        image = image.resize((side, side * HEIGHT // WIDTH), Pillow.Resampling.LANCZOS)
+    image.save(path, **{**({"quality": 92} if path.suffix.lower() == ".jpg" else {}), **how})
+
+
+@pytest.fixture
+def used(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], tuple[list[str], list[str]]]:
+    """Names of the photos that structure from motion is given of a folder, and the warnings."""
+    tasks: list[dict[str, Any]] = []
+
+    def run(task: dict[str, Any], work: Path, report: object) -> dict[str, Any]:
+        tasks.append(task)
+        (work / "result" / "images").mkdir(parents=True)
+        return {"result": {"registered": sorted(name for group in task["groups"] for name in group)}}
+
+    monkeypatch.setattr(sfm, "_run_worker", run)
+    monkeypatch.setattr(sfm, "_without_their_alpha", lambda *_: [])
+
+    def work(folder: Path) -> tuple[list[str], list[str]]:
+        messages = warnings_of(lambda: sfm.reconstruct(folder, folder.parent / "scene"))
+        return sorted(name for group in tasks[-1]["groups"] for name in group), messages
+
+    return work
+
+
+def names(folder: str, extension: str = "jpg") -> list[str]:
+    return [f"{folder}{index}.{extension}" for index in range(COUNT)]
+
+
+@pytest.mark.brings("nerfstudio, 3DGS", "`images_2` and so on beside `images`, into `sfm`", "the largest alone")
+@pytest.mark.parametrize(
+    ("kept", "others"),
+    [
+        ("images", {"images_2": 120, "images_4": 60, "images_8": 30}),
+        ("scan/images", {"scan/images_3": 80}),
+        ("rgb", {"rgb_2": 120}),
+        ("images_2", {"images_4": 120, "images_8": 60}),
+    ],
+)
+def test_smaller_copies_in_folders_beside(
+    kept: str, others: dict[str, int], pictures: list[Picture], tmp_path: Path, used: Any
+) -> None:
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / kept / f"{index}.jpg", picture)
+        for folder, side in others.items():
+            write(tmp_path / "in" / folder / f"{index}.png", picture, side)
+    found, (message,) = used(tmp_path / "in")
+    assert found == names(f"{kept}/")
+    first = min(others)
+    assert f"{len(others) * COUNT} photo(s) are others again and left out ({first}/0.png is {kept}/0.jpg, smaller," in (
+        message
+    )
+
+
+@pytest.mark.brings("Polycam, 3DGS", "`corrected_images` or `input` beside `images`, into `sfm`", "one of them")
+@pytest.mark.parametrize(
+    ("kept", "other"),
+    [("images", "corrected_images"), ("input", "images"), ("images", "undistorted"), ("Input", "undistorted_images")],
+)
+def test_pictures_before_and_after_their_lens_was_undone(
+    kept: str, other: str, pictures: list[Picture], tmp_path: Path, used: Any
+) -> None:
+    """By their names, as the pictures differ."""
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / "keyframes" / kept / f"{index}.jpg", picture)
+        write(tmp_path / "in" / "keyframes" / other / f"{index}.jpg", np.roll(picture, 9, axis=1))
+    found, (message,) = used(tmp_path / "in")
+    assert found == names(f"keyframes/{kept}/")
+    assert f"keyframes/{other}/0.jpg is keyframes/{kept}/0.jpg, corrected" in message
+
+
+def test_the_larger_one_is_kept_whichever_came_first(pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / "input" / f"{index}.jpg", picture, 120)
+        write(tmp_path / "in" / "images" / f"{index}.jpg", picture)
+    found, (message,) = used(tmp_path / "in")
+    assert found == names("images/")
+    assert "input/0.jpg is images/0.jpg, smaller" in message
+
+
+@pytest.mark.parametrize(("folder", "side"), [("for the web", 120), ("backup", WIDTH), ("all/deep", 60)])
+def test_the_same_names_and_pictures_in_any_folder(
+    folder: str, side: int, pictures: list[Picture], tmp_path: Path, used: Any
+) -> None:
+    """Beside the photographs' folder, or in it."""
+    top = {"for the web": "photos/", "backup": "", "all/deep": "all/"}[folder]
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / f"{top}{index}.jpg", picture)
+        write(tmp_path / "in" / folder / f"{index}.jpg", picture, side, optimize=True)
+    found, (message,) = used(tmp_path / "in")
+    assert found == names(top)
+    why = "smaller" if side < WIDTH else "same"
+    assert f"{folder}/0.jpg is {top}0.jpg, {why}" in message
+
+
+@pytest.mark.brings("phones, raw converters", "IMG.jpg and IMG.png, into `sfm`", "one of them")
+@pytest.mark.parametrize(("one", "other"), [("jpg", "png"), ("png", "tif"), ("JPG", "bmp")])
+def test_one_stem_in_two_types(one: str, other: str, pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / f"{index}.{one}", picture)
+        write(tmp_path / "in" / f"{index}.{other}", picture)
+    found, (message,) = used(tmp_path / "in")
+    lossless = one if one == "png" else other  # of two lossless ones the first by name
+    assert found == names("", lossless)
+    assert f"{COUNT} photo(s) are others again" in message
+
+
+def test_a_photograph_turned_by_exif_is_its_upright_copy(pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    exif = Pillow.Exif()
+    exif[0x0112], exif[0x010F] = 6, "Maker"
+    for index, picture in enumerate(pictures):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        Pillow.fromarray(np.rot90(picture, 1)).save(tmp_path / "in" / f"{index}.jpg", exif=exif)
+        write(tmp_path / "in" / f"{index}.png", picture)
+    found, _ = used(tmp_path / "in")
+    assert found == names("")  # with a lens in EXIF
+
+
+@pytest.mark.parametrize("copy", ["0 (1).jpg", "copy of 0.jpg", "z/elsewhere/other.jpg"])
+def test_the_same_bytes_under_another_name(copy: str, pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / f"{index}.jpg", picture)
+    (tmp_path / "in" / copy).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(tmp_path / "in" / "0.jpg", tmp_path / "in" / copy)
+    found, (message,) = used(tmp_path / "in")
+    assert found == names("")
+    assert f"1 photo(s) are others again and left out ({copy} is 0.jpg, same bytes); to use them, give" in message
+
+
+@pytest.mark.parametrize("folders", [("left", "right"), ("cam0", "cam1"), ("images_1", "images_2"), ("cam", "cam_2")])
+def test_several_cameras_stay(folders: tuple[str, str], pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    """One's pictures are the next view's of the other: a fortieth of a turn apart."""
+    for index in range(COUNT - 1):
+        for side, folder in enumerate(folders):
+            write(tmp_path / "in" / folder / f"{index}.jpg", pictures[index + side])
+    found, messages = used(tmp_path / "in")
+    assert len(found) == 2 * (COUNT - 1) - (COUNT - 2)  # the rest is each the same file as one of the other camera's
+    assert [text for text in messages if "same bytes" not in text] == []
+
+
+def test_a_stereo_rig_stays(pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    """Pictures that are apart by a hundredth of their width, with a dark one each."""
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / "left" / f"{index:04}.jpg", picture)
+        write(tmp_path / "in" / "right" / f"{index:04}.jpg", np.roll(picture, 3, axis=1))
+    for side, folder in enumerate(("left", "right")):
+        write(tmp_path / "in" / folder / "dark.png", np.full((HEIGHT, WIDTH, 3), side, np.uint8))
+    found, messages = used(tmp_path / "in")
+    assert len(found) == 2 * COUNT + 2
+    assert messages == []
+
+
+def test_a_folder_without_copies_is_not_compared(
+    pictures: list[Picture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, used: Any
+) -> None:
+    monkeypatch.setattr(sfm_photos, "thumb_of", lambda *_: pytest.fail("compared"))
+    monkeypatch.setattr(sfm_copies, "image_size", lambda *_: pytest.fail("looked at"))
+    monkeypatch.setattr(sfm_copies, "short_digest", lambda *_: pytest.fail("read"))
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / "a" / f"{index}.jpg", picture)
+        write(tmp_path / "in" / "b" / f"{index + COUNT}.jpg", np.roll(picture, 20, axis=0))
+    found, messages = used(tmp_path / "in")
+    assert (len(found), messages) == (2 * COUNT, [])
+
+
+def test_copies_are_no_photographs_to_count(pictures: list[Picture], tmp_path: Path) -> None:
+    for index, picture in enumerate(pictures[:2]):
+        write(tmp_path / "in" / "a" / f"{index}.jpg", picture)
+        write(tmp_path / "in" / "b" / f"{index}.png", picture)
+    with pytest.warns(UserWarning, match="2 photo"), pytest.raises(InputError, match=r"only 2 photo\(s\) found"):
+        sfm.reconstruct(tmp_path / "in", tmp_path / "scene")
+
+
+def test_what_is_compared_has_one_scale_in_every_type() -> None:
+    ramp = np.linspace(0, 1, WIDTH)[None, :, None] * np.ones((HEIGHT, 1, 3))
+    thumbs = [
+        sfm_copies.thumb_of(np.rint(255 * ramp).astype(np.uint8), -1),
+        sfm_copies.thumb_of(np.rint(65535 * ramp).astype(np.uint16), -1),
+        sfm_copies.thumb_of(ramp.astype(np.float32), -1),
+        sfm_copies.thumb_of(np.rint(255 * ramp[:, :, :1]).astype(np.uint8), -1),
+        sfm_copies.thumb_of(np.rint(255 * np.dstack([1 - ramp[:, :, 0], ramp])).astype(np.uint8), 0),
+    ]
+    for thumb in thumbs:
+        assert thumb.shape == (72, 96)
+        # means of two and a half columns of a ramp of about one level each, and two roundings
+        assert np.abs(thumb[40].astype(float) - (np.arange(96) + 0.5) * 255 / 96).max() <= 1.5
+
+
+def test_masks_are_those_of_what_is_kept(pictures: list[Picture], tmp_path: Path, monkeypatch: Any, used: Any) -> None:
+    """Masks of copies are passed over, and those beside the only folder that is left are found."""
+    staged: list[tuple[str, str]] = []
+    monkeypatch.setattr(sfm, "stage_mask", lambda path, target, *_, **__: staged.append((path.name, target.name)))
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / "images" / f"{index}.jpg", picture)
+        write(tmp_path / "in" / "images_2" / f"{index}.jpg", picture, 120)
+        write(tmp_path / "in" / "masks" / f"{index}.jpg.mask.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    with pytest.warns(UserWarning, match="4 photo"):
+        sfm.reconstruct(tmp_path / "in", tmp_path / "scene", masks=MaskUse("ignore"))
+    assert staged == [(f"{index}.jpg.mask.png", f"{index}.jpg.png") for index in range(COUNT)]

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of many kinds, made by Pillow, that may stand under the name of another: downloads and renamed files."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+HEIGHT, WIDTH = 19, 23
+
+
+def colours() -> Image.Image:
+    """Three ramps, 19 x 23."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return Image.fromarray(np.stack([columns * 11, rows * 13, 255 - columns * 5], axis=2).astype(np.uint8))
+
+
+def _cut_out() -> Image.Image:
+    picture = colours()
+    picture.putalpha(Image.fromarray(np.where(np.mgrid[:HEIGHT, :WIDTH][1] > 11, 255, 0).astype(np.uint8)))
+    return picture
+
+
+def _palette() -> Image.Image:
+    return colours().quantize(64)
+
+
+def _grey() -> Image.Image:
+    return colours().convert("L")
+
+
+def _more() -> dict[str, Any]:
+    """A second frame, that is another picture."""
+    return {"save_all": True, "append_images": [colours().rotate(180)]}
+
+
+KINDS: dict[str, tuple[str, Callable[[], Image.Image], Callable[[], dict[str, Any]]]] = {
+    "gif": ("GIF", _palette, dict),
+    "gif-grey": ("GIF", _grey, dict),
+    "gif-animated": ("GIF", _palette, _more),
+    "gif-transparent": ("GIF", _cut_out, dict),
+    "webp": ("WEBP", colours, lambda: {"lossless": True}),
+    "webp-animated": ("WEBP", colours, lambda: {"lossless": True, **_more()}),
+    "webp-alpha": ("WEBP", _cut_out, lambda: {"lossless": True, "exact": True}),
+    "bmp": ("BMP", colours, dict),
+    "bmp-palette": ("BMP", _palette, dict),
+    "tiff-palette": ("TIFF", _palette, dict),
+    "tiff-grey": ("TIFF", _grey, dict),
+    "tiff-bits": ("TIFF", lambda: _grey().convert("1"), dict),
+    "tiff-16": ("TIFF", lambda: Image.fromarray((np.mgrid[:HEIGHT, :WIDTH][1] * 2000).astype(np.uint16)), dict),
+    "tiff-alpha": ("TIFF", _cut_out, dict),
+    "tiff-cmyk": ("TIFF", lambda: colours().convert("CMYK"), dict),
+    "tiff-pages": ("TIFF", colours, _more),
+    "jpeg": ("JPEG", colours, lambda: {"quality": 95}),
+    "jpeg-grey": ("JPEG", _grey, lambda: {"quality": 95}),
+    "jpeg-cmyk": ("JPEG", lambda: colours().convert("CMYK"), lambda: {"quality": 95}),
+    "jpeg-2000": ("JPEG2000", colours, dict),
+    "png": ("PNG", colours, dict),
+    "png-palette": ("PNG", _palette, dict),
+    "png-bits": ("PNG", lambda: _grey().convert("1"), dict),
+    "png-grey-alpha": ("PNG", lambda: _cut_out().convert("LA"), dict),
+    "png-animated": ("PNG", colours, _more),
+    "ico": ("ICO", colours, lambda: {"sizes": [(16, 13)]}),
+    "tga": ("TGA", colours, dict),
+    "ppm": ("PPM", colours, dict),
+    "sgi": ("SGI", colours, dict),
+    "dds": ("DDS", colours, dict),
+    "pcx": ("PCX", colours, dict),
+}
+"""By name: Pillow's format, what makes the picture, and what makes the settings of its file."""
+
+
+def other_picture(kind: str) -> bytes:
+    """A file of one of KINDS."""
+    form, picture, settings = KINDS[kind]
+    file = io.BytesIO()
+    picture().save(file, form, **settings())
+    return file.getvalue()
