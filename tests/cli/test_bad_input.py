@@ -180,7 +180,7 @@ def no_opacity(head: bytes, data: bytes) -> tuple[bytes, str]:
     return head.replace(b"float opacity", b"float opaque") + data, "property opacity"
 
 
-def nan_everywhere(head: bytes, data: bytes) -> tuple[bytes, str]:
+def all_nan(head: bytes, data: bytes) -> tuple[bytes, str]:
     return head + np.full(len(data) // 4, np.nan, "<f4").tobytes(), "with a position; expected some that are finite"
 
 
@@ -193,7 +193,7 @@ def cut_short(head: bytes, data: bytes) -> tuple[bytes, str]:
     return head + data[:-100], "truncated"
 
 
-@pytest.mark.parametrize("spoil", [no_opacity, nan_everywhere, no_gaussians, cut_short], ids=lambda spoil: spoil.__name__)
+@pytest.mark.parametrize("spoil", [no_opacity, all_nan, no_gaussians, cut_short], ids=lambda spoil: spoil.__name__)
 @pytest.mark.parametrize("verb", ["render", "eval"])
 def test_bad_models(
     verb: str,
