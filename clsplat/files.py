@@ -29,6 +29,10 @@ from clsplat.errors import InputError, WriteError, amount, reason_of
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 MAX_DOCUMENT = 32 << 20
 """Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
+MAX_POINTER = 1024
+"""First bytes, and most bytes, of the note that Git LFS leaves in place of a file
+(https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md)."""
 ABANDONED = 600.0
 """Seconds without a write after which a temporary file of another machine counts as abandoned."""
 UNWRITTEN = 20
@@ -418,10 +422,12 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
     """Open a file to read it.
 
     `expected` ends the message of the InputError for one that is missing, a folder, or anything else that is no regular
-    file, such as a pipe, which may never be written to; and for one that cannot be read.
+    file, such as a pipe, which may never be written to; for one that cannot be read; and for Git LFS's note in place of
+    one that was not fetched.
     """
     try:
-        mode = path.stat().st_mode
+        status = path.stat()
+        mode = status.st_mode
         if stat.S_ISDIR(mode):
             raise InputError(f"{path}: is a folder, expected {expected}")
         if not stat.S_ISREG(mode):
@@ -435,6 +441,12 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
         ) from None
     with file:
         try:
+            if status.st_size < MAX_POINTER:
+                if file.read(len(LFS_POINTER)) == LFS_POINTER:
+                    raise InputError(
+                        f"{path}: is Git LFS's note of a file that is not here; git lfs pull fetches it"
+                    )
+                file.seek(0)
             yield file
         except WriteError:
             raise

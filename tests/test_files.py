@@ -10,8 +10,8 @@ import pytest
 from systems import posix
 
 from clsplat.cli.main import one_line
-from clsplat.errors import WriteError
-from clsplat.files import atomic_write, atomic_writer
+from clsplat.errors import InputError, WriteError
+from clsplat.files import atomic_write, atomic_writer, open_input
 
 
 def test_replaces_the_file(tmp_path: Path) -> None:
@@ -119,3 +119,15 @@ def test_errors_of_the_system_are_plain_sentences() -> None:
     assert one_line(error) == "/a/b: permission is denied"
     assert one_line(OSError(errno.ENOSPC, "No space left on device")) == "the disk is full"
     assert one_line(MemoryError()) == "there is not enough main memory: the system gave no more"
+
+
+@pytest.mark.brings("GitHub's archives", "Git LFS's notes in place of files", "named, with `git lfs pull`")
+@pytest.mark.parametrize("name", ["model.ply", "cameras.json", "photo.png", "cloud.las"])
+def test_a_file_that_git_lfs_did_not_fetch_is_told(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'ab' * 32}\nsize 123456\n")
+    with pytest.raises(InputError, match=r"is Git LFS's note .*; git lfs pull"), open_input(path, "a file"):
+        pass
+    path.write_bytes(b"version 1" + bytes(20))
+    with open_input(path, "a file") as file:
+        assert file.read(9) == b"version 1"

@@ -28,6 +28,11 @@ SEEN, TIMES = 0.25, 4.0
 as the poses as given. Pictures of a survey show a hundredth each, either way."""
 FACING, MEETING = 0.2, 0.9
 """Shares of the cameras that face one point: at most as given, and at least with the poses turned round."""
+ASTRAY = 0.7
+"""Length of the cameras' mean axis from which on they look one way, as in front of a facade or from a drone. There
+poses that are turned round meet by chance."""
+ALIKE = 0.02
+"""Part by which a principal point's place across and down may differ where both are those of a smaller picture."""
 AIM = np.cos(np.deg2rad(20.0))
 """Cosine of the angle to its axis within which a camera faces a point."""
 BENT = 0.5
@@ -55,7 +60,8 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
     """Warnings about the cameras of pictures, at any size, by name. points: (N, 3) of the world, if there are any."""
     cameras = [camera for _, camera, _ in views]
-    found = (_focal(views), _corner(views), _poses(cameras, np.empty((0, 3)) if points is None else points))
+    points = np.empty((0, 3)) if points is None else points
+    found = (_focal(views), _corner(views), _another_size(views), _poses(cameras, points))
     return [text for text in found if text]
 
 
@@ -79,14 +85,33 @@ def _corner(views: Sequence[Named]) -> str:
     for name, _, lens in views:
         x, y = (0.5 * lens.width, 0.5 * lens.height) if lens.model == PANORAMA else lens.centre
         near = abs(x) < SHORTEST * lens.width and abs(y) < SHORTEST * lens.height
-        if near and min(lens.width, lens.height) >= SMALLEST:
+        part = 0 <= x <= 1 or 0 <= y <= 1  # of the width or height, one of them alone
+        if (near or part) and min(lens.width, lens.height) >= SMALLEST:
             odd.append((name, x, y, lens))
     if not odd:
         return ""
     _, x, y, lens = odd[0]
     return (
-        f"the principal point (cx cy) of {examples(name for name, *_ in odd)} lies in the corner, at {x:g} {y:g} of "
-        f"{lens.width} x {lens.height} pixels: is it the distance from the middle? Give it from the upper left corner"
+        f"the principal point (cx cy) of {examples(name for name, *_ in odd)} lies at {x:g} {y:g} of {lens.width} x "
+        f"{lens.height} pixels: is it the distance from the middle, or a part? Give pixels from the upper left corner"
+    )
+
+
+def _another_size(views: Sequence[Named]) -> str:
+    odd = []
+    for name, _, lens in views:
+        if lens.model != PANORAMA and min(lens.width, lens.height) >= SMALLEST:
+            part, other = lens.centre[0] / lens.width, lens.centre[1] / lens.height
+            if SHORTEST < part < 1 / 3 and abs(part - other) < ALIKE * part:
+                odd.append((name, lens))
+    if not odd:
+        return ""
+    lens = odd[0][1]
+    x, y = lens.centre
+    return (
+        f"the principal point (cx cy) of {examples(name for name, _ in odd)}, {x:g} {y:g}, is the middle of {2 * x:g} "
+        f"x {2 * y:g} pixels, and 'w' and 'h' are {lens.width} x {lens.height}: are they of another size than the "
+        "focal lengths? Give all of one size"
     )
 
 
@@ -108,6 +133,8 @@ def _poses(cameras: Sequence[Camera], points: Float64) -> str:
         )
     else:
         ways = OTHER_WAYS[:2]  # turned axes alone move no camera
+        if np.linalg.norm(np.mean([camera.rotation[2] for camera in flat], axis=0)) > ASTRAY:
+            return ""
         best, words = max(((_facing(list(map(how, flat))), words) for words, how in ways), key=_first)
         if best < MEETING or _facing(flat) > FACING:
             return ""

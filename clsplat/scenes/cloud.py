@@ -80,10 +80,10 @@ def with_cloud_beside(scene: Scene) -> Scene:
         except InputError as error:
             warn(f"{error}; it is not used")
             continue
-        warn(f"{path}: its {len(cloud.points):,} points are started from, as the scene names none")
+        warn(f"{path}: its {len(cloud.points):,} points are the scene's, which names none")
         colors = np.full(cloud.points.shape, UNSEEN, np.float32) if cloud.colors is None else cloud.colors
         return replace(scene, points=cloud.points, point_colors=colors, clouds=scene.clouds[index + 1 :])
-    return scene
+    return replace(scene, clouds=()) if scene.clouds else scene
 
 
 def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArray[np.bool_]:

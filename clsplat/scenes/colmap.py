@@ -154,7 +154,7 @@ def safe_name(name: str) -> bool:
 def _named(path: Path, name: str) -> str:
     """A picture's name; of an absolute one what is behind the drive or the root, which is found by its ending. Raises
     InputError for one that leads out of the images' folder."""
-    inner = name if safe_name(name) else slashed(name)
+    inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
     if not safe_name(inner):
         raise corrupt(path, f"an image has the name {name[:80]!r}, expected a path inside the images' folder")
     return inner
@@ -223,7 +223,10 @@ def _file(folder: Path, stem: str) -> Path | None:
         path = folder / (stem + extension)
         if is_file(path):
             return path
-    return None
+    if not os.path.isdir(folder):  # noqa: PTH112  # Path raises for names too long
+        return None
+    lower = {f"{stem}{extension}".lower() for extension in (".bin", ".txt")}  # hierarchical-3d-gaussians: points3d
+    return next((path for path in sorted(folder.iterdir()) if path.name.lower() in lower and is_file(path)), None)
 
 
 def _require(folder: Path, stem: str) -> Path:
@@ -370,6 +373,10 @@ def _read_points(folder: Path) -> tuple[Float64, Float32]:
         values.extend(row)
     table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
     _check_count(path, len(table))
+    known = ~np.isnan(table).any(axis=1)
+    if not known.all() and known.any():
+        warn(f"{path}: {np.count_nonzero(~known):,} of {len(table):,} points are not numbers, and are left out")
+        table = table[known]
     near = (np.abs(table[:, :3]) < MAX_NUMBER).all(axis=1)
     good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 65535)).all(axis=1)
     if not good.all():
@@ -393,10 +400,16 @@ def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
 def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
     for number, line in _lines(path):
         with _parsing(path, number, POINT):
-            _, x, y, z, red, green, blue, *others = line.split(maxsplit=8)  # some tools leave error and track out
+            _, x, y, z, red, green, blue, *others = _with_colours(line)  # some tools leave error and track out
             if len(others) == 2 and len(others[1].split()) % 2:
                 raise ValueError("a track is of pairs")
             yield float(x), float(y), float(z), float(red), float(green), float(blue)
+
+
+def _with_colours(line: str) -> list[str]:
+    """The words of a point's line, the track as one; grey where there is nothing but the place."""
+    words = line.split(maxsplit=8)
+    return [*words, "128", "128", "128"] if len(words) == 4 else words
 
 
 def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
@@ -412,7 +425,7 @@ def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple
 def _text_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
     for number, line in _lines(path):
         with _parsing(path, number, POINT):
-            _, x, y, z, _, _, _, *others = line.split()
+            _, x, y, z, _, _, _, *others = [*line.split(), *[""] * 3] if len(line.split()) == 4 else line.split()
             error = float(others[0]) if others else 0.0
             yield (float(x), float(y), float(z)), error, tuple(map(int, others[1::2]))
 

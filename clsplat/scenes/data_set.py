@@ -194,7 +194,7 @@ class PosedImage:
 
     rotation (3, 3), translation (3,), float64; path: the file, where the data set says which; split: "train", "test",
     or None where the data set has no split of its own; mask, depth: the files of its mask and its depth map, where the
-    data set says which.
+    data set says which; listed: the name that it has in the data set, if the file has another.
     """
 
     name: str
@@ -205,6 +205,12 @@ class PosedImage:
     split: str | None = None
     mask: Path | None = None
     depth: Path | None = None
+    listed: str = ""
+
+    @property
+    def rank(self) -> str:
+        """The name by which the split counts."""
+        return self.listed or self.name
 
 
 @dataclass(eq=False)
@@ -258,7 +264,10 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
         return lens, False
     focal = list(camera.focal_length_idxs())
     if all(params[index] < SHORTEST * max(sides) for index in focal):
-        for index, side in zip(focal, sides if len(focal) == 2 else (max(sides),), strict=True):
+        given = [params[index] for index in focal]
+        alike = len(given) == 2 and abs(given[0] / given[1] - 1) < abs(given[0] * sides[0] / given[1] / sides[1] - 1)
+        by = (sides[0],) * 2 if alike else sides  # both by the width, as pixels are square
+        for index, side in zip(focal, by if len(focal) == 2 else (max(sides),), strict=True):
             params[index] *= side
     for index, side in zip(centre, sides, strict=True):
         params[index] *= side
@@ -292,6 +301,21 @@ def pixels_of(
     x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
     inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return y[inside].astype(np.int64), x[inside].astype(np.int64), inside
+
+
+def depths_of(points: Float64, camera: Camera) -> Float64:
+    """(N,) depths along the axis of points (N, 3) of the world, of a camera that is no pinhole distances."""
+    local = points @ camera.rotation.T + camera.translation
+    return np.asarray(local[:, 2] if camera.projection == "perspective" else np.linalg.norm(local, axis=1))
+
+
+def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: Float64, cell: float) -> Float64:
+    """(N,) least depth of the points that lie in the same cell of a picture, of `cell` pixels a side, as each."""
+    across, down = (columns // cell).astype(np.int64), (rows // cell).astype(np.int64)
+    cells = down * (across.max(initial=0) + 1) + across
+    nearest = np.full(cells.max(initial=0) + 1, np.inf)
+    np.minimum.at(nearest, cells, depths)
+    return np.asarray(nearest[cells])
 
 
 def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:

@@ -14,6 +14,7 @@ from clsplat.errors import InputError, examples, warn
 from clsplat.files import is_file, open_input
 from clsplat.images.reading import companions, find_images
 from clsplat.scenes import colmap, transforms
+from clsplat.scenes.beside import inside
 from clsplat.scenes.data_set import DataSet, PosedImage
 from clsplat.scenes.picture_files import SMALLER, called, find_pictures, has_pictures, or_smaller
 from clsplat.scenes.picture_names import legible, match
@@ -23,8 +24,10 @@ Kind = Literal["colmap", "blender", "transforms", "photos"]
 
 IMAGES = "images"
 """Name of the folder of a COLMAP model's pictures."""
-FOLDERS = ("input", "image", "rgb", "color", "frames", "photos")
+FOLDERS = ("input", "inputs", "image", "img", "imgs", "rgb", "color", "frames", "photos", "pictures")
 """Names of it in other programs' data sets, in the order in which they are tried: 3DGS' convert.py reads input/."""
+MODELS = ("sparse", "colmap", "distorted")
+"""Names of folders with a model and without pictures, which may be given in place of the scene's."""
 HELD_OUT = "test.txt"
 """The file beside a COLMAP model (3DGS authors' code, hierarchical-3d-gaussians) or a transforms.json (LichtFeld)
 with the names of the held-out pictures, a line each."""
@@ -70,8 +73,12 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
     files = find_pictures(listed, [folder / name for name in listed], folder, model_path, missing, present)
     names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]
     posed = zip(model.images, names, files, strict=True)
-    model.images = [replace(image, name=name, path=file) for image, name, file in posed if file is not None]
-    model.missing = [name for name, file in zip(names, files, strict=True) if file is None]
+    model.images = [
+        replace(image, name=name, path=file, listed=legible(image.name))
+        for image, name, file in posed
+        if file is not None
+    ]
+    model.missing = [legible(name) for name, file in zip(listed, files, strict=True) if file is None]
     _warn_of_unlisted(present, model, model_path, folder)
     model.images = _held_out(model, model_path / HELD_OUT)
     model.clouds = clouds_beside([model_path, path])
@@ -106,13 +113,14 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
         if not (folder := path / chosen).is_dir():
             raise InputError(f"{folder}: no such folder, expected the images of {model_path}")
         return folder
-    # The model's own folder may be what was given: then the pictures are beside one of those above it.
-    above = [path, *path.resolve().parents[:2]] if model_path == path else [path]
-    usual = [parent / IMAGES for parent in above]
+    # The model's own folder may be what was given, or sparse/: then the pictures are beside one of those above it.
+    above = [path, *path.resolve().parents[:2]] if model_path == path or path.name in MODELS else [path]
+    usual = [inside(parent, (IMAGES,)) or parent / IMAGES for parent in above]
     if own := next((folder for folder in usual if has_pictures(folder)), None):
         return own
     copies = [copy for folder in usual if (copy := or_smaller(folder)) != folder]
-    others = [parent / name for parent in above for name in FOLDERS if has_pictures(parent / name)]
+    named = [inside(parent, (name,)) for parent in above for name in FOLDERS]
+    others = [folder for folder in named if folder is not None and has_pictures(folder)]
     bare = [parent for parent in above if find_images(parent, deep=False)]  # RealityScan writes all in one folder
     found = [*copies, *others, *bare]
     listed = [folder for folder in found if any(is_file(folder / image.name) for image in images)]
@@ -128,7 +136,8 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
 def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, folder: Path) -> None:
     listed = {image.path for image in data.images}
     unlisted = sorted(path for path in present if path not in listed)
-    known = companions(unlisted, listed, folder) if unlisted else set()
+    pictures = {*listed, *(folder / name for name in data.missing)}
+    known = companions(unlisted, pictures, folder) if unlisted else set()
     if unlisted := [path for path in unlisted if path not in known]:
         warn(
             f"{listed_in}: does not list {len(unlisted):,} image(s) that are there, and they are not used: "
@@ -139,6 +148,7 @@ def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, f
 def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
     """The images with the split that a file of held-out names makes, if there is one. Names may differ as those of
     pictures may. Warns of names that are no picture's. Raises InputError where nothing is left to train on."""
+    path = next((each for each in path.parent.iterdir() if each.name.lower() == path.name), path)
     if not is_file(path):
         return data.images
     lines = [line.strip("\ufeff \t").strip("\"',").strip() for line in _text(path).splitlines()]
@@ -150,6 +160,8 @@ def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
     held_out = set(found.names.values())
     if not held_out:
         return data.images
+    if held_out <= set(data.missing):
+        warn(f"{path}: all pictures that it holds out are missing, so that none is measured")
     images = [replace(image, split="test" if image.name in held_out else "train") for image in data.images]
     if all(image.split == "test" for image in images):
         raise InputError(

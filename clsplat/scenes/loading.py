@@ -103,10 +103,10 @@ def load_scene(
             smaller = []
         of_pictures = masks_of(masks, posed, path)
         own_split = any(image.split for image in posed)
-        every = {name: index for index, name in enumerate(sorted([*(image.name for image in posed), *data.missing]))}
+        every = {name: index for index, name in enumerate(sorted([*(image.rank for image in posed), *data.missing]))}
         views = []
         for image in posed:
-            by_name = test_every > 0 and every[image.name] % test_every == 0
+            by_name = test_every > 0 and every[image.rank] % test_every == 0
             held_out = image.split == "test" if own_split else by_name
             view = _view(image, "test" if held_out else "train", resolution, smaller, lenses)
             views.append(replace(view, mask=of_pictures.get(image.name), depth_file=image.depth))
@@ -117,6 +117,8 @@ def load_scene(
         scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=source, clouds=tuple(data.clouds))
         if len(scene.points) == 0:
             scene = with_cloud_beside(scene)
+            if not len(scene.points) and kind in ("colmap", "photos"):
+                warn(f"{path}: has no points, training starts from random ones")
         if kind != "blender":
             near = [view.camera for view in views if view.name not in scene.stray_cameras]
             scene.bounds = camera_bounds(near, data.box)

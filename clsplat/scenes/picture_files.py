@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from clsplat.config.training import Missing
 from clsplat.errors import InputError, examples, warn
@@ -14,7 +14,9 @@ from clsplat.images.reading import companions, find_images
 from clsplat.scenes.picture_names import legible, match, nearest, slashed
 
 SMALLER = (2, 4, 8)
-"""Factors of the folders of smaller pictures, images_2 and so on."""
+"""Factors of the folders of smaller pictures, images_2 and so on, that stand in where their size is asked for."""
+COPIES = range(2, 65)
+"""Factors of those that are taken where there are no others."""
 FEW_MISSING = 0.1
 """Share of the pictures that may be missing where nothing is said of it: some are thrown away, or did not copy. Where
 more are, the folder may be another one."""
@@ -42,7 +44,8 @@ def find_pictures(
     there = by_name(folder, find_images(folder) if present is None else present, [path for path in files if path])
     taken = {path for path in files if path}
     free = [name for name, path in there.items() if path not in taken]
-    found = match([listed[index] for index in lost], free)
+    settled = [name for name, path in zip(listed, files, strict=True) if path]
+    found = match([listed[index] for index in lost], free, settled)
     for index in lost:
         if listed[index] in found.names:
             files[index] = there[found.names[listed[index]]]
@@ -54,18 +57,28 @@ def find_pictures(
         text = f"{listed_in}: lists {len(gone):,} image(s) that are missing: {shown}"
         allowed = {"error": 0, "skip": len(listed) - 1, "few": int(FEW_MISSING * len(listed))}[missing]
         if len(gone) > allowed:
-            close = nearest(listed[gone[0]], free)
-            text += f"; of other names there is {close}" if close else f"; {len(there):,} are in {folder}"
-            raise InputError(text + ("" if len(gone) == len(listed) else "; --missing skip trains on the others"))
+            others = len(find_images(folder) if present is None else present)
+            close = nearest(listed[gone[0]], sorted(set(free).difference(found.names.values())))
+            text += f"; of other names there is {close}" if close else f"; {others:,} others are in {folder}"
+            usual = next((path.parent for path in exact if path is not None), folder)
+            copies = [copy for factor in COPIES if has_pictures(copy := usual.with_name(f"{usual.name}_{factor}"))]
+            text += f"; smaller ones are in {copies[0]}" if copies else ""
+            some = "; train and eval go on with the others by --missing skip"
+            raise InputError(text + ("" if len(gone) == len(listed) else some))
         warn(f"{text}; the other {len(listed) - len(gone):,} are used")
     return files
 
 
 def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> str:
-    """The name of a picture in its scene: the listed one, or that of the file in the folder where it was found."""
+    """The name of a picture in its scene: the listed one, with the file's extension where it has none, or where it has
+    other folders that of the file in the folder where it was found."""
+    plain = listed if listed.isprintable() else slashed(legible(listed))
     if file is None or file == exact:
-        return listed if listed.isprintable() else slashed(legible(listed))
-    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else slashed(legible(listed))
+        return plain
+    inner = file.relative_to(folder).as_posix() if file.is_relative_to(folder) else slashed(plain)
+    if inner.count("/") != slashed(plain).count("/"):
+        return inner
+    return slashed(plain) if PurePosixPath(plain).suffix else f"{slashed(plain)}{file.suffix}"
 
 
 def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> dict[str, Path]:
@@ -80,7 +93,7 @@ def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> di
 def is_smaller_copy(folder: Path) -> bool:
     """True for images_2 and the like beside images/ with pictures."""
     base, _, factor = folder.name.rpartition("_")
-    return factor in map(str, SMALLER) and bool(base) and has_pictures(folder.with_name(base))
+    return factor in map(str, COPIES) and bool(base) and has_pictures(folder.with_name(base))
 
 
 def has_pictures(folder: Path) -> bool:
@@ -93,5 +106,5 @@ def or_smaller(folder: Path) -> Path:
     there is one."""
     if has_pictures(folder):
         return folder
-    copies = (folder.with_name(f"{folder.name}_{factor}") for factor in SMALLER)
+    copies = (folder.with_name(f"{folder.name}_{factor}") for factor in COPIES)
     return next((copy for copy in copies if has_pictures(copy)), folder)

@@ -37,9 +37,12 @@ RAW = (
     ".orf",
 )
 """Extensions of photographs before they were converted."""
-ENCODINGS = ("utf-8", "gb18030", "cp932", "cp949", "big5", "cp1252", "cp1251", "cp1250", "latin-1")
+ENCODINGS = ("utf-8", "gb18030", "cp932", "cp949", "big5", "cp1252", "cp1250", "cp1251", "cp1253", "cp1254", "cp1255",
+             "cp1256", "cp437", "cp850", "cp866", "mac_roman", "latin-1")  # fmt: skip
 """Encodings of names, in the order in which they are tried."""
 DRIVE = re.compile(r"\A[A-Za-z]:(?=/)")
+FOLDER = "folder"
+"""Beginning of the names of the steps that pass over folders."""
 Key = Callable[[str], str]
 
 
@@ -51,17 +54,23 @@ class Found:
     how: list[str] = field(default_factory=list)
 
 
-def match(listed: Sequence[str], present: Iterable[str]) -> Found:
+def match(listed: Sequence[str], present: Iterable[str], settled: Iterable[str] = ()) -> Found:
     """The present name for each listed one, both with folders, as far as it is unambiguous.
 
     Each step is looser than the one before it and takes what is left: a listed name finds a present one where neither
-    looks like another that is left. Names with surrogates (`os.fsdecode`) are bytes of an encoding that is not known.
+    looks like another that is left. Another folder counts for all pictures of a listed folder or for none: where one of
+    them is found in place, or a name of `settled` is, the others are missing. Names with surrogates (`os.fsdecode`) are
+    bytes of an encoding that is not known.
     """
     there = dict.fromkeys(present)
     found = {name: name for name in listed if name in there}
     how = []
     for label, key in _steps([*listed, *there]):
         open_names = [name for name in dict.fromkeys(listed) if name not in found]
+        if label.startswith(FOLDER):
+            in_place = {_folder_of(name) for name, at in found.items() if _folder_of(name) == _folder_of(at)}
+            in_place |= {_folder_of(name) for name in settled}
+            open_names = [name for name in open_names if _folder_of(name) not in in_place]
         if not open_names:
             break
         taken = set(found.values())
@@ -78,7 +87,8 @@ def match(listed: Sequence[str], present: Iterable[str]) -> Found:
         if new:
             found |= new
             first = next(iter(new))
-            how.append(f"{len(new):,} by {label} ({legible(first)} is {legible(new[first])})")
+            shown = new[first] if _is_raw(first) else f"{first} is {new[first]}"
+            how.append(f"{len(new):,} by {label} ({legible(shown)})")
     return Found(found, how)
 
 
@@ -135,8 +145,8 @@ def _steps(names: Iterable[str]) -> Iterator[tuple[str, Key]]:
     yield "extension", _without_extension
     deepest = max((slashed(name).count("/") for name in names), default=0)
     for count in range(deepest, 0, -1):  # the longest ending that fits comes first
-        yield "folder", partial(_ending, count, _lower)
-        yield "folder and extension", partial(_ending, count, _without_extension)
+        yield FOLDER, partial(_ending, count, _lower)
+        yield f"{FOLDER} and extension", partial(_ending, count, _without_extension)
 
 
 def _lower(name: str) -> str:
@@ -150,6 +160,10 @@ def _in(encoding: str, name: str) -> str:
         return slashed(name.encode("utf-8", "surrogateescape").decode(encoding))
     except UnicodeDecodeError:
         return ""
+
+
+def _folder_of(name: str) -> str:
+    return _lower(name).rpartition("/")[0]
 
 
 def _without_extension(name: str) -> str:

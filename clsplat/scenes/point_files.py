@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.files import is_file, open_input
 from clsplat.images.reading import one_line
 from clsplat.models.codec import ply_file
@@ -23,8 +23,10 @@ COLOURS = (
     ("red", "green", "blue"),
     ("r", "g", "b"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("scalar_red", "scalar_green", "scalar_blue"),
+    ("color_red", "color_green", "color_blue"),
 )
-"""Names of a PLY's colours, the first that are there count."""
+"""Names of a PLY's colours, in any case; the first that are there count."""
 UNCOLOURED = 0.5
 """Grey, of points in a file without colours."""
 LAS = (".las", ".laz")
@@ -99,7 +101,9 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
         kinds = dict(vertex.properties)
         if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
-        coloured = next((names for names in (*COLOURS, DC) if all(name in kinds for name in names)), None)
+        lower = {name.lower(): name for name in kinds}
+        named = next((names for names in (*COLOURS, DC) if all(name in lower for name in names)), None)
+        coloured = named and tuple(lower[name] for name in named)
         parts: list[tuple[NDArray[Any], NDArray[Any]]] = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
         for block in ply_file.read_vertices(file, header, "point"):
             points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
@@ -109,13 +113,12 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
                     levels = np.stack([block[name] for name in coloured], axis=1).astype(np.float32)
             parts.append((points, levels))
     points, levels = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: holds positions that are not finite")
-    if not np.isfinite(levels).all():
-        raise InputError(f"{path}: holds colours that are not finite")
+    good = np.isfinite(points).all(axis=1) & np.isfinite(levels).all(axis=1)
+    points, levels = points[good], levels[good]
+    _warn_of_left_out(path, good)
     if not coloured:
         return points, levels
-    if coloured == DC:
+    if named == DC:
         return points, np.clip(colours(levels), 0, 1).astype(np.float32)
     stored = np.dtype(kinds[coloured[0]])  # floats hold all values of 8 and 16 bits
     return points, point_colours(levels.astype(stored) if stored.kind in "iu" else levels)
@@ -142,6 +145,17 @@ def _read_las(path: Path) -> Cloud:
     except Exception as error:  # noqa: BLE001  # laspy raises its own, those of struct and NumPy, and LAZ's decoder panics
         why = one_line(f"{type(error).__name__}: {error}")
         raise InputError(f"{path}: does not read as LAS or LAZ ({why}); export it again") from None
-    if not np.isfinite(points).all():
-        raise InputError(f"{path}: holds positions that are not finite")
-    return Cloud(points, colors)
+    good = np.asarray(np.isfinite(points).all(axis=1))
+    _warn_of_left_out(path, good)
+    return Cloud(points[good], None if colors is None else colors[good])
+
+
+def _warn_of_left_out(path: Path, good: NDArray[np.bool_]) -> None:
+    """Warn of points that are not finite. Raises InputError where all are such."""
+    if good.all():
+        return
+    bad = int(np.count_nonzero(~good))
+    found = f"{path}: {bad:,} of {len(good):,} points have a position or colour that is not finite"
+    if bad == len(good):
+        raise InputError(f"{found}, expected some that are")
+    warn(f"{found}, and are left out")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,7 +21,7 @@ from clsplat.config.points import OWN_POINTS, StartPoints
 from clsplat.errors import InputError
 from clsplat.files import short_digest
 from clsplat.images.reading import downscale, read_image
-from clsplat.scenes.data_set import Lens, undistort
+from clsplat.scenes.data_set import Lens, pixels_of, undistort
 from clsplat.scenes.glance import Glance, glance_at
 from clsplat.scenes.known_depth import KnownDepth
 from clsplat.scenes.masks import HALF, Mask
@@ -33,6 +33,12 @@ T = TypeVar("T")
 FAR = 64.0
 """Distance of a scene from the world's origin, in its own sizes, beyond which its means count from its middle: float32
 there knows places to 64 * 2^-24 of the size, a hundredth of a pixel of 2600 across the scene."""
+LEAST_SHOWN, SHOWN_PART = 10, 0.08
+"""Points in the picture of a far camera, and their standard deviation in parts of the picture, from which on it shows
+what the others do from further off, or something else that was reconstructed. Points all over it have 0.29; a stray has
+none, or all in a pixel."""
+GROUP = 2
+"""Other cameras beside a far one that are a group with it: wrong poses are scattered."""
 ROUNDING = 1e-12
 """Cameras that are nearer than this to each other, as a part of how far they are from the origin, are in one place."""
 
@@ -197,12 +203,14 @@ class Scene:
 
     @cached_property
     def stray_cameras(self) -> frozenset[str]:
-        """Names of the views whose cameras stand so far off the others, and off the points, that they are strays."""
+        """Names of the views whose cameras stand so far off the others, and off the points, that they are strays. Those
+        that show points in a fair part of their picture are none, nor groups of cameras near each other."""
         centres = np.stack([view.camera.position for view in self.views])
         middle = np.median(centres, axis=0)
         away = float(np.median(np.linalg.norm(self.points - middle, axis=1))) if len(self.points) else 0.0
         far = stray_cameras([view.camera for view in self.views], away)
-        return frozenset(view.name for view, stray in zip(self.views, far, strict=True) if stray)
+        found = [view for view, stray in zip(self.views, far, strict=True) if stray]
+        return frozenset(view.name for view in found if not _shows_much(view, self.points, self.views))
 
     @cached_property
     def spread(self) -> tuple[Float64, float, float]:
@@ -236,6 +244,21 @@ class Scene:
     def near(self) -> float:
         """The near plane of a model of this scene, world units (docs/decisions/0019)."""
         return min(NEAR, self.extent / NEARS)
+
+
+def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:
+    """True if a far camera is a part of the capture, as in another room: its picture has points in a fair part of it,
+    or without points GROUP other cameras are nearer to it than half of all are to their middle."""
+    if len(points):
+        rows, columns, _ = pixels_of(points, view.camera, view.lens)
+        if len(rows) < LEAST_SHOWN:
+            return False
+        sides = np.std(rows) / view.camera.height, np.std(columns) / view.camera.width
+        return bool(max(sides) > SHOWN_PART)
+    centres = np.stack([each.camera.position for each in views])
+    usual = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    near = np.linalg.norm(centres - view.camera.position, axis=1) < usual
+    return int(near.sum()) > GROUP
 
 
 def _has_alpha(image: Float32) -> bool:

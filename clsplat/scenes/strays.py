@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
+GAP = 2.0
+"""Distance of a place from the middle, in that of the next one nearer to it, from which on it may be a stray. In the
+captures at hand the next one out is up to 1.7 times as far."""
 FACTOR = 5.0
-"""Distance of the nearest stray from the middle, in that of the farthest of the others. In captures as they are the
-next one out is up to twice as far as the one before it. A training of 24 photographs whose sizes include a stray
-loses 1.2 dB at 5, 2.7 at 8, 4 at 12 and 7 at 30."""
-MOST_CAMERAS = 0.2
+"""Distance of a stray from the middle, in that of the farthest of the others. A training of 24 photographs whose sizes
+include a stray loses 1.2 dB at 5, 2.7 at 8, 4 at 12 and 7 at 30."""
+MOST_CAMERAS = 0.25
 """Largest share of the cameras that can be strays: more of them are a part of the capture."""
 MOST_POINTS = 0.01
 """The same of the points, of which thousands are left."""
@@ -24,10 +26,10 @@ MOST_POINTS = 0.01
 def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | None = None) -> NDArray[np.bool_]:
     """(N,): True for the places (N, 3) that are strays.
 
-    Distances count from the middle (3,), by default the median of each axis. Sorted, strays are those behind the first
-    gap of FACTOR, if they are at most this share of all. least: a distance from which FACTOR counts in any case, such
-    as that of what the cameras look at. Places that are all the same but for some have no size to compare with, and no
-    strays.
+    Distances count from the middle (3,), by default the median of each axis. Sorted, those behind the first gap of GAP
+    are strays if they are FACTOR times as far as the last before it, and at most this share of all. least: a distance
+    from which FACTOR counts in any case, such as that of what the cameras look at. Places that are all the same but for
+    some have no size to compare with otherwise, and no strays.
     """
     found = np.zeros(len(places), np.bool_)
     first = len(places) - int(most * len(places))  # so many stay whatever their distances are
@@ -36,9 +38,11 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
     distances = np.linalg.norm(places - (np.median(places, axis=0) if middle is None else middle), axis=1)
     order = np.argsort(distances, kind="stable")
     within, beyond = distances[order[first - 1 : -1]], distances[order[first:]]
-    gaps = (beyond > FACTOR * np.maximum(within, least)) & (within > 0)
+    reach = np.maximum(within, least)
+    gaps = (beyond > GAP * reach) & (reach > 0)
     if gaps.any():
-        found[order[first + int(gaps.argmax()) :]] = True
+        at = int(gaps.argmax())
+        found[order[first + at :]] = beyond[at:] > FACTOR * reach[at]
     return found
 
 

@@ -11,6 +11,7 @@ import math
 import os
 import posixpath
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -19,15 +20,15 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float64, numbers
-from clsplat.camera import Camera, Projection, focal_length
+from clsplat.camera import Camera
 from clsplat.config.training import Lenses, Missing
 from clsplat.errors import InputError, examples, warn
-from clsplat.files import is_file, parse_json, read_document
+from clsplat.files import is_file
 from clsplat.images.reading import EXTENSIONS, image_size
 from clsplat.scenes.camera_checks import cameras_of
+from clsplat.scenes.camera_json import EXPORT_AGAIN, Keys, load_document, objects, short
 from clsplat.scenes.data_set import (
     MAX_NUMBER,
-    MAX_SIZE,
     PANORAMA,
     DataSet,
     Lens,
@@ -36,7 +37,7 @@ from clsplat.scenes.data_set import (
     given_in_parts,
     in_pixels,
 )
-from clsplat.scenes.picture_files import find_pictures, or_smaller
+from clsplat.scenes.picture_files import COPIES, called, find_pictures, or_smaller
 from clsplat.scenes.picture_names import match
 from clsplat.scenes.point_files import clouds_beside, read_point_cloud
 
@@ -51,7 +52,6 @@ FISHEYE = ("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE
 AGREE = 0.02
 """Part by which a focal length may differ from what the angle of view beside it makes of it: tools round angles, and
 some take them before they refine the lens."""
-EXPORT_AGAIN = "export the data set anew or add it"
 
 
 def read_transforms(
@@ -79,6 +79,8 @@ def read_transforms(
     if isinstance(cloud, str) and cloud:
         _inside(path.parent, cloud, f"{path}: 'ply_file_path'")
         file = path.parent / cloud.replace("\\", "/")
+        if not is_file(file) and (found := match([_plain(cloud)], _clouds_below(path.parent)).names):
+            file = path.parent / found[_plain(cloud)]
         if is_file(file):
             data.points, data.colors = read_point_cloud(file)
             data.clouds = [other for other in data.clouds if not other.samefile(file)]
@@ -86,6 +88,12 @@ def read_transforms(
             instead = data.clouds[0].name if data.clouds else "random ones"
             warn(f"{path}: its points 'ply_file_path' are missing: {file}; using {instead}")
     return data
+
+
+def _clouds_below(folder: Path) -> list[str]:
+    """Names of the PLYs in a folder and those in it."""
+    files = [file for pattern in ("*", "*/*") for file in folder.glob(pattern) if file.suffix.lower() == ".ply"]
+    return sorted(file.relative_to(folder).as_posix() for file in files)
 
 
 def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Missing) -> list[Path | None]:
@@ -135,9 +143,21 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
     """The images of a transforms.json, in its order, whose pictures need not be there, as of `read_poses`."""
     readers = _readers(path, load_document(path))
-    for keys in readers:
-        _inside(path.parent, keys.text("file_path"), keys.where)
-    return _images(path, [(keys, _find_file(keys)) for keys in readers], size=size)
+    with warnings.catch_warnings():  # of pictures: they are not looked at
+        warnings.simplefilter("ignore")
+        try:
+            files = _pictures(path, readers, None, "skip")
+        except InputError:
+            files = [None] * len(readers)
+    return _images(path, [(keys, file or _within(keys)) for keys, file in zip(readers, files, strict=True)], size=size)
+
+
+def _within(keys: Keys) -> Path:
+    """A file that is not there: by its listed name, or by its end where that leads out of the folder."""
+    listed = keys.text("file_path")
+    if not listed.isprintable():
+        _inside(keys.path.parent, listed, keys.where)
+    return _find_file(keys) if is_inside(keys.path.parent, listed) else keys.path.parent / _plain(listed)
 
 
 def _readers(path: Path, document: dict[str, Any]) -> list[Keys]:
@@ -155,17 +175,17 @@ def _images(
     in_parts = []
     for keys, file in frames:
         listed = _plain(keys.text("file_path"))
-        if _find_file(keys) == file or not file.is_relative_to(path.parent):
+        exact = _find_file(keys)
+        name = called(listed, None, file, path.parent)
+        if exact == file or not file.is_relative_to(path.parent):
             name = listed + file.name[len(PurePosixPath(listed).name) :]  # with the extension of the file
-        else:
-            name = file.relative_to(path.parent).as_posix()
         lens, parts = _lens(keys, file, size)
         in_parts += [name] if parts else []
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
         if name in images:
             raise InputError(f"{path}: lists {name} twice, expected each picture once; remove one of the frames")
         mask, depth = (_file_of(keys, key) for key in ("mask_path", "depth_file_path"))
-        images[name] = PosedImage(name, lens, rotation, translation, file, mask=mask, depth=depth)
+        images[name] = PosedImage(name, lens, rotation, translation, file, mask=mask, depth=depth, listed=listed)
     readers = [keys for keys, _ in frames]
     if in_parts:
         warn(f"{path}: {given_in_parts(in_parts)}")
@@ -239,94 +259,6 @@ def read_blender(folder: Path, *, images: Path | None = None, missing: Missing =
     return replace(train, images=both, missing=train.missing + test.missing)
 
 
-class Keys:
-    """Values of one frame or camera, or of the file where that does not have them; `where` begins every error. Every
-    method raises InputError for a value that cannot be."""
-
-    def __init__(self, path: Path, part: str | None, frame: dict[str, Any], document: dict[str, Any]) -> None:
-        self.path, self.frame, self.document = path, frame, document
-        self.where = str(path) if part is None else f"{path}: {part}"
-
-    def get(self, key: str) -> Any:
-        value = self.frame.get(key)
-        return self.document.get(key) if value is None else value
-
-    def text(self, key: str) -> str:
-        value = self.get(key)
-        if not isinstance(value, str) or not value.strip():
-            trouble = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
-            raise InputError(f"{self.where}: {trouble}; {EXPORT_AGAIN}")
-        return value
-
-    def number(self, key: str) -> float | None:
-        value = self.get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
-            raise self.wrong(key, "a number")
-        return float(value)
-
-    def require(self, key: str, default: float | None = None) -> float:
-        """The number of `key`, else the default; InputError for what `number` refuses, and where there is neither."""
-        value = self.number(key)
-        if (value := default if value is None else value) is None:
-            raise self.wrong(key, "a number")
-        return value
-
-    def side(self, key: str) -> int:
-        """Width or height in pixels."""
-        side = self.number(key)
-        if side is None or not 1 <= side <= MAX_SIZE or side != round(side):
-            raise self.wrong(key, f"a whole number of pixels from 1 to {MAX_SIZE}")
-        return round(side)
-
-    def vector(self, key: str, size: int) -> Float64:
-        """Finite numbers (size,)."""
-        vector = numbers(self.get(key))
-        if vector.shape != (size,) or not np.isfinite(vector).all():
-            raise self.wrong(key, f"a list of {size} numbers")
-        return vector
-
-    def focal(self, key: str, size: int, projection: Projection = "perspective") -> float:
-        """The focal length in pixels of an angle of view in degrees across `size` pixels."""
-        try:
-            return focal_length(math.radians(self.require(key)), size, projection)
-        except ValueError as error:
-            raise InputError(f"{self.where}: '{key}': {error}") from None
-
-    def wrong(self, key: str, expected: str) -> InputError:
-        """The error for a value that is missing or cannot be."""
-        value = self.get(key)
-        shown = f"{value:g}" if isinstance(value, float) else short(value)
-        problem = f"has no '{key}'" if value is None else f"'{key}' is {shown}"
-        return InputError(f"{self.where}: {problem}, expected {expected}")
-
-
-def short(value: object) -> str:
-    """A value for an error's line."""
-    try:
-        return repr(value)[:60]
-    except ValueError:  # an integer of thousands of digits
-        return "an endless number"
-
-
-def load_document(path: Path, expected: str = "a transforms.json", key: str = "'frames'") -> dict[str, Any]:
-    """The JSON object in a file. Raises InputError, which says that `expected`, an object with `key`, was."""
-    try:
-        document = parse_json(read_document(path, expected), once=True)
-    except ValueError as error:
-        raise InputError(f"{path}: is not JSON: {error}; expected {expected}") from None
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: holds no JSON object, expected one with {key}")
-    return document
-
-
-def objects(document: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    """The list of objects under a key, empty where that is none."""
-    given = document.get(key)
-    return given if isinstance(given, list) and all(isinstance(entry, dict) for entry in given) else []
-
-
 def _plain(listed: str) -> str:
     """A file_path as a name: forward slashes, nothing like "./", "../" or "C:/" before it."""
     text = DRIVE.sub("/", posixpath.normpath(listed.replace("\\", "/")))
@@ -382,7 +314,7 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, b
                 )
             actual = size
         else:
-            actual = image_size(file, orient=False)
+            actual = _full_size(keys, file)
         if width is not None:  # the other one in the picture's proportions
             height = width * actual[1] / actual[0]
         elif height is not None:
@@ -409,6 +341,17 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, b
     model, extra = _distortion(keys)
     params = tuple(float(value) for value in (*core, *extra) if value is not None)
     return in_pixels(check_lens(Lens(model, round(width), round(height), params), keys.where))
+
+
+def _full_size(keys: Keys, file: Path) -> tuple[int, int]:
+    """The size of a frame's picture; of one in a smaller copy of the listed folder that of the larger one."""
+    width, height = image_size(file, orient=False)
+    listed = PurePosixPath(_plain(keys.text("file_path"))).parts
+    for part in file.parts:
+        name, _, factor = part.rpartition("_")
+        if name in listed and part not in listed and factor.isdecimal() and int(factor) in COPIES:
+            return width * int(factor), height * int(factor)
+    return width, height
 
 
 def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:

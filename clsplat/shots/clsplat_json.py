@@ -14,7 +14,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import LARGEST_FOCAL, Camera, Projection
 from clsplat.errors import InputError
 from clsplat.rotations import rotation_from_quaternion
-from clsplat.scenes.transforms import Keys, objects, short
+from clsplat.scenes.camera_json import Keys, objects, short
 from clsplat.shots.keys import Key, interpolate
 from clsplat.shots.shot import Shot, numbered, whole_frames
 

@@ -14,7 +14,8 @@ from typing import Any, cast
 
 from clsplat.camera import Camera, Projection
 from clsplat.errors import InputError
-from clsplat.scenes.transforms import Keys, objects, opengl_pose, short
+from clsplat.scenes.camera_json import Keys, objects, short
+from clsplat.scenes.transforms import opengl_pose
 from clsplat.shots.shot import Shot, numbered
 
 TYPES = ("perspective", "fisheye", "equirectangular")

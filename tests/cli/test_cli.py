@@ -271,7 +271,7 @@ def test_bad_models(verb: str, trouble: str, model: str, folder: str, pipeline: 
     head, data = path.read_bytes().split(b"end_header\n")
     content, message = {
         "property": (head.replace(b"float opacity", b"float opaque") + b"end_header\n" + data, "property opacity"),
-        "nan": (head + b"end_header\n" + np.float32(np.nan).tobytes() + data[4:], "1 of 4 Gaussians have a position"),
+        "nan": (head + b"end_header\n" + np.full(len(data) // 4, np.nan, "<f4").tobytes(), "4 of 4 Gaussians have"),
         "none": (head.replace(b"vertex 4", b"vertex 0") + b"end_header\n", "0 Gaussians"),
         "truncated": (path.read_bytes()[:-9], "truncated"),
         "text": (b"hello", "not a PLY"),

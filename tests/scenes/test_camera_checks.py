@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ring import FOCAL, HEIGHT, WIDTH, matrix_of, points, poses, write_cloud, write_colmap, write_transforms
+from scipy.spatial.transform import Rotation
 from tiny import write_scene
 
 from clsplat.cli.main import main
@@ -34,6 +35,7 @@ NO_POINTS = (np.empty((0, 3)), np.empty((0, 3), np.uint8))
         {"cx": 0.5, "cy": 0.5},
         {"cx": 0.5, "cy": 0.5, "fl_x": FOCAL / WIDTH, "fl_y": FOCAL / HEIGHT},
         {"cx": 0.5, "cy": 0.5, "fl_x": None, "fl_y": None, "camera_angle_x": 2 * np.arctan(WIDTH / 2 / FOCAL)},
+        {"cx": 0.5, "cy": 0.5, "fl_x": FOCAL / WIDTH, "fl_y": FOCAL / WIDTH},  # both by the width
         {"cx": 0.5, "cy": 0.5, "k1": 0.0, "camera_model": "OPENCV"},
     ],
 )
@@ -58,8 +60,10 @@ def test_those_of_a_colmap_model_too(tmp_path: Path) -> None:
     [
         ({"fl_x": 2.0, "fl_y": 2.0}, "and 17 more is 2 pixels in 48 x 32"),  # in millimetres
         ({"fl_x": 0.83, "fl_y": 0.83, "cx": None, "cy": None}, "is 0.83 pixels in 48 x 32"),
-        ({"cx": 0.0, "cy": 0.0}, "lies in the corner, at 0 0 of 48 x 32 pixels"),  # from the middle
-        ({"cx": -0.4, "cy": 1.2}, "lies in the corner, at -0.4 1.2"),
+        ({"cx": 0.0, "cy": 0.0}, "lies at 0 0 of 48 x 32 pixels"),  # from the middle
+        ({"cx": -0.4, "cy": 1.2}, "lies at -0.4 1.2"),
+        ({"cx": 0.5}, "lies at 0.5 16 of 48 x 32 pixels"),  # a part, of one alone
+        ({"fl_x": 10.0, "fl_y": 10.0, "cx": 6.0, "cy": 4.0}, "6 4, is the middle of 12 x 8 pixels"),
     ],
 )  # fmt: skip
 def test_intrinsics_that_no_lens_has_are_told(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
@@ -185,6 +189,26 @@ def around(count: int = 20) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(rotation, translation + rng.normal(0, 0.5, 3)) for rotation, translation in poses(count)]
 
 
+def facade(seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Cameras before a wall or above a field, that look one way but for what hands and wind do."""
+    rng = np.random.default_rng(seed)
+    turned = [Rotation.from_rotvec(rng.normal(0, 0.12, 3)).as_matrix() for _ in range(20)]
+    places = rng.uniform(-3, 3, (20, 3)) * [1, 1, 0.1]
+    return [(rotation, -rotation @ place) for rotation, place in zip(turned, places, strict=True)]
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_cameras_that_look_one_way_are_not_told(seed: int, up: str, tmp_path: Path) -> None:
+    """Whatever way they are turned round: those of a drone in a world with z up."""
+    posed = facade(seed)
+    if up == "z":
+        turn = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+        posed = [(rotation @ turn.T, translation) for rotation, translation in posed]
+    scene = load_scene(write_colmap(tmp_path, posed=posed, cloud=NO_POINTS))
+    assert not [text for text in scene.warnings if "poses" in text]
+
+
 @pytest.mark.parametrize("posed", [poses(), around(), away(), along()], ids=["ring", "by hand", "outward", "ahead"])
 @pytest.mark.parametrize("cloud", [points(), NO_POINTS], ids=["points", "none"])
 def test_captures_are_not_told(posed: Any, cloud: Any, tmp_path: Path) -> None:
@@ -219,6 +243,6 @@ def test_the_verbs_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         capsys.readouterr()
         assert main(words) == 0
         told = capsys.readouterr().err
-        assert "lies in the corner, at 0 0" in told, words[0]
+        assert "lies at 0 0" in told, words[0]
         assert "the poses are inverted" in told, words[0]
     assert json.loads((wrong / "transforms.json").read_text())["cx"] == 0

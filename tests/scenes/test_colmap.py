@@ -208,7 +208,7 @@ def test_unknown_camera_models_are_refused_by_name(tmp_path: Path) -> None:
     ("images", "found"),
     [
         ("1 1 0 0 0 0 0 0 2 a.png\n\n", "camera 2, which is not in the model"),
-        ("1 1 0 0 0 0 0 0 1 ../../etc/a.png\n\n", "expected a path inside"),
+        ("1 1 0 0 0 0 0 0 1 ../..\n\n", "expected a path inside"),
         ("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 a.png\n\n", "a.png is there twice"),
         ("1 0 0 0 0 0 0 0 1 a.png\n\n", "expected a unit quaternion"),
         ("1 1 0 0 0 nan 0 0 1 a.png\n\n", "expected a unit quaternion, finite numbers"),
@@ -284,3 +284,12 @@ def test_real_points_project_to_their_observations(name: str) -> None:
     per_image = np.array([error.mean() for error in errors])
     assert per_image.max() < 1
     assert np.concatenate(errors).mean() < 0.45
+
+
+@pytest.mark.parametrize("name", ["../../etc/a.png", "/etc/a.png", "C:\\etc\\a.png", "..\\etc\\a.png", "./etc/./a.png"])
+def test_a_name_from_elsewhere_stays_inside(name: str, tmp_path: Path) -> None:
+    """It is looked for by its ending, and nothing outside is ever opened."""
+    make_model(tmp_path)
+    (tmp_path / "txt" / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
+    (image,) = read_model(tmp_path / "txt").images
+    assert image.name in ("etc/a.png", "./etc/./a.png")

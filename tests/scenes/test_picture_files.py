@@ -16,6 +16,7 @@ from clsplat.scenes.colmap import read_cameras
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.picture_names import match, nearest
 from clsplat.scenes.scene import Scene
+from clsplat.scenes.transforms import read_poses
 
 
 def assert_each_has_its_picture(scene: Scene, skipped: tuple[int, ...] = ()) -> None:
@@ -96,7 +97,7 @@ def test_a_name_that_could_be_two_pictures_is_missing(tmp_path: Path) -> None:
     (warning, unlisted) = load_scene(tmp_path).warnings
     assert "lists 1 image(s) that are missing: " in warning
     assert "does not list 2 image(s)" in unlisted
-    with pytest.raises(InputError, match=r"VIEW00\.png; of other names there is View00\.png; --missing skip"):
+    with pytest.raises(InputError, match=r"VIEW00\.png; of other names there is View00\.png; train and eval"):
         load_scene(tmp_path, missing="error")
 
 
@@ -113,6 +114,39 @@ def test_masks_and_smaller_copies_are_no_pictures(tmp_path: Path) -> None:
         write_pictures(tmp_path / folder, [NAMES[3]])
     (warning,) = load_scene(tmp_path).warnings
     assert "lists 1 image(s) that are missing" in warning
+
+
+def test_one_deleted_picture_is_not_one_of_another_folder(tmp_path: Path) -> None:
+    """Thumbnails, renders, other cameras of a rig, pictures that were moved away: equal names say nothing there."""
+    write_colmap(tmp_path, [f"cam0/{name}" for name in NAMES])
+    for folder in ("cam1", "thumbs", "cam0/rejected"):
+        write_pictures(tmp_path / "images" / folder, [NAMES[3]])
+    (tmp_path / "images" / "cam0" / NAMES[3]).unlink()
+    (tmp_path / "images" / "cam0" / NAMES[8]).rename(tmp_path / "images" / "cam0" / NAMES[8].upper())
+    scene = load_scene(tmp_path)
+    assert_each_has_its_picture(scene, (3,))
+    assert "lists 1 image(s) that are missing: " in scene.warnings[1]
+    assert [view.name for view in scene.test_views] == [f"cam0/{NAMES[index]}" for index in (0, 8, 16)]
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_one_of_blenders_pictures_is_not_the_other_splits(split: str, tmp_path: Path) -> None:
+    for name in ("train", "test"):
+        write_transforms(tmp_path, [f"./{name}/{each[:-4]}" for each in NAMES], [f"{name}/{each}" for each in NAMES],
+                         name=f"transforms_{name}.json")  # fmt: skip
+    (tmp_path / split / NAMES[3]).unlink()
+    scene = load_scene(tmp_path)
+    assert len(scene.views) == 2 * COUNT - 1
+    assert f"{split}/{NAMES[3]}" not in {view.name for view in scene.views}
+
+
+def test_names_in_another_case_keep_the_split_and_their_names(tmp_path: Path) -> None:
+    """Renamed files are the same pictures of the same run."""
+    write_colmap(tmp_path, [name.upper() for name in NAMES], NAMES)
+    for index in (4, 9):
+        (tmp_path / "images" / NAMES[index]).unlink()
+    scene = load_scene(tmp_path)
+    assert [view.name for view in scene.test_views] == [NAMES[index].upper() for index in (0, 8, 16)]
 
 
 @pytest.mark.parametrize(
@@ -173,7 +207,7 @@ def test_many_missing_pictures_are_an_error_that_says_what_to_give(kind: str, tm
     write_colmap(tmp_path) if kind == "colmap" else write_transforms(tmp_path)
     for index in range(1, 8):
         (tmp_path / "images" / NAMES[index]).unlink()
-    with pytest.raises(InputError, match=r"lists 7 image.*; --missing skip trains on the others$"):
+    with pytest.raises(InputError, match=r"lists 7 image.*; train and eval go on with the others by --missing skip$"):
         load_scene(tmp_path)
     scene = load_scene(tmp_path, missing="skip")
     assert_each_has_its_picture(scene, tuple(range(1, 8)))
@@ -216,7 +250,7 @@ def test_those_in_sub_folders_too(tmp_path: Path) -> None:
     (tmp_path / "images").rename(tmp_path / "images_4")
     scene = load_scene(tmp_path)
     assert_each_has_its_picture(scene)
-    assert scene.views[0].name == "images_4/cam0/00.png"
+    assert scene.views[0].name == "images/cam0/00.png"
 
 
 @pytest.mark.brings("3DGS' convert.py", "`input/` in place of `images/`", "taken where there is no `images/`")
@@ -229,6 +263,32 @@ def test_folders_of_other_names(images: str, model: str, tmp_path: Path) -> None
     assert_each_has_its_picture(scene)
     assert [text for text in scene.warnings if "the pictures are taken from" in text] == scene.warnings
     assert len(scene.warnings) == 1
+
+
+@pytest.mark.parametrize("given", ["sparse", "sparse/0"])
+@pytest.mark.parametrize("images", ["images", "Images", "INPUT"])
+def test_the_models_folder_may_be_given(given: str, images: str, tmp_path: Path) -> None:
+    write_colmap(tmp_path, images=images)
+    assert_each_has_its_picture(load_scene(tmp_path / given))
+
+
+def test_sizes_that_are_not_told_are_those_of_the_larger_pictures(tmp_path: Path) -> None:
+    write_transforms(tmp_path, w=None, h=None)
+    before = load_scene(tmp_path).views[0].camera
+    write_pictures(tmp_path / "images_2", NAMES, (WIDTH // 2, HEIGHT // 2))
+    for path in (tmp_path / "images").iterdir():
+        path.unlink()
+    camera = load_scene(tmp_path).views[0].camera
+    assert (camera.width, camera.fx, camera.cx) == (before.width / 2, before.fx / 2, before.cx / 2)
+
+
+@pytest.mark.parametrize("listed", ["/home/bob/set/images/{}", "../../data/images/{}", "C:\\set\\images\\{}"])
+def test_cameras_alone_are_read_where_pictures_are_elsewhere(listed: str, tmp_path: Path) -> None:
+    write_transforms(tmp_path, [listed.format(name) for name in NAMES], [f"images/{name}" for name in NAMES])
+    plain = load_scene(tmp_path)
+    assert_each_has_its_picture(plain)
+    cameras = read_poses(tmp_path / "transforms.json")
+    assert set(cameras) == {view.name for view in plain.views}
 
 
 # Sizes
@@ -325,3 +385,7 @@ def test_a_list_of_what_is_missing_holds_out_the_rest(tmp_path: Path) -> None:
     (tmp_path / "sparse" / "0" / "test.txt").write_text("view03.png\nview10.png\n")
     (tmp_path / "images" / "view03.png").unlink()
     assert [view.name for view in load_scene(tmp_path).test_views] == ["view10.png"]
+    (tmp_path / "images" / "view10.png").unlink()
+    scene = load_scene(tmp_path)
+    assert scene.test_views == []
+    assert scene.warnings[-1].endswith("test.txt: all pictures that it holds out are missing, so that none is measured")

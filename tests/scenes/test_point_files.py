@@ -97,10 +97,60 @@ def test_text_of_points(lines: list[str], tmp_path: Path) -> None:
     np.testing.assert_allclose(model.colors, [[1, 0, 0.2], [0, 0, 0]], atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["points3d.txt", "Points3D.txt"])
+def test_points_in_another_case(name: str, tmp_path: Path) -> None:
+    """hierarchical-3d-gaussians writes points3d.bin."""
+    folder = write_points(tmp_path, ["1 1 2 3 255 0 51"])
+    (folder / "points3D.txt").rename(folder / name)
+    assert len(read_model(folder).points) == 1
+
+
 def test_points_without_tracks_are_seen_by_nothing(tmp_path: Path) -> None:
     tracks = read_tracks(write_points(tmp_path, ["1 1 2 3 255 0 51", "2 4 5 6 0 0 0 0.5 1 0"]))
     np.testing.assert_array_equal(tracks.errors, [0, 0.5])
     assert {name: rows.tolist() for name, rows in tracks.by_image.items()} == {"sub/0.png": [1]}
+
+
+@pytest.mark.brings("scanners, filters", "points of NaN in PLY, LAS or points3D.txt", "left out and counted")
+@pytest.mark.parametrize("kind", ["position", "colour"])
+def test_points_that_are_no_numbers_are_left_out(kind: str, tmp_path: Path) -> None:
+    xyz, rgb = XYZ.copy(), RGB / 255
+    (xyz if kind == "position" else rgb)[5, 1] = np.nan
+    write_cloud(tmp_path / "a.ply", xyz, rgb, "float")
+    with pytest.warns(UserWarning, match="1 of 60 points have a position or colour that is not finite, and are left"):
+        found, colours = read_point_cloud(tmp_path / "a.ply")
+    np.testing.assert_array_equal(found, np.delete(XYZ, 5, axis=0).astype(np.float32))
+    np.testing.assert_allclose(colours, np.delete(RGB, 5, axis=0) / 255, atol=1e-6)
+
+
+def test_those_of_text_too_and_points_of_places_alone(tmp_path: Path) -> None:
+    folder = write_points(tmp_path, ["1 1 2 3", "2 nan 5 6", "3 7 8 9"])
+    with pytest.warns(UserWarning, match="1 of 3 points are not numbers, and are left out"):
+        model = read_model(folder)
+    np.testing.assert_array_equal(model.points, [[1, 2, 3], [7, 8, 9]])
+    assert (model.colors == model.colors[0]).all()
+
+
+def test_highlights_do_not_make_a_cloud_black(tmp_path: Path) -> None:
+    rgb = RGB / 255
+    rgb[7, 0] = 3.7
+    write_cloud(tmp_path / "a.ply", XYZ, rgb, "float")
+    np.testing.assert_allclose(read_point_cloud(tmp_path / "a.ply")[1], np.clip(rgb, 0, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names", [("Red", "Green", "Blue"), ("R", "G", "B"), ("scalar_Red", "scalar_Green", "scalar_Blue")]
+)
+def test_names_of_colours_in_any_case(names: tuple[str, ...], tmp_path: Path) -> None:
+    write_cloud(tmp_path / "a.ply", XYZ, RGB, "uchar", names)
+    np.testing.assert_allclose(read_point_cloud(tmp_path / "a.ply")[1], RGB / 255, atol=1e-6)
+
+
+def test_a_named_cloud_in_another_case_is_found(tmp_path: Path) -> None:
+    write_transforms(tmp_path, ply_file_path="sub\\Cloud.PLY")
+    write_cloud(tmp_path / "sub" / "cloud.ply", XYZ, RGB)
+    scene = load_scene(tmp_path)
+    assert (len(scene.points), scene.warnings) == (60, [])
 
 
 # Clouds beside a scene
@@ -121,7 +171,7 @@ def test_a_cloud_beside_a_scene_without_points_is_taken(kind: str, name: str, tm
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.points, XYZ.astype(np.float32))
     np.testing.assert_allclose(scene.point_colors, RGB / 255, atol=1e-6)
-    assert f"{path}: its 60 points are started from, as the scene names none" in scene.warnings
+    assert f"{path}: its 60 points are the scene's, which names none" in scene.warnings
     assert not [text for text in doubts.of_scene(scene, "black") if "not used" in text]
 
 
@@ -180,6 +230,7 @@ def test_a_cloud_that_does_not_read_or_lies_elsewhere_is_told_and_passed_over(tm
     assert "points3d.ply" in scene.warnings[0]
     assert "sparse_pc.ply: its points are 1e+06 from the cameras that see them" in scene.warnings[1]
     assert all(text.endswith("; it is not used") for text in scene.warnings)
+    assert not [text for text in doubts.of_scene(scene, "black") if "points of its own" in text]
 
 
 # How many

@@ -276,7 +276,7 @@ def test_point_clouds(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.ply: truncated"):
         read_point_cloud(path)
     path.write_bytes(head + np.full((3, 3), np.nan, ">f8").tobytes())
-    with pytest.raises(InputError, match="not finite"):
+    with pytest.raises(InputError, match="3 of 3 points have a position or colour that is not finite"):
         read_point_cloud(path)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from clsplat.camera import focal_length
 from clsplat.errors import InputError
-from clsplat.scenes.transforms import Keys, objects
+from clsplat.scenes.camera_json import Keys, objects
 from clsplat.shots import read_shot
 from clsplat.shots.shot import whole_frames
 

@@ -122,9 +122,16 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             return Result(np.full((*size, 3), 0.25, np.float32), np.full(size, 0.5, np.float32))
 
     def load_scene(
-        path: Path, *, resolution: int, test_every: int, masks: MaskUse, lenses: str, progress: Callable[..., None]
+        path: Path,
+        *,
+        resolution: int,
+        test_every: int,
+        masks: MaskUse,
+        lenses: str,
+        missing: str,
+        progress: Callable[..., None],
     ) -> Scene:
-        assert (masks, lenses) == (NO_MASKS, "undistort")
+        assert (masks, lenses, missing) == (NO_MASKS, "undistort", "few")
         if not Path(path).is_dir():
             raise InputError(f"{path}: no such folder")
         pipe.calls.append(("load_scene", str(path), resolution, test_every))

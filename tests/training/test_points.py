@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture, error_line
+from ring import write_cloud
 from tiny import CONFIG, FEW, hidden_model, write_scene
 
 from clsplat.cli.main import main
@@ -16,7 +17,6 @@ from clsplat.config.points import SKY_RADIUS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.models.formats import ply
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.training.density.adaptive import Adaptive
@@ -34,9 +34,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Means without colours, in a file of ours."""
+    """Means without colours."""
     path = tmp_path_factory.mktemp("cloud") / "cloud.ply"
-    ply.write(path, hidden_model(300))
+    write_cloud(path, hidden_model(300).means)
     return path
 
 
@@ -59,8 +59,7 @@ def test_a_run_starts_from_the_cloud_and_goes_on(
     [
         (("--points", "gone.ply"), "gone.ply: no such file, expected a cloud of points"),
         (("--points-use", "join"), "--points-use join: no points are given, expected --points FILE too"),
-        (("--points-limit", "0"), "--points-limit 0: expected at least 1"),
-        (("--points-limit", "5"), "--points-limit 5: no points are given, expected --points FILE too"),
+        (("--points-limit", "-1"), "--points-limit -1: expected at least 0"),
         (("--depth-unit", "0.01"), "--depth-unit 0.01: no depth maps are used, expected --depth maps too"),
         (("--pose-reach", "3"), "--pose-reach 3.0: poses stay as given, expected --refine-poses too"),
         (("--lens-reach", "3"), "--lens-reach 3.0: lenses stay as given, expected --refine-lenses too"),
@@ -78,9 +77,9 @@ def test_calls_that_make_no_sense(
 
 def test_a_cloud_that_changes_is_refused(scene: Path, tmp_path: Path, capsys: Capture) -> None:
     cloud, run = tmp_path / "cloud.ply", tmp_path / "run"
-    ply.write(cloud, hidden_model(50))
+    hidden_model(50).save(cloud)
     assert main(["train", str(scene), "-o", str(run), "--points", str(cloud), *WORDS]) == 0
-    ply.write(cloud, hidden_model(60))
+    hidden_model(60).save(cloud)
     capsys.readouterr()
     assert main(["train", "-o", str(run), "--resume", "--iterations", "5"]) == 2
     assert "other points (50 then, 60 now)" in error_line(capsys)

@@ -6,7 +6,7 @@ Colours in formats of bytes are 0.5 + C0 times SH coefficient 0, opacities lie i
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,6 +34,8 @@ OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 MORTON_BITS = 21
 BEYOND_WHITE = 2.0
 """Colours of floats that are up to here, and no whole numbers, are parts of 1, some of them brighter than white."""
+USUAL = 0.95
+"""Share of the colours that lie in 0 to 1 where those of floats are parts of 1 with highlights among them."""
 ROUNDING = 1e-3
 """By how much, in parts of it, a colour of floats may pass white, or an opacity 1: that of half floats and averages."""
 NAMES = ("a position", "a rotation", "a scale", "an opacity", "a colour")
@@ -92,40 +94,55 @@ def byte_logits() -> Float32:
 
 
 def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
-    """Take logs of linear scales, standard deviations that a file has in place of logs, in place.
+    """`all_to_log_scales` of a model of one part."""
+    all_to_log_scales([(where, gaussians)])
+
+
+def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str = "") -> None:
+    """Take logs of linear scales, standard deviations that a file has in place of logs, in place, in all its parts.
 
     Those of which `LOGS` or more are negative are logs, and stay, with a warning: splat-transform's .glb of before 22
-    June 2026, and the review draft of KHR_gaussian_splatting, had such. All that are given at once decide together.
-    `where` begins messages. Raises InputError for fewer negative ones.
+    June 2026, and the review draft of KHR_gaussian_splatting, had such. All parts decide together; `where` of the part
+    begins messages. writer: a program that is known to write logs, negative or not. Raises InputError for fewer
+    negative ones.
     """
-    scales = gaussians.log_scales
     with np.errstate(invalid="ignore"):
-        negative = (scales < 0).any(axis=1)
-    if count := int(negative.sum()):
-        at = int(negative.argmax())
-        found = f"Gaussian {at} has the scales {' '.join(f'{value:g}' for value in scales[at])}"
-        if count < LOGS * len(scales):
-            raise InputError(
-                f"{where}: {found}, expected numbers of at least 0; {count:,} of {len(scales):,} have a negative one"
-            )
-        warn(
-            f"{where}: {found}, and {count:,} of {len(scales):,} have a negative one: all are read as logs of scales, "
-            "though this format holds scales themselves"
-        )
+        negative = [(gaussians.log_scales < 0).any(axis=1) for _, gaussians in parts]
+    count, total = sum(int(rows.sum()) for rows in negative), sum(map(len, negative))
+    logs = "read as logs of scales, though this format holds scales themselves"
+    if writer:
+        warn(f"{parts[0][0]}: its scales are {logs}, as {writer} wrote them")
         return
-    for rows in row_blocks(len(scales)):
-        scales[rows] = np.log(np.maximum(scales[rows], LEAST_SCALE, dtype=np.float64))
+    if count:
+        (where, gaussians), rows = next(each for each in zip(parts, negative, strict=True) if each[1].any())
+        at = int(rows.argmax())
+        found = f"Gaussian {at} has the scales {' '.join(f'{value:g}' for value in gaussians.log_scales[at])}"
+        many = f"{count:,} of {total:,} {have(count)} a negative one"
+        if count < LOGS * total:
+            raise InputError(f"{where}: {found}, expected numbers of at least 0; {many}")
+        warn(f"{where}: {found}, and {many}: all are {logs}")
+        return
+    for _, gaussians in parts:
+        scales = gaussians.log_scales
+        for block in row_blocks(len(scales)):
+            scales[block] = np.log(np.maximum(scales[block], LEAST_SCALE, dtype=np.float64))
 
 
-def logits_of(opacity: NDArray[Any], where: Path | str, first: int = 0) -> Float32:
-    """Logits of a file's opacities; NaN is passed on. `first`: the number of the first of them. Raises
-    InputError for what is outside [0, 1] by more than rounding."""
+def have(count: int) -> str:
+    """The verb of so many Gaussians."""
+    return "has" if count == 1 else "have"
+
+
+def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[np.intp] = 0) -> Float32:
+    """Logits of a file's opacities; NaN is passed on. `numbers`: of each, or of the first of them. Raises InputError
+    for what is outside [0, 1] by more than rounding."""
     with np.errstate(invalid="ignore"):
         bad = (opacity < -ROUNDING) | (opacity > 1 + ROUNDING)
     if bad.any():
         at = int(bad.argmax())
+        number = numbers + at if isinstance(numbers, int) else numbers[at]
         raise InputError(
-            f"{where}: Gaussian {first + at} has an opacity outside [0, 1], {float(opacity[at]):g}; if these are "
+            f"{where}: Gaussian {number} has an opacity outside [0, 1], {float(opacity[at]):g}; if these are "
             "logits, expected 1 / (1 + exp(-logit))"
         )
     return logits(opacity)
@@ -155,8 +172,11 @@ def full_scale(levels: NDArray[Any]) -> float:
     values = values[np.isfinite(values)]
     largest = float(values.max(initial=0))
     if integer:
-        return 255.0 if largest <= 255 else 65535.0
+        return next((white for white in (255.0, 65535.0, 2.0**31 - 1) if largest <= white), 2.0**32 - 1)
     slack = 1 + ROUNDING
+    if largest > BEYOND_WHITE and bool((values != np.rint(values)).any()):
+        usual = float(np.quantile(values, USUAL))  # some parts of 1 may be far brighter than white
+        largest = usual if usual <= slack else largest
     if largest <= slack or (largest <= BEYOND_WHITE and bool((values != np.rint(values)).any())):
         return 1.0
     return 255.0 if largest <= 255 * slack else 65535.0
