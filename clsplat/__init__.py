@@ -17,6 +17,7 @@ TYPE_CHECKING = False  # typing's own would be an import, in which Ctrl-C is a t
 if TYPE_CHECKING:
     from typing import Any
 
+    from clsplat.api import devices as devices
     from clsplat.api import train as train
     from clsplat.camera import Camera as Camera
     from clsplat.config.training import TrainConfig as TrainConfig
@@ -27,12 +28,23 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["Camera", "Gaussians", "TrainConfig", "__version__", "load_scene", "rasterize", "render", "train"]
+__all__ = [
+    "Camera",
+    "Gaussians",
+    "TrainConfig",
+    "__version__",
+    "devices",
+    "load_scene",
+    "rasterize",
+    "render",
+    "train",
+]
 
 _MODULES = {
     "Camera": "clsplat.camera",
     "Gaussians": "clsplat.gaussians",
     "TrainConfig": "clsplat.config.training",
+    "devices": "clsplat.api",
     "load_scene": "clsplat.scenes.loading",
     "rasterize": "clsplat.library.rasterize",
     "render": "clsplat.rendering.renderer",

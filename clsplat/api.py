@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat.train`: the training, and the report of its run."""
+"""`clsplat.train`: the training, and the report of its run; and `clsplat.devices`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from contextlib import closing, nullcontext
 
 from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
-from clsplat.device.context import Device, open_devices
-from clsplat.errors import InputError
+from clsplat.device.context import Device, DeviceInfo, list_devices, open_devices
+from clsplat.errors import InputError, of_argument
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.memory_plan import Plan
 from clsplat.report.page import write_last
@@ -18,6 +18,13 @@ from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.training.loop import Between, Session, StepReport, begin, checked
 from clsplat.training.trainer import Trainer
+
+
+def devices() -> list[DeviceInfo]:
+    """The OpenCL devices of this machine, as `clsplat devices` lists them: index, name, platform, version, kind,
+    compute_units, memory_bytes, and the shape of kernels. What other calls take as `device` is an index as text, "cpu",
+    "gpu", or a part of a name, platform or version."""
+    return list_devices()
 
 
 def train(
@@ -65,7 +72,8 @@ def train(
 def _opened(device: Device | str | Sequence[Device] | None, limit: int | None) -> list[Device]:
     """The devices, with `limit` bytes of memory each. Raises InputError for what is none."""
     if device is None or isinstance(device, str):
-        return open_devices(device, limit)
+        with of_argument():
+            return open_devices(device, limit)
     given = [device] if isinstance(device, Device) else device if isinstance(device, Sequence) else ()
     devices = [one for one in given if isinstance(one, Device)]
     if not devices or len(devices) < len(given):

@@ -225,7 +225,12 @@ class Camera:
     def depths_of_distances(self) -> Float32 | None:
         """Cosines (height, width) at the pixels of a perspective camera, where kernels have distances: times these they
         are depths, z. None where kernels have the depth."""
-        if not self.by_rays:
+        return self.cosines() if self.by_rays else None
+
+    def cosines(self) -> Float32 | None:
+        """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels; None
+        for other projections, whose depths are not along rays or are distances."""
+        if self.projection != "perspective":
             return None
         x, y = (self.window.x, self.window.y) if self.window else (0, 0)
         a = (x + np.arange(self.width) + 0.5 - self.cx) / self.fx

@@ -6,7 +6,8 @@ from __future__ import annotations
 import errno
 import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class ClsplatError(Exception):
@@ -100,6 +101,15 @@ def switched_on(variable: str) -> bool:
 
 class DeviceError(InputError):
     """No OpenCL device, or not the one asked for."""
+
+
+@contextmanager
+def of_argument() -> Iterator[None]:
+    """Errors of the flag --device within, as of the argument `device` of a call in Python."""
+    try:
+        yield
+    except DeviceError as error:
+        raise DeviceError(str(error).replace("--device ", "device ")) from None
 
 
 class KernelBuildError(ClsplatError):

@@ -443,9 +443,7 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
         try:
             if status.st_size < MAX_POINTER:
                 if file.read(len(LFS_POINTER)) == LFS_POINTER:
-                    raise InputError(
-                        f"{path}: is Git LFS's note of a file that is not here; git lfs pull fetches it"
-                    )
+                    raise InputError(f"{path}: is Git LFS's note of a file that is not here; git lfs pull fetches it")
                 file.seek(0)
             yield file
         except WriteError:

@@ -72,7 +72,8 @@ def terminable() -> AbstractContextManager[object]:
 @contextmanager
 def undisturbed() -> Iterator[None]:
     """Inside, signals that ask the process to end wait; afterwards the first that came is raised. Handlers that a
-    library installs inside are removed. In the main thread, as `handled`."""
+    library installs inside are removed, in the main thread, as `handled`. Threads that a library starts inside have
+    these signals blocked for good, and so have the programs that they run."""
     came: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -80,7 +81,8 @@ def undisturbed() -> Iterator[None]:
 
     try:
         with handled((signal.SIGINT, *endings()), note) as before:
-            mask = signal.pthread_sigmask(signal.SIG_BLOCK, before) if sys.platform != "win32" else None
+            numbers = before or (signal.SIGINT, *endings())
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, numbers) if sys.platform != "win32" else None
             try:
                 yield
             finally:

@@ -53,8 +53,8 @@ class Convert(Verb):
     overwrite: Flag = False
     """Replace a file that is there, the source too."""
     activated: Annotated[Literal["opacities", "scales", "both"] | None, arg(metavar="opacities|scales|both")] = None
-    """Take the source's opacities, 0 to 1 or 0 to 255, or its scales as they are, for a file that has them in place of
-    the logits and logs that belong there: a warning says where that seems so."""
+    """Take the source's opacities, 0 to 1, to 100 or to 255, or its scales as they are, for a file that has them in
+    place of the logits and logs that belong there: a warning says where that seems so."""
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
@@ -83,7 +83,11 @@ class Convert(Verb):
     up: Annotated[Literal["y", "z"] | None, arg(metavar="y|z")] = None
     """Axis that a USD stage names as up; y if not given. The model stays as it is, --rotate turns it."""
     spz_version: Annotated[Literal[2, 3, 4] | None, arg(metavar="2|3|4")] = None
-    """Version of an SPZ file, for programs that do not read the newest, which is 4; 4 if not given."""
+    """Version of an SPZ file, 3 if not given. 4 is smaller by up to a tenth, and PlayCanvas's engine reads no other;
+    Spark, Babylon.js and older three.js refuse it. docs/formats.md has who reads which."""
+    sh_bits: Annotated[str | None, arg(metavar="BITS|BITS,BITS")] = None
+    """Bits of an SPZ file's spherical harmonics, of band 1 and of those above, 1 to 8: fewer are a smaller file of less
+    true reflections. 6,6 if not given; 5,4 is what SPZ's own library keeps."""
     scene: ScenePath = None
     """Measure PSNR on this scene's held-out views before and after, and of the two renders against each other. Of the
     scene of a run, pixels that its masks leave out do not count."""
@@ -121,7 +125,7 @@ def run(verb: Convert, services: Services) -> int:
     save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK), **options)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
-    read = load(verb.target)
+    read = load(verb.target, doubts=False)  # the source was told of
     if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
         warn(
             f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
@@ -210,11 +214,22 @@ def _of_format(verb: Convert, target: Format) -> dict[str, Any]:
     for flag, value, name, format_name in (
         ("up", verb.up and verb.up.upper(), "up_axis", "OpenUSD"),
         ("spz-version", verb.spz_version, "version", "SPZ"),
+        ("sh-bits", _sh_bits(verb.sh_bits), "sh_bits", "SPZ"),
     ):
         if value is not None and target.name != format_name:
             raise InputError(f"--{flag}: is of {format_name} files, {verb.target} is {target.name}")
         options |= {name: value} if value is not None else {}
     return options
+
+
+def _sh_bits(text: str | None) -> tuple[int, int] | None:
+    """Bits of band 1 and of those above, of "6" or "5,4". Raises InputError."""
+    if text is None:
+        return None
+    words = [word.strip() for word in text.split(",")]
+    if not 1 <= len(words) <= 2 or not all(word.isdecimal() and 1 <= int(word) <= 8 for word in words):
+        raise InputError(f"--sh-bits {text[:80]}: expected bits from 1 to 8, such as 6, or 5,4 for band 1 and the rest")
+    return int(words[0]), int(words[-1])
 
 
 def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:

@@ -3,7 +3,7 @@
 
 Exit status: 0 done, 1 the work failed, 2 the call or its input is wrong, 130 interrupted, 128 and the signal's number
 where another one did that (docs/interruptions.md). Trouble is one line on standard error; CLSPLAT_DEBUG=1 shows the
-traceback as well.
+traceback as well. With --json an error is an object on standard output too: its message as "error", and the "status".
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
-from clsplat.cli.parsing import parse, tell, verb_module
+from clsplat.cli.parsing import as_json, parse, report, tell, verb_module
 from clsplat.cli.session import Services
 from clsplat.errors import ClsplatError, InputError, switched_on, system_trouble
 from clsplat.process import reader_has_gone, status_of, terminable
@@ -54,27 +54,31 @@ def _run(arguments: list[str], services: Services) -> int:
                 return 0
             with terminable():
                 verb = parse(arguments)
-                status: int = verb_module(type(verb).__name__.lower()).run(verb, services)
-                return status
+                return int(verb_module(type(verb).__name__.lower()).run(verb, services))
         except SystemExit as error:  # --help, or a wrong call that has been reported
             return error.code if isinstance(error.code, int) else 1
         except KeyboardInterrupt as error:
             if debug:
                 traceback.print_exc()
+            status = status_of(error)
+            interrupted = " ".join(("interrupted", *map(str, error.args)))
             with contextlib.suppress(OSError):  # the terminal may be gone
-                print(" ".join(("clsplat: interrupted", *map(str, error.args))), file=sys.stderr)
-            return status_of(error)
+                print(f"clsplat: {interrupted}", file=sys.stderr)
+                if "--json" in arguments:
+                    print(as_json(interrupted, status), flush=True)
+            return status
         except (ClsplatError, OSError, MemoryError) as error:
             if isinstance(error, OSError) and reader_has_gone(error):
                 raise
             if debug:
                 traceback.print_exc()
-            tell(f"clsplat: error: {one_line(error)}")
-            return error.exit_status if isinstance(error, ClsplatError) else 1
+            status = error.exit_status if isinstance(error, ClsplatError) else 1
+            report(one_line(error), status, arguments)
+            return status
         except Exception as error:
             if debug or not type(error).__module__.startswith("pyopencl"):
                 raise
-            print(f"clsplat: error: the OpenCL driver failed: {one_line(error)}", file=sys.stderr)
+            report(f"the OpenCL driver failed: {one_line(error)}", 1, arguments)
             return 1
 
 

@@ -6,10 +6,11 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from clsplat.cli.flags import Groups
 from clsplat.config.checks import device_names, parse_bytes
 from clsplat.config.verbs import HOST, PORT
 
@@ -28,7 +29,10 @@ Settings = TypeVar("Settings")
 
 
 class Verb:
-    """Arguments of a verb. Its module in `clsplat.cli` has the verb's name, and a function `run` that does it."""
+    """Arguments of a verb. Its module in `clsplat.cli` has the verb's name, and a function `run` that does it. groups:
+    of its help, where its flags are too many for one list."""
+
+    groups: ClassVar[Groups] = ()
 
     def completed(self, given: Collection[str]) -> Verb:
         """The arguments with the settings of a run or a bundle where no flag is `given`. Raises InputError."""

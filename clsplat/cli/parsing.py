@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 import sys
@@ -17,6 +18,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import tyro
 from tyro.conf import subcommand
 
+from clsplat.cli.flags import grouped_help, near, unknown_flags
 from clsplat.cli.options import Verb
 
 DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
@@ -30,7 +32,8 @@ VERBS = {
     "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS where the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
     "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
-    "thumbnail": "Draw one picture of a model, without cameras: of all of it, or of what a scene has most detail of.",
+    "thumbnail": "Draw one picture of a model: of a run from among its photographs, of a file of all of it, or of "
+    "what a scene has most detail of.",
     "view": "Look at a model in the browser: the device renders, the page shows it.",
     "report": "Write a run's report: one HTML file with curves, pictures, figures and settings, that "
     "loads nothing else.",
@@ -68,19 +71,39 @@ def parse(arguments: Sequence[str]) -> Verb:
     or after the help has been printed."""
     kinds = {name: verb_class(name) if name in arguments else _listed(name) for name in VERBS}
     commands: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
-    report = io.StringIO()
+    boxes = io.StringIO()
     helping = not {"-h", "--help"}.isdisjoint(arguments)
+    called = verb_class(arguments[0]) if arguments and arguments[0] in VERBS else None
+    if helping and called is not None and called.groups:
+        print(grouped_help(called, f"clsplat {arguments[0]}", called.groups))
+        raise SystemExit(0)
     try:
-        with _text_rules(), contextlib.redirect_stderr(report), contextlib.nullcontext() if helping else _wide():
+        with _text_rules(), contextlib.redirect_stderr(boxes), contextlib.nullcontext() if helping else _wide():
             verb: Verb = tyro.cli(commands, args=list(arguments), prog="clsplat", description=DESCRIPTION)
     except SystemExit as error:
         if error.code == 2:
-            tell(f"clsplat: error: {_unboxed(report.getvalue())}")
+            report(_trouble(arguments, called, _unboxed(boxes.getvalue())), 2, arguments)
         else:
-            sys.stderr.write(report.getvalue())
+            sys.stderr.write(boxes.getvalue())
         raise
     flags = [word.partition("=")[0][2:].replace("-", "_") for word in arguments if word.startswith("--")]
     return verb.completed({*flags, *(re.sub(r"(^|\.)no_", r"\1", flag) for flag in flags)})
+
+
+_UNION = re.compile(r"no type matching \{None\}\|.* could be instantiated from .*\. Got errors: .*- <class '\w+'>: ")
+"""Begins what tyro says of a number that may be left out, before what is wrong with it."""
+
+
+def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> str:
+    """The trouble with a call: flags and verbs that are not there, with near names, else what tyro has `said`."""
+    said = _UNION.sub("", said)
+    if called is not None:
+        return unknown_flags(arguments[1:], called, f"clsplat {arguments[0]}") or said
+    word = next((word for word in arguments if not word.startswith("-")), "")
+    if not word or word in VERBS:
+        return said
+    found = near(word, list(VERBS))
+    return f"{word} is no verb, did you mean {found}?" if found else said
 
 
 def _text_rules() -> tyro.constructors.ConstructorRegistry:
@@ -153,6 +176,18 @@ def _unboxed(report: str) -> str:
         else:
             words.append(text)
     return " ".join(" ".join(words).split()) or "the call is wrong, see clsplat --help"
+
+
+def report(message: str, status: int, arguments: Sequence[str]) -> None:
+    """Tell of an error; where the command line asks for JSON, as an object on standard output too."""
+    tell(f"clsplat: error: {message}")
+    if "--json" in arguments:
+        print(as_json(message, status), flush=True)
+
+
+def as_json(message: str, status: int) -> str:
+    """An error, for a program that asked for JSON."""
+    return json.dumps({"error": message, "status": status})
 
 
 def tell(line: str) -> None:

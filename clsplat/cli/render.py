@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Memory, OptionalInt, RunOrModel, Verb, with_given
+from clsplat.cli.render_help import RENDER_GROUPS
 from clsplat.cli.session import Services
 from clsplat.config.checks import parse_bytes
 from clsplat.config.holdout import HoldoutConfig
@@ -65,6 +66,7 @@ _USED_BY = {
 class Render(Verb):
     """Render a model from the cameras of a file or along a path made from them, an image for each frame."""
 
+    groups = RENDER_GROUPS
     model: RunOrModel
     """A run's folder or a model file; or a shot of several models (.json, docs/shot.md), or a USD stage that places
     some."""
@@ -83,11 +85,12 @@ class Render(Verb):
     frame (docs/shot.md)."""
     path: Annotated[Literal["turntable", "spiral", "through"] | None, arg(metavar="turntable|spiral|through")] = None
     """A path made from the cameras, in place of the cameras themselves: around what they look at, the same twice while
-    rising and sinking, or through them in their order, smoothed. Its frames count from 1. Without --cameras it goes
-    around the model, or what a scene has most detail of."""
+    rising and sinking, or through them in their order, smoothed. Its frames count from 1. Without --cameras it is made
+    from those of a run's photographs; it goes around a model alone, or what a scene has most detail of."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
-    """Direction that is up on a path without --cameras: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a
-    COLMAP scene. Write --up=-z if it begins with a minus."""
+    """Direction that is up on a path around a model, without --cameras: x, y, z, -x, -y, -z or three numbers; -y if not
+    given, as in a COLMAP scene. With it the path goes around a run's model too. Write --up=-z if it begins with a
+    minus."""
     count: OptionalInt = None
     """Frames of the path; 120 if not given."""
     frames: Annotated[str | None, arg(metavar="1-100,200-300:2,...")] = None
@@ -223,6 +226,8 @@ def _read_job(verb: Render) -> Job:
     from clsplat.images.colour import CHROMATICITIES, Colours
     from clsplat.images.frame_files import VIDEOS
     from clsplat.runs.appearance import gains_of
+    from clsplat.runs.run import run_of
+    from clsplat.runs.scene_record import own_cameras
     from clsplat.sequence import existing
     from clsplat.sequence.holdouts import held_out
     from clsplat.sequence.mattes import mattes_of, names_of
@@ -230,8 +235,9 @@ def _read_job(verb: Render) -> Job:
     from clsplat.sequence.task import digest_of
     from clsplat.shots import check_around
 
+    own = own_cameras(run_of(verb.model)) if verb.cameras is None and not verb.transform else []
     if verb.cameras is None:
-        check_around(verb.path)
+        check_around(verb.path, among_own=bool(own) and verb.up is None)
     options = _options(verb)
     verb.rasterizer.check()
     limit = parse_bytes(verb.max_device_mem)
@@ -242,7 +248,7 @@ def _read_job(verb: Render) -> Job:
         return read_cast(verb.model, verb.transform, verb.appearance)
 
     source = (verb.cameras, verb.path, verb.count, (verb.width, verb.height), verb.usd_camera)
-    asked = Asked(*source, verb.lenses or "undistort", verb.warp.distort, verb.up, cast_of)
+    asked = Asked(*source, verb.lenses or "undistort", verb.warp.distort, verb.up, cast_of, own)
     shots, cast = shots_asked(asked, verb.pairs)
     if verb.deep:
         shots = {eye: shot.without_optics() for eye, shot in shots.items()}
@@ -347,8 +353,8 @@ def _options(verb: Render) -> RenderOptions:
     bits = bits_of(verb.output, verb.bits, channels)
     encoding = Encoding(verb.exr, verb.parts, verb.compression, bits, verb.quality, verb.video.prores)
     colour = parse_colour(verb.background or "black")
-    deep, bent = verb.slices if verb.deep else None, verb.warp != WarpConfig()
-    holdout = holdout_settings(verb.holdout, verb.holding, deep=verb.deep, bent=bent)
+    deep = verb.slices if verb.deep else None
+    holdout = holdout_settings(verb.holdout, verb.holding, deep=verb.deep)
     return RenderOptions(channels, colour, encoding, pictures=pictures, deep=deep, holdout=holdout)
 
 

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from clsplat.camera import Camera
 from clsplat.config.stereo import EYES, StereoConfig
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError
@@ -24,7 +25,8 @@ ROLE = "stereoRole"
 
 @dataclass(frozen=True)
 class Asked:
-    """The shot that the flags ask for. model: reads the models, for paths around them; the rest is as of `Render`."""
+    """The shot that the flags ask for. model: reads the models, for paths around them; own: the cameras of a run's
+    photographs, for paths among them; the rest is as of `Render`."""
 
     cameras: Path | None
     path: str | None
@@ -35,6 +37,7 @@ class Asked:
     distort: bool
     up: str | None
     model: Callable[[], Cast]
+    own: Sequence[Camera] = ()
 
 
 def shots_asked(asked: Asked, pairs: StereoConfig) -> tuple[dict[str, Shot], Cast | None]:
@@ -53,7 +56,7 @@ def shots_asked(asked: Asked, pairs: StereoConfig) -> tuple[dict[str, Shot], Cas
     if asked.usd_camera is not None:
         raise InputError(f"--usd-camera {asked.usd_camera}: expected the USD stage in --cameras with it")
     cast = asked.model()
-    whole = shot_around(cast.at(1), asked.path, up=asked.up, **size)
+    whole = shot_around(cast.at(1), asked.path, up=asked.up, own=asked.own, **size)
     return shots_of(pairs, whole, lambda _: whole, {}), cast
 
 

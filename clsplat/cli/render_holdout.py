@@ -7,14 +7,13 @@ from clsplat.config.holdout import HoldoutConfig
 from clsplat.errors import InputError
 
 
-def holdout_settings(pattern: str | None, config: HoldoutConfig, *, deep: bool, bent: bool) -> HoldoutConfig | None:
+def holdout_settings(pattern: str | None, config: HoldoutConfig, *, deep: bool) -> HoldoutConfig | None:
     """How hold-outs are read, None where there are none. Raises InputError."""
     if pattern is None:
         if config != HoldoutConfig():
-            raise InputError(f"--holdout.channel {config.channel}: is of hold-outs, expected --holdout with it")
+            given = f"channel {config.channel}" if config.channel else f"depths {config.depths}"
+            raise InputError(f"--holdout.{given}: is of hold-outs, expected --holdout with it")
         return None
     if deep:
         raise InputError("--deep and --holdout exclude each other: a deep picture is held out where it is composited")
-    if bent:
-        raise InputError("--holdout: is of straight pictures, expected it without --stmap and --distort")
     return config

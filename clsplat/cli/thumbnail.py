@@ -21,7 +21,8 @@ SMALLEST, LARGEST = 16, 8192
 
 @dataclass(frozen=True)
 class Thumbnail(Verb):
-    """Draw one picture of a model, without cameras: of all of it, or of what a scene has most detail of.
+    """Draw one picture of a model: of a run from among its photographs, of a file of all of it, or of what a scene has
+    most detail of.
 
     It is the first frame of `clsplat render MODEL --path turntable`.
     """
@@ -33,8 +34,8 @@ class Thumbnail(Verb):
     size: int = 512
     """Width and height in pixels."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
-    """Direction that is up: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. Write --up=-z
-    if it begins with a minus."""
+    """Direction that is up: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. With it a run
+    is drawn from outside too. Write --up=-z if it begins with a minus."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
     alpha: Flag = False

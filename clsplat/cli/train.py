@@ -126,6 +126,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
     from clsplat.selftest.result import APPEARANCE, DEPTH, LENSES, MASKS, POSES, TRAINING
+    from clsplat.training.forecast import Forecast
 
     verb.device.check()
     verb.config.check()
@@ -187,7 +188,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     try:
         with (
             page(scene, run.config) if page else nullcontext() as between,
-            TrainProgress(run.config.iterations) as progress,
+            TrainProgress(run.config.iterations, Forecast(run.config)) as progress,
         ):
             services.train(scene, run.config, **how, on_step=progress, between=between)
     except KeyboardInterrupt as error:

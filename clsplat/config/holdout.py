@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+Depths = Literal["z", "inverse", "ray"]
 
 HELD = ("Z", "BACK", "KEEP", "RATE")
 """A surface: depths at which it begins and ends, the share of the light that it lets through, and the binary logarithm
@@ -17,3 +20,6 @@ class HoldoutConfig:
     channel: str = ""
     """Channel of --holdout's files that has the depths, such as depth.Z; Z if not given. Their alpha is A of the same
     layer."""
+    depths: Depths = "z"
+    """Kind of the depths: z, along the camera's axis; inverse, 1 / z, which Nuke writes; ray, distances from the
+    camera."""

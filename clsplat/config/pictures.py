@@ -16,8 +16,8 @@ Filter = Literal["box", "blackman-harris"]
 
 STRIP_PIXELS = 1 << 24
 """Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""
-DEEP_STRIP_FLOATS = 1 << 26
-"""Floats for the slices of a deep picture's strip: 256 MiB."""
+DEEP_STRIP_FLOATS = 1 << 24
+"""Floats for the slices of a deep picture's strip: 64 MiB."""
 SENSOR_WIDTH = 36.0
 """Millimetres of a picture's width, where nothing says otherwise."""
 _MOST_SUPERSAMPLES = 64

@@ -445,5 +445,5 @@ class TrainConfig:
         if self.batch == 1 and not explicit:
             return replace(self, batch=count)
         if self.batch % count:
-            raise InputError(f"--batch {self.batch}: expected a multiple of {count}, as --device names {count} devices")
+            raise InputError(f"--batch {self.batch}: expected a multiple of {count}, the number of devices")
         return self

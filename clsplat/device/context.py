@@ -30,6 +30,7 @@ from clsplat.device.source import kernel_source
 from clsplat.device.tape import Tape
 from clsplat.device.traits import pretended, traits_of
 from clsplat.errors import DeviceError, DriverError, KernelBuildError, switched_on
+from clsplat.process import undisturbed
 
 T = TypeVar("T")
 
@@ -54,6 +55,14 @@ class DeviceInfo:
 def all_devices() -> list[cl.Device]:
     """Every OpenCL device that is visible, in the order of its index. Raises DeviceError in a fork (`forks`)."""
     forks.claim()
+    with undisturbed():  # a driver's threads start compilers and linkers, which a Ctrl-C on this terminal would end
+        devices = _visible()
+    for device in devices:
+        name_processor(device)
+    return devices
+
+
+def _visible() -> list[cl.Device]:
     try:
         platforms = cl.get_platforms()
     except cl.Error:
@@ -64,8 +73,6 @@ def all_devices() -> list[cl.Device]:
             devices += platform.get_devices()
         except cl.Error:
             continue
-    for device in devices:
-        name_processor(device)
     return devices
 
 

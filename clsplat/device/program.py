@@ -70,11 +70,18 @@ def text_of(stem: str) -> str:
 def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.Program, str]:
     """Compile a kernel file; the program, and the salt of `Variant.anew` that it took, or nothing. Raises
     KernelBuildError with the device, the options, the log and the source, and DriverError for a program without
-    kernels, as PoCL makes of what an aborted build left in its cache."""
+    kernels.
+
+    What fails is built once more in a text that is this process's own: an aborted build leaves a program without
+    kernels in PoCL's cache, and another process that builds the same text may take its files away."""
     if (saved := binaries.load(context, device, variant.digest, variant.options)) is not None:
         return saved, ""
-    program, salt = _compiled(context, device, variant), ""
-    if program.num_kernels == 0:
+    salt = ""
+    try:
+        program = _compiled(context, device, variant)
+    except KernelBuildError:
+        program = None
+    if program is None or program.num_kernels == 0:
         salt = secrets.token_hex(8)
         program = _compiled(context, device, variant.anew(salt))
     if program.num_kernels == 0:

@@ -43,8 +43,12 @@ class _Process:
         self._timer: threading.Timer | None = None
 
     def ask(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
-        """The answer; how the process ended, if it did, and whether that was the driver's doing. Raises
-        TrialInterrupted, and DriverError where there can be no such process."""
+        """The answer; how the process ended, if it did, and whether that was the driver's doing, twice: the first time
+        its linker may have been killed. Raises TrialInterrupted, and DriverError where there can be no such process."""
+        answer, ending, crashed = self._once(message)
+        return (answer, ending, crashed) if not crashed or answer.get("hung") else self._once(message)
+
+    def _once(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
         with self._lock:
             if self._timer is not None:
                 self._timer.cancel()
@@ -70,7 +74,7 @@ class _Process:
         try:
             answer = self._child.receive(seconds)
         except TimeoutError as error:
-            return {}, str(error), True
+            return {"hung": True}, str(error), True
         if answer is not None:
             return answer, "", False
         return {"memory": self._child.killed}, self._child.ending(), self._child.crashed
@@ -168,7 +172,7 @@ class Rehearsal:
         """The error to raise; lasting: remember too that the driver cannot be used in this shape; trial: what failed
         (`known.Entry`), if it was one."""
         text = f"{variant.stem}.cl{f', {kernel},' if kernel else ''} {trouble}"
-        advice = f"--device takes another device, {REGARDLESS}=1 goes on regardless"
+        advice = f"CLSPLAT_DEVICE takes another device, {REGARDLESS}=1 goes on regardless"
         if lasting and not regardless():
             trial = trial or {"name": f"{variant.digest} {kernel}"}
             known.remember(self._device, self._shape, failed=text, trial=trial)

@@ -7,14 +7,12 @@ pixel has its slices where its light is taken (docs/pictures.md).
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
@@ -23,15 +21,20 @@ from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig, Encoding
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
+from clsplat.files import scratch_folder
 from clsplat.frame.draw import on_tiles
 from clsplat.frame.strips import strips
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import Colours
+from clsplat.images.deep_samples import deep_data, samples_bytes
 from clsplat.images.frame_files import HALF_MAX, Header, deep_spec
 from clsplat.images.writing import write_rows
 from clsplat.rendering.memory_needs import frame_pixels
 from clsplat.rendering.renderer import Renderer
 from clsplat.stages.deep import DEEP_FLOATS
+
+_MOST_PIXELS = 1 << 16
+"""Pixels that are encoded at once: bounds the host's memory, and leaves the encoder rows for its threads."""
 
 
 def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
@@ -71,39 +74,33 @@ def write_deep(
     rows = deep_rows(renderer.device, camera, config.bins)
     seen: list[bool] = []
 
-    def pieces() -> Iterator[tuple[Any, int]]:
-        for strip in strips(camera, rows):
-            slices = render_deep(renderer, gaussians, strip, config.bins)
-            seen.append(bool(slices[:, :, :, 3].any()))
-            for image in slices:
-                rgb, alpha = np.ascontiguousarray(image[:, :, :3]), np.ascontiguousarray(image[:, :, 3])
-                image[:, :, :3] = colours.convert(rgb, alpha, colours.model, colours.output)
-            yield from _deep_rows(slices, list(spec.channelformats), half=encoding.depth == "half")
+    with scratch_folder(samples_bytes(_MOST_PIXELS + camera.width, config.bins)) as folder:
 
-    write_rows(path, spec, "exr", pieces())
+        def pieces() -> Iterator[tuple[Any, int]]:
+            for strip in strips(camera, rows):
+                slices = render_deep(renderer, gaussians, strip, config.bins)
+                for top in range(0, strip.height, step := max(_MOST_PIXELS // camera.width, 1)):
+                    counts, columns = _samples(slices[:, top : top + step], colours, half=encoding.depth == "half")
+                    seen.append(bool(counts.any()))
+                    yield deep_data(folder / "rows.exr", counts, columns), len(counts)
+                del slices  # its memory is free before the next strip takes some
+
+        write_rows(path, spec, "exr", pieces())
     return not any(seen)
 
 
-def _deep_rows(slices: Float32, kinds: list[Any], *, half: bool) -> Iterator[tuple[Any, int]]:
-    """(samples, rows) from the top, a few rows at a time."""
-    bins, height, width, _ = slices.shape
+def _samples(slices: Float32, colours: Colours, *, half: bool) -> tuple[NDArray[np.int32], dict[str, NDArray[Any]]]:
+    """The number of samples of each pixel, and their values as `deep_data` takes them. slices: of a few rows."""
+    _, height, width, floats = slices.shape
+    planes = np.ascontiguousarray(slices.transpose(3, 0, 1, 2)).reshape(floats, -1)
+    counts = (slices[:, :, :, 3] > 0).sum(axis=0, dtype=np.int32)
+    # the slices of a pixel are its first ones: sample k of pixel p is at k H W + p
+    first = np.cumsum(counts.ravel(), dtype=np.int64) - counts.ravel()
+    pixels = np.repeat(np.arange(height * width), counts.ravel())
+    at = (np.arange(len(pixels)) - first[pixels]) * (height * width) + pixels
+    alpha, depth = planes[3].take(at), planes[4].take(at)
+    rgb = np.stack([planes[channel].take(at) for channel in range(3)]).T
+    light = [*colours.convert(rgb[None], alpha[None], colours.model, colours.output)[0].T, alpha]
     if half:
-        slices[:, :, :, :4] = np.clip(slices[:, :, :, :4], -HALF_MAX, HALF_MAX)
-    for top in range(0, height, step := max((1 << 18) // width, 1)):
-        rows = slices[:, top : top + step].reshape(bins, -1, DEEP_FLOATS).transpose(1, 0, 2)
-        taken = rows[:, :, 3] > 0
-        data = oiio.DeepData()
-        data.init(len(rows), len(DEEP), kinds, list(DEEP))
-        _call_with(data.set_samples, range(len(rows)), taken.sum(axis=1).tolist())
-        pixels = np.nonzero(taken)[0].tolist()
-        samples = (np.cumsum(taken, axis=1) - 1)[taken].tolist()
-        values = rows[taken]
-        for channel in range(len(DEEP)):  # the last is Z again: a slice begins and ends at one depth
-            column = values[:, min(channel, DEEP_FLOATS - 1)].tolist()
-            _call_with(data.set_deep_value, pixels, repeat(channel), samples, column)
-        yield data, len(rows) // width
-
-
-def _call_with(function: Any, *arguments: Any) -> None:
-    """Call it with each row of arguments: OpenImageIO takes deep values one by one, and a loop takes twice as long."""
-    deque(map(function, *arguments), maxlen=0)
+        light = [np.clip(values, -HALF_MAX, HALF_MAX).astype(np.float16) for values in light]
+    return counts, dict(zip(DEEP, [*light, depth, depth], strict=True))  # a slice begins and ends at one depth

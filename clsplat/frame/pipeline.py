@@ -25,6 +25,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
 from clsplat.images.cryptomatte import ranked
 from clsplat.rendering.renderer import Renderer
+from clsplat.stages.holdout import held_bytes
 
 UNSEEN = 1e-6
 """Most that a colour differs from the background's where nothing is seen: averages of equal samples are rounded."""
@@ -95,7 +96,8 @@ class FramePipeline:
             device, straight = self._renderer.device, draw
 
             def rows(camera: Camera, names: Collection[str]) -> Planes:
-                return in_strips(straight, strip_rows(device, camera, names, config.framing))(camera, names)
+                planes = held_bytes(cut(camera)) if cut else 0
+                return in_strips(straight, strip_rows(device, camera, names, config.framing, planes))(camera, names)
 
             draw = warped(rows, Warp(lens, at(sampling.middle)))
         return draw, lambda planes: self._with_ranks(converted(planes, colours, space, colours.output))

@@ -64,19 +64,21 @@ class Holdout:
     size: tuple[int, int]
 
 
-def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> None:
-    """Raise InputError for a file that cannot be the hold-out of a frame of that size (width, height), as its header
-    says."""
-    with _part(path, size, channel):
-        pass
+def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
+    """True if its depths are half floats. Raises InputError for a file that cannot be the hold-out of a frame of that
+    size (width, height), as its header says."""
+    with _part(path, size, channel) as (source, _, places):
+        spec = source.spec()
+        kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
+        return any(kinds[place] == "half" for place in (places[0], places[2]) if place is not None)
 
 
-def read_holdout(path: Path, size: tuple[int, int], channel: str = "") -> Holdout:
+def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, inverse: bool = False) -> Holdout:
     """The hold-out of a frame of that size (width, height).
 
     channel: the name of the depths, Z if empty; a deep file's samples have A and may have ZBack, a flat file may have
-    A. Depths of 0 and infinity are no surface. Raises InputError as `check_holdout`, and for values that
-    are not numbers, negative depths, and files that do not decode.
+    A. Depths of 0 and infinity are no surface. inverse: the file has 1 / depth. Raises InputError as `check_holdout`,
+    and for values that are not numbers, negative depths, and files that do not decode.
     """
     with _part(path, size, channel) as (source, part, places):
         spec = source.spec()
@@ -96,6 +98,9 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "") -> Holdou
             raise InputError(f"{path}: {odd} values of {what} are not a number, expected depths and alpha of surfaces")
     if odd := int((begin < 0).sum()):
         raise InputError(f"{path}: {odd} values of {name} are negative, expected depths along the camera's axis")
+    if inverse:
+        with np.errstate(divide="ignore"):
+            begin, end = (1 / np.asarray(values, np.float64) for values in (begin, end))
     return Holdout(_surfaces(begin, end, alpha, counts, shape), *origin, size)
 
 

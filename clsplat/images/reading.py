@@ -48,12 +48,16 @@ HARMLESS = ("extraneous bytes",)
 
 
 COMPANION = (
-    r"(?:depths?|disp|disparity|normals?|alpha|albedo|masks?|matte|seg|segmentation|semantics?|confidence|conf|flow"
-    r"|edges?)"
+    r"(?:depths?|disp|disparity|normals?|alpha|albedo|masks?|mattes?|seg|segmentations?|semantics?|confidence|conf|flow"
+    r"|edges?|silhouettes?|labels?)"
 )
+GROUND = r"(?:fg|foreground)"
+"""Words in names of masks that count only where a mark parts them from the photograph's."""
 _COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION}(?:[_-]\w+)?", re.IGNORECASE)
-_COMPANION_AFTER = re.compile(rf"[._-]?{COMPANION}(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE)
-_COMPANION_BEFORE = re.compile(rf"(?:dynamic[._-])?{COMPANION}(?:[._-]map)?[._-]", re.IGNORECASE)
+_COMPANION_AFTER = re.compile(
+    rf"(?:[._-]?{COMPANION}|[._-]{GROUND})(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE
+)
+_COMPANION_BEFORE = re.compile(rf"(?:dynamic[._-])?(?:{COMPANION}|{GROUND})(?:[._-]map)?[._-]", re.IGNORECASE)
 _COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
 
 

@@ -24,6 +24,14 @@ HALF_PLACES = 2048
 """Pixels a side from which on a half float is more than half a pixel off."""
 
 
+_PARTS = 32
+"""Parts of a map's sides, of each of which it is asked which way around it lies."""
+_SINE = 0.05
+"""Least of the angle between a part's sides: those of a grey picture are one."""
+_ALIKE = 0.7
+"""Share of these that lie the same way in any map; in pictures it is a half, or they lie no way as they are grey."""
+
+
 @dataclass(frozen=True, eq=False)
 class StMap:
     """A map that was read. values (H, W, 2) float32: across and up; x, y: of its first pixel in the frame, which may be
@@ -89,10 +97,34 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # asked anew wher
     if pixels is None:
         raise InputError(f"{path}: does not decode: {one_line(reason)}; expected an STMap")
     values = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[:, :, channels]
+    if (share := _one_way(values)) < _ALIKE:
+        raise InputError(
+            f"{path}: looks like a picture, as its R and G lead to and fro ({100 * share:.0f} % of its parts one way), "
+            "expected an STMap, whose R and G are places that follow each other"
+        )
     if "half" in kinds and max(spec.full_width, spec.full_height) >= HALF_PLACES:
         warn(f"{path}: is of half floats, which are pixels off at {spec.full_width}x{spec.full_height}; write floats")
     place = (spec.x - spec.full_x, spec.y - spec.full_y, spec.full_width, spec.full_height)
     return StMap(np.ascontiguousarray(values), *place, digest(path))
+
+
+def _one_way(values: Float32) -> float:
+    """The share of the parts of a map that show what they show the same way around, mirrored or not, of those that have
+    numbers and are no part of one value; 1 of maps without numbers or too small to tell, 0 of those that show a line or
+    a place."""
+    rows, columns = (np.arange(0, side, max(side // _PARTS, 1)) for side in values.shape[:2])
+    if len(rows) < _PARTS // 2 or len(columns) < _PARTS // 2:
+        return 1.0
+    corners = values[rows[:, None], columns].astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        across, down = corners[:-1, 1:] - corners[:-1, :-1], corners[1:, :-1] - corners[:-1, :-1]
+        areas = across[:, :, 0] * down[:, :, 1] - across[:, :, 1] * down[:, :, 0]
+        sides = np.linalg.norm(across, axis=2) * np.linalg.norm(down, axis=2)
+        told = np.isfinite(areas) & (sides > 0)
+    if not told.any():
+        return 0.0 if np.isfinite(corners).any() else 1.0
+    turned = areas[told] / sides[told]  # the sine of the angle between them
+    return float(max((turned > _SINE).mean(), (turned < -_SINE).mean()))
 
 
 def write_stmap(path: Path, places: Float64, width: int, height: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -84,20 +85,45 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
 
 def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
     """Write a file of one part from the top as its rows come, atomically. pieces: pixels, or OpenImageIO's deep data,
-    and how many rows they are. Raises ClsplatError if writing fails."""
+    and how many rows they are. While deep ones are written the next are taken. Raises ClsplatError if writing fails."""
+    reasons: list[str] = []
 
     def steps(file: Any, _: str) -> Iterator[bool]:
-        write, row = file.write_deep_scanlines if spec.deep else file.write_scanlines, spec.y
-        for pixels, count in pieces:
-            yield write(row, row + count, 0, pixels)
-            row += count
+        row = spec.y
+        if not spec.deep:
+            for pixels, count in pieces:
+                yield file.write_scanlines(row, row + count, 0, pixels)
+                row += count
+            return
 
-    _write(path, [spec], kind, steps)
+        def written(row: int, count: int, pixels: Any) -> bool:
+            done = bool(file.write_deep_scanlines(row, row + count, 0, pixels))
+            if not done:
+                reasons.append(file.geterror())  # OpenImageIO tells it to this thread alone
+            return done
+
+        with ThreadPoolExecutor(1) as pool:  # it compresses for longer than most frames are rendered
+            under_way = None
+            for pixels, count in pieces:
+                if under_way is not None:
+                    yield under_way.result()
+                under_way = pool.submit(written, row, count, pixels)
+                row += count
+            if under_way is not None:
+                yield under_way.result()
+
+    _write(path, [spec], kind, steps, reasons)
 
 
-def _write(path: Path, specs: Sequence[Any], kind: str, steps: Callable[[Any, str], Iterable[bool]]) -> None:
+def _write(
+    path: Path,
+    specs: Sequence[Any],
+    kind: str,
+    steps: Callable[[Any, str], Iterable[bool]],
+    reasons: Sequence[str] = (),
+) -> None:
     """Write a file of these parts. steps: go on writing OpenImageIO's file, which is open under a name, and say of each
-    call whether it went well."""
+    call whether it went well; reasons: why one in another thread did not."""
     # libjpeg ends the process when it cannot write
     most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
     with atomic_name(path) as temporary:
@@ -113,7 +139,7 @@ def _write(path: Path, specs: Sequence[Any], kind: str, steps: Callable[[Any, st
                 if kind == "dpx":
                     _without_name(temporary)
                 return
-            reason = "the file is not whole" if written else file.geterror()
+            reason = "the file is not whole" if written else "; ".join(reasons) or file.geterror()
             if error := room_error(temporary.parent):  # OpenImageIO seldom says that the system refuses to write
                 raise OSError(error.errno, error.strerror)
             raise ClsplatError(f"{path}: cannot be written: {plain(one_line(reason))}")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -52,34 +53,48 @@ def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
     return array.reshape(-1, side, side)
 
 
+def plain(given: Any) -> Any:
+    """A number that is given as an array or a tensor of one, as Python's; all else as it is."""
+    one = hasattr(given, "item") and prod(getattr(given, "shape", (0,))) == 1
+    return given.item() if one else given
+
+
+def whole(given: Any) -> int | None:
+    """A whole number, that may be given as a real number (40.0) or an array or a tensor of one; None for what is
+    none."""
+    number = plain(given)
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or number != number // 1:
+        return None
+    return int(number)
+
+
 def sizes(name: str, given: Any, count: int) -> list[int]:
     """A length in pixels for each of `count` cameras, from one for all or one for each. Raises InputError."""
-    each = [given] * count if np.ndim(given) == 0 else list(given)
-    whole = all(
-        isinstance(size, (int, np.integer)) and not isinstance(size, bool) and 0 < size < 2**24 for size in each
-    )
-    if len(each) != count or not whole:
+    each = [whole(size) for size in ([given] * count if np.ndim(given) == 0 else given)]
+    lengths = [size for size in each if size is not None and 0 < size < 2**24]
+    if not len(lengths) == len(each) == count:
         raise InputError(
             f"{name} is {given!r:.80}, expected a positive whole number, or one for each of {count} cameras"
         )
-    return [int(size) for size in each]
+    return lengths
 
 
 def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
     """A number from `least` to `most`. Raises InputError."""
-    if not isinstance(given, (int, float, np.number)) or isinstance(given, bool) or not least <= given <= most:
+    value = plain(given)
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not least <= value <= most:
         bound = f"from {least:g} to {most:g}" if np.isfinite(most) else f"of at least {least:g}"
         raise InputError(f"{name} is {given!r:.80}, expected a number {bound}")
-    return float(given)
+    return float(value)
 
 
 def degree(name: str, given: Any, highest: int, otherwise: str = "") -> int:
     """A degree of spherical harmonics, 0 to `highest`; otherwise: what else may be given, in words. Raises
     InputError."""
-    whole = isinstance(given, (int, np.integer)) and not isinstance(given, bool)
-    if not whole or not 0 <= given <= highest:
+    found = whole(given)
+    if found is None or not 0 <= found <= highest:
         raise InputError(f"{name} is {given!r:.80}, expected 0 to {highest}{otherwise}")
-    return int(given)
+    return found
 
 
 def choice(name: str, given: Any, choices: Sequence[str]) -> None:

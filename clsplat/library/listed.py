@@ -14,8 +14,8 @@ from clsplat.device.buffers import Workspace, from_host, upload
 from clsplat.device.context import Device
 from clsplat.device.layout import TILE
 from clsplat.errors import InputError
-from clsplat.library.checks import floats, gradient
-from clsplat.library.pixels import MOST_CHANNELS, Listed, ListedPixels
+from clsplat.library.checks import floats, gradient, number, whole
+from clsplat.library.pixels import Listed, ListedPixels
 from clsplat.library.session import Session, session_of
 from clsplat.rendering.build_flags import ALPHA_MAX
 from clsplat.stages.duplicate import Band
@@ -84,7 +84,7 @@ def rasterize_to_pixels(
     """Blend projected Gaussians in the lists of `isect_tiles`.
 
     means2d (..., N, 2) in pixels, the first pixel's middle at 0.5; conics (..., N, 3): a, b, c of the inverse
-    covariance; colors (..., N, D), D from 1 to 512; opacities (..., N) in [0, 1]; or packed, (M, 2) and so on.
+    covariance; colors (..., N, D), D of at least 1; opacities (..., N) in [0, 1]; or packed, (M, 2) and so on.
     tile_size: 16; isect_offsets (..., tile_height, tile_width), where each tile's list begins in flatten_ids (pairs,),
     the numbers of Gaussians among those of all images, front to back; backgrounds (..., D), None for black; masks
     (..., tile_height, tile_width): a tile where it is false has the background alone; alpha_max: the cap of alpha;
@@ -97,12 +97,15 @@ def rasterize_to_pixels(
     shape_conics = floats("conics", conics, (*batch, 3)).reshape(-1, 3)
     values = floats("colors", colors, (*batch, "D"))
     depth, opacity = values.shape[-1], floats("opacities", opacities, batch).reshape(-1)
-    if not 1 <= depth <= MOST_CHANNELS:
-        raise InputError(f"colors: have {depth} channels, expected 1 to {MOST_CHANNELS}")
-    if tile_size != TILE:
+    if depth < 1:
+        raise InputError(f"colors: have {depth} channels, expected 1 or more")
+    if whole(tile_size) != TILE:
         raise InputError(f"tile_size: got {tile_size}, expected {TILE}, which the kernels are made for")
-    if image_width < 1 or image_height < 1:
+    size = whole(image_width) or 0, whole(image_height) or 0
+    if min(size) < 1:
         raise InputError(f"image_width, image_height: got {image_width} x {image_height}, expected 1 x 1 up")
+    image_width, image_height = size
+    alpha_max = number("alpha_max", alpha_max, 0)
     if not 0 < alpha_max < 1:
         raise InputError(f"alpha_max: got {alpha_max}, expected between 0 and 1")
     tiles = (-(-image_height // TILE), -(-image_width // TILE))

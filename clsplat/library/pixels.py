@@ -26,8 +26,6 @@ from clsplat.stages.splats import COLOURS, ScreenGaussians, ScreenGradients, spl
 from clsplat.stages.values import ValuePass, values, values_grad
 
 Array = NDArray[Any] | DeviceArray
-MOST_CHANNELS = 512
-"""Values of a Gaussian."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +167,7 @@ class Pixels(ListedPixels):
     """One camera's pixels, from arrays of projected Gaussians, with all that the gradient needs, until it is dropped.
 
     means2d (n, 2) in pixels, the first pixel's middle at 0.5; conics (n, 3), the inverse covariance's a, b, c;
-    opacities (n,) in [0, 1]; colours (n, D), D from 1 to 512; depths (n,), by which the Gaussians are sorted, ties by
+    opacities (n,) in [0, 1]; colours (n, D), D of at least 1; depths (n,), by which the Gaussians are sorted, ties by
     index; radii (n, 2) int32: one that is 0 culls; each on the session's device or on the host, where what is float32
     and C-contiguous is not copied. The colours must not change before the last `gradient`. background (D,) float32 or
     None for black; alpha_max: the cap of alpha, below 1; backward: True if there is likely to be a `gradient`,

@@ -14,7 +14,6 @@ from clsplat.arrays import Float32
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.library.checks import choice, floats, gradient, number
-from clsplat.library.pixels import MOST_CHANNELS
 from clsplat.library.projection import checked_cameras, stacked
 from clsplat.library.session import session_of
 from clsplat.library.view import Given, Gradients, View
@@ -179,7 +178,7 @@ def rasterize(
     """Images of N Gaussians as C cameras see them (Kerbl et al. 2023; gsplat's conventions, docs/library.md).
 
     means (N, 3): world units. quaternions (N, 4): w x y z, of any length but 0. scales (N, 3): standard deviations,
-    world units. opacities (N,): 0 to 1. colors: (N, D) or (C, N, D), D from 1 to 512, or with sh_degree SH coefficients
+    world units. opacities (N,): 0 to 1. colors: (N, D) or (C, N, D), D of at least 1, or with sh_degree SH coefficients
     (N, K, 3) or (C, N, K, 3), of which (sh_degree + 1)^2 count. viewmats (C, 4, 4) or (4, 4): camera from world.
     intrinsics (C, 3, 3) or (3, 3): pixels. width, height: pixels, of all cameras or of each. Arrays of float32 are read
     in place where the device shares the host's memory, and must not change before the last gradient; others are
@@ -237,9 +236,9 @@ def rasterize(
 
 
 def check_channels(channels: int) -> None:
-    """Raise InputError where colors has more than can be blended, or none."""
-    if not 1 <= channels <= MOST_CHANNELS:
-        raise InputError(f"colors has {channels} channels, expected 1 to {MOST_CHANNELS}")
+    """Raise InputError where colors has none."""
+    if channels < 1:
+        raise InputError(f"colors has {channels} channels, expected 1 or more")
 
 
 def checked_modes(render_mode: str, rasterize_mode: str, alpha_max: float) -> float:

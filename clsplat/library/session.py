@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device, open_device
+from clsplat.errors import of_argument
 from clsplat.rendering.build_flags import kernel_defines
 
 _PAIRS = ("ranges", "gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted")
@@ -81,7 +82,8 @@ _CHOOSE = ("CLSPLAT_DEVICE", "CLSPLAT_SHAPE", "CLSPLAT_PRETEND")
 
 @cache
 def _named(selector: str | None, _variables: tuple[str | None, ...]) -> Session:
-    return _session(open_device(selector))
+    with of_argument():
+        return _session(open_device(selector))
 
 
 def session_of(device: Device | str | None = None) -> Session:

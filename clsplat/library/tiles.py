@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clsplat.errors import InputError
-from clsplat.library.checks import floats
+from clsplat.library.checks import floats, whole
 
 DEPTH_BITS = 32
 """Low bits of an id: those of the depth as a float32."""
@@ -40,11 +40,8 @@ def isect_tiles(
     count = means.shape[:-1]
     reach = floats("radii", radii, (*count, 2)).reshape(-1, 2)
     depth = np.ascontiguousarray(floats("depths", depths, count).reshape(-1))
-    if min(tile_size, tile_width, tile_height) < 1:
-        raise InputError(
-            f"tile_size, tile_width, tile_height: got {tile_size}, {tile_width}, {tile_height}, expected 1 up"
-        )
-    images, image = _images(count, image_ids, n_images)
+    tile_size, tile_width, tile_height = _lengths(tile_size=tile_size, tile_width=tile_width, tile_height=tile_height)
+    images, image = _images(count, image_ids, None if n_images is None else whole(n_images))
 
     most = np.array([tile_width, tile_height])
     middle, side = means.reshape(-1, 2) / np.float32(tile_size), reach / np.float32(tile_size)
@@ -76,6 +73,7 @@ def isect_tiles(
 def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, tile_height: int) -> NDArray[np.int32]:
     """Places in sorted ids of `isect_tiles` where each tile's begin, (n_images, tile_height, tile_width) int32. Raises
     InputError for ids of other images or tiles."""
+    n_images, tile_width, tile_height = _lengths(n_images=n_images, tile_width=tile_width, tile_height=tile_height)
     ids, tiles = np.asarray(isect_ids), tile_width * tile_height
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"isect_ids: got {ids.dtype} of shape {ids.shape}, expected integers (pairs,)")
@@ -86,6 +84,15 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
         raise InputError(f"isect_ids: of images or tiles beyond {n_images} of {tile_width} x {tile_height}")
     counts = np.bincount(image * tiles + tile, minlength=n_images * tiles)
     return (np.cumsum(counts) - counts).astype(np.int32).reshape(n_images, tile_height, tile_width)
+
+
+def _lengths(**given: int) -> list[int]:
+    """Arguments as whole numbers. Raises InputError where one is none, or below 1."""
+    found = [whole(value) for value in given.values()]
+    lengths = [length for length in found if length is not None and length >= 1]
+    if len(lengths) < len(found):
+        raise InputError(f"{', '.join(given)}: got {', '.join(map(str, given.values()))}, expected 1 up")
+    return lengths
 
 
 def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:

@@ -21,6 +21,8 @@ from clsplat.models.codec import values as packing
 from clsplat.models.formats import Format, resolve
 
 PERCENTILES = (0, 1, 50, 99, 100)
+LARGEST_LOG = 709.0
+"""Of a scale that float64 holds."""
 
 
 def model_info(path: Path) -> dict[str, Any]:
@@ -47,16 +49,18 @@ def size(path: Path, form: Format) -> int:
 def _summary(blocks: Iterator[Gaussians], path: Path) -> dict[str, Any]:
     """Everything but SH is held for the percentiles, 28 bytes a Gaussian. Warns of doubtful values, as loading does."""
     parts: list[list[Float32]] = []
-    not_finite = degree = used = 0
+    not_finite = unturned = degree = used = 0
     for block in blocks:
         degree, origin = block.sh_degree, block.origin
         soundness.mend(block)
         good = soundness.finite_rows(block)
         not_finite += int((~good).sum())
+        unturned += int((good & soundness.without_turn(block)).sum())
         used = max([used, *(band for band in range(1, degree + 1) if block.sh[:, band**2 : (band + 1) ** 2].any())])
         parts.append([array[good] for array in (block.means, block.log_scales, block.opacity_logits)])
     m, s, o = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     result: dict[str, Any] = {"gaussians": len(m) + not_finite, "not_finite": not_finite}
+    result |= {"zero_quaternions": unturned}
     result |= {"sh_degree": degree, "sh_degree_used": used}
     if len(m):
         for doubt in soundness.doubts(o, s):
@@ -65,8 +69,7 @@ def _summary(blocks: Iterator[Gaussians], path: Path) -> dict[str, Any]:
         inner = np.percentile(m, (1, 99), axis=0)
         result["bounds"] = {"min": low.tolist(), "max": high.tolist(), "extent": float(np.linalg.norm(high - low))}
         result["bounds"] |= {"p1": inner[0].tolist(), "p99": inner[1].tolist()}
-        with np.errstate(over="ignore"):
-            result["scale"] = _percentiles(np.exp(s.astype(np.float64)))
+        result["scale"] = _percentiles(np.exp(np.minimum(s.astype(np.float64), LARGEST_LOG)))
         result["opacity"] = _percentiles(packing.opacities(o))
     return result | {"origin": origin.tolist()}
 
@@ -88,12 +91,9 @@ def text(info: dict[str, Any]) -> str:
         ("format", ", ".join([info["format"], *details])),
         ("bytes", f"{info['bytes']:,}, {info['bytes'] / max(count, 1):.1f} a Gaussian"),
     ]
-    lines.append(
-        (
-            "Gaussians",
-            f"{count:,}" + (f", {info['not_finite']:,} not finite, which are left out" if info["not_finite"] else ""),
-        )
-    )
+    odd = f", {info['not_finite']:,} not finite, which are left out" if info["not_finite"] else ""
+    odd += f", {info['zero_quaternions']:,} with a quaternion of 0, drawn unrotated" if info["zero_quaternions"] else ""
+    lines.append(("Gaussians", f"{count:,}{odd}"))
     used = info["sh_degree_used"]
     only = "" if used == info["sh_degree"] else f", zero beyond {used}"
     lines.append(("SH degree", f"{info['sh_degree']}{only}"))

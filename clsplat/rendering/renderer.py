@@ -17,7 +17,7 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.device.layout import DEEP
-from clsplat.errors import InputError
+from clsplat.errors import InputError, of_argument
 from clsplat.gaussians import Gaussians
 from clsplat.images.holdouts import Surfaces
 from clsplat.rendering.memory_needs import plan_frame
@@ -191,14 +191,15 @@ class Renderer:
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
         """(bins, H, W, 5): the view in slices by depth, each pixel's front to back, where its light is taken: red,
-        green, blue, associated with alpha; alpha; the slice's depth. All 0 behind a pixel's last slice."""
+        green, blue, associated with alpha; alpha; the slice's depth. All 0 behind a pixel's last slice; a view of
+        planes."""
         camera.check()
         on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
         planes = self._rasterizer.deep(frame, bins).get()[:, :, : camera.height, : camera.width]
         if (of_distances := camera.depths_of_distances()) is not None:
             planes[:, DEEP.index("DEPTH")] *= of_distances
-        return np.ascontiguousarray(planes.transpose(0, 2, 3, 1))
+        return np.asarray(planes.transpose(0, 2, 3, 1), np.float32)
 
     def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
         with np.errstate(over="ignore"):
@@ -279,4 +280,6 @@ def render(
     Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera or a background that is none,
     DeviceError for a device that is not there, CapacityError where a picture does not fit into its memory.
     """
-    return Renderer(open_device(device, parse_bytes(max_device_mem))).render(gaussians, camera, background)
+    with of_argument():
+        opened = open_device(device, parse_bytes(max_device_mem))
+    return Renderer(opened).render(gaussians, camera, background)

@@ -7,12 +7,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import clsplat
+from clsplat.camera import Camera
 from clsplat.errors import InputError, examples, warn
 from clsplat.files import atomic_write, parse_json, read_document, short_digest
 from clsplat.runs.checkpoints import scene_of
@@ -100,6 +102,22 @@ def read(run: Run) -> dict[str, Any] | None:
         why = str(error) or "not of its form"
         raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED}; {advice}") from None
     return dict(record)
+
+
+def own_cameras(run: Run | None) -> list[Camera]:
+    """The cameras of all photographs that a run was trained on or held against, by their names; none where it does not
+    know them. Raises InputError as `read`."""
+    record = read(run) if run is not None else None
+    if record is None:
+        return []
+    cameras = []
+    for _, view in sorted(record["views"].items()):
+        (width, height), (fx, fy, cx, cy), pose = view["size"], view["lens"], np.array(view["pose"], np.float64)
+        camera = Camera(width, height, fx, fy, cx, cy, pose[:9].reshape(3, 3), pose[9:])
+        if "radial" in view:
+            camera = replace(camera, projection=view["projection"], radial=tuple(view["radial"]))
+        cameras.append(camera)
+    return cameras
 
 
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:

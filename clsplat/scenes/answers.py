@@ -64,8 +64,8 @@ class Answer:
         if advice := ADVICE.get(kind):
             return f"{self.finding.text}: {advice}"
         answer = flags(self.settings)
-        if kind in ANSWERS and not self.settings:
-            wanted = flags(ANSWERS[kind][0])
+        if (options := _options(self.finding)) and not self.settings:
+            wanted = flags(options[0])
             given = f"--{self.given.replace('_', '-')} is given"
             answer = given if self.given else f"{wanted} does not go with the other settings"
         return f"{self.finding.text} ({answer})" if answer else self.finding.text
@@ -85,7 +85,7 @@ def answered(
     """The answers to findings, and the settings with all of them. given: names of settings that stay as they are."""
     answers = []
     for finding in found:
-        options = ANSWERS.get(finding.kind, ())
+        options = _options(finding)
         touched = [_touched(option, given) for option in options]
         free = [option for option, name in zip(options, touched, strict=True) if not name]
         taken: Mapping[str, Any] = {}
@@ -98,6 +98,11 @@ def answered(
             break
         answers.append(Answer(finding, taken, "" if free or not options else touched[0]))
     return answers, config
+
+
+def _options(finding: Finding) -> Sequence[Mapping[str, Any]]:
+    """The settings that answer a finding, the best first; none where nothing does."""
+    return finding.options or ANSWERS.get(finding.kind, ())
 
 
 def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:

@@ -14,6 +14,8 @@ from clsplat.errors import InputError, examples
 _INNER = re.compile(r"\.(?:jpe?g|png|tiff?|webp|bmp|exr|heic|dng)(?=[._-]|\Z)")
 """A photograph's extension in the name of a file that goes with it."""
 
+_NUMBER = re.compile(r"(.*?)([0-9]{1,18})\Z", re.DOTALL)
+
 
 class Named(Protocol):
     """A photograph: its name in the data set, and its file."""
@@ -65,10 +67,12 @@ def owned(
     *,
     without: Iterable[Path] = (),
     strict: bool = True,
+    numbered: bool = False,
 ) -> dict[str, Path]:
     """The files of a folder by the photographs that they go with. known: these by the names that a file may have,
     without its extension; what: a word for such a file; example: a photograph's name; without: files to pass over;
-    strict: whether files that fit no photograph are refused, or passed over too.
+    strict: whether files that fit no photograph are refused, or passed over too; numbered: whether mask_0007.png is
+    that of image_0007.png, where no name fits otherwise, and the files and the photographs are one series each.
 
     Names need not agree to the letter: what is left after exact ones may differ in case, then in the photograph's
     extension, then in folders, each where that leaves one photograph alone. Raises InputError for a file that fits no
@@ -91,12 +95,31 @@ def owned(
             if not more:
                 found[owner] = first
                 del left[first]
+    if numbered and not found:
+        numbers, photographs = _series(left.values()), _series(set(known.values()))
+        by_relative = {relative: path for path, relative in left.items()}
+        for number in numbers.keys() & photographs.keys():
+            found[photographs[number]] = path = by_relative[numbers[number]]
+            del left[path]
     if left and strict:
         raise InputError(
             f"{folder}: {len(left):,} {what}(s) fit no photograph ({examples(left.values())}): expected names such as "
             f"{example}.png; rename or remove them"
         )
     return found
+
+
+def _series(names: Iterable[str]) -> dict[int, str]:
+    """Names by the number at their end, before extensions, where there are two or more that differ in that alone."""
+    texts, numbers = set(), {}
+    names = sorted(names)
+    for name in names:
+        match = _NUMBER.match(_INNER.sub("", _loose(str(PurePosixPath(name).with_suffix("")))))
+        if match is None:
+            return {}
+        texts.add(match[1])
+        numbers[int(match[2])] = name
+    return numbers if len(texts) == 1 and 1 < len(numbers) == len(names) else {}
 
 
 def _loose(name: str) -> str:

@@ -98,7 +98,7 @@ def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> 
 def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
     """Depth maps of the photographs, relative ones with the scale and offset that the points give them."""
     told = {view.name: view.depth_file for view in scene.views if view.depth_file}
-    files = {**_beside(scene.views, told), **told}
+    files = {**_beside(scene.views, told, strict=not scene.missing), **told}
     if not files:
         raise InputError(
             f"{scene.name}: --depth maps, and there are none; expected depths/IMAGE.png, .exr or .npy beside images/, "
@@ -158,10 +158,10 @@ def _middle(values: Float64) -> tuple[float, float]:
     return median, float(np.abs(values - median).mean())
 
 
-def _beside(views: Sequence[View], told: Mapping[str, Path]) -> dict[str, Path]:
+def _beside(views: Sequence[View], told: Mapping[str, Path], *, strict: bool) -> dict[str, Path]:
     """Maps in the folder beside the photographs, or in theirs, by the views' names. A map is called as its photograph,
     with or without that one's extension, or with _depth behind. told: maps that a file names, to pass over. Raises
-    InputError for one that fits no photograph, and for two of one."""
+    InputError for one that fits no photograph, if strict, and for two of one."""
     if all(view.name in told for view in views):
         return {}
     for base in bases_of(views):
@@ -175,7 +175,7 @@ def _beside(views: Sequence[View], told: Mapping[str, Path]) -> dict[str, Path]:
             for key in (str(plain), stem, f"{stem}_depth", f"{stem}.depth"):
                 known.setdefault(key, view.name)
         example = next(iter(sorted(known)))
-        return owned(folder, _maps_in(folder), known, "depth map", example, without=told.values())
+        return owned(folder, _maps_in(folder), known, "depth map", example, without=told.values(), strict=strict)
     return {}
 
 

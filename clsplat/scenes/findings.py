@@ -4,8 +4,9 @@ photographs. They come from glances at the photographs, the cameras and the poin
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ Kind = Literal[
     "fisheye",
     "sky",
     "few views",
+    "some views",
     "blur",
     "duplicates",
 ]
@@ -51,6 +53,11 @@ WIDE = 100.0
 FEW = 16
 """Training photographs under which each part of a scene is seen from too few sides to fix its depth; published
 trainings of 12 are 8 dB under those of 100, of 24 about 3."""
+SOME = 30
+"""Training photographs under which growth without a bound fits them rather than the scene (docs/quality.md)."""
+A_POINT, A_GAUSSIAN = 12, 16
+"""Gaussians at most for each point that was found in so many photographs, and pixels at least for each Gaussian: it has
+up to 59 numbers, a pixel three. fox's 50 photographs are best with 7 Gaussians a point (docs/quality.md, Growth)."""
 FEW_STEPS = 60
 """Steps for each training photograph under which high rates pay (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING = range(1000, 10_001)
@@ -76,10 +83,12 @@ SKY_BLUE = 0.02
 
 @dataclass(frozen=True)
 class Finding:
-    """A part of a sentence about the photographs, and its kind."""
+    """A part of a sentence about the photographs, and its kind. options: settings that answer it, the best first, where
+    they follow from the photographs."""
 
     kind: Kind
     text: str
+    options: Sequence[Mapping[str, Any]] = ()
 
 
 def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list[Finding]:
@@ -88,6 +97,7 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
     looked = Looked(scene)
     found = (
         _few(scene),
+        _some(scene),
         _few_steps(scene, iterations),
         _exposure(looked),
         _scales(looked),
@@ -191,6 +201,19 @@ def _few(scene: Scene) -> Finding | None:
     if count >= FEW:
         return None
     return Finding("few views", f"{count} photographs to train on are few, so that views from elsewhere will show fog")
+
+
+def _some(scene: Scene) -> Finding | None:
+    count = len(scene.train_views)
+    if not FEW <= count < SOME:
+        return None
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
+    points = len(scene.points)
+    most = max(min(pixels // A_GAUSSIAN, A_POINT * points or pixels), points, 1)
+    why = f"{count} photographs to train on, with {points:,} points and {pixels / 1e6:.1f} million pixels"
+    sparse, bound = {"thinning": 0.2, "penalty": 0.02}, {"density.max_gaussians": most}
+    options = ({**sparse, **bound}, sparse, {"thinning": 0.2})
+    return Finding("some views", f"{why}, tell of about {most:,} Gaussians", options)
 
 
 def _few_steps(scene: Scene, iterations: int) -> Finding | None:

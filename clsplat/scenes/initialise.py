@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Gaussians that training starts from: one a point, isotropic, as wide as the way to its neighbours. Of a
-cloud without colours each has the mean of what the training photographs have where it is seen."""
+cloud without colours each has the median of what the training photographs have where they show it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clsplat.camera import NEAR
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import composite
-from clsplat.scenes.data_set import pixels_of
+from clsplat.scenes.data_set import depths_of, nearest_around, pixels_of
 from clsplat.scenes.point_files import UNCOLOURED, of_one_colour
 from clsplat.spherical_harmonics import C0
 
@@ -30,8 +30,18 @@ LEAST_COLOUR = 1 / 512
 """Half a step of an 8 bit image. A channel that starts at 0 is at the clamp of colours, where it has no gradient, and
 rounding may keep it there for good."""
 NEIGHBOURS = 3
-LONGEST = 400
-"""Pixels of the photographs' longer side here: a point stands for a few of the full size."""
+NEAREST = 15
+"""Photographs that a point without a colour takes it from. Those from afar show it with what is around; of a few, one
+that shows something else counts for much."""
+IN_A_CELL = 16
+"""Points on average in the cells in which the nearest hides others: of fewer some let what is behind through, and more
+are so wide that they hold things side by side."""
+WIDEST = 1 / 25
+"""Side of these cells at most, in the longer of the picture: with few points hardly any hides another."""
+BEHIND = 1.05
+"""Depth, in that of the nearest point of the cell, from which on a point is taken to be hidden."""
+HIDDEN = 1e30
+"""Rank of a hidden point, times how deep it is behind the nearest: above that of any which is shown."""
 UNSEEN = UNCOLOURED
 """Grey, for points that no photograph shows."""
 
@@ -126,19 +136,39 @@ def is_colourless(scene: Scene) -> bool:
 
 
 def photographed(scene: Scene, background: ArrayLike) -> Float32:
-    """(N, 3) float32 in [0, 1] for the scene's points, but for those that have their own. What lies before a point is
-    not known, and counts too."""
-    sums, seen = np.zeros((len(scene.points), 3)), np.zeros(len(scene.points))
+    """(N, 3) float32 in [0, 1] for the scene's points, but for those that have their own: by channel the median of what
+    the NEAREST training photographs that show a point have there, at the size that is trained on.
+
+    A photograph does not show what its mask leaves out, nor what lies behind others. A point that lies so in all of
+    them takes those where it does least.
+    """
+    count = len(scene.points)
+    ranks, colors = np.full((count, NEAREST), np.inf), np.full((count, NEAREST, 3), np.inf, np.float32)
     for view in scene.train_views:
-        factor = min(LONGEST / max(view.camera.width, view.camera.height), 1.0)
-        camera = view.camera.resized(
-            max(round(factor * view.camera.width), 1), max(round(factor * view.camera.height), 1)
-        ).before(scene.near)
-        picture = composite(view.load(camera.width, camera.height), background)
+        camera, picture = view.camera.before(scene.near), view.load_masked()
         rows, columns, inside = pixels_of(scene.points, camera, view.lens)
-        sums[inside] += picture[rows, columns]
-        seen[inside] += 1
-    means = np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], UNSEEN)
-    if scene.colourless is not None:
-        means = np.where(scene.colourless[:, None], means, scene.point_colors)
-    return np.clip(means, 0, 1).astype(np.float32)
+        which, depths = np.flatnonzero(inside), depths_of(scene.points[inside], camera)
+        cell = np.sqrt(IN_A_CELL * camera.width * camera.height / max(len(which), 1))
+        cell = max(min(cell, WIDEST * max(camera.width, camera.height)), 1.0)
+        behind = depths / nearest_around(rows, columns, depths, cell)
+        rank = np.where(behind <= BEHIND, depths / camera.fx, HIDDEN * behind)
+        pixels = picture[rows, columns]
+        counts = pixels[:, 4] > 0 if pixels.shape[1] == 5 else np.ones(len(which), np.bool_)
+        last = ranks[which].argmax(axis=1)
+        kept = counts & (rank < ranks[which, last])
+        which, last = which[kept], last[kept]
+        ranks[which, last] = rank[kept]
+        colors[which, last] = composite(pixels[None, kept, :4], background)[0]
+    shown = ranks < HIDDEN
+    colors[~shown & shown.any(axis=1, keepdims=True)] = np.inf
+    medians = np.clip(_medians(colors), 0, 1)
+    return medians if scene.colourless is None else np.where(scene.colourless[:, None], medians, scene.point_colors)
+
+
+def _medians(colors: Float32) -> Float32:
+    """(N, 3) medians by channel of the finite ones of colours (N, K, 3), which are sorted in place; UNSEEN for none."""
+    counts = np.isfinite(colors).all(axis=2).sum(axis=1)[:, None, None]
+    colors.sort(axis=1)
+    middles = np.concatenate([np.maximum(counts - 1, 0) // 2, counts // 2], axis=1)
+    medians = np.take_along_axis(colors, middles, axis=1).mean(axis=1)
+    return np.asarray(np.where(counts[:, 0] > 0, medians, np.float32(UNSEEN)))

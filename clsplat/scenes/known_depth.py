@@ -15,7 +15,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.files import short_digest
 from clsplat.images.depth_maps import read_map
-from clsplat.scenes.data_set import Lens, pixels_of
+from clsplat.scenes.data_set import Lens, depths_of, pixels_of
 
 NOTHING = 65535
 """Value of a metric map of whole numbers that some sensors write where they know nothing; 0 is another."""
@@ -42,9 +42,8 @@ class KnownDepth:
             found = np.flatnonzero((nearness > 0) & (nearness < np.finfo(np.float32).max))
             return found, nearness.ravel()[found].astype(np.float32), np.ones(len(found), np.float32)
         rows, columns, inside = pixels_of(self.points, camera, lens)
-        local = self.points[inside] @ camera.rotation.T + camera.translation
-        depth = local[:, 2] if camera.projection == "perspective" else np.linalg.norm(local, axis=1)
-        index, near, weights = rows * camera.width + columns, 1 / depth, self.weights[inside]
+        index, near = rows * camera.width + columns, 1 / depths_of(self.points[inside], camera)
+        weights = self.weights[inside]
         order = np.lexsort((-near, index))  # of several in a pixel the nearest
         index, first = np.unique(index[order], return_index=True)
         kept = order[first]

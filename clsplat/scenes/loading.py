@@ -101,7 +101,7 @@ def load_scene(
         posed = sorted(data.images, key=lambda image: image.name)
         if masks != NO_MASKS:
             smaller = []
-        of_pictures = masks_of(masks, posed, path)
+        of_pictures = masks_of(masks, posed, path, strict=not data.missing)
         own_split = any(image.split for image in posed)
         every = {name: index for index, name in enumerate(sorted([*(image.rank for image in posed), *data.missing]))}
         views = []
@@ -115,6 +115,7 @@ def load_scene(
         cube = np.full(3, BLENDER_CUBE)
         name = path.resolve().name if path.is_dir() else path.resolve().parent.name
         scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=source, clouds=tuple(data.clouds))
+        scene.missing = tuple(data.missing)
         if len(scene.points) == 0:
             scene = with_cloud_beside(scene)
             if not len(scene.points) and kind in ("colmap", "photos"):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
-from clsplat.scenes.data_set import PANORAMA, RADIAL, pixels_of
+from clsplat.scenes.data_set import PANORAMA, RADIAL, nearest_around, pixels_of
 from clsplat.scenes.point_files import of_one_colour
 from clsplat.scenes.scene import Scene, View
 
@@ -61,11 +61,7 @@ class Looked:
         rows, columns, inside = pixels_of(self.points, camera, view.lens)
         where = np.flatnonzero(inside)
         depths = (self.points[where] - camera.position) @ camera.rotation[2]
-        across = -(-width // CELL)
-        cells = rows // CELL * across + columns // CELL
-        nearest = np.full(across * -(-height // CELL), np.inf)
-        np.minimum.at(nearest, cells, depths)
-        seen = depths <= BEHIND * nearest[cells]
+        seen = depths <= BEHIND * nearest_around(rows, columns, depths, CELL)
         return where[seen], rows[seen], columns[seen], depths[seen]
 
     @cached_property

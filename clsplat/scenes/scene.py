@@ -125,7 +125,7 @@ class Scene:
     points; warnings: for the user, a line each; start: how the points were chosen (`scenes.cloud`); colourless (N,):
     points whose colours are those of the photographs, None for none; source: the folder that it was read from;
     depth_use: how what is known of depths was chosen (`scenes.depth`); clouds: files of points beside the scene that
-    are not used.
+    are not used; missing: names of pictures that are listed and not there.
     """
 
     name: str
@@ -139,6 +139,7 @@ class Scene:
     source: Path | None = None
     depth_use: DepthUse = NO_DEPTH
     clouds: tuple[Path, ...] = ()
+    missing: tuple[str, ...] = ()
 
     @cached_property
     def train_views(self) -> list[View]:

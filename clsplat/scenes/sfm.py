@@ -22,10 +22,10 @@ from clsplat.config.masks import MaskUse
 from clsplat.errors import ClsplatError, InputError, examples, warn
 from clsplat.files import is_file, replace
 from clsplat.process import apart
-from clsplat.progress import Progress, no_progress
+from clsplat.progress import Counted, Progress, no_progress
 from clsplat.scenes import sfm_copies, sfm_photos
-from clsplat.scenes.masks import masks_beside, stage_mask
-from clsplat.scenes.transforms import load_document
+from clsplat.scenes.camera_json import load_document
+from clsplat.scenes.masks import OTHER_FOLDERS, masks_beside, stage_mask, warn_of_sense
 
 Matching = Literal["auto", "exhaustive", "sequential"]
 
@@ -37,6 +37,7 @@ MINIMUM_PHOTOS = 3
 CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
                  "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
 
+STAND = "cameras stand"
 # stage of the worker: what the user reads, and the table that grows by a row with each photo or pair
 _STAGES = {
     "features": ("finding features", "keypoints"),
@@ -115,8 +116,11 @@ def reconstruct(
         copies = sfm_copies.resolved({**copies, **sfm_copies.told_by_pictures(photos)})
         photos = [photo for photo in photos if photo.name not in copies]
         if copies:
-            again = f"{len(copies):,} photo(s) are others again and left out ({sfm_copies.listed(copies)})"
-            warn(f"{images}: {again}; to use them, give their folder alone")
+            count = (
+                "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
+            )
+            again = f"{count} and left out ({sfm_copies.listed(copies)}); to use copies, give their folder alone"
+            warn(f"{images}: {again}")
         _require_enough(images, len(photos))
         masked = []
         for photo in photos:
@@ -177,11 +181,13 @@ def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Pa
     photo."""
     if use is None or use.masks == "none":
         return {}
-    found = masks_beside([_Found(sfm_photos.photo_name(images, path), path) for path in paths])
+    photos = [_Found(sfm_photos.photo_name(images, path), path) for path in paths]
+    found = masks_beside(photos, others=OTHER_FOLDERS)
     if not found:
         raise InputError(
             f"{images}: there are no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder"
         )
+    warn_of_sense(found.values(), use, images)
     return found
 
 
@@ -297,10 +303,10 @@ def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
             return dict(message)
         if "stage" in message:
             text, table = _STAGES[message["stage"]]
-            total = message["total"]
-            report(text, 0.0 if total else None)
+            total, places = message["total"], message["stage"].startswith("cameras")
+            report(text, None if not total else Counted(0, total, STAND) if places else 0.0)
         elif total:
-            report(text, message["done"] / total)
+            report(text, Counted(message["done"], total, STAND))
 
 
 def _rows(database: Path, table: str) -> int:

@@ -14,11 +14,12 @@ from clsplat.config.points import SKY_RADIUS
 from clsplat.errors import InputError
 from clsplat.images.alpha import composite
 from clsplat.scenes.data_set import pixels_of
-from clsplat.scenes.initialise import LONGEST
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene, View
 
+LONGEST = 400
+"""Pixels of the photographs' longer side here: a point of the sky stands for a few of the full size."""
 FARTHEST = 0.95
 """Share of the scene's points that are within the distance of what counts as the farthest."""
 DENSER = 4

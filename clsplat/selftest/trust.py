@@ -27,14 +27,16 @@ from clsplat.selftest.result import FORWARD, STAGES, TRAINING, Result
 class Report:
     """The test of a device. digests: of what each stage made, by "scene/stage"; build_seconds: None where the kernels
     were not built first; end: the end of the process before its work was done, in words, or empty; crashed: True if
-    that was the driver's doing; kernels: those that were built and launched, in the form of `device.rehearsal`;
-    remembered: a failure in this shape that has not been seen to be gone, in words, or empty."""
+    that was the driver's doing; hung: True if it did not come back; kernels: those that were built and launched, in the
+    form of `device.rehearsal`; remembered: a failure in this shape that has not been seen to be gone, in words, or
+    empty."""
 
     results: list[Result] = field(default_factory=list)
     digests: dict[str, str] = field(default_factory=dict)
     build_seconds: float | None = None
     end: str = ""
     crashed: bool = False
+    hung: bool = False
     wanted: tuple[str, ...] = STAGES
     kernels: dict[str, str] = field(default_factory=dict)
     remembered: str = ""
@@ -90,7 +92,7 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = STAGES, *, quick: 
                     return report
             report.end, report.crashed = f"the process {child.ending(begun)}", child.crashed
         except TimeoutError as error:
-            report.end, report.crashed = f"the driver {error} from {begun}", True
+            report.end, report.crashed, report.hung = f"the driver {error} from {begun}", True, True
     return report
 
 
@@ -129,7 +131,7 @@ def require(device: Device, stages: Sequence[str] = TRAINING) -> Device:
     )
 
 
-_ADVICE = f"clsplat selftest tells more, --device takes another device, {REGARDLESS}=1 goes on regardless"
+_ADVICE = f"clsplat selftest tells more, CLSPLAT_DEVICE takes another device, {REGARDLESS}=1 goes on regardless"
 
 
 def _has_passed(device: Device, stages: Sequence[str]) -> bool:
@@ -142,6 +144,8 @@ def _short_test(device: Device, stages: Sequence[str]) -> str:
     DriverError where the test itself could not be made, and DeviceError like `require`."""
     wanted = [name for name in STAGES if name in FORWARD or name in stages]
     report = examine(device.index, device.shape, wanted, quick=True)
+    if report.crashed and not report.hung:  # the driver's linker may have been killed
+        report = examine(device.index, device.shape, wanted, quick=True)
     if report.crashed:
         return report.end
     if report.end:

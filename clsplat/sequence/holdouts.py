@@ -5,28 +5,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from clsplat.camera import Camera
 from clsplat.config.holdout import HoldoutConfig
-from clsplat.errors import warn
+from clsplat.errors import examples, warn
 from clsplat.frame.holdout import Cut
+from clsplat.frame.lens import MARGIN
+from clsplat.frame.window import crop
 from clsplat.images.holdouts import check_holdout, read_holdout
-from clsplat.sequence.task import RenderOptions, Task, picture_camera
+from clsplat.sequence.task import RenderOptions, Task, straight_camera, warp_of
 from clsplat.shots.frame_numbers import check_pattern, path_of
 from clsplat.shots.stereo import for_eye
 
 
 def held_out(tasks: Sequence[Task], pattern: str, config: HoldoutConfig) -> list[Task]:
     """The tasks with their hold-outs, of which one without a field for the number is every frame's, and one without a
-    field for the eye both eyes'. Raises InputError for a file that is missing, or none as its header says."""
+    field for the eye both eyes'. Warns of depths of half floats. Raises InputError for a file that is missing, or none
+    as its header says."""
     check_pattern(for_eye(pattern, tasks[0].eye))
+    coarse: dict[Path, bool] = {}
 
     def held(task: Task) -> Task:
         path = path_of(for_eye(pattern, task.eye), task.number, task.name).absolute()
-        check_holdout(path, (task.camera.width, task.camera.height), config.channel)
+        if check_holdout(path, (task.camera.width, task.camera.height), config.channel):
+            coarse[path] = True
         return replace(task, holdout=path, right=task.right and held(task.right))
 
-    return [held(task) for task in tasks]
+    made = [held(task) for task in tasks]
+    if coarse:
+        warn(
+            f"{examples(coarse)}: has depths of half floats, which are up to a two-thousandth off, so that Gaussians "
+            "near a surface are on its wrong side; write the depths as floats"
+        )
+    return made
 
 
 def cut_of(task: Task, options: RenderOptions) -> Cut | None:
@@ -34,20 +46,23 @@ def cut_of(task: Task, options: RenderOptions) -> Cut | None:
     picture that goes on. Raises InputError."""
     if task.holdout is None or options.holdout is None:
         return None
-    camera = picture_camera(task, options)
-    cut = Cut(read_holdout(task.holdout, (task.camera.width, task.camera.height), options.holdout.channel))
-    if _reaches_out(camera) and cut.goes_on:
-        warn(f"{task.holdout}: ends with the frame, and nothing is held out in the overscan; render the CG with it too")
+    how, size = options.holdout, (task.camera.width, task.camera.height)
+    holdout = read_holdout(task.holdout, size, how.channel, inverse=how.depths == "inverse")
+    if how.depths == "ray":
+        height, width = holdout.surfaces.counts.shape
+        cosines = crop(task.camera, holdout.x, holdout.y, width, height).cosines()
+        holdout = replace(holdout, surfaces=holdout.surfaces if cosines is None else holdout.surfaces.scaled(cosines))
+    cut, bent = Cut(holdout), warp_of(task, options) is not None
+    if _reaches_out(straight_camera(task, options), MARGIN + 1 if bent else 0) and cut.goes_on:
+        where = "where the bent picture looks beyond it" if bent else "in the overscan"
+        warn(f"{task.holdout}: ends with the frame, and nothing is held out {where}; render the CG with overscan")
     return cut
 
 
-def _reaches_out(camera: Camera) -> bool:
-    """True if the picture has pixels beyond its frame."""
+def _reaches_out(camera: Camera, margin: int) -> bool:
+    """True if the picture has pixels further than so many beyond its frame."""
     window = camera.window
     if window is None:
         return False
-    return (
-        min(window.x, window.y) < 0
-        or window.x + camera.width > window.width
-        or window.y + camera.height > window.height
-    )
+    ends = (window.x + camera.width - window.width, window.y + camera.height - window.height)
+    return max(-window.x, -window.y, *ends) > margin

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clsplat.config.channels import MATTES
 from clsplat.errors import InputError
 from clsplat.frame.objects import Matte
-from clsplat.models.formats import format_of
+from clsplat.models.formats import unpacked
 from clsplat.models.formats.ply import read_whole_numbers
 from clsplat.sequence.cast import Cast
 from clsplat.sequence.task import MatteNames
@@ -62,9 +62,11 @@ def _semantic(cast: Cast, ids_from: str) -> Matte:
         raise InputError(f"--ids-from {ids_from}: {cast.path} is a stage, expected PLY files that have the property")
     columns: list[NDArray[np.int64]] = []
     for file, model in zip(cast.files, cast.models, strict=True):
-        if (form := format_of(file).name) != "3DGS PLY":
-            raise InputError(f"--ids-from {ids_from}: {file} is {form}, expected a 3DGS PLY that has the property")
-        columns.append(read_whole_numbers(file, ids_from))
+        with unpacked(file) as (opened, form):
+            if form.name != "3DGS PLY":
+                found = f"{file} is {form.name}, expected a 3DGS PLY that has the property"
+                raise InputError(f"--ids-from {ids_from}: {found}")
+            columns.append(read_whole_numbers(opened, ids_from))
         assert len(columns[-1]) == len(model)
     numbers, owners = np.unique(np.concatenate(columns), return_inverse=True)
     return Matte(tuple(str(number) for number in numbers.tolist()), owners.astype(np.int32))

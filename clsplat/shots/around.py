@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras around a model of which nothing else is known: by where its Gaussians are, and how much detail they show."""
+"""Cameras around a model of which nothing else is known: by where its Gaussians are, and how much detail they show; and
+those among the photographs' own cameras, where a run knows them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +14,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.scenes.strays import stray_cameras
 from clsplat.shots.viewpoints import COLMAP_UP, extent_of, look_at
 
 SIZE = (1280, 720)
@@ -90,6 +94,40 @@ def cameras_around(
             rotation, translation = look_at(position, centre, axis)
             cameras.append(Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, translation))
     return cameras
+
+
+def among(own: Sequence[Camera], size: tuple[int | None, int | None] = (None, None)) -> list[Camera]:
+    """The photographs' own cameras without strays, as pinholes, for a path among them: it shows what they have shown.
+
+    size: width and height in pixels. Where both are given, the field of view is what fits into the photographs', else
+    the pictures have their shape. Photographs that are no perspective pictures stand for pinholes of FIELD.
+    """
+    far = stray_cameras(own)
+    return [_pinhole(camera, size) for camera, stray in zip(own, far, strict=True) if not stray]
+
+
+def _pinhole(camera: Camera, size: tuple[int | None, int | None]) -> Camera:
+    width, height = size
+    if camera.projection != "perspective":
+        width, height = _size(size)
+        focal = 0.5 * min(width, height) / math.tan(0.5 * FIELD)
+        return Camera(
+            width,
+            height,
+            focal,
+            focal,
+            0.5 * width,
+            0.5 * height,
+            camera.rotation,
+            camera.translation,
+            near=camera.near,
+        )
+    if width is None or height is None:
+        return camera
+    scale = max(width / camera.width, height / camera.height)
+    across, down = (scale * value for value in (camera.cx - 0.5 * camera.width, camera.cy - 0.5 * camera.height))
+    fx, fy, cx, cy = scale * camera.fx, scale * camera.fy, 0.5 * width + across, 0.5 * height + down
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def _size(size: tuple[int | None, int | None]) -> tuple[int, int]:

@@ -3,12 +3,13 @@
 
 Its values are those of `camera_to_JSON` in utils/camera_utils.py of graphdeco-inria/gaussian-splatting: `position` is
 the camera's centre, `rotation` the rows of world_from_camera in COLMAP's axes, `fx` and `fy` are pixels of a picture of
-`width` times `height`, whose middle is the principal point. SuperSplat imports the same (src/json-types.ts), where all
-but position and rotation may be missing.
+`width` times `height`, whose middle is the principal point, but where other programs write `cx` and `cy` in pixels.
+SuperSplat imports the same (src/json-types.ts), where all but position and rotation may be missing.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from clsplat.arrays import Float64, numbers
 from clsplat.camera import LARGEST_FOCAL, Camera
 from clsplat.errors import InputError
-from clsplat.scenes.transforms import Keys, short
+from clsplat.scenes.camera_json import Keys, short
 from clsplat.shots.shot import MOST_FRAMES, Frame, Shot
 
 NAME = "cameras.json"
@@ -33,20 +34,23 @@ def read_cameras_json(path: Path, entries: list[Any], size: tuple[int | None, in
     Raises InputError, with the file and the entry, for a list of something else, and values that are missing or cannot
     be.
     """
-    if not entries or not all(
-        isinstance(entry, dict) and {"position", "rotation"} <= entry.keys() for entry in entries
-    ):
-        what = f"a list that begins with {short(entries[0])}" if entries else "an empty list"
-        raise InputError(
-            f"{path}: is {what}, expected the cameras of a 3DGS training, each an object with 'position', 'rotation', "
-            "'width', 'height', 'fx' and 'fy'"
-        )
+    expected = "an object with 'position', 'rotation', 'width', 'height', 'fx' and 'fy'"
+    if not any(map(_is_camera, entries)):
+        what = f"a list that begins with {_json(entries[0])}" if entries else "an empty list"
+        raise InputError(f"{path}: is {what}, expected the cameras of a 3DGS training, each {expected}")
+    for number, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise InputError(f"{path}: camera {number} is {_json(entry)}, expected {expected}")
+        if lacks := [f"'{key}'" for key in ("position", "rotation") if entry.get(key) is None]:
+            raise InputError(
+                f"{path}: camera {number}{_called(entry)}: has no {' and no '.join(lacks)}, expected {expected}"
+            )
     if len(entries) > MOST_FRAMES:
         raise InputError(f"{path}: has {len(entries):,} cameras, expected at most {MOST_FRAMES:,}")
     frames = []
     for number, entry in enumerate(entries, 1):
         name = entry.get("img_name")
-        keys = Keys(path, f"camera {number - 1}" + (f" ({name[:80]})" if isinstance(name, str) else ""), entry, {})
+        keys = Keys(path, f"camera {number - 1}{_called(entry)}", entry, {})
         if not isinstance(name, str) or not name.strip():
             name = f"{number:04d}"
         frames.append(Frame(number, _camera(keys, size), name.replace("\\", "/")))
@@ -54,7 +58,18 @@ def read_cameras_json(path: Path, entries: list[Any], size: tuple[int | None, in
 
 
 def _is_camera(entry: object) -> bool:
-    return isinstance(entry, dict) and "position" in entry and "rotation" in entry
+    return isinstance(entry, dict) and {"position", "rotation"} <= entry.keys()
+
+
+def _called(entry: dict[str, Any]) -> str:
+    """The name of an entry behind its number, for an error's line."""
+    name = entry.get("img_name")
+    return f" ({name[:80]})" if isinstance(name, str) and name.strip() else ""
+
+
+def _json(value: object) -> str:
+    """A value for an error's line: what stands in the file."""
+    return json.dumps(value) if value is None or isinstance(value, bool) else short(value)
 
 
 def _camera(keys: Keys, size: tuple[int | None, int | None]) -> Camera:
@@ -69,7 +84,8 @@ def _camera(keys: Keys, size: tuple[int | None, int | None]) -> Camera:
             raise keys.wrong(key, f"pixels above 0, at most {LARGEST_FOCAL:g}")
     rotation = _rotation(keys)
     translation = -rotation @ keys.vector("position", 3)
-    return Camera(width, height, fx, fy, width / 2, height / 2, rotation, translation)
+    cx, cy = keys.require("cx", width / 2), keys.require("cy", height / 2)
+    return Camera(width, height, fx, fy, cx, cy, rotation, translation)
 
 
 def _rotation(keys: Keys) -> Float64:

@@ -20,7 +20,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.models.mesh import Mesh, read_mesh
 from clsplat.models.placed import IDENTITY, Placement, Track, checked, grade, rows_of
-from clsplat.scenes.transforms import Keys, load_document, objects, short
+from clsplat.scenes.camera_json import Keys, load_document, objects, short
 
 VERSION_KEY, VERSION = "clsplat_shot", 1
 EXPECTED = f"a shot of several models (.json, with '{VERSION_KEY}')"
@@ -290,7 +290,8 @@ def _numbers(where: str, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not np.isfinite(values).all():
-        raise InputError(f"{where}: expected {count} numbers with commas, found {short(text.strip())}")
+        expected = f"{count} numbers with commas" if count > 1 else "one number: a model has the same in all directions"
+        raise InputError(f"{where}: expected {expected}, found {short(text.strip())}")
     return values
 
 

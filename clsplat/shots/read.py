@@ -19,7 +19,7 @@ from clsplat.scenes.colmap import find_model, read_cameras
 from clsplat.scenes.data_set import PANORAMA, PosedImage
 from clsplat.scenes.strays import FACTOR, stray_cameras
 from clsplat.scenes.transforms import read_poses
-from clsplat.shots.around import cameras_around, parse_up
+from clsplat.shots.around import among, cameras_around, parse_up
 from clsplat.shots.cameras_json import NAME, read_cameras_json
 from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
 from clsplat.shots.generated import PATHS
@@ -113,7 +113,8 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
     if not far.any():
         return near, ()
     names = examples(frame.name for frame, stray in zip(frames, far, strict=True) if stray)
-    return near, (f"{source}: {names} stand over {FACTOR:g} times as far off as the others; the path is of these",)
+    text = f"{source}: the cameras of {names} stand over {FACTOR:g} times as far off as the others"
+    return near, (f"{text}, and the path is made of the others",)
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
@@ -149,23 +150,28 @@ def shot_around(
     count: int | None = None,
     size: tuple[int | None, int | None] = (None, None),
     up: str | None = None,
+    own: Sequence[Camera] = (),
 ) -> Shot:
-    """The shot that --path, --count and --up ask for without --cameras: around the model, as `cameras_around`. Raises
-    InputError."""
-    path = check_around(path)
+    """The shot that --path, --count and --up ask for without --cameras: among the photographs' own cameras where these
+    are known and no direction is given that is up, else around the model, as `cameras_around`. Raises InputError."""
+    among_own = bool(own) and up is None
+    path = check_around(path, among_own=among_own)
     _check_count(count)
+    if among_own:
+        return Shot(_path(path, among(own, size), count))
     found = cameras_around(gaussians, COLMAP_UP if up is None else parse_up(up), size)
     return Shot(_path(path, found, count))
 
 
-def check_around(path: str | None) -> str:
-    """The path, which goes around a model. Raises InputError for one that needs cameras, and for none."""
+def check_around(path: str | None, *, among_own: bool = False) -> str:
+    """The path, which goes around a model, or among the photographs' own cameras. Raises InputError for one that needs
+    cameras, and for none."""
     if path is None:
         raise InputError(
             "--cameras is missing, expected cameras to render from; or --path turntable or spiral alone, for a path "
             "around the model"
         )
-    if path == "through":
+    if path == "through" and not among_own:
         raise InputError("--path through: goes through cameras, expected --cameras with it")
     return path
 

@@ -18,7 +18,8 @@ import numpy as np
 from clsplat.errors import examples, warn
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec.soundness import sound
-from clsplat.models.formats.usd import gaussians_of, open_stage, readable, space_of, splats_of, survive
+from clsplat.models.formats.usd import TYPE, gaussians_of, open_stage, readable, space_of, splats_of, survive
+from clsplat.models.formats.usd_places import Place
 from clsplat.models.placed import IDENTITY, Placement, checked, rows_of
 
 ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
@@ -31,38 +32,28 @@ class StageTrack:
     """The `Track` of a prim. where: begins errors; held: the stage, which USD closes with its last reference."""
 
     where: str
-    prim: Any
+    place: Place
     held: Any
 
     def at(self, frame: float) -> Placement:
         """World transform and visibility at a time code. Raises InputError for a transform that Gaussians cannot
         follow."""
-        from pxr import Usd, UsdGeom
+        from pxr import Usd
 
-        code = Usd.TimeCode(frame)
-        shown = UsdGeom.Imageable(self.prim).ComputeVisibility(code) != UsdGeom.Tokens.invisible
-        # USD's vectors are rows, so its matrices are the transposes of ours
-        matrix = np.array(UsdGeom.XformCache(code).GetLocalToWorldTransform(self.prim), np.float64).T
+        matrix, shown = self.place.at(Usd.TimeCode(frame))
         place = Placement(rows_of(matrix), float(shown))
         return place if place.matrix == IDENTITY else checked(place, f"{self.where} at {frame:g}")
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """The first and the last time at which its transform has a value, or that of what it is in."""
-        from pxr import UsdGeom
-
-        times, prim = [], self.prim
-        while prim and not prim.IsPseudoRoot():
-            if prim.IsA(UsdGeom.Xformable):
-                times += UsdGeom.Xformable(prim).GetTimeSamples()
-            prim = prim.GetParent()
-        return (min(times), max(times)) if times else None
+        """The first and the last time that says where it is (`Place.reach`)."""
+        return self.place.reach
 
 
 @dataclass(frozen=True, eq=False)
 class StageModels:
-    """The Gaussians of a stage, prim by prim, in their own coordinates. names: paths of the prims; digest: SHA-256 of
-    what they are read from; space: of their colours."""
+    """The Gaussians of a stage, prim by prim, in their own coordinates, those of an instanced prim once for each
+    instance. names: of their places; digest: SHA-256 of what they are read from; space: of their colours."""
 
     models: tuple[Gaussians, ...]
     names: tuple[str, ...]
@@ -80,52 +71,39 @@ def read_stage(path: Path) -> StageModels | None:
 
 def read_here(path: Path) -> StageModels | None:
     """`read_stage` of a file that is known not to end the process."""
-    from pxr import Usd, UsdGeom, UsdUtils
+    from pxr import Usd, UsdUtils
 
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
     stage = open_stage(path, path)
     time = Usd.TimeCode.EarliestTime()
     with readable(path):
-        prims = splats_of(path, stage)
-        drawn = [prim for prim in prims if _is_drawn(prim)]
-        still = all(not _moves(prim) for prim in prims)
-        seen = all(UsdGeom.Imageable(prim).ComputeVisibility(time) != UsdGeom.Tokens.invisible for prim in prims)
+        places, left = splats_of(path, stage)
+        if left:
+            warn(f"{path}: not drawn: {examples(left)}; of a stage only {TYPE} prims are drawn")
+        drawn = [place for place in places if place.is_drawn]
+        still = not any(place.moves for place in places)
+        seen = all(place.at(time)[1] for place in places)
         layers = [layer for layer in stage.GetUsedLayers() if layer != stage.GetSessionLayer()]
-        if still and seen and len(layers) == 1 and len(drawn) == len(prims):
+        if still and seen and len(layers) == 1 and len(drawn) == len(places):
             return None
-        prims = drawn or prims
-        if animated := [f"{name} of {prim.GetPath()}" for prim in prims for name in _animated(prim)]:
+        places = drawn or places
+        prims = {place.prim.GetPath(): place.prim for place in places}
+        if animated := [f"{name} of {own}" for own, prim in prims.items() for name in _animated(prim)]:
             warn(f"{path}: not applied: the animation of {examples(animated)}; they are those of the first time")
-        space, sums = space_of(path, prims), hashlib.sha256()
-        models = []
-        for prim in prims:
-            where = f"{path}: {prim.GetPath()}"
-            models.append(sound(gaussians_of(where, prim, time, space), where))
-            _add(sums, prim, time)
-        tracks = [StageTrack(f"{path}: {prim.GetPath()}", prim, stage) for prim in prims]
+        space, sums = space_of(path, list(prims.values())), hashlib.sha256()
+        known: dict[Any, Gaussians] = {}
+        for place in places:
+            own = place.prim.GetPath()
+            if own not in known:
+                where = f"{path}: {own}"
+                known[own] = sound(gaussians_of(where, place.prim, time, space), where)
+                _add(sums, place.prim, time)
+            elif place.seat is not None:
+                sums.update(f"again {list(known).index(own)}\n".encode())
+        tracks = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]
     del diagnostics
-    names = tuple(str(prim.GetPath()) for prim in prims)
-    return StageModels(tuple(models), names, tuple(tracks), sums.hexdigest(), space)
-
-
-def _is_drawn(prim: Any) -> bool:
-    """True unless its purpose is that of a proxy or a guide."""
-    from pxr import UsdGeom
-
-    return UsdGeom.Imageable(prim).ComputePurpose() in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
-
-
-def _moves(prim: Any) -> bool:
-    """True if the transform or the visibility of the prim, or of what it is in, may change over time."""
-    from pxr import UsdGeom
-
-    while prim and not prim.IsPseudoRoot():
-        if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
-            return True
-        if prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).GetVisibilityAttr().ValueMightBeTimeVarying():
-            return True
-        prim = prim.GetParent()
-    return False
+    models, names = tuple(known[place.prim.GetPath()] for place in places), tuple(place.name for place in places)
+    return StageModels(models, names, tuple(tracks), sums.hexdigest(), space)
 
 
 def _attributes(prim: Any) -> list[Any]:

@@ -19,7 +19,8 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError, examples
 from clsplat.models.formats.usd import open_stage, readable, survive
-from clsplat.scenes.transforms import opengl_pose, short
+from clsplat.scenes.camera_json import short
+from clsplat.scenes.transforms import opengl_pose
 from clsplat.shots.optics import Optics
 from clsplat.shots.shot import Shot, numbered, whole_frames
 from clsplat.shots.usd_settings import Settings, camera_of_settings, read_settings

@@ -10,6 +10,7 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("clsplat.torch needs PyTorch: pip install 'clsplat[torch]'", name="torch") from error
 
+from clsplat.torch.absent import NEED_CUDA, what_is_absent
 from clsplat.torch.covariances import quat_scale_to_covar_preci
 from clsplat.torch.harmonics import spherical_harmonics
 from clsplat.torch.pixels import rasterize_to_pixels
@@ -40,6 +41,8 @@ STRATEGIES = ("DefaultStrategy", "MCMCStrategy")
 
 
 def __getattr__(name: str) -> Any:
+    if name in NEED_CUDA:
+        raise AttributeError(what_is_absent(name))
     if name not in STRATEGIES:
         raise AttributeError(f"module 'clsplat.torch' has no attribute {name!r}")
     globals()[name] = value = strategy(name)

@@ -9,13 +9,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch._C._functorch import is_batchedtensor, is_gradtrackingtensor
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError, warn
+from clsplat.library.checks import plain, whole
 
 _SAID: set[str] = set()
 """Kinds of tensors that have been warned of."""
@@ -41,7 +42,14 @@ def renamed(**names: str) -> Iterator[None]:
 
 def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     """Raise InputError, which names the argument, unless it is a dense tensor of real numbers of one of `shapes`, in
-    which a word stands for any size."""
+    which a word stands for any size; and for a tensor of torch.func, whose numbers kernels cannot read."""
+    if isinstance(value, Tensor) and (is_gradtrackingtensor(value) or is_batchedtensor(value)):
+        raise refuse(name, "a tensor of torch.func", "a plain one: clsplat.torch has the gradients of torch.autograd")
+    _check_shape(name, value, *shapes)
+
+
+def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
+    """Check as `check_shape` does, for functions in PyTorch alone, which torch.func may call."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -54,7 +62,7 @@ def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 
 def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     """Raise InputError, which names the argument, where `check_shape` does, and for NaN."""
-    check_shape(name, value, *shapes)
+    _check_shape(name, value, *shapes)
     # a sum is NaN where a number is, and is made in one pass without another array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
         first = tuple(broken.nonzero()[0].tolist())
@@ -76,18 +84,20 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
 
 
 def check_size(name: str, value: object) -> int:
-    """A number of pixels. Raises InputError where it is none."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    """A number of pixels, which may be a real number or a tensor of one. Raises InputError where it is none."""
+    size = whole(value)
+    if size is None or size < 1:
         raise refuse(name, repr(value), "a whole number of pixels, 1 or more")
-    return int(value)
+    return size
 
 
 def check_number(name: str, value: object, least: float = -math.inf, most: float = math.inf) -> float:
-    """A number in a range. Raises InputError where it is none."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not least <= value <= most:
+    """A number in a range, which may be a tensor of one. Raises InputError where it is none."""
+    number = plain(value)
+    if isinstance(number, bool) or not isinstance(number, int | float) or not least <= number <= most:
         limits = [f"{least} or more"] * (least > -math.inf) + [f"{most} or less"] * (most < math.inf)
         raise refuse(name, repr(value), " and ".join(["a number", *limits]))
-    return float(value)
+    return float(number)
 
 
 def as_array(value: Tensor) -> Float32:

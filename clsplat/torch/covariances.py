@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from clsplat.torch.arguments import check
+from clsplat.torch.graphs import differentiable_once
 
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of the upper triangle of a 3x3 matrix, in the order of the flattened form."""
@@ -46,6 +49,35 @@ def rotation_matrices(quats: Tensor) -> Tensor:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def sparse_upper(covars: Tensor) -> Tensor:
+    """The upper triangles (N, 6) of matrices (N, 3, 3), by which a gradient may be a COO tensor of rows: that by the
+    matrices is one too then."""
+    upper: Tensor = _SparseUpper.apply(covars)
+    return upper
+
+
+class _SparseUpper(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
+    @staticmethod
+    def forward(_: Any, covars: Tensor) -> Tensor:
+        return covars[..., UPPER[0], UPPER[1]]
+
+    @staticmethod
+    @differentiable_once
+    def backward(_: Any, gradient: Tensor) -> Tensor:
+        rows = gradient.coalesce().values() if gradient.is_sparse else gradient
+        matrices = rows.new_zeros(len(rows), 3, 3)
+        matrices[:, UPPER[0], UPPER[1]] = rows
+        if not gradient.is_sparse:
+            return matrices
+        return torch.sparse_coo_tensor(
+            gradient.coalesce().indices(),
+            matrices,
+            (len(gradient), 3, 3),
+            is_coalesced=True,
+            check_invariants=False,
+        )
 
 
 def _leading(value: object) -> tuple[int | str, ...]:

@@ -39,7 +39,7 @@ def rasterize_to_pixels(
     """Images (..., H, W, D) and alphas (..., H, W, 1) of splats, as gsplat 1.5.3's function of this name.
 
     means2d: (..., N, 2), pixels, the first pixel's centre at 0.5. conics: (..., N, 3), the inverse covariance's xx, xy,
-    yy. colors: (..., N, D), D from 1 to 512. opacities: (..., N), in [0, 1]. Or all of them `packed`, (nnz, ...).
+    yy. colors: (..., N, D), D of at least 1. opacities: (..., N), in [0, 1]. Or all of them `packed`, (nnz, ...).
     image_width, image_height: pixels. tile_size: 16, the one that clsplat has. isect_offsets: (..., tile_height,
     tile_width) and flatten_ids: (n_isects,), of `isect_offset_encode` and `isect_tiles`: each tile's splats, front to
     back. backgrounds: (..., D), black if None. masks: (..., tile_height, tile_width) of bool; a tile where it is false

@@ -9,13 +9,15 @@ from torch import Tensor
 from clsplat.torch.arguments import check, refuse
 
 
-def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
+def compute_relocation(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *, min_opacity: float = 0.0
+) -> tuple[Tensor, Tensor]:
     """Opacities and scales of n Gaussians in the place of one that look like that one, as gsplat 1.5.3's function.
 
     opacities: (N,), in [0, 1]. scales: (N, 3). ratios: (N,), how many share each one's place, any kind of number; taken
-    as at least 1 and at most n_max. binoms: (n_max, n_max), binoms[n, k] = n over k. Returns the new opacities (N,) and
-    scales (N, 3). Eq. (9) of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo", whose sum of
-    alternating terms is made in float64.
+    as at least 1 and at most n_max. binoms: (n_max, n_max), binoms[n, k] = n over k. min_opacity: the least new
+    opacity, gsplat 1.6's. Returns the new opacities (N,) and scales (N, 3). Eq. (9) of Kheradmand et al. 2024,
+    "3D Gaussian Splatting as Markov Chain Monte Carlo", whose sum of alternating terms is made in float64.
 
     Raises InputError, which names the argument, for other shapes and for NaN.
     """
@@ -32,7 +34,7 @@ def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms
         most = len(table)
         shares = ratios.clamp(1, most).long()
         old = opacities.double()
-        new = 1 - (1 - old) ** (1 / shares)
+        new = (1 - (1 - old) ** (1 / shares)).clamp(min=min_opacity)
         powers = torch.arange(1, most + 1, device=old.device)
         signs = 1 - 2 * ((powers - 1) % 2)
         # binoms[i - 1, k] summed over i = 1 .. n

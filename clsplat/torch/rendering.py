@@ -13,20 +13,22 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from clsplat.device.context import Device
-from clsplat.library.checks import degree
+from clsplat.library.checks import degree, whole
 from clsplat.library.rasterize import rasterize
 from clsplat.stages.harmonics import HIGHEST
 from clsplat.torch.arguments import check, check_choice, check_number, check_shape, check_size, refuse, renamed
 from clsplat.torch.autograd import SPLATS, Batches, Call, Pixels, Projection
-from clsplat.torch.covariances import UPPER
+from clsplat.torch.covariances import UPPER, sparse_upper
 from clsplat.torch.graphs import outside_graphs
 from clsplat.torch.meta import Meta
 from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+HIT_DISTANCES = ("d", "Ed", "RGB-d", "RGB-Ed")
+"""Modes of gsplat 1.6, which has them with `with_eval3d` alone."""
 RASTERIZE_MODES = ("classic", "antialiased")
 CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
-MOST_CHANNELS = 512
+TILE_SIZE = 16
 IDS = ("batch_ids", "camera_ids", "gaussian_ids")
 """Names of a splat's own in `meta`."""
 
@@ -47,7 +49,7 @@ def rasterization(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,  # noqa: N803  # gsplat's name
     width: int,
@@ -58,7 +60,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int | None = TILE_SIZE,
     backgrounds: Tensor | None = None,
     render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
     sparse_grad: bool = False,
@@ -78,30 +80,42 @@ def rasterization(
     rolling_shutter: Any = RollingShutterType.GLOBAL,
     viewmats_rs: Tensor | None = None,
     *,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
+    ut_params: Any = None,  # noqa: ARG001  # of with_ut
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
     alpha_max: float = 0.999,
     device: Device | str | None = None,
 ) -> tuple[Tensor, Tensor, Meta]:
-    """Images, alphas and `meta` of N Gaussians in C cameras: gsplat 1.5.3's function, argument by argument.
+    """Images, alphas and `meta` of N Gaussians in C cameras: gsplat 1.5.3's function, argument by argument, and those
+    of gsplat 1.6 by name.
 
     Leading sizes `...` are those of batches, and may be none. Tensors of float32 on the CPU share their memory with a
     CPU's OpenCL device; others are copied there and back, which a warning says once. Everything has a gradient, `Ks`
     too.
 
     means: (..., N, 3), in units of the scene. quats: (..., N, 4), w x y z, of any length. scales: (..., N, 3), standard
-    deviations, over 0. opacities: (..., N), in [0, 1]. colors: (..., N, D) or (..., C, N, D) with D from 1 to 512; with
+    deviations, over 0. opacities: (..., N), in [0, 1]. colors: (..., N, D) or (..., C, N, D) with any D; with
     `sh_degree` coefficients (..., N, K, 3) or (..., C, N, K, 3), K >= (sh_degree + 1)^2, in the order and with the
-    signs of 3DGS files. viewmats: (..., C, 4, 4), camera from world, x right, y down, z forward. Ks: (..., C, 3, 3), in
-    pixels, the centre of the first pixel at 0.5; skew is ignored. width, height: pixels. near_plane, far_plane: depths
-    between which a Gaussian is drawn. radius_clip: pixels; a splat of no larger radius is not drawn. eps2d: pixels^2,
-    added to the variance of each splat. sh_degree: the degree to use, 0 to 4; None for colours. packed: `meta` has the
-    splats in view alone. tile_size: pixels, of the tile lists in `meta` alone. backgrounds: (..., C, D). render_mode:
-    colour, depth along z (D), expected depth (ED), or colour and depth, in the last channel. sparse_grad: with
-    `packed`, without batches: the gradients of means, quats and scales (or covars) are COO tensors of the rows in view.
-    absgrad: after the backward pass `meta["means2d"].absgrad` has sums over pixels of absolute gradients.
-    rasterize_mode: "antialiased" scales opacities by what eps2d added (Mip-Splatting). camera_model: pinhole, ortho or
-    fisheye (equidistant). covars: (..., N, 3, 3) in the place of quats and scales, which may be None. alpha_max: the
-    largest alpha, under 1; gsplat's 0.999, where `clsplat train` and `render` have 0.99. device: an OpenCL device, open
-    or as `clsplat devices` lists it; None for the first. channel_chunk and segmented change no result, and are ignored.
+    signs of 3DGS files; None where depth alone is drawn. viewmats: (..., C, 4, 4), camera from world, x right, y down,
+    z forward. Ks: (..., C, 3, 3), in pixels, the centre of the first pixel at 0.5; skew is ignored. width, height:
+    pixels. near_plane, far_plane: depths between which a Gaussian is drawn. radius_clip: pixels; a splat of no larger
+    radius is not drawn. eps2d: pixels^2, added to the variance of each splat. sh_degree: the degree to use, 0 to 4;
+    None for colours. packed: `meta` has the splats in view alone. tile_size: pixels, of the tile lists in `meta` alone;
+    None for 16. backgrounds: (..., C, D). render_mode: colour, depth along z (D), expected depth (ED), or colour and
+    depth, in the last channel. sparse_grad: with `packed`, without batches: the gradients of means, quats and scales
+    (or covars) are COO tensors of the rows in view. absgrad: after the backward pass `meta["means2d"].absgrad` has sums
+    over pixels of absolute gradients. rasterize_mode: "antialiased" scales opacities by what eps2d added
+    (Mip-Splatting). camera_model: pinhole, ortho or fisheye (equidistant). covars: (..., N, 3, 3) in the place of quats
+    and scales, which may be None. alpha_max: the largest alpha, under 1; gsplat's 0.999, where `clsplat train` and
+    `render` have 0.99. device: an OpenCL device, open or as `clsplat devices` lists it; None for the first.
+    channel_chunk, segmented and ut_params change no result, and are ignored. Sizes and numbers may be tensors of one
+    number; sizes may be 40.0.
 
     Returns images (..., C, height, width, X), X = D, 1 or D + 1 by the mode, alphas (..., C, height, width, 1), and
     meta, a dictionary with gsplat's names: batch_ids, camera_ids, gaussian_ids (nnz,) int64, None unless packed; radii
@@ -111,8 +125,9 @@ def rasterization(
     n_batches, n_cameras.
 
     Raises InputError, which names the argument: other shapes, NaN, settings out of range; and `distributed`, `with_ut`,
-    `with_eval3d`, the model ftheta, coefficients of lenses, and shutters other than GLOBAL, which clsplat does not
-    have.
+    `with_eval3d`, what gsplat 1.6 has with these two alone (modes of hit distances, return_normals, another
+    global_z_order), the model ftheta, coefficients of lenses, shutters other than GLOBAL, rays, extra_signals, and
+    tensors of torch.func, which clsplat does not have.
 
     Source: gsplat 1.5.3, https://docs.gsplat.studio; Kerbl et al. 2023.
     """
@@ -125,15 +140,38 @@ def rasterization(
         thin_prism_coeffs=thin_prism_coeffs,
         ftheta_coeffs=ftheta_coeffs,
         viewmats_rs=viewmats_rs,
+        return_normals=return_normals,
+        rays=rays,
+        lidar_coeffs=lidar_coeffs,
+        external_distortion_coeffs=external_distortion_coeffs,
+        extra_signals=extra_signals,
+        extra_signals_sh_degree=extra_signals_sh_degree,
     )
+    if global_z_order is not True:
+        raise refuse(
+            "global_z_order", global_z_order, "True: clsplat.torch has no with_ut, which gsplat has False with"
+        )
+    if type(renderer_config).__name__ not in {"NoneType", "RendererConfig_MixedBatch"}:
+        raise refuse("renderer_config", f"a {type(renderer_config).__name__}", "None: clsplat.torch has no with_eval3d")
+    if render_mode in HIT_DISTANCES:
+        raise refuse(
+            "render_mode",
+            repr(render_mode),
+            f"one of {', '.join(RENDER_MODES)}: clsplat.torch has no with_eval3d, which gsplat has hit distances with",
+        )
     if getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL":
         raise refuse("rolling_shutter", rolling_shutter, "GLOBAL, the one that clsplat.torch has")
     check_choice("camera_model", camera_model, CAMERA_MODELS)
     check_choice("render_mode", render_mode, RENDER_MODES)
     check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
     width, height = check_size("width", width), check_size("height", height)
-    tile_size = check_size("tile_size", tile_size)
+    tile_size = TILE_SIZE if tile_size is None else check_size("tile_size", tile_size)
+    depth_alone = render_mode in {"D", "ED"}
+    if colors is None and depth_alone:
+        sh_degree, backgrounds = None, None
+        colors = torch.zeros(*opacities.shape, 1) if isinstance(opacities, Tensor) else colors
     batch = _check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
+    sh_degree = None if sh_degree is None else whole(sh_degree)
     if sparse_grad and (batch or not packed):
         raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
     settings: dict[str, Any] = {
@@ -152,7 +190,6 @@ def rasterization(
         "differentiable": torch.is_grad_enabled(),
         "device": device,
     }
-    depth_alone = render_mode in {"D", "ED"}
     backgrounds = None if depth_alone else backgrounds
     if covars is not None:
         quats = scales = None
@@ -179,7 +216,8 @@ def rasterization(
     call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
     if not settings["differentiable"] and not dual:  # of a dual tensor PyTorch says that there is no derivative
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
-    covars = None if covars is None else covars[..., UPPER[0], UPPER[1]]
+    if covars is not None:
+        covars = sparse_upper(covars) if sparse_grad else covars[..., UPPER[0], UPPER[1]]
     coefficients = None if sh_degree is None or depth_alone else colors
     *splats, colors2d = Projection.apply(call, means, quats, scales, covars, opacities, coefficients, viewmats, Ks)
     values = None if depth_alone else colors if sh_degree is None else colors2d
@@ -200,7 +238,7 @@ def _check_tensors(
     quats: Tensor | None,
     scales: Tensor | None,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Any,
     viewmats: Tensor,
     Ks: Tensor,  # noqa: N803
     backgrounds: Tensor | None,
@@ -224,8 +262,8 @@ def _check_tensors(
     check_shape("Ks", Ks, (*batch, cameras, 3, 3))
     if sh_degree is None:
         check_shape("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
-        if not 1 <= colors.shape[-1] <= MOST_CHANNELS:
-            raise refuse("colors", f"of {colors.shape[-1]} channels", f"1 to {MOST_CHANNELS}")
+        if colors.shape[-1] == 0:
+            raise refuse("colors", "of 0 channels", "1 or more")
     else:
         sh_degree = degree("sh_degree", sh_degree, HIGHEST, ", or None for colours")
         check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
@@ -236,7 +274,9 @@ def _check_tensors(
                 f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}",
             )
     if backgrounds is not None:  # depths have none behind them, so that nothing else looks at its numbers then
-        check("backgrounds", backgrounds, (*batch, cameras, colors.shape[-1]))
+        shape = (*batch, cameras, colors.shape[-1])
+        check_shape("backgrounds", backgrounds, shape)
+        check("backgrounds", backgrounds, shape)
     return batch
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from torch import Tensor
 
 from clsplat.errors import ClsplatError
+from clsplat.torch import absent
 from clsplat.torch.covariances import quat_scale_to_covar_preci
 from clsplat.torch.harmonics import spherical_harmonics
 from clsplat.torch.pixels import rasterize_to_pixels
@@ -52,9 +53,10 @@ def install_as_gsplat() -> list[str]:
     """Let a program that imports gsplat run on clsplat; returns the names that are clsplat's from now on.
 
     Where gsplat is installed, its functions are replaced in every module that has been imported, its own and the
-    program's; what clsplat does not have stays gsplat's. In versions before 1.5 `meta["radii"]` of `rasterization` has
+    program's. What gsplat has in CUDA alone, and clsplat does not have, is an InputError that names it from now on when
+    it is called; its own code in Python stays. In versions before 1.5 `meta["radii"]` of `rasterization` has
     one radius a splat, as their strategies expect. Where gsplat is not installed, a module `gsplat` with the names that
-    clsplat has takes its place; it has no strategies. A second call does nothing.
+    clsplat has takes its place, and refuses the others by name; it has no strategies. A second call does nothing.
 
     Source: gsplat 1.5.3 (Apache-2.0), https://github.com/nerfstudio-project/gsplat.
     """
@@ -69,13 +71,18 @@ def install_as_gsplat() -> list[str]:
             theirs = getattr(module, ours.__name__, None)
             if theirs is not None and not _is_ours(theirs):
                 replaced[id(theirs)] = (theirs, _with_one_radius(ours) if old and ours is rasterization else ours)
+    for home in filter(_has, absent.HOMES):
+        for name in absent.NEED_CUDA:
+            theirs = getattr(import_module(home), name, None)
+            if theirs is not None and not absent.is_refused(theirs):
+                replaced[id(theirs)] = (theirs, absent.refuses(name, theirs))
     names = []
     for module_name, module in list(sys.modules.items()):
         for name, value in list(getattr(module, "__dict__", {}).items()):
             theirs, ours = replaced.get(id(value), (None, None))
             if theirs is not None and theirs is value:
                 setattr(module, name, ours)
-                names.append(f"{module_name}.{name}")
+                names += [] if absent.is_refused(ours) else [f"{module_name}.{name}"]
     return sorted(names)
 
 
@@ -85,9 +92,7 @@ def strategy(name: str) -> Any:
     Raises ImportError where gsplat is not installed, ClsplatError where it is older than 1.5.
     """
     if not _has("gsplat") or not _has("gsplat.strategy"):
-        raise ImportError(
-            f"{name} is gsplat's own class: pip install --no-deps gsplat=={VERSION}; it needs no CUDA here"
-        )
+        raise ImportError(_own(name))
     if (found := _version(import_module("gsplat"))) < ONE_RADIUS:
         raise ClsplatError(
             f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()"
@@ -96,6 +101,21 @@ def strategy(name: str) -> Any:
     for ours in (quat_scale_to_covar_preci, compute_relocation):
         setattr(operations, ours.__name__, ours)
     return getattr(import_module("gsplat.strategy"), name)
+
+
+def _of_gsplat(place: str, name: str) -> Any:
+    """An attribute that clsplat does not have, of a module in the place of gsplat's."""
+    if name in absent.NEED_CUDA:
+        return absent.refuses(name)
+    if place == "gsplat" and name in {"DefaultStrategy", "MCMCStrategy"}:
+        return strategy(name)
+    if place == "gsplat" and name in absent.OWN:
+        raise ImportError(_own(name))
+    raise AttributeError(f"module {place!r} has no attribute {name!r}; clsplat.torch is in the place of gsplat")
+
+
+def _own(name: str) -> str:
+    return f"{name} is gsplat's own: pip install --no-deps gsplat=={VERSION}; it needs no CUDA here"
 
 
 def _has(module: str) -> bool:
@@ -148,5 +168,7 @@ def _make_package() -> list[str]:
                 names.append(f"{place}.{ours.__name__}")
     for place in ("gsplat", "gsplat.cuda._wrapper"):
         sys.modules[place].RollingShutterType = RollingShutterType  # type: ignore[attr-defined]
+    for place in ("gsplat", "gsplat.rendering", "gsplat.cuda._wrapper"):
+        sys.modules[place].__getattr__ = functools.partial(_of_gsplat, place)  # type: ignore[method-assign]
     sys.modules["gsplat"].__version__ = VERSION  # type: ignore[attr-defined]
     return sorted(names)

@@ -25,6 +25,9 @@ def isect_tiles(
     n_images: int | None = None,
     image_ids: Tensor | None = None,
     gaussian_ids: Tensor | None = None,
+    *,
+    conics: Tensor | None = None,
+    opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Pairs of a tile and a splat whose box, its mean plus and minus the radii, overlaps it, as gsplat 1.5.3's
     function.
@@ -32,12 +35,15 @@ def isect_tiles(
     means2d: (..., N, 2), pixels. radii: (..., N, 2), pixels; where one is 0 there is no pair. depths: (..., N). With
     `packed` (nnz, 2), (nnz, 2), (nnz,), image_ids (nnz,) of integers below n_images, and gaussian_ids (nnz,), which
     change nothing. tile_size: pixels. tile_width, tile_height: tiles across and down. sort: by id. segmented changes
-    nothing.
+    nothing. conics, opacities: None; gsplat 1.6 leaves tiles out by them.
 
     Returns tiles_per_gauss (..., N) or (nnz,) int32; isect_ids (n_isects,) int64, the image's number, the tile's, row
     by row, and the depth's 32 bits, from the high bits down; flatten_ids (n_isects,) int32, the splat's number among
     those of all images. None has a gradient. Raises InputError, which names the argument.
     """
+    for name, value in (("conics", conics), ("opacities", opacities)):
+        if value is not None:
+            raise refuse(name, "given", "None: clsplat.torch has the tiles of a box alone")
     leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
     check_shape("means2d", means2d, (*leading, 2))
     if not isinstance(radii, Tensor) or radii.shape != means2d.shape:

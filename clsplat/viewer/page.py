@@ -21,7 +21,7 @@ from clsplat.scenes.marked import masked
 from clsplat.shots.around import parse_up
 from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
 from clsplat.viewer.path_recorder import FPS, add_key, path_document, save_path
-from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start, leaning
+from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start, leaning, wide_enough
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
@@ -55,6 +55,10 @@ class World:
     views: Sequence[View] = ()
 
 
+COARSE = "coarse"
+"""Remark on a picture that is not the exact one, in motion or on the way to rest."""
+
+
 class ViserPage:
     """One viewer's page, with its controls. The methods that render are called by the device's thread."""
 
@@ -72,9 +76,8 @@ class ViserPage:
         self._shown += 1
         if self._shown == 2:  # controls keep a browser busy: they may not come before the first picture
             self._build()
-        if level.exact and self._status is not None:
-            height, width = image.shape[:2]
-            self._say(", ".join(filter(None, (f"{width} x {height}, exact", text))))
+        height, width = image.shape[:2]
+        self._say(", ".join(filter(None, (f"{width} x {height}, exact" if level.exact else COARSE, text))))
 
     def tell(self, message: str) -> None:
         """Show the reason that there is no picture."""
@@ -177,7 +180,10 @@ class ViserPage:
         camera = view.camera
         if camera.projection != "perspective":
             return
-        fov = 2 * math.atan2(0.5 * camera.height, camera.fy)
+        fov, aspect = (
+            2 * math.atan2(0.5 * camera.height, camera.fy),
+            camera.width / camera.fx * camera.fy / camera.height,
+        )
         pose = Pose(camera.rotation.T, camera.position, fov, camera.width, camera.height)
         image = thumbnail(view) if photo else None
         shadows = {"cast_shadow": False, "receive_shadow": False}
@@ -189,7 +195,7 @@ class ViserPage:
             with self.client.atomic():
                 viewpoint.position = camera.position - self.world.origin
                 viewpoint.look_at = camera.position - self.world.origin + ahead * camera.rotation[2]
-                viewpoint.fov = fov
+                viewpoint.fov = wide_enough(fov, aspect, viewpoint.image_width, viewpoint.image_height)
 
         handle.on_click(clicked)
 

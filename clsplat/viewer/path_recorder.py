@@ -47,7 +47,7 @@ def path_document(
             "frame": 1 + step * index,
             "position": [float(value) for value in pose.position],
             "world_from_cam": [float(value) for value in quaternion_of(pose.rotation)],
-            "fov_y": math.degrees(pose.fov),
+            "fov_y": math.degrees(pose.angle(width, height)),
         }
         for index, pose in enumerate(keys)
     ]

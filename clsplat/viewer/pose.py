@@ -21,6 +21,8 @@ MOST_PIXELS = 4096 * 2304
 LARGEST_SIDE = 16384
 FIELD = math.radians(60)
 """Vertical angle of view where no camera of a scene says another."""
+WIDEST = math.radians(120)
+"""Largest vertical angle that a narrow page begins with: beyond it little but what is above and below is added."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +37,19 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """The camera, of the page's size or another; where that has another shape, the vertical angle is kept. It is to
-        the last bit the one that a file of cameras holds (`path_document`), as a quaternion and degrees."""
+        """The camera, of the page's size or another, with the `angle` of that. It is to the last bit the one that a
+        file of cameras holds (`path_document`), as a quaternion and degrees."""
         across, down = width or self.width, height or self.height
-        focal = focal_length(math.radians(math.degrees(self.fov)), down)
+        focal = focal_length(math.radians(math.degrees(self.angle(across, down))), down)
         quaternion = quaternion_of(self.rotation)
         turn = rotation_from_quaternion(quaternion / float(np.linalg.norm(quaternion))).T
         return Camera(across, down, focal, focal, across / 2, down / 2, turn, -turn @ self.position)
+
+    def angle(self, width: int, height: int) -> float:
+        """The vertical angle of a picture of this size: the page's. Of an upright page, which is higher than anything
+        that it shows, a wider picture keeps the angle across, and one wider than high has that angle down."""
+        page, picture = self.width / self.height, min(width / height, 1.0)
+        return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)
 
     def same(self, other: Pose | None) -> bool:
         """True if the other shows the same."""
@@ -76,12 +84,26 @@ def read_pose(
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Start of a page: a camera in the world, the point that it turns about, and the direction that is up there."""
+    """Start of a page: a camera in the world, the point that it turns about, and the direction that is up there.
+    aspect: width by height of what is to be seen at the vertical angle `fov`."""
 
     position: Float64
     target: Float64
     up: Float64
     fov: float
+    aspect: float = 1.0
+
+    def fov_on(self, width: int, height: int) -> float:
+        """The vertical angle on a page of this size: the start's, or as much more as a narrow page, such as a phone's
+        that is held upright, takes to show it from side to side."""
+        return wide_enough(self.fov, self.aspect, width, height)
+
+
+def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
+    """The vertical angle, radians, on a page of this size at which all of a picture is seen whose vertical angle is
+    `fov` and whose width by height is `aspect`; `WIDEST` at most, and not less than `fov`."""
+    more = aspect * height / max(width, 1)
+    return max(fov, min(2 * math.atan(math.tan(0.5 * fov) * more), WIDEST)) if more > 1 else fov
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
@@ -95,8 +117,10 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
         away = float(np.linalg.norm(focus - first.position))
         if not distance > 1e-6 * away:
             distance = away or 1.0
-        fov = 2 * math.atan2(0.5 * first.height, first.fy) if first.projection == "perspective" else FIELD
-        return Start(first.position, first.position + distance * ahead, up, fov)
+        if first.projection != "perspective":
+            return Start(first.position, first.position + distance * ahead, up, FIELD)
+        fov, aspect = 2 * math.atan2(0.5 * first.height, first.fy), (first.width / first.fx) / (first.height / first.fy)
+        return Start(first.position, first.position + distance * ahead, up, fov, aspect)
     low, high = extent_of(points)
     middle = 0.5 * (low + high)
     distance = 0.6 * float(np.linalg.norm(high - low)) / math.tan(FIELD / 2) or 1.0
@@ -116,7 +140,7 @@ def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
 def looking(start: Start, size: tuple[int, int]) -> Pose:
     """The pose of the start on a page of this size."""
     rotation, _ = look_at(start.position, start.target, start.up)
-    return Pose(rotation.T, start.position, start.fov, *size)
+    return Pose(rotation.T, start.position, start.fov_on(*size), *size)
 
 
 def fitted(width: int, height: int, scale: float, most: float = MOST_PIXELS) -> tuple[int, int]:

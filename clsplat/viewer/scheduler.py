@@ -140,7 +140,10 @@ class Viewing:
         try:
             image, text = model.picture(camera, look, exact=level.exact)
             if viewer in self._viewers:
-                viewer.page.show(image, level, text)
+                moved_on = (
+                    level.exact and viewer.refinement.changes != begun
+                )  # since then: it is no longer what is seen
+                viewer.page.show(image, Level(level.scale, exact=False) if moved_on else level, text)
             viewer.trouble = ""
         except ClsplatError as error:
             if viewer.trouble != str(error):  # once is enough

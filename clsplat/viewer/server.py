@@ -12,6 +12,7 @@ import http
 import io
 import ipaddress
 import logging
+import math
 import os
 import re
 import socket
@@ -115,9 +116,15 @@ class Server:
 
         async def came(client: Any) -> None:
             viewer = viewers[client.client_id] = ViserPage(client, viewing, world, address.paths).viewer
+            fov, before = start.fov, (0, 0)
 
             async def moved(camera: Any) -> None:
+                nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
+                # the start's angle, on a page of another shape now, and not that of a camera which was gone to
+                if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
+                    fov = camera.fov = start.fov_on(*size)
+                before = size
                 pose = read_pose(camera.wxyz, camera.position, camera.fov, size, world.origin)
                 if pose is not None:
                     viewing.moved(viewer, pose)

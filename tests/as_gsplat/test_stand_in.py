@@ -60,8 +60,20 @@ assert compute_relocation is clsplat.torch.compute_relocation is ops.compute_rel
 assert ops.quat_scale_to_covar_preci is clsplat.torch.quat_scale_to_covar_preci
 assert gsplat.rendering.isect_tiles is gsplat.cuda._wrapper.isect_tiles is clsplat.torch.isect_tiles
 assert gsplat.rasterization_2dgs.__module__ == "gsplat.rendering"
+assert gsplat.PngCompression.__module__ == gsplat.compression.__name__ + ".png_compression"
 assert "__main__.rasterization" in names and "gsplat.strategy.ops.compute_relocation" in names
+assert "gsplat.rasterization_2dgs" not in names
 assert clsplat.torch.install_as_gsplat() == []
+from clsplat.errors import InputError
+from gsplat.cuda._wrapper import fully_fused_projection_with_ut, world_to_cam
+for absent in (gsplat.rasterization_2dgs, gsplat.rendering.rasterization_2dgs, gsplat.proj, world_to_cam,
+               fully_fused_projection_with_ut):
+    try:
+        absent(torch.zeros(1, 3), quats=None)
+    except InputError as error:
+        assert str(error).startswith(absent.__name__ + " is gsplat's, in CUDA alone, and clsplat does not"), error
+    else:
+        raise AssertionError(absent)
 images, alphas, meta = render(rasterization)
 print(tuple(images.shape), tuple(meta["radii"].shape))
 """
@@ -82,6 +94,22 @@ from gsplat.cuda._wrapper import spherical_harmonics
 from gsplat.relocation import compute_relocation
 from gsplat.optimizers import SelectiveAdam
 assert rasterization is same is clsplat.torch.rasterization
+from gsplat import rasterization_2dgs, world_to_cam
+from gsplat.rendering import rasterization_2dgs as same_2dgs
+for absent in (rasterization_2dgs, same_2dgs, world_to_cam):
+    try:
+        absent(1, 2, 3)
+    except clsplat.errors.InputError as error:
+        assert str(error).startswith(absent.__name__ + " is gsplat's, in CUDA alone"), error
+for name in ("DefaultStrategy", "PngCompression", "export_splats"):
+    try:
+        getattr(gsplat, name)
+    except ImportError as error:
+        assert str(error).startswith(name + " is gsplat's own: pip install --no-deps gsplat==1.5.3"), error
+try:
+    from gsplat import nothing_of_this_name
+except ImportError as error:
+    assert "nothing_of_this_name" in str(error)
 try:
     import gsplat.strategy
 except ModuleNotFoundError as error:

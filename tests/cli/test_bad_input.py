@@ -246,7 +246,7 @@ def test_an_unknown_device(verb: str, scene: Path, trained: Path, tmp_path: Path
         (["--device", "0/0,0"], "--device 0/0,0: has 0 twice"),
         (["--device", "0,abacus"], "--device abacus: no such device"),
         (["--device", "0/70000"], "cannot be divided into 70001 equal parts"),
-        (["--device", "0/0,0/1", "--batch", "3"], "--batch 3: expected a multiple of 2, as --device names 2 devices"),
+        (["--device", "0/0,0/1", "--batch", "3"], "--batch 3: expected a multiple of 2, the number of devices"),
         (["--device", "0/0,0/1", "--batch", "1"], "--batch 1: expected a multiple of 2"),
         (["--batch", "0"], "--batch 0: expected at least 1"),
     ],

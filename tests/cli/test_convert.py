@@ -13,6 +13,7 @@ import pytest
 from calls import Capture, error_line
 from models import assert_equal, random_gaussians
 from scipy.spatial.transform import Rotation
+from splats import lopsided
 from systems import can_link
 from tiny import cameras, hidden_model
 
@@ -125,12 +126,41 @@ def test_bands_that_are_zero_are_not_rounded(tmp_path: Path, capsys: Capture) ->
     assert edit.without_empty_bands(model).sh_degree == 0
 
 
+def test_bits_of_spz_are_chosen(tmp_path: Path, capsys: Capture) -> None:
+    """Fewer are a smaller file that is farther off: each lost bit is a step twice as wide."""
+    model, found = tmp_path / "lopsided.ply", {}
+    lopsided().save(model)
+    for bits in ("8", "6", "6,6", "5,4", "2", "1,8"):
+        target = model.with_name(f"{bits}.spz")
+        assert convert(model, target, "--sh-bits", bits, "--json") == 0
+        result = json.loads(capsys.readouterr().out)
+        found[bits] = result["target"]["bytes"], result["errors"]["sh"]["largest"]
+    assert found["6"] == found["6,6"]
+    for more, fewer in (("8", "6"), ("6", "5,4"), ("5,4", "2")):
+        assert found[more][0] > found[fewer][0]
+        assert found[more][1] < found[fewer][1]
+    step = 1 / 128
+    assert found["8"][1] <= 0.5 * step * 1.001
+    assert 6 * step < found["5,4"][1] <= 8.5 * step * 1.001  # half of 16 steps, after rounding to one
+    read = Gaussians.load(model.with_name("1,8.spz"))
+    exact, source = Gaussians.load(model.with_name("8.spz")), Gaussians.load(model)
+    assert np.array_equal(read.sh[:, 4:], exact.sh[:, 4:])
+    assert np.abs(read.sh[:, 1:4] - source.sh[:, 1:4]).max() > 0.3  # of a bit for +-1, half is 0.5
+    default = model.with_name("plain.spz")
+    assert convert(model, default) == 0
+    assert default.read_bytes() == model.with_name("6.spz").read_bytes()
+    capsys.readouterr()
+
+
 def test_what_formats_have_beside_the_model(model: Path, capsys: Capture) -> None:
     """--spz-version and --up, which changes no Gaussian."""
     for version in (2, 3, 4):
         target = model.with_name(f"{version}.spz")
         assert convert(model, target, "--spz-version", version) == 0
         assert formats.spz.describe(target)["version"] == version
+    plain = model.with_name("plain.spz")
+    assert convert(model, plain) == 0
+    assert plain.read_bytes() == model.with_name("3.spz").read_bytes()
     pytest.importorskip("pxr")
     for up in ("y", "z"):
         target = model.with_name(f"{up}.usda")
@@ -210,6 +240,8 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--translate", "1,2,inf"], "--translate 1,2,inf: expected 3 numbers"),
         (["--up", "z"], "out.ply is 3DGS PLY"),
         (["--spz-version", "3"], "--spz-version: is of SPZ files, "),
+        (["--sh-bits", "5"], "--sh-bits: is of SPZ files, "),
+        *((["--sh-bits", bits], f"--sh-bits {bits}: expected bits from 1 to 8") for bits in ("0", "9,4", "5,4,3", "x")),
     ],
 )
 def test_wrong_calls_are_one_line_and_write_nothing(

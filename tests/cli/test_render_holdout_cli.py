@@ -18,6 +18,7 @@ from tiny import HEIGHT, WIDTH, hidden_model
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.gaussians import Gaussians
+from clsplat.images.stmap import write_stmap
 from clsplat.reference import holdout as twin
 from clsplat.reference import render as reference
 from clsplat.shots import choose_shot
@@ -176,6 +177,62 @@ def test_cg_that_ends_with_the_frame_is_told_with_overscan(folder: Path, tmp_pat
     assert "overscan" not in capsys.readouterr().err
 
 
+def test_a_bent_picture_is_held_out_straight(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    """A map that shifts by whole pixels shows the pixels of the straight picture that is held out; the hold-out is of
+    the straight frame."""
+    places = np.stack(np.meshgrid(np.arange(WIDTH) + 5.5, np.arange(HEIGHT) - 2.5), axis=2)
+    write_stmap(tmp_path / "shift.exr", places, WIDTH, HEIGHT)
+    flags = f"--frames 2 --channels rgb,alpha,depth --holdout {folder}/z.####.exr"
+    assert render(folder, tmp_path / "straight", flags) == 0
+    assert render(folder, tmp_path / "bent", f"{flags} --stmap {tmp_path}/shift.exr") == 0
+    assert render(folder, tmp_path / "whole", f"--frames 2 --alpha --stmap {tmp_path}/shift.exr") == 0
+    straight, bent, whole = (pixels(tmp_path / name / "a.0002.exr") for name in ("straight", "bent", "whole"))
+    wanted, got = straight[:-3, 5:], bent[3:, :-5]
+    np.testing.assert_allclose(got[:, :, :4], wanted[:, :, :4], atol=1e-5)  # float32 places, through linear light
+    np.testing.assert_array_equal(got[:, :, 4], wanted[:, :, 4])
+    assert (whole[:, :, 3] - bent[:, :, 3]).max() > 0.1
+    capsys.readouterr()
+    write_flat(tmp_path / "all.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})
+    call = f"--frames 2 --holdout {tmp_path}/all.exr --stmap {tmp_path}/shift.exr"
+    assert render(folder, tmp_path / "told", call) == 0
+    assert (
+        "all.exr: ends with the frame, and nothing is held out where the bent picture looks" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize("how", ["inverse", "ray"])
+def test_depths_of_other_kinds(folder: Path, tmp_path: Path, how: str) -> None:
+    """1 / z, whose 0 is no surface, and distances along the rays, of a file smaller than the frame."""
+    camera = camera_of(folder, 2)
+    depth, cosines = sphere(camera, CENTRE, RADIUS), camera.cosines()
+    assert cosines is not None and cosines.min() < 0.9
+    given = 1 / depth if how == "inverse" else depth / cosines
+    window = (4, 3, WIDTH - 8, HEIGHT - 6)
+    write_flat(tmp_path / "z.exr", {"Z": depth[3:-3, 4:-4]}, size=(WIDTH, HEIGHT), window=window)
+    write_flat(tmp_path / "other.exr", {"Z": given[3:-3, 4:-4]}, size=(WIDTH, HEIGHT), window=window)
+    flags = "--frames 2 --alpha --holdout"
+    assert render(folder, tmp_path / "z", f"{flags} {tmp_path}/z.exr") == 0
+    assert render(folder, tmp_path / "other", f"{flags} {tmp_path}/other.exr --holdout.depths {how}") == 0
+    assert render(folder, tmp_path / "wrong", f"{flags} {tmp_path}/other.exr") == 0
+    wanted, got, wrong = (pixels(tmp_path / name / "a.0002.exr") for name in ("z", "other", "wrong"))
+    np.testing.assert_allclose(got, wanted, atol=1e-6)  # no Gaussian is within float32's rounding of the sphere
+    assert np.abs(wrong - wanted).max() > 0.01
+
+
+def test_depths_of_half_floats_are_told(folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    depth = np.nan_to_num(sphere(camera_of(folder, 2), CENTRE, RADIUS), posinf=0.0)
+    for name, kinds in (("whole", ("half", "float")), ("coarse", ("float", "half"))):
+        spec = oiio.ImageSpec(WIDTH, HEIGHT, 2, oiio.FLOAT)
+        spec.channelnames, spec.channelformats = ("A", "Z"), tuple(map(oiio.TypeDesc, kinds))
+        file = oiio.ImageOutput.create(str(tmp_path / f"{name}.exr"))
+        assert file.open(str(tmp_path / f"{name}.exr"), spec)
+        assert file.write_image(np.stack([np.ones_like(depth), depth], axis=2).astype(np.float32))
+        assert file.close()
+        assert render(folder, tmp_path / name, f"--holdout {tmp_path}/{name}.exr --dry-run") == 0
+        told = "coarse.exr: has depths of half floats" in capsys.readouterr().err
+        assert told == (name == "coarse")
+
+
 def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     write_flat(tmp_path / "nan.exr", {"Z": np.full((HEIGHT, WIDTH), np.nan)})
     held = f"--holdout {folder}/z.####.exr"
@@ -185,7 +242,7 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
         (f"{held} --holdout.channel depth.Z", "has no channel depth.Z, but Z; name its depths with --holdout.channel"),
         ("--holdout.channel Z", "--holdout.channel Z: is of hold-outs, expected --holdout with it"),
         (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
-        (f"{held} --distort", "--holdout: is of straight pictures, expected it without --stmap and --distort"),
+        ("--holdout.depths ray", "--holdout.depths ray: is of hold-outs, expected --holdout with it"),
         (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such hold-out"),
         (f"--holdout {folder}/z.{{shot}}.exr", "{shot} is not known, expected {name}"),
         (f"--holdout {tmp_path}/nan.exr", "values of Z are not a number, expected depths and alpha of surfaces"),

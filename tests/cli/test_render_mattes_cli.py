@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -196,6 +197,19 @@ def test_semantic_ids(folder: Path, tmp_path: Path) -> None:
     seen = wanted[:, :, 1] > largest[:, :, 0]
     assert np.abs(one - wanted[:, :, 1])[seen].max() < CLOSE and seen.sum() > 20
     assert list(json.loads(read(tmp_path / "1.exr", "cryptoobject")[1]["manifest"])) == ["ids"]
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_ids_of_a_zipped_ply(compression: int, folder: Path, tmp_path: Path) -> None:
+    labelled(folder / "zipped.ply", np.arange(15) % 3 + 5)
+    with zipfile.ZipFile(folder / "zipped.zip", "w", compression) as archive:
+        archive.write(folder / "zipped.ply", "scan/zipped.ply")
+    found = []
+    for name in ("zipped.ply", "zipped.zip"):
+        assert render(folder, tmp_path / name, "--channels semantic --ids-from label", name) == 0
+        found.append(read(tmp_path / name / "1.exr", "cryptosemantic"))
+    assert list(json.loads(found[1][1]["manifest"])) == ["5", "6", "7"]
+    np.testing.assert_array_equal(found[0][0], found[1][0])
 
 
 def test_skip_existing_sees_the_mattes(folder: Path, tmp_path: Path, capsys: Capture) -> None:

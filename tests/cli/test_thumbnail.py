@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -74,3 +75,50 @@ def test_wrong_calls_are_one_line(words: list[str], message: str, model: Path, c
     assert main(words) == 2
     assert message in error_line(capsys)
     assert [path.name for path in model.parent.iterdir()] == ["model.ply"]
+
+
+def test_a_run_is_seen_from_among_its_photographs(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its folder and the model file in it; a copy elsewhere, and a run that knows no photographs, from outside."""
+    monkeypatch.chdir(tmp_path)
+    run, bare = tmp_path / "run", tmp_path / "bare"
+    for folder in (run, bare):
+        shutil.copytree(trained, folder)
+    (bare / "scene.json").unlink()
+    shutil.copy(run / "model.ply", "alone.ply")
+    pictures = {}
+    for model in ("run", "run/model.ply", "bare", "alone.ply"):
+        assert main(["thumbnail", model, "-o", "a.png", "--size", "40", "--overwrite"]) == 0
+        pictures[model] = read_image(Path("a.png"))
+    assert np.array_equal(pictures["run"], pictures["run/model.ply"])
+    assert np.array_equal(pictures["bare"], pictures["alone.ply"])
+    assert not np.array_equal(pictures["run"], pictures["bare"])
+    assert main(["thumbnail", "run", "-o", "a.png", "--size", "40", "--up=-y", "--overwrite"]) == 0
+    assert np.array_equal(read_image(Path("a.png")), pictures["bare"]), "a direction that is given: from outside"
+
+
+@pytest.mark.parametrize("path", ["turntable", "spiral", "through"])
+def test_paths_of_a_run_are_those_of_its_cameras(
+    path: str, trained: Path, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bit for bit the frames that the scene's own cameras give; all of its photographs have one shape."""
+    monkeypatch.chdir(tmp_path)
+    words = ["--path", path, "--count", "3"]
+    assert main(["render", str(trained), *words, "-o", "own.#.png"]) == 0
+    assert main(["render", str(trained), "--cameras", str(scene), *words, "-o", "given.#.png"]) == 0
+    for number in (1, 2, 3):
+        own, given = (read_image(Path(f"{name}.{number}.png")) for name in ("own", "given"))
+        assert np.array_equal(own, given)
+
+
+def test_a_moved_run_is_seen_from_outside(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its photographs stand elsewhere then."""
+    monkeypatch.chdir(tmp_path)
+    words = ["--path", "turntable", "--count", "1", "--width", "40", "--height", "40", "--transform", "translate=0,0,0"]
+    assert main(["render", str(trained), *words, "-o", "moved.#.png"]) == 0
+    assert main(["render", str(trained / "model.ply"), *words, "-o", "file.#.png"]) == 0
+    assert np.array_equal(read_image(Path("moved.1.png")), read_image(Path("file.1.png")))
+    shutil.copy(trained / "model.ply", "alone.ply")
+    assert main(["render", "alone.ply", *words[:-2], "-o", "alone.#.png"]) == 0
+    assert np.abs(read_image(Path("moved.1.png")) - read_image(Path("alone.1.png"))).max() < 2 / 255  # rounding

@@ -96,6 +96,20 @@ def test_a_program_without_kernels_is_built_anew(
     assert len(numbers.read_text().splitlines()) > 5
 
 
+@pytest.mark.parametrize(
+    "number", [1, pytest.param(4, marks=pytest.mark.slow), pytest.param(9, marks=pytest.mark.slow)]
+)
+def test_a_process_that_ended_once_is_no_failure(
+    number: int, standing: Standing, standing_device: Device, scene: Path, trained: Path, tmp_path: Path,
+    capsys: Capture,
+) -> None:  # fmt: skip
+    """A driver aborts where its linker is killed, by a Ctrl-C or for want of memory."""
+    standing("once", number, number)
+    assert call("eval", scene, trained, tmp_path / "new") == 0
+    assert "warning" not in capsys.readouterr().err
+    assert not any(entry.failed for entry in known.entries(standing_device.cl_device).values())
+
+
 def test_what_failed_is_not_waited_for_twice(standing: Standing, monkeypatch: pytest.MonkeyPatch) -> None:
     standing("abort", 1)
     device = context.open_device()

@@ -289,6 +289,41 @@ def test_errors_are_one_line(shot: list[str], tmp_path: Path, capsys: Capture, f
     assert sorted(tmp_path.iterdir()) == before
 
 
+def swirl() -> np.ndarray:
+    """Places of a map that turns by up to two thirds of a turn, and is nowhere at its edges."""
+    middle = np.array([WIDTH / 2, HEIGHT / 2])
+    across, down = (grid(WIDTH, HEIGHT) - middle).transpose(2, 0, 1)
+    far = np.hypot(across, down)
+    angle = 4 * (1 - far / far.max())
+    turned = np.stack([across * np.cos(angle) - down * np.sin(angle), across * np.sin(angle) + down * np.cos(angle)], 2)
+    turned[far > 0.9 * far.max()] = np.nan
+    return np.asarray(turned + middle)
+
+
+@pytest.mark.parametrize("kind", ["noise", "grey", "one colour", "beauty"])
+def test_a_picture_is_no_map(shot: list[str], tmp_path: Path, capsys: Capture, kind: str) -> None:
+    values = {
+        "noise": np.random.default_rng(1).random((HEIGHT, WIDTH, 2)),
+        "grey": np.repeat(grid(WIDTH, HEIGHT)[:, :, :1] / WIDTH, 2, axis=2),
+        "one colour": np.full((HEIGHT, WIDTH, 2), (0.25, 0.5)),
+        "beauty": picture(shot, tmp_path / "beauty.exr")[:, :, :2],
+    }[kind]
+    write_stmap(tmp_path / "map.exr", values * (WIDTH, HEIGHT), WIDTH, HEIGHT)
+    capsys.readouterr()
+    assert render(shot, tmp_path / "a.exr", f"--stmap {tmp_path}/map.exr") == 2
+    assert "map.exr: looks like a picture, as its R and G lead to and fro" in error_line(capsys)
+
+
+def test_maps_of_any_way_around_are_maps(tmp_path: Path) -> None:
+    """Mirrored, on its side, of halves, drawn in by fifty, turned, and without numbers."""
+    same = grid(WIDTH, HEIGHT)
+    halves = (same / 4096).astype(np.float16).astype(np.float64) * 4096
+    turned, mirrored, nowhere = same[::-1, ::-1, ::-1], same[:, ::-1], np.full_like(same, np.nan)
+    for index, places in enumerate((same, mirrored, turned, halves, same / 50, swirl(), nowhere)):
+        write_stmap(tmp_path / f"{index}.exr", places, WIDTH, HEIGHT)
+        assert read_stmap(tmp_path / f"{index}.exr").values.shape == (HEIGHT, WIDTH, 2)
+
+
 def test_a_map_that_points_nowhere_is_told(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     places = grid(WIDTH, HEIGHT)
     places[:, : WIDTH // 2] = np.nan

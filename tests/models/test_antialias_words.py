@@ -21,14 +21,21 @@ YES = [
     *("SplatRenderMode: mip", "SplatRenderMode: mip-0.1", "splatrendermode=MIP", "SplatRenderMode: mip splatting"),
     *("rasterize_mode antialiased", "rasterize-mode: antialiased", "--pipeline.model.rasterize-mode antialiased"),
     *('"rasterize_mode": "antialiased",', "mip_splatting true", "use_mip: 1", "mip-filter: 1"),
+    *("antialiased 1.0", "antialias: enabled", "anti-aliased: y", "Mip Splatting = 1", "mip splatting: true", "aa 1"),
+    *("anti aliasing: on", "SplatRenderMode: Mip 0.1", "SplatRenderMode: mip_2", "train_flags antialiasing"),
+    *("antialiased", "--antialiasing", "Anti-Aliased", "python train.py -s garden --antialiasing --eval"),
+    *("model: mip", "model: antialiased", "render_mode: mip-splatting", "train_flags: --antialiasing"),
 ]
 NO = [
     *("antialiased 0", "AntiAliased: False", "anti-aliasing = off", "antialias no", "SplatRenderMode: default"),
     *("SplatRenderMode: 2dgs", "rasterize_mode classic", "rasterize_mode: Classic", "mip-splatting 0"),
+    *("antialiased: 0.0", "anti aliased: disabled", "aa: n"),
 ]
 NOTHING = [
-    *("not trained antialiased by X", "antialiased", "antialiased 2", "this model is antialiased", "antialiased maybe"),
+    *("not trained antialiased by X", "antialiased 2", "this model is antialiased", "antialiased maybe"),
     *("is it antialiased: no", "Exported by mip viewer 1", "rasterize_mode", "rasterize_mode fast", "", "mip"),
+    *("model: mipnerf360_garden", "model mip-nerf360", "render_mode: mipmapped", "SplatRenderMode: mipmapped"),
+    *("model: mip-0.1", "mip: 360", "scene: mip", "not with --antialiasing", "render with --antialiasing for less"),
     *("antialiased 1 of 3", "generator mip", "near 1", "SplatRenderMode: mip or default"),
 ]
 
@@ -52,6 +59,24 @@ def test_the_last_counts_and_a_contradiction_is_told() -> None:
     assert of_comments(["rasterize_mode classic", "antialiased 1"]).antialiased
     assert of_comments(["antialiased 1", "SplatRenderMode: mip"]).contradiction == ""
     assert not of_comments([]).antialiased
+
+
+@pytest.mark.parametrize(
+    ("lines", "named"),
+    [
+        (["this model is antialiased", "antialiased maybe"], "this model is antialiased"),
+        (["by hand", "Anti-Aliasing: fast"], "Anti-Aliasing: fast"),
+        (["antialiased?"], "antialiased?"),
+        (["this model is antialiased", "antialiased 0"], ""),
+        (["not trained antialiased by X", "without antialiasing", "model: mipnerf360"], ""),
+        (["made with mip-splatting's viewer", "xantialiasedx 1"], ""),
+    ],
+)
+def test_words_that_are_not_understood_are_told_once(lines: list[str], named: str) -> None:
+    said = of_comments(lines)
+    assert not said.antialiased
+    told = f"says {named!r}, which is not understood: the model counts as not antialiased, expected words such as "
+    assert said.warning == (f"{told}'antialiased 1'" if named else "")
 
 
 @pytest.mark.brings("gsplat, nerfstudio", "`rasterize_mode antialiased`", "the same")
@@ -86,6 +111,8 @@ def test_comments_of_plys(tmp_path: Path, name: str) -> None:
         ({"model": "2dgs", "antialias": False}, False, False),
         ({"antialias": 1, "model": "Antialiased"}, True, False),
         ({"antialias": "false"}, False, False),
+        ({"model": "mipnerf360"}, False, False),
+        ({"antialias": "maybe"}, False, True),
         ({"model": ["antialiased"], "antialias": None}, False, False),
         ({"antialias": True, "model": "default"}, False, True),
         ({"antialias": False, "model": "antialiased"}, True, True),

@@ -311,6 +311,25 @@ def test_lies(tmp_path: Path, lie: str) -> None:
     assert assert_refused_or_sound(gltf.read, path)
 
 
+@pytest.mark.parametrize(
+    ("accessor", "change", "message"),
+    [
+        (3, {"type": "VEC2"}, "KHR_gaussian_splatting:OPACITY is of the type VEC2, expected SCALAR"),
+        (0, {"type": "MAT4"}, "POSITION is of the type MAT4, expected VEC3"),
+        (1, {"type": "VEC3"}, "KHR_gaussian_splatting:ROTATION is of the type VEC3, expected VEC4"),
+        (2, {"componentType": 5124}, "KHR_gaussian_splatting:SCALE has the componentType 5124, expected 5120 to 5126"),
+    ],
+)
+def test_an_accessor_of_another_type_is_told_as_gltf_says_it(
+    accessor: int, change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "model.gltf"
+    gltf.write(path, lopsided(8, degree=1))
+    changed(path, lambda asset: asset["accessors"][accessor].update(change))
+    with pytest.raises(InputError, match=message):
+        gltf.read(path)
+
+
 def test_a_scale_below_zero_and_opacities_over_one_are_refused(tmp_path: Path) -> None:
     for accessor, message in ((2, "Gaussian 0 has the scales -0.5 .*1 of 101 "), (3, r"outside \[0, 1\], -0.5")):
         path = tmp_path / "model.gltf"

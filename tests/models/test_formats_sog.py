@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+import re
 import tracemalloc
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from models import real_file
+from models import assert_equal, real_file
 from node import splat_transform
 from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, opacity, read_plainly, with_origin
 from systems import links
@@ -241,6 +243,46 @@ def test_lies(tmp_path: Path, lie: str) -> None:
     assert assert_refused_or_sound(sog.read, folder / "meta.json")
 
 
+def test_a_count_that_is_too_large_is_named_with_what_fits(tmp_path: Path) -> None:
+    path = tmp_path / "meta.json"
+    sog.write(path, lopsided(20, degree=1))
+    for count, shown in ((10**12, "1000000000000"), (1 << 32, "4294967296"), (0, "0"), (-3, "-3")):
+        change(tmp_path, lambda meta, count=count: meta.update(count=count))
+        with pytest.raises(InputError, match=rf"meta\.json: has {shown} Gaussians, expected 1 to 4294967295$"):
+            sog.read(path)
+
+
+@pytest.mark.parametrize("kind", ["empty", "text", "cut", "head", "changed", "PNG"])
+def test_a_picture_that_does_not_decode_has_its_own_name(kind: str, tmp_path: Path) -> None:
+    """The decoder's words too name it as the archive does, not by the file that it was unpacked to."""
+    good, bad = tmp_path / "good.sog", tmp_path / "bad.sog"
+    sog.write(good, lopsided(50, degree=1))
+    with zipfile.ZipFile(good) as source, zipfile.ZipFile(bad, "w") as target:
+        for name in source.namelist():
+            data = source.read(name)
+            wrong = {
+                "empty": b"", "text": b"x" * 100, "cut": data[: len(data) // 2], "head": data[:20],
+                "changed": data[:30] + bytes([data[30] ^ 255]) + data[31:], "PNG": b"\x89PNG\r\n\x1a\n" + bytes(50),
+            }[kind]  # fmt: skip
+            target.writestr(name, wrong if name == "quats.webp" else data)
+    with pytest.raises(InputError, match=r"bad\.sog: quats\.webp: does not decode: ") as caught:
+        sog.read(bad)
+    said = str(caught.value).removeprefix(str(bad))
+    assert "/" not in said and "file.webp" not in said and "\n" not in said
+
+
+def test_one_number_is_called_so(tmp_path: Path) -> None:
+    sog.write(tmp_path / "meta.json", lopsided(100, degree=2))
+    as_version_1(tmp_path)
+    for given, said in (
+        (["x"], "mins of shN in meta.json has other values than numbers, expected a number"),
+        ([1, 2], "mins of shN in meta.json has 2 numbers, expected 1"),
+    ):
+        change(tmp_path, lambda meta, given=given: meta["shN"].update(mins=given))
+        with pytest.raises(InputError, match=rf": {re.escape(said)}$"):
+            sog.read(tmp_path / "meta.json")
+
+
 @pytest.mark.brings("splat-transform", "SOG with null in codebooks", "a scale of 0, or left out")
 def test_null_is_what_json_has_no_number_for(tmp_path: Path) -> None:
     """splat-transform writes it for -inf, the log of a scale of 0, and for NaN."""
@@ -250,9 +292,11 @@ def test_null_is_what_json_has_no_number_for(tmp_path: Path) -> None:
     meta = json.loads(path.read_text())
     code = int(np.abs(np.array(meta["scales"]["codebook"]) - plain.log_scales[5, 2]).argmin())
     change(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(code, None))
-    read = formats.load(path)
     flat = plain.log_scales == plain.log_scales[5, 2]
-    assert flat.any(axis=1).sum() < 30
+    users = flat.any(axis=1).sum()
+    assert users < 30
+    with pytest.warns(UserWarning, match=f"has null in place of 1 of 256 numbers, which {users} of 300 Gaussians use"):
+        read = formats.load(path)
     wanted = np.where(flat, np.float32(np.log(packing.LEAST_SCALE)), plain.log_scales)
     np.testing.assert_array_equal(read.log_scales, wanted)
     colour = int(np.abs(np.array(meta["sh0"]["codebook"]) - plain.sh[7, 0, 1]).argmin())
@@ -334,3 +378,62 @@ def test_an_archive_cannot_unpack_to_more_than_its_gaussians(tmp_path: Path) -> 
     path.write_bytes(b"PK\3\4 and nothing more")
     with pytest.raises(InputError, match=r"model\.sog: is no \.sog archive"):
         sog.read(path)
+
+
+def test_null_at_the_head_of_a_codebook_is_a_scale_of_0(tmp_path: Path) -> None:
+    """As splat-transform, which sorts it, writes flat Gaussians: no word. Among the numbers it is told."""
+    sog.write(tmp_path / "meta.json", lopsided(300, degree=0))
+    change(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(slice(0, 2), [None, None]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        formats.load(tmp_path / "meta.json")
+    change(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(-1, None))
+    with pytest.warns(UserWarning, match="has null in place of 3 of 256 numbers, which"):
+        formats.load(tmp_path / "meta.json")
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"version": "2"}, r'SOG version "2" in meta\.json, expected the number 1 or 2$'),
+        ({"version": 3}, r"SOG version 3 in meta\.json, expected the number 1 or 2$"),
+        ({"count": None}, r"meta\.json has the count null, expected the number of Gaussians, a whole number$"),
+        ({"count": 20.0}, r"meta\.json has the count 20\.0, expected the number of Gaussians"),
+        ({"count": "20"}, r'meta\.json has the count "20", expected the number of Gaussians'),
+    ],
+)
+def test_what_is_wrong_is_told_as_it_is(tmp_path: Path, keys: dict[str, Any], message: str) -> None:
+    path = tmp_path / "meta.json"
+    sog.write(path, lopsided(20, degree=0))
+    change(tmp_path, lambda meta: meta.update(keys))
+    with pytest.raises(InputError, match=message):
+        sog.read(path)
+    change(tmp_path, lambda meta: [meta.pop("count"), meta.update(version=2)])
+    with pytest.raises(InputError, match=r"meta\.json has no count, expected the number of Gaussians"):
+        sog.read(path)
+
+
+def test_null_in_place_of_the_coefficients_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "meta.json"
+    sog.write(path, lopsided(20, degree=0))
+    wanted = sog.read(path)
+    change(tmp_path, lambda meta: meta.update(shN=None))
+    assert_equal(sog.read(path), wanted)
+
+
+@pytest.mark.brings("Windows, macOS", "SOG whose pictures' names are of another case", "found")
+@pytest.mark.parametrize("archived", [False, True])
+def test_names_of_another_case(tmp_path: Path, archived: bool) -> None:
+    path = tmp_path / "meta.json"
+    sog.write(path, lopsided(20, degree=1))
+    wanted = sog.read(path)
+    change(tmp_path, lambda meta: meta["means"].update(files=["MEANS_L.webp", "Means_U.WEBP"]))
+    if archived:
+        with zipfile.ZipFile(tmp_path / "model.sog", "w") as archive:
+            for file in [path, *tmp_path.glob("*.webp")]:
+                archive.write(file, file.name)
+        path = tmp_path / "model.sog"
+    assert_equal(sog.read(path), wanted)
+    change(tmp_path, lambda meta: meta["means"].update(files=["means.webp", "Means_U.WEBP"]))
+    with pytest.raises(InputError, match=r"its picture means\.webp is missing"):
+        sog.read(tmp_path / "meta.json")

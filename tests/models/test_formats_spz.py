@@ -57,6 +57,16 @@ def test_more_bits_lose_less_of_the_harmonics(tmp_path: Path) -> None:
     assert losses(spz.read(path), model)["sh"] <= 0.5 / 128 * 1.001
 
 
+def test_the_default_is_a_version_that_readers_of_the_web_read(tmp_path: Path) -> None:
+    """Version 3 begins with gzip's signature. Spark, Babylon.js and older three.js refuse 4 (docs/formats.md)."""
+    model, path = lopsided(), tmp_path / "model.spz"
+    spz.write(path, model)
+    assert path.read_bytes()[:2] == b"\x1f\x8b"
+    assert gzip.decompress(path.read_bytes())[:8] == b"NGSP\3\0\0\0"
+    spz.write(tmp_path / "3.spz", model, version=3)
+    assert path.read_bytes() == (tmp_path / "3.spz").read_bytes()
+
+
 @pytest.mark.parametrize("name", SAMPLES)
 def test_samples_are_what_another_reader_has(tmp_path: Path, name: str) -> None:
     path = real_file(f"samples/{name}.spz")
@@ -147,7 +157,7 @@ def with_extensions(data: bytes, *records: tuple[int, bytes]) -> bytes:
 
 def test_extensions_are_passed_over_and_a_frame_is_honoured(tmp_path: Path) -> None:
     path = tmp_path / "model.spz"
-    spz.write(path, lopsided(50))
+    spz.write(path, lopsided(50), version=4)
     plain, data = spz.read(path), path.read_bytes()
     path.write_bytes(with_extensions(data, (0xADBE0002, bytes(12)), (0x12345678, b"more")))
     assert_within(spz.read(path), plain, **dict.fromkeys(BOUNDS, 0))
@@ -215,18 +225,32 @@ def test_a_file_that_is_none(tmp_path: Path, data: bytes, message: str) -> None:
         spz.read(path)
 
 
-def test_bombs_take_no_memory(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("version", "degree", "count"), [(3, 0, 100), (2, 3, 31), (2, 0, 1), (3, 2, 4000)])
+def test_bombs_are_refused_and_take_no_memory(version: int, degree: int, count: int, tmp_path: Path) -> None:
+    """A kilobyte of gzip may become a megabyte behind the last Gaussian."""
     path = tmp_path / "model.spz"
+    payload = count * sum(spz.Header(version, count, degree, 12, 0).widths.values())
     with gzip.open(path, "wb") as file:
-        file.write(header(3, 100) + bytes(2000))
+        file.write(header(version, count, degree) + bytes(payload))
         for _ in range(64):
             file.write(bytes(1 << 20))
+    assert path.stat().st_size < 1 << 17
     tracemalloc.start()
-    with pytest.warns(UserWarning, match="bytes after the last Gaussian"):
+    with pytest.raises(InputError, match=rf"model\.spz: unpacks to more than {count} Gaussians: over 1048576 bytes "):
         spz.read(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 12 << 20  # the 64 MiB behind the Gaussians are not unpacked
+
+
+@pytest.mark.parametrize("behind", [1, 1 << 20])
+def test_a_little_behind_the_gaussians_is_passed_over(behind: int, tmp_path: Path) -> None:
+    path = tmp_path / "model.spz"
+    spz.write(path, lopsided(20), version=2)
+    plain = spz.read(path)
+    path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()) + bytes(behind)))
+    with pytest.warns(UserWarning, match="bytes after the last Gaussian ignored"):
+        assert_within(spz.read(path), plain, **dict.fromkeys(BOUNDS, 0))
 
 
 def test_reading_keeps_no_second_copy(tmp_path: Path) -> None:

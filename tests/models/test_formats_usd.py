@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from contextlib import suppress
@@ -208,6 +209,21 @@ def test_text_that_stands_alone_is_read_at_once(tmp_path: Path, monkeypatch: pyt
     usd.write(tmp_path / "model.usda", lopsided(4, degree=0))
     monkeypatch.setattr(usd, "_lives", None)
     assert len(usd.read(tmp_path / "model.usda")) == 4
+
+
+def test_values_of_another_kind_are_named(tmp_path: Path) -> None:
+    """One number of each Gaussian is not called a row."""
+    path = tmp_path / "model.usda"
+    usd.write(path, lopsided(4, degree=0))
+    text = path.read_text()
+    for kind, name, expected in (("float", "opacities", "numbers"), ("float3", "scales", "rows of 3 numbers")):
+        assert f"{kind}[] {name}" in text
+        wrong = re.sub(
+            rf"{re.escape(kind)}\[\] {name} = \[.*?\]", f"int[] {name} = [1, 2, 3, 4, 5]", text, flags=re.DOTALL
+        )
+        path.write_text(wrong)
+        with pytest.raises(InputError, match=rf"{name} are int32 \(5,\), expected {expected}$"):
+            usd.read(path)
 
 
 def test_a_stage_without_gaussians(tmp_path: Path) -> None:

@@ -252,7 +252,7 @@ def test_records_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     path = tmp_path / "a.compressed.ply"
     both = compressed([(0, 0, 0, 0xFF00FF80), (2047 << 21, 0, 0, 0x00FF0080)], BOUNDS)
     path.write_bytes(both.replace(struct.pack("<f", 0.5), struct.pack("<f", -np.inf)))  # the least blue
-    with pytest.warns(UserWarning, match=r"1 of 2 Gaussians have .*, the first is Gaussian 1 with a colour; they are"):
+    with pytest.warns(UserWarning, match=r"1 of 2 Gaussians has .*, the first is Gaussian 1 with a colour; it is"):
         np.testing.assert_allclose(0.5 + C0 * formats.load(path).sh[:, 0], [[1, 0.25, 1.5]], atol=1e-6)
 
 

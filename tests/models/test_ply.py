@@ -180,7 +180,8 @@ def test_truncated(tmp_path: Path) -> None:
     text = "\n".join(" ".join(map(str, row)) for row in plain_table(5)).encode()
     assert "truncated: 6 Gaussians expected, 5 are there" in bad(tmp_path, header(NAMES, 6, "ascii") + text)
     assert "Gaussian 4 has 13 values, expected 14" in bad(tmp_path, header(NAMES, 5, "ascii") + text.rsplit(b" ", 1)[0])
-    assert "no number" in bad(tmp_path, header(NAMES, 5, "ascii") + text.rsplit(b" ", 1)[0] + b" red")
+    wrong = text.rsplit(b" ", 1)[0] + b" red"
+    assert "Gaussian 4 has 'red', expected a number" in bad(tmp_path, header(NAMES, 5, "ascii") + wrong)
 
 
 def test_no_gaussians(tmp_path: Path) -> None:

@@ -335,7 +335,7 @@ def test_negative_scales_are_logs(tmp_path: Path, file: str, offset: float, monk
     assert "have a negative one: all are read as logs of scales, though this format holds scales" in texts[0]
     few = np.exp(model.log_scales)
     few[7, 2] = -1
-    with pytest.raises(InputError, match=r"Gaussian 7 has the scales .* -1, expected .* at least 0; 1 of 300 have"):
+    with pytest.raises(InputError, match=r"Gaussian 7 has the scales .* -1, expected .* at least 0; 1 of 300 has"):
         formats.load(with_logs(path, model, few))
 
 

@@ -66,7 +66,14 @@ def test_two_scales_are_those_of_a_flat_gaussian(tmp_path: Path, order: str) -> 
 
 @pytest.mark.brings("nerfstudio", "`red green blue` in place of `f_dc`", "their coefficients")
 @pytest.mark.parametrize(
-    "names", [("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")]
+    "names",
+    [
+        ("red", "green", "blue"),
+        ("r", "g", "b"),
+        ("diffuse_red", "diffuse_green", "diffuse_blue"),
+        ("R", "G", "B"),
+        ("Red", "Green", "BLUE"),
+    ],
 )
 @pytest.mark.parametrize(
     ("kind", "levels", "white"),
@@ -113,7 +120,10 @@ def test_coefficients_go_before_colours(tmp_path: Path) -> None:
     assert_equal(Gaussians.load(path), model)
     assert model_info(path)["ignored"] == ["red", "green", "blue"]
     del table["green"], table["f_dc_1"]
-    with pytest.raises(InputError, match="PLY lacks the property f_dc_1"):
+    with pytest.raises(InputError, match=r"PLY lacks the property f_dc_1, expected a 3DGS model$"):
+        Gaussians.load(write(path, table, {}))
+    del table["f_dc_0"], table["f_dc_2"]
+    with pytest.raises(InputError, match=r"f_dc_2, expected a 3DGS model with f_dc_0 to 2, or red green blue$"):
         Gaussians.load(write(path, table, {}))
 
 
@@ -132,6 +142,75 @@ def test_a_long_comment(tmp_path: Path, name: str, length: int) -> None:
         other.write_bytes(data)
         assert_equal(Gaussians.load(other), wanted)
         assert "a" * length in model_info(other)["comments"]
+
+
+@pytest.mark.brings("Visual C++ of before 2015", "ascii PLY with `1.#QNAN`, `-nan(ind)`", "NaN and infinite")
+@pytest.mark.parametrize("word", ["-nan(ind)", "1.#QNAN", "-1.#IND", "1.#SNAN0", "nan(snan)", "-1.#IND00"])
+def test_words_for_no_number(tmp_path: Path, word: str) -> None:
+    path, lines = ascii_file(tmp_path)
+    at = lines.index("end_header") + 1
+    lines[at + 2] = lines[at + 2].rsplit(" ", 1)[0] + f" {word}"
+    path.write_text("\n".join(lines))
+    with pytest.warns(UserWarning, match="1 of 6 Gaussians has a value .* Gaussian 2 with a rotation; it is left out"):
+        assert len(Gaussians.load(path)) == 5
+
+
+@pytest.mark.parametrize(("word", "sign"), [("-1.#INF", -1), ("1.#INF", 1), ("1.#INF00", 1), ("-inf", -1)])
+def test_words_for_infinite(tmp_path: Path, word: str, sign: int) -> None:
+    path, lines = ascii_file(tmp_path, last="opacity")
+    at = lines.index("end_header") + 1
+    lines[at + 4] = lines[at + 4].rsplit(" ", 1)[0] + f" {word}"
+    path.write_text("\n".join(lines))
+    assert Gaussians.load(path).opacity_logits[4] == values.logits(np.array([(1 + sign) / 2]))[0]
+
+
+@pytest.mark.parametrize("word", ["1,5", "1.#", "nano", "12x", "é"])
+def test_a_word_that_is_no_number_is_told_with_its_row(
+    tmp_path: Path, word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ply_file, "BLOCK_ROWS", 2)
+    path, lines = ascii_file(tmp_path)
+    at = lines.index("end_header") + 1
+    lines[at + 5] = lines[at + 5].rsplit(" ", 1)[0] + f" {word}"
+    path.write_text("\n".join(lines))
+    shown = word if word.isascii() else "\ufffd\ufffd"
+    with pytest.raises(InputError, match=rf"model\.ply: Gaussian 5 has {shown!r}, expected a number$"):
+        Gaussians.load(path)
+
+
+def ascii_file(tmp_path: Path, last: str = "rot_3") -> tuple[Path, list[str]]:
+    """One of 6 Gaussians, and its lines, each of whose last word is that property."""
+    table = columns(random_gaussians(6, 0))
+    table[last] = table.pop(last)
+    path = write(tmp_path / "model.ply", table, {}, "ascii")
+    return path, path.read_text().splitlines()
+
+
+def test_whole_colours_in_text_that_are_no_number(tmp_path: Path) -> None:
+    """They warn once, and not of NumPy's cast; the others have the range that they have without it."""
+    table = {name: column for name, column in columns(random_gaussians(6, 0)).items() if not name.startswith("f_dc")}
+    names = ("red", "green", "blue")
+    table |= dict.fromkeys(names, np.array([0, 1000, 65535, 4, 5, 6]))
+    path = write(tmp_path / "model.ply", table, dict.fromkeys(names, "ushort"), "ascii")
+    path.write_text(path.read_text().replace(" 4 4 4\n", " 4 nan 4\n"))
+    with pytest.warns(UserWarning, match="1 of 6 Gaussians has") as caught:
+        read = Gaussians.load(path)
+    assert len(caught) == 1
+    # float32's rounding
+    np.testing.assert_allclose(0.5 + C0 * read.sh[:, 0, 0], np.array([0, 1000, 65535, 5, 6]) / 65535, atol=1e-6)
+
+
+@pytest.mark.parametrize(("lines", "fits"), [(9_000, True), (10_000, False), (12_000, False)])
+def test_lines_of_a_header_are_bounded(tmp_path: Path, lines: int, fits: bool) -> None:
+    path = tmp_path / "model.ply"
+    formats.save(path, random_gaussians(3, 0))
+    many = b"".join(b"comment %d\n" % line for line in range(lines))
+    path.write_bytes(path.read_bytes().replace(b"element vertex", many + b"element vertex", 1))
+    if fits:
+        assert len(Gaussians.load(path)) == 3
+        return
+    with pytest.raises(InputError, match=r"model\.ply: PLY header has more than 10,000 lines; is it damaged\?$"):
+        Gaussians.load(path)
 
 
 def test_a_header_is_bounded(tmp_path: Path) -> None:

@@ -100,7 +100,10 @@ def test_what_is_wrong_with_the_model_names_the_archive(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"a/one.ply": b"ply", "b/two.SPLAT": b"x"}, r"holds 2 model files \(a/one\.ply, b/two\.SPLAT\), expected one"),
+        (
+            {"a/one.ply": b"ply scale_0", "b/two.SPLAT": b"x"},
+            r"holds 2 model files \(a/one\.ply, b/two\.SPLAT\), expected one",
+        ),
         (
             {f"{i}.ply": b"ply" for i in range(5)},
             r"holds 5 model files \(0\.ply, 1\.ply, 2\.ply and 2 more\), expected",
@@ -156,11 +159,60 @@ def test_damage_anywhere(tmp_path: Path, compression: int) -> None:
     assert refused > 40  # every cut, and most changes: zip has sums
 
 
-def test_a_zip_by_another_name_is_no_sog(tmp_path: Path) -> None:
-    """The name decides between the formats that are archives."""
+@pytest.mark.brings("any", "zip of a PLY named .ply or .sog", "the model")
+@pytest.mark.parametrize("name", ["x.ply", "x.sog", "x", "x.splat"])
+def test_the_files_of_an_archive_tell_what_it_is(tmp_path: Path, name: str) -> None:
+    """Whatever its own name is; a .zip needs no word."""
     path = tmp_path / "model.ply"
     formats.save(path, random_gaussians(3, 0))
-    other = packed(tmp_path / "model.sog", {"model.ply": path.read_bytes()})
+    other = packed(tmp_path / name, {"a/model.ply": path.read_bytes(), "a/meta.json": b'{"title": "a scan"}'})
+    with pytest.warns(UserWarning, match=rf"{name}: is zipped model by its content, whatever its name") as caught:
+        np.testing.assert_array_equal(formats.load(other).means, formats.load(path).means)
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(formats.load(other.rename(tmp_path / "m.ZIP")).means, formats.load(path).means)
+
+
+def test_an_archive_of_sog_is_one_by_any_name(tmp_path: Path) -> None:
+    path = tmp_path / "model.sog"
+    formats.save(path, random_gaussians(30, 1))
+    wanted = formats.load(path)
+    for name in ("x.ply", "x"):
+        other = path.rename(tmp_path / name)
+        with pytest.warns(UserWarning, match=f"{name}: is SOG by its content"):
+            assert_equal(formats.load(other), wanted)
+        path = other
+    for name in ("model.sog", "b.zip"):
+        with zipfile.ZipFile(path) as source:
+            files = {f"export/{member}": source.read(member) for member in source.namelist()}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert_equal(formats.load(packed(tmp_path / name, files)), wanted)
+    empty = packed(tmp_path / "none.sog", {"readme.txt": b"x"})
     with pytest.raises(InputError, match=r"has no meta\.json in it"):
-        formats.load(other)
-    np.testing.assert_array_equal(formats.load(other.rename(tmp_path / "m.ZIP")).means, formats.load(path).means)
+        formats.load(empty)
+    with pytest.raises(InputError, match=r"meta\.json has no means, expected that of a SOG model"):
+        formats.load(packed(empty, {"meta.json": b'{"title": "a scan"}'}))
+
+
+@pytest.mark.brings("viewers' downloads", ".zip with a point cloud, a mesh, a meta.json beside the model", "the model")
+@pytest.mark.parametrize(
+    "beside",
+    [
+        {"meta.json": b'{"name": "scan", "date": 1}'},
+        {"mesh.glb": b"glTF" + bytes(20), "mesh.gltf": b'{"asset": {"version": "2.0"}}'},
+        {"input.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"},
+    ],
+)
+@pytest.mark.parametrize("name", ["model.ply", "model.compressed.ply", "model.splat", "model.sog"])
+def test_files_without_gaussians_are_no_models(tmp_path: Path, name: str, beside: dict[str, bytes]) -> None:
+    path = tmp_path / name
+    formats.save(path, random_gaussians(300, 0))
+    archive = packed(tmp_path / "all.zip", {**beside, f"run/{name}": path.read_bytes()})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_equal(formats.load(archive), formats.load(path))
+    both = packed(tmp_path / "two.zip", {f"{at}/{name}": path.read_bytes() for at in (7000, 30000)} | beside)
+    with pytest.raises(InputError, match=rf"holds 2 model files \(7000/{name}, 30000/{name}\)"):
+        formats.load(both)

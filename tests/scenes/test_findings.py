@@ -22,7 +22,7 @@ from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
 from clsplat.scenes.answers import ADVICE, ANSWERS, SCHEDULED, answered, paragraph, with_settings
 from clsplat.scenes.data_set import Lens
-from clsplat.scenes.findings import FEW, Finding, findings
+from clsplat.scenes.findings import FEW, SOME, Finding, findings
 from clsplat.scenes.glance import Glance, glance_at, sharpness_of
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
@@ -38,7 +38,7 @@ def camera_at(angle: float, distance: float) -> Camera:
     return Camera(ACROSS, DOWN, focal, focal, *centre, rotation, rotation @ forward * distance)
 
 
-def made(count: int = 24, distances: tuple[float, ...] = (4.0,)) -> Scene:
+def made(count: int = 32, distances: tuple[float, ...] = (4.0,)) -> Scene:
     """Photographs of a ball of points of many colours, all round it, before a grey wall."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(6000, 3))
@@ -84,7 +84,7 @@ def test_nothing_is_found_where_nothing_is() -> None:
 @pytest.mark.parametrize("range_of", [1.0, 0.02])
 def test_exposures_that_differ(range_of: float) -> None:
     scene = made()
-    gains = 2 ** np.random.default_rng(1).uniform(-range_of, range_of, len(scene.views))
+    gains = 2 ** np.random.default_rng(2).uniform(-range_of, range_of, len(scene.views))
     for index, gain in enumerate(gains):
         pixels = scene.glances[scene.views[index].name].pixels * np.float32(gain)
         changed(scene, index, pixels=np.clip(pixels, 0, 1))
@@ -113,7 +113,36 @@ def test_near_and_far() -> None:
 
 def test_few_views() -> None:
     assert kinds(made(FEW - 1)) == ["few views"]
-    assert kinds(made(FEW)) == []
+    assert kinds(made(FEW)) == ["some views"]
+    assert kinds(made(SOME - 1)) == ["some views"]
+    assert kinds(made(SOME)) == []
+
+
+@pytest.mark.parametrize(
+    ("points", "size", "most"),
+    [
+        (6000, (ACROSS, DOWN), 9216),  # a Gaussian for 16 pixels: 24 of 96 x 64
+        (600, (960, 640), 7200),  # 12 a point
+        (6000, (32, 24), 6000),  # the points that there are
+        (0, (960, 640), 921_600),
+    ],
+)
+def test_growth_from_some_views_is_bounded(points: int, size: tuple[int, int], most: int) -> None:
+    scene = made(24)
+    scene.points, scene.point_colors = scene.points[:points], scene.point_colors[:points]
+    for index, view in enumerate(scene.views):
+        scene.views[index] = replace(view, camera=view.camera.resized(*size))
+    found = [finding for finding in findings(scene) if finding.kind == "some views"]
+    assert f"tell of about {most:,} Gaussians" in found[0].text
+    (answer,), config = answered(found, TrainConfig())
+    assert config == replace(TrainConfig(), thinning=0.2, penalty=0.02, density=DensityConfig(max_gaussians=most))
+    taken = f"--thinning 0.2 --penalty 0.02 --density.max-gaussians {most}"
+    assert paragraph([answer], 24, auto=True).endswith(f". --auto takes {taken}")
+    own = TrainConfig(density=DensityConfig(max_gaussians=50))
+    (answer,), config = answered(found, own, {"density.max_gaussians"})
+    assert config == replace(own, thinning=0.2, penalty=0.02)
+    mcmc = replace(own, density=replace(own.density, growth="mcmc"))
+    assert answered(found, mcmc, {"density.max_gaussians"})[1] == replace(mcmc, thinning=0.2)
 
 
 def test_few_steps() -> None:
@@ -149,7 +178,7 @@ def test_a_sky() -> None:
         changed(scene, index, pixels=pixels)
     (found,) = findings(scene)
     assert found.kind == "sky"
-    assert found.text.startswith("24 photographs have a sky, 14 % of each")
+    assert found.text.startswith("32 photographs have a sky, 14 % of each")
 
 
 def test_points_without_colours_say_nothing_of_exposures() -> None:

@@ -60,20 +60,20 @@ def spread(scene: Scene, gains: np.ndarray) -> np.ndarray:
 
 def test_gains_on_photographs_are_told_from_them_alone() -> None:
     gains = 2 ** np.random.default_rng(3).uniform(-1, 1, 24)
-    found, own = spread(made(), gains), spread(made(), np.ones(24))
+    found, own = spread(made(24), gains), spread(made(24), np.ones(24))
     apart = found - own - np.log2(gains)[:, None]
     # Pixels that are too bright to tell of a photograph without gains do so with them.
     assert np.abs(apart - apart.mean(axis=0)).max() < 0.1
     assert np.abs(apart - apart.mean(axis=0)).mean() < 0.01
-    grey = replace(made(), point_colors=np.full((6000, 3), 0.5, np.float32))
-    grey.__dict__["glances"] = made().glances
+    grey = replace(made(24), point_colors=np.full((6000, 3), 0.5, np.float32))
+    grey.__dict__["glances"] = made(24).glances
     assert np.array_equal(spread(grey, gains), found)
 
 
 def test_a_dark_photograph_keeps_its_dark_points() -> None:
     """Many points are of 0.012 to 0.03; without the darkest of them the photograph would seem brighter than it is."""
     gains = np.tile([0.5, 1.0], 12)
-    dark = [made(), made()]
+    dark = [made(24), made(24)]
     for scene in dark:
         for index, view in enumerate(scene.views):
             pixels = scene.glances[view.name].pixels
@@ -85,7 +85,7 @@ def test_a_dark_photograph_keeps_its_dark_points() -> None:
 @pytest.mark.parametrize("count", [0, LEAST_POINTS - 1])
 def test_few_points_tell_nothing(count: int) -> None:
     """And no photograph is looked at, of which there is no file here."""
-    scene = made()
+    scene = made(24)
     few = replace(scene, points=scene.points[:count], point_colors=scene.point_colors[:count])
     assert "glances" not in few.__dict__
     assert Looked(few).exposures == {}

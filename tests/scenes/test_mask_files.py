@@ -19,7 +19,7 @@ from clsplat.images.writing import write_image
 from clsplat.scenes import sfm, sfm_photos
 from clsplat.scenes.findings import findings
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.masks import find_masks, masks_beside, read_mask
+from clsplat.scenes.masks import OTHER_FOLDERS, find_masks, masks_beside, read_mask
 
 IGNORE = MaskUse("ignore")
 
@@ -208,6 +208,10 @@ def masks_at(scene: Path, *places: str) -> None:
         ("IMG_1.jpg", "images/IMG_1.jpg.mask.png"),
         ("IMG_1.jpg", "images/IMG_1.jpg.png"),
         ("a/IMG_1.JPG", "images/a/img_1_MASK.PNG"),
+        ("IMG_1.jpg", "masks/IMG_1-mask.png"),
+        ("IMG_1.jpg", "images/IMG_1-mask.png"),
+        ("IMG_1.JPG", "masks/mask-IMG_1.png"),
+        ("a/IMG_1.jpg", "images/a/IMG_1.jpg-mask.png"),
     ],
 )
 def test_masks_of_other_programs(photo: str, mask: str, tmp_path: Path) -> None:
@@ -223,6 +227,113 @@ def test_masks_of_other_programs(photo: str, mask: str, tmp_path: Path) -> None:
     assert {path for path in present if path not in listed} == companions(
         [path for path in present if path not in listed], listed, tmp_path / "images"
     )
+
+
+@pytest.mark.brings("SAM's users, matting tools", "`images_mask/`, `mattes/`, `segmentation/`", "masks, if asked for")
+@pytest.mark.parametrize(
+    "mask",
+    [
+        *["images_mask/IMG_1.png", "Images_Masks/IMG_1.jpg.png", "mattes/IMG_1.png", "segmentation/IMG_1-mask.png"],
+        *["silhouettes/img_1.png", "images/images_mask/IMG_1.png"],
+    ],
+)
+def test_folders_of_masks_by_other_names(mask: str, tmp_path: Path) -> None:
+    images = photographs(tmp_path / "images", "IMG_1.jpg", "IMG_2.jpg")
+    masks_at(tmp_path, mask)
+    assert masks_beside(images) == {}
+    found = {"IMG_1.jpg": tmp_path / mask}
+    assert masks_beside(images, others=OTHER_FOLDERS) == found
+    assert sfm._masks(tmp_path / "images", [image.path for image in images], IGNORE) == found
+    masks_at(tmp_path, "masks/IMG_1.png")  # these go first
+    assert masks_beside(images, others=OTHER_FOLDERS) == {"IMG_1.jpg": tmp_path / "masks" / "IMG_1.png"}
+
+
+def test_white_may_be_what_moves(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "scene")
+    for index in range(VIEWS):
+        (scene / "dynamic_masks").mkdir(exist_ok=True)
+        write_image(scene / "dynamic_masks" / f"{index:02d}.png", mask_of())
+    read = load_scene(scene, masks=IGNORE)
+    assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * VIEWS
+    (told,) = [text for text in read.warnings if "dynamic_masks" in text]
+    assert "white is taken for what counts, as in all masks; if it is what moves there, give --invert-masks" in told
+    inverted = load_scene(scene, masks=MaskUse("ignore", invert=True))
+    assert not [text for text in inverted.warnings if "dynamic_masks" in text]
+    paths = sorted((scene / "images").iterdir())
+    with pytest.warns(UserWarning, match="white is taken for what counts"):
+        sfm._masks(scene / "images", paths, IGNORE)
+
+
+@pytest.mark.brings("renderers, video tools", "masks/mask_0007.png for image_0007.png", "by their numbers")
+@pytest.mark.parametrize(
+    ("photo", "mask"),
+    [
+        ("image_{0:04}.png", "mask_{0:04}.png"),
+        ("frame{0:05}.jpg", "matte_{0:03}.png"),
+        ("a/IMG_{0}.jpg", "segmented-{0}.jpg.png"),
+        ("{0:04}.png", "{0}.png"),
+    ],
+)
+def test_two_series_go_together_by_their_numbers(photo: str, mask: str, tmp_path: Path) -> None:
+    images = photographs(tmp_path / "images", *(photo.format(number) for number in range(1, 4)))
+    masks_at(tmp_path, *(f"masks/{mask.format(number)}" for number in range(1, 3)))
+    wanted = {photo.format(number): tmp_path / "masks" / mask.format(number) for number in range(1, 3)}
+    assert masks_beside(images) == wanted
+    masks_at(tmp_path, f"masks/{mask.format(7)}")
+    with pytest.raises(InputError, match=r"masks: 1 mask\(s\) fit no photograph"):
+        masks_beside(images)
+
+
+@pytest.mark.parametrize(
+    ("photos", "masks"),
+    [
+        (("image_1.jpg", "photo_2.jpg"), ("mask_1.png", "mask_2.png")),
+        (("a/image_1.jpg", "b/image_2.jpg"), ("m_1.png", "m_2.png")),
+        (("image_1.jpg", "image_2.jpg"), ("mask_1.png", "other_2.png")),
+        (("image_1.jpg", "image_01.jpg"), ("m_1.png", "m_2.png")),
+        (("image_1.jpg", "image_2.jpg"), ("m_1.png", "m_01.png")),
+        (("image_1.jpg", "image_2.jpg"), ("m_1.png",)),
+        (("image_1.jpg", "image_2.jpg"), ("image_1.png", "m_2.png")),
+    ],
+)
+def test_numbers_that_are_of_no_series(photos: tuple[str, ...], masks: tuple[str, ...], tmp_path: Path) -> None:
+    images = photographs(tmp_path / "images", *photos)
+    masks_at(tmp_path, *(f"masks/{name}" for name in masks))
+    with pytest.raises(InputError, match=r"mask\(s\) fit no photograph"):
+        masks_beside(images)
+
+
+@pytest.mark.brings("matting and label tools", "IMG_silhouette.png, IMG_fg.png, labels/, into `sfm`", "no photographs")
+@pytest.mark.parametrize(
+    "mask",
+    [
+        *["IMG_{0}_silhouette.png", "IMG_{0}_fg.png", "labels/IMG_{0}.png", "IMG_{0}-foreground.png"],
+        *["silhouettes/IMG_{0}.png", "fg_IMG_{0}.png", "images_labels/IMG_{0}.jpg.png", "mattes/IMG_{0}.png"],
+    ],
+)
+def test_masks_are_no_photographs(mask: str, tmp_path: Path) -> None:
+    images = photographs(tmp_path, *(f"IMG_{index}.jpg" for index in range(3)))
+    masks_at(tmp_path, *(mask.format(index) for index in range(3)))
+    paths, left_out = sfm_photos.find_photos(tmp_path)
+    assert sorted(paths) == sorted(image.path for image in images)
+    assert [len(each) for each in left_out.values()] == [3]
+
+
+@pytest.mark.parametrize(
+    ("photos", "masks"),
+    [
+        (("_091-0_mask_0.jpg", "_091-1_mask_0.jpg"), ("masks/_091-0_mask_0.png", "masks/_091-1_mask_0.png")),
+        (("labels/IMG_1.jpg", "bottles/IMG_2.jpg"), ()),
+        (("labels/IMG_1.jpg", "labels/IMG_2.jpg"), ()),
+        (("IMG_1_fg.jpg", "IMG_2_fg.jpg"), ()),
+        (("cof.jpg", "coffg.jpg", "x/cof_silhouette_left.jpg"), ()),
+    ],
+)
+def test_photographs_by_names_of_masks_stay(photos: tuple[str, ...], masks: tuple[str, ...], tmp_path: Path) -> None:
+    images = photographs(tmp_path, *photos)
+    masks_at(tmp_path, *masks)
+    paths, _ = sfm_photos.find_photos(tmp_path)
+    assert sorted(paths) == sorted(image.path for image in images)
 
 
 @pytest.mark.parametrize(
@@ -271,67 +382,3 @@ def test_masks_beside_the_photographs_are_found_and_used(tmp_path: Path) -> None
     read = load_scene(scene, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * VIEWS
     assert not any("does not list" in text for text in read.warnings)
-
-
-def save_levels(path: Path, levels: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Pillow.fromarray(levels).save(path)
-
-
-@pytest.mark.brings("label tools", "masks of 0 and 1, 8 or 16 bit", "1 counts")
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("extension", ["png", "tif"])
-def test_masks_of_0_and_1(dtype: type, extension: str, tmp_path: Path) -> None:
-    labels = np.array([[0, 1, 1, 0]] * 3, dtype)
-    for name, levels in (("some", labels), ("all", np.ones_like(labels)), ("none", np.zeros_like(labels))):
-        save_levels(tmp_path / f"{name}.{extension}", levels)
-        mask = read_mask(tmp_path / f"{name}.{extension}", orient=False, invert=False)
-        assert mask[:, :, 0].tolist() == levels.tolist()
-        inverted = read_mask(tmp_path / f"{name}.{extension}", orient=False, invert=True)
-        assert inverted[:, :, 0].tolist() == (1 - levels.astype(int)).tolist()
-
-
-def test_a_mask_of_0_and_1_in_colour_and_in_alpha(tmp_path: Path) -> None:
-    labels = np.array([[0, 1, 1, 0]] * 3, np.uint8)
-    save_levels(tmp_path / "rgb.png", np.repeat(labels[:, :, None], 3, axis=2))
-    save_levels(tmp_path / "alpha.png", np.dstack([np.full((3, 4, 3), 255, np.uint8), labels]))
-    palette = Pillow.fromarray(labels, "P")
-    palette.putpalette([0, 0, 0, 1, 1, 1])
-    palette.save(tmp_path / "palette.png")
-    for name in ("rgb", "alpha", "palette"):
-        assert read_mask(tmp_path / f"{name}.png", orient=False, invert=False)[:, :, 0].tolist() == labels.tolist()
-
-
-@pytest.mark.parametrize(
-    ("levels", "told"),
-    [
-        (np.array([[0, 64]], np.uint8), "0 and 64, all of them dark, expected 0 and 255"),
-        (np.array([[0, 127]], np.uint8), "0 and 127, all"),
-        (np.array([[0, 255]], np.uint16), "0 and 255, all of them dark, expected 0 and 65535"),
-        (np.array([[64, 64]], np.uint8), "64, all"),
-        (np.array([[1, 2]], np.uint8), "1 and 2, all"),
-        (np.array([[0, 1, 2, 7, 20]], np.uint8), "5 from 0 to 20, all"),
-    ],
-)
-def test_masks_that_are_all_dark(levels: np.ndarray, told: str, tmp_path: Path) -> None:
-    scene = write_scene(tmp_path / "scene")
-    for index in range(VIEWS):
-        tiled = np.resize(levels[0], (HEIGHT, WIDTH)).astype(levels.dtype)
-        save_levels(scene / "masks" / f"{index:02d}.png", tiled)
-    with pytest.raises(InputError, match=rf"masks/00\.png: the mask's values are {told}"):
-        load_scene(scene, masks=IGNORE).check_pictures()
-
-
-def test_a_soft_mask_may_be_dark_where_others_are_not(tmp_path: Path) -> None:
-    """Nothing of it counts then, as in any mask; two values that are dark are none of a soft mask."""
-    save_levels(tmp_path / "a.png", np.array([[0, 3, 9, 40, 90]], np.uint8))
-    save_levels(tmp_path / "b.png", np.array([[0, 3, 9, 140, 250]], np.uint8))
-    save_levels(tmp_path / "c.png", np.array([[0, 9, 9, 0, 9]], np.uint8))
-    Pillow.fromarray(np.full((16, 16), 1, np.uint8)).save(tmp_path / "d.jpg", quality=95)
-    assert not read_mask(tmp_path / "a.png", orient=False, invert=False).any()
-    assert not read_mask(tmp_path / "d.jpg", orient=False, invert=False).any()  # JPEG's 1 is about 0
-    with pytest.raises(InputError, match=r"c\.png: the mask's values are 0 and 9"):
-        read_mask(tmp_path / "c.png", orient=False, invert=False)
-    (tmp_path / "b.png").unlink()
-    with pytest.raises(InputError, match=r"a\.png: the mask's values are 5 from 0 to 90"):
-        read_mask(tmp_path / "a.png", orient=False, invert=False)

@@ -11,8 +11,11 @@ import pytest
 from ring import COUNT, HEIGHT, NAMES, WIDTH, level, write_colmap, write_pictures, write_transforms
 from systems import posix
 
+from clsplat.config.depth import DepthUse
+from clsplat.config.masks import MaskUse
 from clsplat.errors import InputError
 from clsplat.scenes.colmap import read_cameras
+from clsplat.scenes.depth import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.picture_names import match, nearest
 from clsplat.scenes.scene import Scene
@@ -218,6 +221,21 @@ def test_many_missing_pictures_are_an_error_that_says_what_to_give(kind: str, tm
     with pytest.raises(InputError, match="lists 20 image") as caught:
         load_scene(tmp_path, missing="skip")
     assert "--missing" not in str(caught.value), "which would not help"
+
+
+def test_masks_and_depths_of_missing_pictures_are_passed_over(tmp_path: Path) -> None:
+    write_colmap(tmp_path)
+    for folder in ("masks", "depths"):
+        write_pictures(tmp_path / folder)
+    (tmp_path / "images" / NAMES[3]).unlink()
+    scene = load_scene(tmp_path, masks=MaskUse("ignore"))
+    assert all(view.mask is not None and view.mask.path == tmp_path / "masks" / view.name for view in scene.views)
+    deep = with_depths(scene, DepthUse("maps"))
+    assert all(view.depth is not None for view in deep.train_views)
+    write_pictures(tmp_path / "images", [NAMES[3]])
+    write_pictures(tmp_path / "masks", ["other.png"])
+    with pytest.raises(InputError, match="fit no photograph"):
+        load_scene(tmp_path, masks=MaskUse("ignore"))
 
 
 # Other folders

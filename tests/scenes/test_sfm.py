@@ -132,6 +132,9 @@ def test_every_pose_is_recovered(scene, pictures):
         "placing cameras",
         "undistorting photos",
     ]
+    placed = [fraction.text for text, fraction in heard if text == "placing cameras"]
+    assert (placed[0], placed[-1]) == (f"0 of {COUNT} cameras stand", f"{COUNT} of {COUNT} cameras stand")
+    assert len(placed) > 3  # they are counted as they come
     assert leftovers(output.parent) == ["scene"]
 
 

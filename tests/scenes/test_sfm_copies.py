@@ -13,6 +13,7 @@ import pytest
 from calls import warnings_of
 from numpy.typing import NDArray
 from PIL import Image as Pillow
+from scipy.ndimage import map_coordinates
 
 from clsplat.config.masks import MaskUse
 from clsplat.demo import ray_caster
@@ -36,7 +37,7 @@ def write(path: Path, picture: Picture, side: int = WIDTH, **how: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     image = Pillow.fromarray(picture)
     if side != WIDTH:
-        image = image.resize((side, side * HEIGHT // WIDTH), Pillow.Resampling.LANCZOS)
+        image = image.resize((side, side * image.height // image.width), Pillow.Resampling.LANCZOS)
     image.save(path, **{**({"quality": 92} if path.suffix.lower() == ".jpg" else {}), **how})
 
 
@@ -58,6 +59,17 @@ def used(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], tuple[list[str], l
         return sorted(name for group in tasks[-1]["groups"] for name in group), messages
 
     return work
+
+
+def undone(picture: Picture, k1: float = -0.25, cut: int = 0) -> Picture:
+    """A picture as of a lens whose distortion is undone, without a margin of `cut` pixels."""
+    height, width = picture.shape[:2]
+    row, column = np.mgrid[0:height, 0:width]
+    y, x = (row - height / 2) / width, (column - width / 2) / width
+    bent = 1 + k1 * (x * x + y * y)
+    rows, columns = y * bent * width + height / 2, x * bent * width + width / 2
+    planes = [map_coordinates(picture[:, :, channel], [rows, columns], order=1, mode="nearest") for channel in range(3)]
+    return np.stack(planes, axis=2)[cut : height - cut, cut : width - cut]
 
 
 def names(folder: str, extension: str = "jpg") -> list[str]:
@@ -84,9 +96,8 @@ def test_smaller_copies_in_folders_beside(
     found, (message,) = used(tmp_path / "in")
     assert found == names(f"{kept}/")
     first = min(others)
-    assert f"{len(others) * COUNT} photo(s) are others again and left out ({first}/0.png is {kept}/0.jpg, smaller," in (
-        message
-    )
+    told = f"{len(others) * COUNT} photographs are copies and left out ({first}/0.png is {kept}/0.jpg, smaller,"
+    assert told in message
 
 
 @pytest.mark.brings("Polycam, 3DGS", "`corrected_images` or `input` beside `images`, into `sfm`", "one of them")
@@ -100,7 +111,7 @@ def test_pictures_before_and_after_their_lens_was_undone(
     """By their names, as the pictures differ."""
     for index, picture in enumerate(pictures):
         write(tmp_path / "in" / "keyframes" / kept / f"{index}.jpg", picture)
-        write(tmp_path / "in" / "keyframes" / other / f"{index}.jpg", np.roll(picture, 9, axis=1))
+        write(tmp_path / "in" / "keyframes" / other / f"{index}.jpg", undone(picture))
     found, (message,) = used(tmp_path / "in")
     assert found == names(f"keyframes/{kept}/")
     assert f"keyframes/{other}/0.jpg is keyframes/{kept}/0.jpg, corrected" in message
@@ -139,7 +150,7 @@ def test_one_stem_in_two_types(one: str, other: str, pictures: list[Picture], tm
     found, (message,) = used(tmp_path / "in")
     lossless = one if one == "png" else other  # of two lossless ones the first by name
     assert found == names("", lossless)
-    assert f"{COUNT} photo(s) are others again" in message
+    assert f"{COUNT} photographs are copies and left out (" in message
 
 
 def test_a_photograph_turned_by_exif_is_its_upright_copy(pictures: list[Picture], tmp_path: Path, used: Any) -> None:
@@ -161,7 +172,8 @@ def test_the_same_bytes_under_another_name(copy: str, pictures: list[Picture], t
     shutil.copy(tmp_path / "in" / "0.jpg", tmp_path / "in" / copy)
     found, (message,) = used(tmp_path / "in")
     assert found == names("")
-    assert f"1 photo(s) are others again and left out ({copy} is 0.jpg, same bytes); to use them, give" in message
+    told = f"1 photograph is a copy of another and left out ({copy} is 0.jpg, same bytes); to use copies, give"
+    assert told in message
 
 
 @pytest.mark.parametrize("folders", [("left", "right"), ("cam0", "cam1"), ("images_1", "images_2"), ("cam", "cam_2")])
@@ -173,6 +185,81 @@ def test_several_cameras_stay(folders: tuple[str, str], pictures: list[Picture],
     found, messages = used(tmp_path / "in")
     assert len(found) == 2 * (COUNT - 1) - (COUNT - 2)  # the rest is each the same file as one of the other camera's
     assert [text for text in messages if "same bytes" not in text] == []
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> list[Picture]:
+    """Views from the other side, (180, 240, 3)."""
+    surfaces = ray_caster.still_life()
+    ray_caster.bake(surfaces, seed=0)
+    cameras = ray_caster.cameras(40, WIDTH, HEIGHT, seed=0)[20 : 20 + COUNT]
+    return [np.rint(ray_caster.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras]
+
+
+@pytest.mark.parametrize("side", [WIDTH, 120])
+@pytest.mark.parametrize(
+    "folders",
+    [
+        *[("cam_1", "cam_2"), ("day-1", "day-2"), ("camera_2", "camera_4"), ("images_1", "images_2")],
+        *[("images", "images_2"), ("raw", "images"), ("images", "corrected"), ("input", "undistorted")],
+        *[("images", "dense/0/images"), ("", "undistorted/images")],
+    ],
+)
+def test_other_pictures_in_folders_whose_names_tell_stay(
+    folders: tuple[str, str], side: int, pictures: list[Picture], elsewhere: list[Picture], tmp_path: Path, used: Any
+) -> None:
+    """Of two cameras, the second of half the size too."""
+    for index in range(COUNT):
+        write(tmp_path / "in" / folders[0] / f"{index}.jpg", pictures[index])
+        write(tmp_path / "in" / folders[1] / f"{index}.jpg", elsewhere[index], side)
+    found, messages = used(tmp_path / "in")
+    assert (len(found), messages) == (2 * COUNT, [])
+
+
+@pytest.mark.brings("3DGS' convert.py", "`input/ images/ images_2/ images_4/`, into `sfm`", "one of them")
+@pytest.mark.parametrize("extension", ["jpg", "png"])
+@pytest.mark.parametrize("cut", [0, 6])
+def test_smaller_copies_of_a_copy(cut: int, extension: str, pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / "input" / f"{index}.jpg", picture)
+        pinhole = undone(picture, cut=cut)
+        for folder, factor in (("images", 1), ("images_2", 2), ("images_4", 4)):
+            side = WIDTH if factor == 1 else pinhole.shape[1] // factor
+            write(tmp_path / "in" / folder / f"{index}.{extension}", pinhole, side)
+    found, (message,) = used(tmp_path / "in")
+    assert found == names("input/")
+    assert f"{3 * COUNT} photographs are copies and left out (images/0.{extension} is input/0.jpg, " in message
+
+
+@pytest.mark.brings("COLMAP, OpenSfM", "`dense/0/images`, `undistorted/images` beside `images`, into `sfm`", "one")
+@pytest.mark.parametrize(
+    ("kept", "other"),
+    [
+        ("images/{0}.jpg", "undistorted/images/{0}.jpg"),
+        ("images/{0}.jpg", "opensfm/undistorted/images/{0}.jpg.jpg"),
+        ("images/{0}.jpg", "dense/images/{0}.jpg"),
+        ("images/{0}.jpg", "dense/0/images/{0}.jpg"),
+        ("images/left/{0}.jpg", "dense/0/images/left/{0}.jpg"),
+        ("{0}.jpg", "undistorted/{0}.png"),
+        ("left/{0}.jpg", "undistorted/left/{0}.jpg"),
+    ],
+)
+def test_copies_some_folders_deeper(kept: str, other: str, pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    for index, picture in enumerate(pictures):
+        write(tmp_path / "in" / kept.format(index), picture)
+        write(tmp_path / "in" / other.format(index), undone(picture))
+    found, (message,) = used(tmp_path / "in")
+    assert found == [kept.format(index) for index in range(COUNT)]
+    assert f"{other.format(0)} is {kept.format(0)}, corrected" in message
+
+
+def test_what_shows_nothing_goes_with_its_folder(pictures: list[Picture], tmp_path: Path, used: Any) -> None:
+    """A dark picture is a copy as the others of its folder are."""
+    for index, picture in enumerate([*pictures, np.full((HEIGHT, WIDTH, 3), 7, np.uint8)]):
+        write(tmp_path / "in" / "images" / f"{index}.png", picture)
+        write(tmp_path / "in" / "images_2" / f"{index}.png", picture, 120)
+    found, _ = used(tmp_path / "in")
+    assert found == [f"images/{index}.png" for index in range(COUNT + 1)]
 
 
 def test_a_stereo_rig_stays(pictures: list[Picture], tmp_path: Path, used: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from clsplat.progress import FrameProgress, StageProgress, TrainProgress, duration
+from clsplat.progress import Counted, FrameProgress, StageProgress, TrainProgress, duration
 from clsplat.sequence.task import Record
 
 
@@ -106,6 +106,28 @@ def test_frames_elsewhere_are_lines() -> None:
     assert plain.getvalue() == ""
 
 
+def test_lines_of_frames_have_the_time_left(now: list[float]) -> None:
+    """By the frames after the first, which may have built kernels; those that were there do not count."""
+    lines = io.StringIO()
+    took = [0.0, 0.0, 30.0, 2.0, 4.0, 600.0, 0.2]
+    with redirect_stderr(io.StringIO()), FrameProgress(9, lines=lines) as progress:
+        for number, seconds in enumerate(took):
+            now[0] += seconds
+            progress(Record(f"{number}", number, "a.exr", 8, 6, seconds, skipped=seconds == 0))
+    left = [line.partition(" s")[2].strip() for line in lines.getvalue().splitlines()]
+    # 6 of 30; 5 of 2; 4 of 3; 3 of 202; 2 of 151.55
+    assert left == ["3:00 left", "0:10 left", "0:12 left", "10:06 left", "5:03 left"]
+
+
+def test_the_last_frame_has_no_time_left(now: list[float]) -> None:
+    lines = io.StringIO()
+    with redirect_stderr(io.StringIO()), FrameProgress(2, lines=lines) as progress:
+        for number in (1, 2):
+            now[0] += 5
+            progress(Record(f"{number}", number, "a.exr", 8, 6, 5.0))
+    assert lines.getvalue() == "a.exr  8x6  5.00 s  0:05 left\na.exr  8x6  5.00 s\n"
+
+
 def test_stages_are_told_apart(now: list[float], capsys: pytest.CaptureFixture[str]) -> None:
     progress = StageProgress()
     for stage, fraction in [("features", None), ("features", 0.5), ("matching", 0.0), ("matching", 1.0)]:
@@ -125,3 +147,74 @@ def test_what_is_quick_is_not_told(now: list[float], capsys: pytest.CaptureFixtu
         now[0] = time
         progress("palette", part)
     assert capsys.readouterr().err.splitlines() == ["palette 50 %", "palette 90 %"]
+
+
+class Fixed:
+    """A forecast that knows."""
+
+    def __init__(self, left: float | None) -> None:
+        self.seen: list[int] = []
+        self._left = left
+
+    def see(self, report: Report) -> None:
+        self.seen.append(report.step)
+
+    def left(self) -> float | None:
+        return self._left
+
+
+@pytest.mark.parametrize(("left", "words"), [(754.0, "12:34 left"), (None, "0:40 left"), (0.0, "0:00 left")])
+def test_the_time_left_is_the_forecasts(now: list[float], left: float | None, words: str) -> None:
+    stream, forecast = io.StringIO(), Fixed(left)
+    with redirect_stderr(stream), TrainProgress(100, forecast) as progress:
+        for step in range(1, 21):
+            now[0] += 0.5
+            progress(Report(step, seconds=now[0]))
+    assert stream.getvalue().splitlines()[0].endswith(f"2.0 steps/s  {words}")
+    assert forecast.seen == list(range(1, 21))
+
+
+def test_the_first_line_has_a_rate(now: list[float]) -> None:
+    """Kernels are built for 30 s before the first report; a line comes with the second, which tells a rate."""
+    stream = io.StringIO()
+    with redirect_stderr(stream), TrainProgress(100) as progress:
+        for step, seconds in ((10, 30.0), (20, 31.0)):
+            now[0] = seconds
+            progress(Report(step, seconds=seconds))
+            assert len(stream.getvalue().splitlines()) == (step == 20)
+    assert "step 20/100" in stream.getvalue()
+    assert "10.0 steps/s  0:08 left" in stream.getvalue()
+
+
+def test_the_rate_is_that_of_the_last_seconds() -> None:
+    progress = TrainProgress(10_000)
+    with redirect_stderr(io.StringIO()):
+        for second in range(100):  # ten steps a second, then one
+            progress(Report(10 * second, seconds=second))
+        for second in range(1, 41):
+            progress(Report(990 + second, seconds=99.0 + second))
+    assert progress.rate() == 1
+
+
+def test_counts_are_told_as_such_and_the_last_always(now: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    progress = StageProgress()
+    for second, done in ((0.0, 0), (3.0, 7), (10.5, 12), (12.0, 23)):
+        now[0] = second
+        progress("placing cameras", Counted(done, 25, "cameras stand"))
+    progress("undistorting photos", None)
+    progress("placing cameras", Counted(2, 2, "cameras stand"))
+    progress("done", None)
+    assert capsys.readouterr().err.splitlines() == [
+        "placing cameras: 0 of 25 cameras stand",
+        "placing cameras: 12 of 25 cameras stand",
+        "placing cameras: 23 of 25 cameras stand",
+        "undistorting photos",
+        "placing cameras: 2 of 2 cameras stand",
+        "done",
+    ]
+
+
+@pytest.mark.parametrize(("done", "part", "text"), [(0, 0.0, "0 of 8 x"), (2, 0.25, "2 of 8 x"), (9, 1.0, "8 of 8 x")])
+def test_a_count_is_a_fraction(done: int, part: float, text: str) -> None:
+    assert Counted(done, 8, "x") == part
+    assert Counted(done, 8, "x").text == text

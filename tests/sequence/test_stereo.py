@@ -290,7 +290,8 @@ def test_each_eye_has_a_holdout(shot: list[str], tmp_path: Path, capsys: Capture
 
 
 def test_a_map_is_looked_at_for_both_eyes(tmp_path: Path) -> None:
-    write_stmap(tmp_path / "map.exr", np.full((64, 96, 2), 9.0), 96, 64)
+    x, y = np.meshgrid(np.arange(96.0), np.arange(64.0))
+    write_stmap(tmp_path / "map.exr", np.stack([x, y], axis=2), 96, 64)
     options = RenderOptions(pictures=PictureConfig(warp=WarpConfig(stmap=str(tmp_path / "map.exr"))))
     camera = scenes.tilted_camera(96, 64)
     right = Task(1, "1", replace(camera, projection="equirectangular"), tmp_path / "a.exr", eye="right")

@@ -10,11 +10,13 @@ import pytest
 from models import random_gaussians
 
 from clsplat.arrays import Float64
+from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.shots import shot_around
-from clsplat.shots.around import RING, ROOM, SIZE, cameras_around, parse_up
+from clsplat.shots.around import RING, ROOM, SIZE, among, cameras_around, parse_up
+from clsplat.shots.viewpoints import look_at
 
 
 def cloud(means: Float64, scale: float = 0.02) -> Gaussians:
@@ -120,3 +122,55 @@ def test_a_direction_has_length_one() -> None:
     for text in ("0,-3,4", "0,-3e200,4e200", "0,-3e-200,4e-200"):
         assert np.allclose(parse_up(text), (0, -0.6, 0.8))
     assert parse_up("-z") == (0, 0, -1)
+
+
+def photographs(count: int = 12, width: int = 300, height: int = 200) -> list[Camera]:
+    """Cameras on a circle of radius 1 in a room, that look at its middle and 20 degrees down."""
+    cameras = []
+    for angle in 2 * np.pi * np.arange(count) / count:
+        position = np.array([np.sin(angle), -np.tan(np.radians(20)), -np.cos(angle)])
+        pose = look_at(position, np.zeros(3), np.array([0.0, -1.0, 0.0]))
+        cameras.append(Camera(width, height, 200.0, 210.0, 140.0, 101.0, *pose))
+    return cameras
+
+
+def test_a_path_among_own_cameras_stays_inside() -> None:
+    """Walls at a distance of 3 are seen from where the photographs were taken, 1 from the middle."""
+    room = cloud(ball(500, 3))
+    own = photographs()
+    turn = shot_around(room, "turntable", count=8, own=own).cameras
+    places = np.stack([camera.position for camera in turn])
+    assert np.allclose(np.linalg.norm(places[:, [0, 2]], axis=1), 1)
+    assert np.allclose(places[0], own[0].position)
+    assert (turn[0].width, turn[0].fx, turn[0].cx) == (300, 200.0, 140.0)
+    outside = shot_around(room, "turntable", count=8, own=own, up="-y").cameras
+    assert min(np.linalg.norm(camera.position) for camera in outside) > 3
+    assert len(shot_around(room, "through", count=5, own=own).frames) == 5
+    with pytest.raises(InputError, match="--path through: goes through cameras"):
+        shot_around(room, "through", own=own, up="-y")
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "scale"),
+    [((300, 200), (512, 512), 2.56), ((200, 300), (512, 512), 2.56), ((300, 200), (600, 200), 2.0)],
+)
+def test_pictures_of_another_shape_show_what_was_photographed(
+    shape: tuple[int, int], size: tuple[int, int], scale: float
+) -> None:
+    """The longer sides are cut, the shorter kept; the principal point keeps its distance from the middle."""
+    camera = among(photographs(12, *shape), size)[0]
+    assert (camera.width, camera.height) == size
+    assert (camera.fx, camera.fy) == pytest.approx((200 * scale, 210 * scale))
+    away = (140 - shape[0] / 2, 101 - shape[1] / 2)
+    assert (camera.cx - size[0] / 2, camera.cy - size[1] / 2) == pytest.approx((away[0] * scale, away[1] * scale))
+
+
+def test_strays_and_other_projections_among_own_cameras() -> None:
+    own = photographs()
+    far = replace(own[3], translation=own[3].translation + np.array([0, 0, 5000.0]))
+    assert len(among([*own, far])) == len(own)
+    fisheyes = [replace(camera, projection="fisheye") for camera in own]
+    camera = among(fisheyes, (400, 300))[0]
+    assert (camera.projection, camera.width, camera.height) == ("perspective", 400, 300)
+    assert 2 * np.degrees(np.arctan(150 / camera.fy)) == pytest.approx(40)  # FIELD
+    assert np.allclose(camera.position, own[0].position)

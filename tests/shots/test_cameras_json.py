@@ -128,8 +128,14 @@ def test_names_that_are_missing_or_there_twice(tmp_path: Path) -> None:
         ([1, 2], "is a list that begins with 1, expected"),
         ([[1.0, 0.0]], "is a list that begins with [1.0, 0.0], expected"),
         ([{"id": 0, "name": "front door"}], "is a list that begins with {'id': 0"),
-        ([camera(rotation=None)], "is a list that begins with"),
-        ([camera(), 7], "is a list that begins with"),
+        ([None], "is a list that begins with null, expected the cameras"),
+        ([camera(rotation=None)], "is a list that begins with {'id': 0"),
+        ([camera(), 7], "camera 1 is 7, expected an object with 'position', 'rotation'"),
+        ([camera(), camera(1), None], "camera 2 is null, expected an object"),
+        ([camera(), {"x": 1}, camera(2)], "camera 1: has no 'position' and no 'rotation', expected an object with"),
+        ([camera(), camera(1, rotation=None)], "camera 1 (IMG_1): has no 'rotation', expected an object"),
+        ([{**camera(), "position": None}, camera(1)], "camera 0 (IMG_0): has no 'position', expected an object"),
+        ([camera(cx="middle")], "camera 0 (IMG_0): 'cx' is 'middle', expected a number"),
         ([camera(rotation=[1, 0, 0, 0])], "camera 0 (IMG_0): 'rotation' is [1, 0, 0, 0], expected three rows"),
         ([camera(rotation=np.diag([1.0, 1, -1]).tolist())], "'rotation' is no rotation (determinant -1)"),
         ([camera(rotation=np.diag([2.0, 2, 2]).tolist())], "'rotation' is no rotation (determinant 8)"),
@@ -156,3 +162,15 @@ def test_lists_that_cannot_be(document: Any, message: str, tmp_path: Path) -> No
 def test_they_have_no_lenses_to_bend_by(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no lenses of photographs, expected a COLMAP model's folder"):
         choose_shot(write(tmp_path / "cameras.json", [camera()]), distort=True)
+
+
+@pytest.mark.brings("exporters of cameras.json", "`cx cy` in its entries", "the principal point")
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [({"cx": 300.5, "cy": 260.0}, (300.5, 260)), ({"cx": 310}, (310, 240)), ({"cy": 0.0}, (320, 0))],
+)
+def test_a_principal_point_beside_the_middle(
+    changes: dict[str, Any], wanted: tuple[float, float], tmp_path: Path
+) -> None:
+    first = read_shot(write(tmp_path / "cameras.json", [camera(**changes)])).cameras[0]
+    assert (first.cx, first.cy) == wanted

@@ -115,7 +115,7 @@ def test_little_memory_changes_no_byte(scene: Scene, default_device: Device) -> 
 def test_without_being_told_a_batch_has_a_view_for_each_device(scene: Scene, default_device: Device) -> None:
     devices = halves(default_device.index)
     assert_same_model(train(scene, short(iterations=12), device=devices), train(scene, short(iterations=12, batch=2)))
-    with pytest.raises(InputError, match=r"--batch 3: expected a multiple of 2, as --device names 2 devices"):
+    with pytest.raises(InputError, match=r"--batch 3: expected a multiple of 2, the number of devices"):
         train(scene, short(batch=3), device=devices)
     with pytest.raises(InputError, match="expected open devices"):
         train(scene, short(), device=[])

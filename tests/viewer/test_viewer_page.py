@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import time
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 from browser import kept
 from systems import posix
-from tiny import CONFIG
+from tiny import CONFIG, cameras
 from viewer_browser import SLOW, choose, clsplat
 
 from clsplat.cli.main import main
@@ -23,8 +24,11 @@ from clsplat.gaussians import Gaussians
 from clsplat.images.reading import read_image
 from clsplat.rendering.renderer import Renderer
 from clsplat.shots import choose_shot
+from clsplat.viewer.pose import start_of
 
 PAGE = {"width": 900, "height": 600}
+EXACT = re.compile(r"^\d+ x \d+, exact$")
+"""The remark on an exact picture, which has fewer pixels than the page where the browser is slow."""
 CLEAR = (slice(250, 580), slice(20, 560))
 """Rows and columns of the page where no panel is, nor the frame of a key that was recorded here."""
 
@@ -109,6 +113,38 @@ def test_the_page_shows_what_render_does(browser: Any, served: tuple[str, Path],
         main(["render", str(trained), "--cameras", str(tmp_path / "one.json"), "--width", "320", "--height", "180",
               "-o", str(tmp_path / "render.png")])  # fmt: skip
         np.testing.assert_array_equal(exact, read_image(tmp_path / "render.png"))
+    finally:
+        page.close()
+
+
+def test_a_phone_held_upright_shows_the_first_photograph_from_side_to_side(
+    browser: Any, served: tuple[str, Path], tmp_path: Path
+) -> None:
+    """And turned, what a wide page shows. In motion nothing says exact."""
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.set_default_timeout(SLOW)
+    try:
+        page.goto(served[0])
+        page.get_by_text(EXACT).wait_for()
+        page.screenshot(path=kept(tmp_path, "upright.png"))
+        start = start_of(cameras(), np.zeros((0, 3)))
+        found = choose_shot(record(page, tmp_path), path=None, count=None).frames[0].camera
+        across = math.tan(start.fov / 2) * start.aspect  # that of the page, which a wide picture has down
+        assert 0.5 * found.height / found.fy == pytest.approx(across, rel=1e-4)  # the browser's degrees
+        page.set_viewport_size(PAGE)
+        page.wait_for_timeout(2000)
+        page.get_by_text(EXACT).wait_for()
+        found = choose_shot(record(page, tmp_path), path=None, count=None).frames[0].camera
+        assert 0.5 * found.height / found.fy == pytest.approx(math.tan(start.fov / 2), rel=1e-4)
+        page.mouse.move(200, 400)
+        page.mouse.down()
+        for step in range(10):
+            page.mouse.move(200 + 8 * step, 400)
+            page.wait_for_timeout(30)
+        page.get_by_text("coarse").wait_for()
+        assert page.get_by_text("exact").count() == 0
+        page.mouse.up()
+        page.get_by_text(EXACT).wait_for()
     finally:
         page.close()
 

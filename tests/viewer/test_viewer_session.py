@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from clsplat.viewer.appearance import (
     read_look,
 )
 from clsplat.viewer.path_recorder import MOST_KEYS, add_key, path_document, save_path
-from clsplat.viewer.pose import Pose, fitted, looking, read_pose, start_of
+from clsplat.viewer.pose import WIDEST, Pose, fitted, looking, read_pose, start_of
 from clsplat.viewer.refinement import PATIENCE, SETTLE, SMALLEST, START, TARGET, Level, Refinement, Share, next_scale
 from clsplat.viewer.scheduler import Viewer, Viewing
 
@@ -112,6 +113,47 @@ def test_the_start_is_where_the_first_camera_stands() -> None:
         start.target, ZERO, atol=0.7
     )  # they look at the origin, some from above, some from below
     np.testing.assert_allclose(start.up, [0, -1, 0], atol=0.05)
+
+
+@pytest.mark.parametrize("size", [(390, 844), (360, 640), (600, 800), (500, 501)])
+def test_an_upright_page_shows_what_the_first_photograph_does(size: tuple[int, int]) -> None:
+    """From side to side and more above and below: a corner of the photograph is on the page."""
+    first = cameras()[0]
+    assert first.width > first.height
+    start = start_of(cameras(), np.zeros((0, 3)))
+    page = looking(start, size).camera()
+    across = [0.5 * each.width / each.fx for each in (page, first)]
+    assert across[0] == pytest.approx(across[1])  # of the horizontal angle the tangent, to rounding
+    assert page.height / page.fy > first.height / first.fy
+    assert start.fov_on(first.width, first.height) == start.fov == start.fov_on(1920, 300)
+
+
+def test_an_upright_page_shows_all_of_a_model_without_cameras() -> None:
+    points = np.random.default_rng(0).normal(size=(5000, 3))
+    start = start_of([], points)
+    for width, height in ((390, 844), (640, 480), (1, 3)):
+        camera = looking(start, (width, height)).camera()
+        seen = points @ camera.rotation.T + camera.translation
+        pixels = seen[:, :2] / seen[:, 2:] * camera.fx
+        inside = (abs(pixels[:, 0]) < width / 2) & (abs(pixels[:, 1]) < height / 2) & (seen[:, 2] > 0)
+        assert inside.mean() > (0.95 if height < 3 * width else 0.8), (width, height)
+    assert start.fov_on(1, 1000) == WIDEST
+
+
+def test_a_picture_of_an_upright_page_is_no_wider_than_the_page() -> None:
+    """The angle across the page is that across a square, and that down a wider picture."""
+    upright = replace(pose(size=(300, 600)), fov=2 * math.atan(1.2))
+    for (width, height), down in (
+        ((300, 600), 1.2),
+        ((600, 600), 0.6),
+        ((1280, 720), 0.6),
+        ((400, 600), 0.9),
+        ((9, 90), 1.2),
+    ):
+        camera = upright.camera(width, height)
+        assert 0.5 * height / camera.fy == pytest.approx(down)
+        document = json.loads(path_document([upright], (width, height)))
+        assert math.tan(math.radians(document["keys"][0]["fov_y"]) / 2) == pytest.approx(down)
 
 
 def test_without_cameras_the_start_is_before_the_points() -> None:
@@ -471,6 +513,29 @@ def test_each_sees_their_own_camera_in_turn() -> None:
     assert pages[1].shown[-1].exact, "who moves does not keep the others from their exact picture"
     assert not pages[0].shown[-1].exact
     assert model.asked[-1][:2] != (0, 0)
+
+
+def test_an_exact_picture_that_comes_too_late_is_not_called_exact() -> None:
+    """The camera has moved while it was made: beside what moves nothing says exact."""
+    found, model, (page,), clock = viewing(0.0)
+    assert found.work()
+    clock.now = 10.0
+    picture = model.picture
+
+    def slow(*arguments: Any, **options: Any) -> tuple[np.ndarray, str]:
+        found.moved(page.viewer, pose(7.0))
+        return picture(*arguments, **options)
+
+    model.picture = slow  # type: ignore[method-assign]
+    assert found.work()
+    assert model.asked[-1][3], "it was made as an exact one"
+    assert not page.shown[-1].exact
+    model.picture = picture  # type: ignore[method-assign]
+    assert found.work() and not page.shown[-1].exact
+    clock.now = 20.0
+    while found.work():
+        pass
+    assert page.shown[-1] == Level(1.0, exact=True)
 
 
 def test_the_same_camera_once_more_is_no_news() -> None:

@@ -151,9 +151,13 @@ class Asset:
         said = self.item("accessors", index)
         kind = COMPONENTS.get(self.integer(said, "componentType"))
         count, offset = self.integer(said, "count"), self.integer(said, "byteOffset", 0)
-        if kind is None or WIDTHS.get(str(said.get("type"))) != width:
+        if kind is None:
+            found = str(said["componentType"])[:20]
+            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126 but 5124")
+        if WIDTHS.get(str(said.get("type"))) != width:
+            expected = next(name for name, numbers in WIDTHS.items() if numbers == width)
             raise InputError(
-                f"{self.path}: {semantic} is of the type {str(said.get('type'))[:20]}, expected {width} numbers"
+                f"{self.path}: {semantic} is of the type {str(said.get('type'))[:20]}, expected {expected}"
             )
         if "sparse" in said or "bufferView" not in said:
             raise InputError(f"{self.path}: {semantic} is sparse or has no values of its own, which is not supported")

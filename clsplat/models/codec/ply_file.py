@@ -8,6 +8,7 @@ NEAR_PLANE and ALONG_RAYS are clsplat's own, those of antialiasing many programs
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -36,6 +37,9 @@ _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4
 TYPES = _TYPES | {np.dtype(code).name: code for code in _TYPES.values()}
 """NumPy's types by PLY's names, of which newer ones, such as float32, are NumPy's."""
 BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+_NAN = re.compile(r"[-+]?(?:1\.#(?:[qs]?nan|ind)\d*|[qs]?nan(?:\(\w*\))?)", re.IGNORECASE)
+_INFINITE = re.compile(r"([-+]?)1\.#inf\d*", re.IGNORECASE)
 
 ORIGIN = ["comment", "clsplat", "origin"]
 NEAR_PLANE = ["comment", "clsplat", "near"]
@@ -79,10 +83,10 @@ class Header:
     by_rays: bool = False
 
     def is_antialiased(self) -> bool:
-        """True if the comments say so (`codec.antialias`). Warns where they say both."""
+        """True if the comments say so (`codec.antialias`). Warns where they say both, or what is not understood."""
         said = antialias.of_comments(self.comments)
-        if said.contradiction:
-            warn(f"{self.path}: {said.contradiction}")
+        if said.warning:
+            warn(f"{self.path}: {said.warning}")
         return said.antialiased
 
     @property
@@ -120,6 +124,7 @@ def _header_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
         if not line.endswith(b"\n"):
             return
         yield line
+    raise InputError(f"{path}: PLY header has more than {MAX_HEADER_LINES:,} lines; is it damaged?")
 
 
 def read_header(file: BinaryIO, path: Path) -> Header:
@@ -216,6 +221,19 @@ def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
             yield line
 
 
+def _spelt(words: list[bytes], where: str) -> list[float]:
+    """The numbers of a row, some of which are not finite in the words of Microsoft's C. Raises InputError, which begins
+    with `where`."""
+    found = []
+    for word in words:
+        text = word.decode("ascii", "replace")
+        try:
+            found.append(np.nan if _NAN.fullmatch(text) else float(_INFINITE.sub(r"\1inf", text)))
+        except ValueError:
+            raise InputError(f"{where} has {text[:40]!r}, expected a number") from None
+    return found
+
+
 def _ascii_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
     """float64. A row is at least a character and a blank for each property."""
     path, vertex = header.path, header.vertex
@@ -241,8 +259,8 @@ def _ascii_blocks(file: BinaryIO, header: Header, what: str) -> Iterator[Block]:
             raise InputError(f"{path}: truncated: {vertex.count} {what}s expected, {have} bytes are too few for them")
         try:
             table = np.array(rows, dtype="S").astype(np.float64).reshape(count, width)
-        except ValueError as error:
-            raise InputError(f"{path}: a value after {what} {first} is no number ({error})") from None
+        except ValueError:
+            table = np.array([_spelt(words, f"{path}: {what} {first + at}") for at, words in enumerate(rows)])
         yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
     if header.elements[-1] is vertex and next(lines, None) is not None:
         warn(f"{path}: text after the last {what} ignored")

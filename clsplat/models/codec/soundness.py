@@ -34,7 +34,15 @@ BYTE_STEP = 0.02
 OPAQUE = 20.0
 """Logits beyond this are of no use in float32: levels of bytes reach further."""
 FEW = 10
-"""Different whole numbers that the logits of a model made by hand may be."""
+"""Different logits that a model made by hand may have."""
+SPREAD = (0.35, 0.93)
+"""Opacities of a trained model reach below the first, a hundredth of them, though it is pruned, and beyond the second.
+Logits that do and are none under 0 would be of a model pruned to opacities from 0.5 to 0.58 on that had its largest
+from 0.717 to 0.735: trained models have some over 0.8, and those of short trainings end lower."""
+CLIPPED = (1e-3, 0.02)
+"""Opacities next to 1, by how much at most, of which networks have this part at least; logits are dense nowhere."""
+PERCENT = (40.0, 100.0)
+"""The largest of percentages. As levels of 255 such would be of a model that has nothing more opaque than 0.4."""
 NO_LOG = float(np.log(values.LEAST_SCALE)) + 1
 """Log scales under this are those of scales of 0, which say nothing of how the others are meant."""
 SKEWED = 3.0
@@ -61,11 +69,18 @@ def finite_rows(gaussians: Gaussians) -> NDArray[np.bool_]:
     return rows
 
 
-def sound(gaussians: Gaussians, where: Path | str) -> Gaussians:
-    """The model with what this module says done to it, in place where no Gaussian is left out. Warns, once of each
-    kind, beginning with `where`; raises InputError where no Gaussian is left."""
+def without_turn(gaussians: Gaussians) -> NDArray[np.bool_]:
+    """(n,): the Gaussians with a quaternion of 0."""
+    return np.asarray(~gaussians.quaternions.any(axis=1))
+
+
+def sound(gaussians: Gaussians, where: Path | str, activated: Activated | None = None) -> Gaussians:
+    """The model with what this module says done to it, in place where no Gaussian is left out. activated: what it has
+    in place of logits and logs, which are taken of it. Warns, once of each kind, beginning with `where`; raises
+    InputError where no Gaussian is left. Gaussians have their numbers in the file."""
     mend(gaussians)
     good = finite_rows(gaussians)
+    numbers = np.flatnonzero(good)
     if not good.all():
         first, bad = int((~good).argmax()), int((~good).sum())
         name = next(
@@ -74,30 +89,31 @@ def sound(gaussians: Gaussians, where: Path | str) -> Gaussians:
             if not np.isfinite(array[first]).all()
         )
         found = (
-            f"{where}: {bad:,} of {len(good):,} Gaussians have a value that is not finite, the first is Gaussian "
-            f"{first} with {name}"
+            f"{where}: {bad:,} of {len(good):,} Gaussians {values.have(bad)} a value that is not finite, the first is "
+            f"Gaussian {first} with {name}"
         )
         if bad == len(good):
             raise InputError(f"{found}; expected some that are finite; is it damaged?")
-        warn(f"{found}; they are left out")
+        warn(f"{found}; {'it is' if bad == 1 else 'they are'} left out")
         gaussians = replace(gaussians, **{name: array[good] for name, array in gaussians.arrays().items()})
-    _turn(gaussians, where)
-    return gaussians
+    _turn(gaussians, numbers, len(good), where)
+    return _deactivated(gaussians, activated, numbers, where) if activated else gaussians
 
 
-def _turn(gaussians: Gaussians, where: Path | str) -> None:
+def _turn(gaussians: Gaussians, numbers: NDArray[np.intp], count: int, where: Path | str) -> None:
     quaternions = gaussians.quaternions
     with np.errstate(over="ignore", under="ignore"):
         squares = np.einsum("ij,ij->i", quaternions, quaternions)
     odd = np.flatnonzero(~((squares > LENGTHS[0]) & (squares < LENGTHS[1])))
     if not len(odd):
         return
-    none = odd[~quaternions[odd].any(axis=1)]
+    none = numbers[odd[~quaternions[odd].any(axis=1)]]
     quaternions[odd] = values.unit_quaternions(quaternions[odd])
     if len(none):
         warn(
-            f"{where}: {len(none):,} of {len(quaternions):,} Gaussians have a quaternion of 0, the first is Gaussian "
-            f"{none[0]}; they are drawn unrotated, other programs may not draw them"
+            f"{where}: {len(none):,} of {count:,} Gaussians {values.have(len(none))} a quaternion of 0, the first is "
+            f"Gaussian {none[0]}; {'it is' if len(none) == 1 else 'they are'} drawn unrotated, other programs may not "
+            f"draw {'it' if len(none) == 1 else 'them'}"
         )
 
 
@@ -120,12 +136,25 @@ def _seen_opacities(logits: Float32) -> str:
     low, high = float(logits.min()), float(logits.max())
     if low < -BYTE_STEP or low == high or high > (1 + BYTE_STEP) * (white := _white(logits)):
         return ""
-    return f"all opacities lie in {low:.3g} to {high:.3g}, as {'opacities from 0 to 1' if white == 1 else 'levels'} do,"
+    if white == 1 and not _spread(logits):
+        return ""
+    kind = {1.0: "opacities from 0 to 1", 100.0: "percentages"}.get(white, "levels")
+    return f"all opacities lie in {low:.3g} to {high:.3g}, as {kind} do,"
+
+
+def _spread(opacities: Float32) -> bool:
+    """True if values from 0 to 1 lie as opacities do, and not as the logits that a pruned model has left do."""
+    if len(np.unique(opacities)) <= FEW:
+        return False
+    reach = bool(np.percentile(opacities, 1) < SPREAD[0]) and bool(opacities.max() > SPREAD[1])
+    return reach or float((np.abs(opacities - 1) <= CLIPPED[0]).mean()) >= CLIPPED[1]
 
 
 def _white(logits: Float32) -> float:
-    """The largest that the opacities are levels of, if they are: 1 or, of whole numbers, 255 or more."""
+    """The largest that the opacities are levels of, if they are: 1 or, of whole numbers, 100, 255 or more."""
     whole = logits.max() > OPAQUE and bool((logits == np.rint(logits)).all()) and len(np.unique(logits)) > FEW
+    if whole and PERCENT[0] <= logits.max() <= PERCENT[1]:
+        return PERCENT[1]
     return values.full_scale(logits) if whole else 1.0
 
 
@@ -141,21 +170,30 @@ def _seen_scales(log_scales: Float32) -> str:
     return f"all scales lie in {p0:.3g} to {p100:.3g}, half of them under {p50:.3g}, as lengths do,"
 
 
-def deactivated(gaussians: Gaussians, which: Activated, where: Path | str) -> Gaussians:
-    """The model whose opacities, 0 to 1 or 0 to 255, or scales were taken for logits and logs, with logits and logs of
-    them. Raises InputError, which begins with `where`, for values that cannot be opacities or scales."""
+def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.intp], where: Path | str) -> Gaussians:
+    """The model whose opacities, 0 to 1, to 100 or to 255, or scales were taken for logits and logs, with logits and
+    logs of them; numbers: of its Gaussians in the file. Raises InputError, which begins with `where`, for values that
+    cannot be opacities or scales, and for levels of which it cannot be told what they are parts of."""
     changed: dict[str, Any] = {}
     if which in ("opacities", "both"):
-        opacity = gaussians.opacity_logits / np.float32(_white(gaussians.opacity_logits))
+        white, most = _white(gaussians.opacity_logits), float(gaussians.opacity_logits.max())
+        if white > PERCENT[1] and most < PERCENT[0]:
+            raise InputError(
+                f"{where}: opacities are whole numbers up to {most:g}, expected 0 to 1, or some over {PERCENT[0]:g}; "
+                "it cannot be known whether these are parts of 100 or of 255"
+            )
+        opacity = gaussians.opacity_logits / np.float32(white)
         near = (opacity >= -BYTE_STEP) & (opacity <= 1 + BYTE_STEP)
-        changed["opacity_logits"] = values.logits_of(np.where(near, np.clip(opacity, 0, 1), opacity), where)
+        opacity = np.where(near, np.clip(opacity, 0, 1), opacity)
+        changed["opacity_logits"] = values.logits_of(opacity, where, numbers)
     if which in ("scales", "both"):
         scales = gaussians.log_scales.copy()
         scales[scales < NO_LOG] = 0
         if (bad := (scales < 0).any(axis=1)).any():
             at = int(bad.argmax())
             raise InputError(
-                f"{where}: Gaussian {at} has a scale of {scales[at].min():g}, expected lengths; are these logs?"
+                f"{where}: Gaussian {numbers[at]} has a scale of {scales[at].min():g}, expected lengths; are these "
+                "logs?"
             )
         log = np.log(np.maximum(scales, values.LEAST_SCALE, dtype=np.float64))
         changed["log_scales"] = log.astype(np.float32)

@@ -107,8 +107,8 @@ def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str
     negative ones.
     """
     with np.errstate(invalid="ignore"):
-        negative = [(gaussians.log_scales < 0).any(axis=1) for _, gaussians in parts]
-    count, total = sum(int(rows.sum()) for rows in negative), sum(map(len, negative))
+        negative = [np.asarray((gaussians.log_scales < 0).any(axis=1)) for _, gaussians in parts]
+    count, total = sum(int(rows.sum()) for rows in negative), sum(len(gaussians) for _, gaussians in parts)
     logs = "read as logs of scales, though this format holds scales themselves"
     if writer:
         warn(f"{parts[0][0]}: its scales are {logs}, as {writer} wrote them")

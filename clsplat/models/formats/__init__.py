@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from clsplat.files import is_file, open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.colour import recorded_space
 from clsplat.models.codec import soundness
+from clsplat.models.codec.gltf_asset import EXTENSION
 from clsplat.models.codec.ply_file import MAX_HEADER_BYTES
 from clsplat.models.codec.soundness import Activated
 from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat, spz, usd, zipped
@@ -46,7 +48,8 @@ class Format:
     loses: what the format does not keep, in a few words; floats: True if it keeps floats; sh_degree: the highest that
     it holds; describe(path): the format's part of `clsplat info`; order(gaussians): (n,), the Gaussian of each row of
     a written file, None for their own order; blocks(path): the Gaussians in the world some rows at a time, for a format
-    that need not be held whole; side_files(path): the other files of a model of this name; space(path): of its colours.
+    that need not be held whole; side_files(path): the other files of a model of this name; space(path): of its colours;
+    marks: bytes of which a file with Gaussians has one in its beginning, none where a file of the format always has.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Format:
     blocks: Callable[[Path], Iterator[Gaussians]] | None = None
     side_files: Callable[[Path], list[Path]] = lambda _: []
     space: Callable[[Path], str] = recorded_space
+    marks: tuple[bytes, ...] = ()
 
 
 ZIP = ".zip"
@@ -70,6 +74,7 @@ UNIT_QUATERNIONS = "nothing but the quaternions' lengths and the logits of opaci
 
 _IN_ZIP = zipped.Inside(
     lambda path: is_model_name(path) and path.suffix.lower() != ZIP,
+    lambda path, head: _has_mark(path, head),  # noqa: PLW0108
     lambda path: resolve(path),  # noqa: PLW0108  # which goes by the table
 )
 
@@ -78,13 +83,15 @@ FORMATS: tuple[Format, ...] = (
            loses="position and scale to 10 or 11 bits of a chunk's range, rotation to 10, colour and opacity to 8, SH "
                  "to 1/32", describe=compressed_ply.describe, order=compressed_ply.order),
     Format("glTF", (".gltf", ".glb"), gltf.read, gltf.write, gltf.recognises,
-           loses=UNIT_QUATERNIONS, floats=True, describe=gltf.describe, side_files=gltf.side_files),
+           loses=UNIT_QUATERNIONS, floats=True, describe=gltf.describe, side_files=gltf.side_files,
+           marks=(EXTENSION.encode(),)),
     Format("ksplat", (".ksplat",), ksplat.read, loses="not written here", describe=ksplat.describe),
     Format("3DGS PLY", (".ply",), ply.read, ply.write, ply.recognises,
-           loses="nothing", floats=True, describe=ply.describe, blocks=ply.blocks),
+           loses="nothing", floats=True, describe=ply.describe, blocks=ply.blocks,
+           marks=(ply.SCALE[0].encode(), b"packed_position")),
     Format("SOG", ("meta.json", ".sog"), sog.read, sog.write, sog.recognises,
            loses="positions to 16 bits, the rest to 8, spherical harmonics to a palette",
-           describe=sog.describe, side_files=sog.side_files),
+           describe=sog.describe, side_files=sog.side_files, marks=(b'"means"', b"PK")),
     Format("splat", (".splat",), splat.read, splat.write,
            loses="SH beyond degree 0; colour, opacity and rotation to 8 bits, colour beyond 0 to 1", sh_degree=0),
     Format("SPZ", (".spz",), spz.read, spz.write, spz.recognises,
@@ -139,8 +146,37 @@ def format_of(path: Path) -> Format:
             head += file.read(MAX_HEADER_BYTES)
     # of a format without a beginning of its own another's counts, but for JSON's, which says too little
     fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
+    if head.startswith(zipped.FILE) and (not fits or named is _row("SOG")):
+        return _archive(path, named)
     others = () if fits else (row for row in FORMATS if row.recognises and row.recognises(head))
     return next(iter(others), named) or format_of_name(path)
+
+
+def _archive(path: Path, named: Format | None) -> Format:
+    """The format of an archive that is none of OpenUSD or .zip by its name: SOG if one of its files is SOG's, or it is
+    named so and has no model of another format."""
+    names = _IN_ZIP.names(path)
+    is_sog = sog.META in names or (named is _row("SOG") and not names)
+    return _row("SOG" if is_sog else "zipped model")
+
+
+def _row(name: str) -> Format:
+    return next(row for row in FORMATS if row.name == name)
+
+
+def _has_mark(path: Path, head: bytes) -> bool:
+    """False for a file of a model's name whose beginning has none of its format's marks."""
+    named = _named(path)
+    return named is not None and (not named.marks or any(mark in head for mark in named.marks))
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[tuple[Path, Format]]:
+    """The model's file and its format, of a zipped model those in the archive; the file is there for as long. Raises
+    InputError as `resolve`, and as `zipped.unpacked`."""
+    file, row = path, format_of(path)
+    with _IN_ZIP.model(path) if row is _row("zipped model") else nullcontext((file, row)) as found:
+        yield found
 
 
 def resolve(path: Path) -> tuple[Path, Format]:
@@ -164,15 +200,13 @@ def model_path(path: Path) -> Path:
     return next((path / name for name in names if is_file(path / name)), path)
 
 
-def load(path: str | os.PathLike[str], *, activated: Activated | None = None) -> Gaussians:
+def load(path: str | os.PathLike[str], *, activated: Activated | None = None, doubts: bool = True) -> Gaussians:
     """Read a model file of any format; `soundness.sound` of it. activated: what the file has in place of its logits or
-    logs, which are taken of it; else a warning says where this seems to be needed. Raises InputError naming the file
-    and the trouble."""
+    logs, which are taken of it; else a warning says where this seems to be needed, unless doubts is False. Raises
+    InputError naming the file and the trouble."""
     path, row = resolve(Path(path))
-    gaussians = soundness.sound(row.read(path), path)
-    if activated:
-        gaussians = soundness.deactivated(gaussians, activated, path)
-    for text in soundness.doubts(gaussians.opacity_logits, gaussians.log_scales):
+    gaussians = soundness.sound(row.read(path), path, activated)
+    for text in soundness.doubts(gaussians.opacity_logits, gaussians.log_scales) if doubts else ():
         warn(f"{path}: {text}")
     if gaussians.near == NEAR:
         gaussians.near = _near_of(gaussians)

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -57,6 +58,8 @@ from clsplat.spherical_harmonics import C0
 GLB_MAGIC = 0x46546C67
 FLOAT32, UINT16 = 5126, 5123
 LARGEST_GLB = (1 << 32) - 1
+LOGS_WRITER, LOGS_UNTIL = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
+"""A program whose files, of versions before that, have logs in place of scales."""
 Rows = Callable[[slice], Array]
 """An attribute: what gives some of its rows."""
 
@@ -84,19 +87,28 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
     asset = Asset.open(path)
-    parts = []
-    for name, matrix, primitive in list(asset.primitives()):  # all of them are counted first
-        part = _gaussians(asset, name, primitive)
-        # the node's matrix is in glTF's frame, the Gaussians are in ours already
-        turn = np.diag([*LEFT_UP, 1.0])
-        parts.append(axes.place(part, turn @ matrix @ turn, f"{path}: {name}"))
-    if not parts:
+    primitives = list(asset.primitives())  # all of them are counted first
+    if not primitives:
         raise InputError(f"{path}: has no primitive with {EXTENSION} in its scene, expected at least one")
-    return merge(parts)
+    scaled: list[tuple[str, Gaussians]] = []
+    parts = [_gaussians(asset, name, primitive, scaled) for name, _, primitive in primitives]
+    if scaled:
+        values.all_to_log_scales(scaled, _writer_of_logs(asset))
+    # the node's matrix is in glTF's frame, the Gaussians are in ours already
+    turn = np.diag([*LEFT_UP, 1.0])
+    placed = zip(parts, primitives, strict=True)
+    return merge([axes.place(part, turn @ matrix @ turn, f"{path}: {name}") for part, (name, matrix, _) in placed])
 
 
-def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
-    """The primitive's Gaussians in our frame."""
+def _writer_of_logs(asset: Asset) -> str:
+    """The program that wrote the file, if it is one that wrote logs of scales; else an empty text."""
+    generator = str(as_object(asset.document.get("asset")).get("generator", ""))[:80]
+    match = LOGS_WRITER.fullmatch(generator.strip())
+    return generator if match and (int(match[1]), int(match[2])) < LOGS_UNTIL else ""
+
+
+def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[tuple[str, Gaussians]]) -> Gaussians:
+    """The primitive's Gaussians in our frame; those with scales in place of logs are added to `scaled`."""
     said = as_object(primitive["extensions"][EXTENSION])
     kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
     if kernel != "ellipse":
@@ -111,10 +123,14 @@ def _gaussians(asset: Asset, name: str, primitive: dict[str, Any]) -> Gaussians:
         if extension in nested:
             blob = asset.view(as_object(nested[extension]).get("bufferView"))
             return spz.read_from(io.BytesIO(blob.data), len(blob), asset.path)
-    return _from_attributes(asset, name, as_object(primitive.get("attributes")))
+    part = _from_attributes(asset, name, as_object(primitive.get("attributes")))
+    scaled.append((f"{asset.path}: {name}", part))
+    return part
 
 
 def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussians:
+    """Its scales are not logs yet."""
+
     def array(semantic: str, width: int) -> Array:
         if semantic not in indices:
             raise InputError(f"{asset.path}: {name} lacks the attribute {semantic}")
@@ -141,7 +157,6 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
         result.opacity_logits[rows] = values.logits_of(real(opacity[rows])[:, 0], where, rows.start)
         for index, coefficient in enumerate(coefficients):
             result.sh[rows, index] = real(coefficient[rows])
-    values.to_log_scales(result, where)
     axes.flip(result, LEFT_UP)
     return result
 

@@ -14,7 +14,7 @@ over both.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from math import isqrt
@@ -58,7 +58,8 @@ FILTER = "filter_3D"
 LOCAL = "clsplat_local"
 """The element that has the means as they count from the origin."""
 RGB = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Names of colours, in place of DC, where there is no view dependence: nerfstudio's export, and files of points."""
+"""Names of colours, in any case, in place of DC, where there is no view dependence: nerfstudio's export, and files of
+points."""
 REQUIRED = (*POSITION, *DC, "opacity", *SCALE, *ROTATION)
 
 
@@ -231,7 +232,8 @@ def _check_properties(header: Header) -> int:
         missing = [name for name in missing if name not in DC]
     if missing:
         noun = "property" if len(missing) == 1 else "properties"
-        raise InputError(f"{path}: PLY lacks the {noun} {examples(missing)}, expected a 3DGS model")
+        colours = f" with {DC[0]} to {DC[-1][-1]}, or {' '.join(RGB[0])}" if {*DC} <= {*missing} else ""
+        raise InputError(f"{path}: PLY lacks the {noun} {examples(missing)}, expected a 3DGS model{colours}")
     rest = sum(name.startswith("f_rest_") for name in names)
     counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 2)]
     if rest not in counts:
@@ -252,8 +254,14 @@ def _degree(rest: int) -> int:
 
 def _colour_names(vertex: Element) -> tuple[str, ...]:
     """The properties that colours are read from: DC, unless there are none of them but others."""
-    names = {name for name, _ in vertex.properties}
-    return next((rgb for rgb in RGB if names.issuperset(rgb) and names.isdisjoint(DC)), DC)
+    names = [name for name, _ in vertex.properties]
+    return _rgb_names(names) or DC if set(DC).isdisjoint(names) else DC
+
+
+def _rgb_names(names: Iterable[str]) -> tuple[str, ...]:
+    """The properties among these that are colours by a name of RGB, as they are spelt there; none without all three."""
+    spelt = {name.lower(): name for name in names}
+    return next((tuple(spelt[name] for name in rgb) for rgb in RGB if spelt.keys() >= {*rgb}), ())
 
 
 def _take_colours(gaussians: Gaussians, vertex: Element) -> None:
@@ -262,8 +270,10 @@ def _take_colours(gaussians: Gaussians, vertex: Element) -> None:
         kinds = {np.dtype(kind) for name, kind in vertex.properties if name in names}
         whole = all(kind.kind in "iu" for kind in kinds)
         levels = gaussians.sh[:, 0]
+        finite = levels[np.isfinite(levels)]  # text may have others for whole numbers too
         kind = np.dtype("u1") if kinds == {np.dtype("u1")} else np.dtype("i8")
-        white = values.full_scale(levels.astype(kind) if whole else levels)
+        with np.errstate(invalid="ignore"):  # of numbers that are none of the type
+            white = values.full_scale(finite.astype(kind) if whole else finite)
         gaussians.sh[:, 0] = values.coefficients(levels / white)
 
 
@@ -288,8 +298,7 @@ def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
     if SCALE[2] not in block:  # 2DGS: flat
         gaussians.log_scales[:, 2] = np.log(values.LEAST_SCALE)
     if DC[0] not in block:
-        rgb = next(names for names in RGB if names[0] in block)
-        gaussians.sh[:, 0] = np.stack([block[name] for name in rgb], axis=1)
+        gaussians.sh[:, 0] = np.stack([block[name] for name in _rgb_names(block)], axis=1)
 
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int) -> Gaussians:

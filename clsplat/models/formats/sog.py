@@ -20,7 +20,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -45,7 +45,7 @@ from clsplat.files import (
     write_error,
 )
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
-from clsplat.images.reading import error_of, open_image
+from clsplat.images.reading import error_of, one_line, open_image
 from clsplat.models.codec import antialias
 from clsplat.models.codec import values as packing
 from clsplat.models.codec.palette import codebook, nearest, palette
@@ -78,10 +78,11 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
-    """True if meta.json says so, as `antialias` or as `model`. Warns where they contradict each other."""
+    """True if meta.json says so, as `antialias` or as `model`. Warns where they contradict each other, or are not
+    understood."""
     said = antialias.of_object(meta)
-    if said.contradiction:
-        warn(f"{path}: {META} {said.contradiction}")
+    if said.warning:
+        warn(f"{path}: {META} {said.warning}")
     return said.antialiased
 
 
@@ -113,8 +114,29 @@ def _opened(path: Path) -> Iterator[tuple[Path, dict[str, Any], PictureFile]]:
         except (zipfile.BadZipFile, ValueError, NotImplementedError, EOFError) as error:
             raise InputError(f"{path}: is no .sog archive ({error})") from None
         with archive:
-            unpacked = partial(_unpacked, path, archive, folder / "file.webp")
+            members = _members(archive)
+            unpacked = partial(_unpacked, path, archive, members, folder / "file.webp")
             yield path, _parsed(path, unpacked(META, MAX_DOCUMENT).read_bytes()), unpacked
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, str]:
+    """The names of the files beside META, which may be in a folder of the archive, by what they are in the archive."""
+    whole = [name.replace("\\", "/") for name in archive.namelist()]
+    metas = sorted((name for name in whole if name.rpartition("/")[2] == META), key=lambda name: name.count("/"))
+    folder = metas[0].removesuffix(META) if metas else ""
+    names = zip(whole, archive.namelist(), strict=True)
+    return {name.removeprefix(folder): stored for name, stored in names if name.startswith(folder)}
+
+
+def _names(folder: Path) -> list[str]:
+    return [file.name for file in folder.iterdir()]
+
+
+def _spelt(name: str, names: Iterable[str]) -> str:
+    """The name, or the only one among these that is it but for the case, as Windows and macOS find files."""
+    names = list(names)
+    alike = [other for other in names if other.lower() == name.lower()] if name not in names else []
+    return alike[0] if len(alike) == 1 else name
 
 
 def _parsed(path: Path, text: str | bytes) -> dict[str, Any]:
@@ -136,15 +158,20 @@ def _beside(path: Path, name: str, _limit: int) -> Path:
         picture = folder
     if picture.parent != folder:
         raise InputError(f"{path}: has a picture {name[:80]!r}, expected one beside it")
+    if not is_file(picture) and is_file(other := folder / _spelt(picture.name, _names(folder))):
+        return other
     if not is_file(picture):
         raise InputError(f"{path}: its picture {name} is missing")
     return picture
 
 
-def _unpacked(path: Path, archive: zipfile.ZipFile, target: Path, name: str, limit: int) -> Path:
-    """A file in a .sog, of at most so many bytes, unpacked to the target."""
+def _unpacked(
+    path: Path, archive: zipfile.ZipFile, members: dict[str, str], target: Path, name: str, limit: int
+) -> Path:
+    """A file in a .sog, of at most so many bytes, unpacked to the target; members: as of `_members`."""
+    spelt = _spelt(name, members)
     try:
-        with archive.open(name) as source, target.open("wb") as file:
+        with archive.open(members.get(spelt, spelt)) as source, target.open("wb") as file:
             left = limit
             while block := source.read(min(1 << 20, left + 1)):
                 left -= len(block)
@@ -169,11 +196,15 @@ class _Meta:
         self.path, self.meta, self.file = path, meta, file
         self.version = meta.get("version", 1)
         if self.version not in (1, 2):
-            raise InputError(f"{self.path}: SOG version {str(self.version)[:20]}, expected 1 or 2")
+            found = json.dumps(self.version)[:20]
+            raise InputError(f"{self.path}: SOG version {found} in {META}, expected the number 1 or 2")
         shape = self.section("means").get("shape", [0])
         count = meta.get("count") if self.version == 2 else shape[0] if isinstance(shape, list) and shape else 0
+        if self.version == 2 and (not isinstance(count, int) or isinstance(count, bool)):
+            found = f"the count {json.dumps(count)[:20]}" if "count" in meta else "no count"
+            raise InputError(f"{self.path}: {META} has {found}, expected the number of Gaussians, a whole number")
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count < 1 << 32:
-            raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected at least one")
+            raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected 1 to {(1 << 32) - 1}")
         self.count = count
 
     def section(self, name: str) -> dict[str, Any]:
@@ -192,7 +223,7 @@ class _Meta:
         value = value if isinstance(value, list) else [value]
         count = f"{least}" if least == most else f"{least} to {most}"
         if not least <= len(value) <= most:
-            raise InputError(f"{where} has {len(value)} numbers, expected {count}")
+            raise InputError(f"{where} has {len(value)} number{'' if len(value) == 1 else 's'}, expected {count}")
         nulls = [number is None for number in value]
         if all(nulls) or (any(nulls) and section == "means"):
             found = "nothing but null" if all(nulls) else "null"
@@ -200,7 +231,8 @@ class _Meta:
         null = -np.inf if section == "scales" else np.nan
         array = numbers([null if empty else number for empty, number in zip(nulls, value, strict=True)])
         if array.shape != (len(value),) or not np.isfinite(array[~np.array(nulls)]).all():
-            raise InputError(f"{where} has other values than numbers, expected {count} of them")
+            expected = "a number" if count == "1" else f"{count} of them"
+            raise InputError(f"{where} has other values than numbers, expected {expected}")
         return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
@@ -223,9 +255,12 @@ class _Meta:
             reason = error_of(source)
             source.close()
             if decoded is None or reason:
-                raise InputError(f"{file}: does not decode: {reason or 'the decoder gives no reason'}")
+                raise InputError(f"{file}: does not decode: {one_line(reason)}")
         except InputError as error:
-            raise InputError(str(error).replace(str(file), f"{self.path}: {names[index][:80]}", 1)) from None
+            before, unpacked, after = str(error).partition(plain(str(file)))
+            # the decoder's own words may have its name too
+            named = f"{self.path}: {names[index][:80]}" + after.replace(unpacked, names[index][:80]) if unpacked else ""
+            raise InputError(before + named) from None
         return np.asarray(decoded).reshape(spec.height, spec.width, -1)[:, :, :channels]
 
     def pixels(self, section: str, index: int, channels: int) -> Bytes:
@@ -242,7 +277,7 @@ class _Meta:
             low, high = (self.numbers("sh0", key, 4, 4)[3] for key in ("mins", "maxs"))
             opacity_logits = (low + (high - low) * (bytes_[:, 3] / 255)).astype(np.float32)
         sh0 = self.dequantised("sh0", bytes_[:, :3])[:, None]
-        sh = np.concatenate([sh0, self.rest()], axis=1) if "shN" in self.meta else sh0
+        sh = np.concatenate([sh0, self.rest()], axis=1) if self.meta.get("shN") is not None else sh0
         return Gaussians(means, quaternions, scales, opacity_logits, sh)
 
     def means(self) -> Float32:
@@ -258,12 +293,24 @@ class _Meta:
             entries = self.numbers(section, "codebook", 1, 256).astype(np.float32)
             if int(values.max()) >= len(entries):
                 raise InputError(f"{self.path}: {section} has an index {values.max()} into {len(entries)} entries")
+            if section == "scales":
+                self.tell_of_nulls(entries, values)
             return entries[values]
         width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
         low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
         part = values / 255
         with np.errstate(invalid="ignore"):  # of infinite bounds
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
+
+    def tell_of_nulls(self, entries: Float32, indices: Bytes) -> None:
+        """Warn of null among the numbers of the scales' codebook: sorted, as they are, -inf would be the first."""
+        null = np.isinf(entries)
+        if (count := int(null.sum())) and null[int((~null).argmax()) :].any():
+            users = int(null[indices].any(axis=1).sum())
+            warn(
+                f"{self.path}: codebook of scales in {META} has null in place of {count} of {len(entries)} numbers, "
+                f"which {users:,} of {self.count:,} Gaussians use as a scale of 0; is the model that it is of damaged?"
+            )
 
     def rest(self) -> Float32:
         """Coefficients above 0, (n, K - 1, 3)."""

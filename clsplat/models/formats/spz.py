@@ -42,8 +42,8 @@ Bytes = NDArray[np.uint8]
 Stream = Any
 """A file, or a reader of gzip or Zstandard."""
 VERSIONS = (2, 3, 4)
-DEFAULT_VERSION = 4
-"""Version that the format's library and splat-transform write."""
+DEFAULT_VERSION = 3
+"""Version that most readers of the web take (docs/formats.md); the format's library and splat-transform write 4."""
 SH_BITS = (6, 6)
 """Bits of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of
 strong view dependence 11 dB worse, at 36 (docs/formats.md). Readers need not know."""
@@ -119,6 +119,11 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     assert stream is not None
     _unpack(((name, stream) for name in header.widths), header, UP_BACK, result, path)
     behind = _rest(stream, path)
+    if len(behind) > MAX_EXTENSIONS and isinstance(stream, gzip.GzipFile):
+        raise InputError(
+            f"{path}: unpacks to more than {header.count} Gaussians: over {MAX_EXTENSIONS} bytes follow, expected "
+            "extensions at most; is it damaged?"
+        )
     if header.flags & HAS_EXTENSIONS and (signs := _frame(behind, path)) != UP_BACK:
         flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
     elif behind and not header.flags & HAS_EXTENSIONS:
@@ -225,9 +230,9 @@ def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
 
 
 def _rest(stream: Any, path: Path) -> bytes:
-    """The bytes after the Gaussians, up to MAX_EXTENSIONS; gzip checks its sum at the end."""
+    """The bytes after the Gaussians, one more than MAX_EXTENSIONS at most; gzip checks its sum at the end."""
     with _decompressing(path, "at its end"):
-        return bytes(stream.read(MAX_EXTENSIONS))
+        return bytes(stream.read(MAX_EXTENSIONS + 1))
 
 
 @contextmanager

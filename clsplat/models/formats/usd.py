@@ -31,13 +31,14 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.errors import InputError, warn
+from clsplat.errors import InputError, examples, warn
 from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.colour import INTEROP, LINEAR, SRGB, linear_to_srgb, srgb_to_linear
 from clsplat.models.codec import axes
 from clsplat.models.codec import values as packing
 from clsplat.models.edit import merge
+from clsplat.models.formats.usd_places import Place, find_places
 
 TYPE = "ParticleField3DGaussianSplat"
 TYPES = (TYPE, "ParticleField_3DGaussianSplat")
@@ -151,31 +152,34 @@ def read(path: Path) -> Gaussians:
 def read_here(path: Path) -> Gaussians:
     """`read` of a file that is known not to end the process."""
     stage = _open(path)
-    from pxr import Usd, UsdGeom
+    from pxr import Usd
 
     time = Usd.TimeCode.EarliestTime()
-    transforms = UsdGeom.XformCache(time)
-    parts = []
+    parts, read = [], {}
     with readable(path):
-        prims = splats_of(path, stage)
-        space = space_of(path, prims)
-        for prim in prims:
-            where = f"{path}: {prim.GetPath()}"
-            part = gaussians_of(where, prim, time, space)
-            # USD's vectors are rows, so its matrices are the transposes of ours
-            matrix = np.array(transforms.GetLocalToWorldTransform(prim), np.float64).T
-            parts.append(axes.place(part, matrix, where))
+        places = splats_of(path, stage)[0]
+        space = space_of(path, [place.prim for place in places])
+        for place in places:
+            where, own = f"{path}: {place.name}", place.prim.GetPath()
+            matrix, shown = place.at(time)
+            if place.seat is not None and not shown:
+                continue
+            if own not in read:
+                read[own] = gaussians_of(where, place.prim, time, space)
+            parts.append(axes.place(read[own], matrix, where))
+    if not parts:
+        raise InputError(f"{path}: shows none of its instances at its first time, expected at least one")
     return merge(parts)
 
 
-def splats_of(path: Path, stage: Any) -> list[Any]:
-    """The prims of Gaussians, those of instances too. Raises InputError for a stage without any."""
-    from pxr import Usd
-
-    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if prim.GetTypeName() in TYPES]
-    if not prims:
-        raise InputError(f"{path}: has no {TYPE} in it, expected at least one")
-    return prims
+def splats_of(path: Path, stage: Any) -> tuple[list[Place], list[str]]:
+    """The prims of Gaussians as they are drawn, those of instances too; and what else is to be drawn (`find_places`).
+    Raises InputError for a stage without any."""
+    places, left = find_places(stage, path, TYPES)
+    if not places:
+        nothing = f"; not drawn: {examples(left)}" if left else ""
+        raise InputError(f"{path}: has no {TYPE} in it that is drawn, expected at least one{nothing}")
+    return places, left
 
 
 def recorded_space(path: Path) -> str:
@@ -183,7 +187,7 @@ def recorded_space(path: Path) -> str:
     survive(path)
     stage = _open(path)
     with readable(path):
-        return space_of(path, splats_of(path, stage))
+        return space_of(path, [place.prim for place in splats_of(path, stage)[0]])
 
 
 def space_of(path: Path, prims: Sequence[Any]) -> str:
@@ -222,7 +226,8 @@ def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int |
         if value is not None:
             array = np.asarray(value)
             if array.size % width or not np.issubdtype(array.dtype, np.floating):
-                raise InputError(f"{where}: {key} are {array.dtype} {array.shape}, expected rows of {width} numbers")
+                expected = "numbers" if width == 1 else f"rows of {width} numbers"
+                raise InputError(f"{where}: {key} are {array.dtype} {array.shape}, expected {expected}")
             rows = array.reshape(-1, width)
             if count is not None and len(rows) < count:
                 raise InputError(f"{where}: has {len(rows)} {key}, expected {count}")

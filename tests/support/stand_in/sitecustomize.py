@@ -18,14 +18,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 
-def _numbered(text: str, name: str, file: Path) -> int:
-    """The number of a text. Processes build one after the other, so the file needs no lock."""
+def _numbered(text: str, name: str, file: Path) -> tuple[int, bool]:
+    """The number of a text, and whether it is new. Processes build one after the other, so the file needs no lock."""
     line = f"{hashlib.sha256(text.encode()).hexdigest()} {name}"
     known = file.read_text().splitlines() if file.exists() else []
-    if line not in known:
+    if is_new := line not in known:
         known.append(line)
         file.write_text("\n".join(known))
-    return known.index(line) + 1
+    return known.index(line) + 1, is_new
 
 
 def _die(words):
@@ -34,7 +34,7 @@ def _die(words):
 
 
 def _end_badly(how):
-    if how == "abort":
+    if how in ("abort", "once"):
         _die("cannot select")
     if how == "hang":
         time.sleep(600)
@@ -50,7 +50,8 @@ def _misbehave(cl):
     texts = {}
 
     def is_doomed(text, name):
-        return int(first) <= _numbered(text, name, Path(file)) <= int(last)
+        number, is_new = _numbered(text, name, Path(file))
+        return int(first) <= number <= int(last) and (is_new or how != "once")
 
     def build(self, options=(), *args, **kwargs):
         if not hasattr(self, "_source"):

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The flags of a verb, read from its dataclass: help in groups by what they are for, and near names for wrong ones."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import difflib
+import inspect
+import shutil
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from tyro.conf import FlagCreatePairsOff, Positional, Suppress
+
+Groups = tuple[tuple[str, tuple[str, ...]], ...]
+"""Titles with names of flags, which may end in `*`. A flag is in the first group that names it."""
+OTHERS = "Others"
+COLUMN = 24
+"""Where the text of a flag begins; what is named longer has it a line below."""
+NEAR = 0.75
+"""Likeness, 0 to 1, from which a flag is taken for the one that was meant."""
+_WORDS = {int: "INT", float: "FLOAT", str: "STR"}
+
+
+@dataclass(frozen=True)
+class Option:
+    """A flag, or an argument without one. names: of the command line, none for an argument; text: its docstring; off:
+    the name that switches it off, where there is one."""
+
+    names: tuple[str, ...]
+    metavar: str
+    text: str
+    default: Any = None
+    required: bool = False
+    off: str = ""
+
+    @property
+    def key(self) -> str:
+        """The long name without its hyphens, of an argument its metavar."""
+        return self.names[-1].removeprefix("--") if self.names else self.metavar
+
+    @property
+    def told(self) -> str:
+        """Text with what counts where the flag is not given, unless that is nothing or the text says it."""
+        silent = self.default is None or self.default is False or self.default in ("", ())
+        if self.required:
+            return f"{self.text} (required)"
+        return self.text if silent else f"{self.text} (default: {_shown(self.default)})"
+
+
+def options(kind: type, prefix: str = "") -> Iterator[Option]:
+    """The flags of a dataclass, those of dataclasses within it too, in the order of its fields."""
+    hints, texts = get_type_hints(kind, include_extras=True), _docstrings(kind)
+    for field in dataclasses.fields(kind):
+        hint, conf = hints[field.name], _conf(hints[field.name])
+        name = getattr(conf, "name", None)
+        bare = _bare(hint)
+        if _marker(Suppress) in _metadata(hint):
+            continue
+        if isinstance(bare, type) and dataclasses.is_dataclass(bare):
+            within = field.name if name is None else name
+            yield from options(bare, f"{prefix}{within}." if within else prefix)
+            continue
+        long = (prefix + (name or field.name)).replace("_", "-")
+        positional = _marker(Positional) in _metadata(hint)
+        pairs = bare is bool and _marker(FlagCreatePairsOff) not in _metadata(hint)
+        *parents, last = long.split(".")
+        default, required = field.default, field.default is dataclasses.MISSING
+        names = () if positional else (*(getattr(conf, "aliases", None) or ()), f"--{long}")
+        metavar = getattr(conf, "metavar", None) or ("" if bare is bool else _metavar(bare, long))
+        off = ".".join([*parents, f"no-{last}"]) if pairs else ""
+        yield Option(
+            names, metavar, texts.get(field.name, ""), None if required else default, required, off and f"--{off}"
+        )
+
+
+def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None) -> str:
+    """The help of a verb, its flags in groups; width: of the lines, by the terminal if not given."""
+    width = min(width or shutil.get_terminal_size().columns, 100)
+    every = list(options(kind))
+    placed: dict[str, list[Option]] = {title: [] for title in (*(title for title, _ in groups), OTHERS)}
+    for option in every:
+        title = next((title for title, names in groups if any(fnmatchcase(option.key, name) for name in names)), OTHERS)
+        placed[title].append(option)
+    for title, names in groups:  # as the table lists them
+        order = {option.key: index for index, name in enumerate(names) for option in every if option.key == name}
+        placed[title].sort(key=lambda option: order.get(option.key, len(every)))
+    wanted = [option for option in every if option.required]
+    usage = " ".join(f"{(*option.names, '')[0]} {option.metavar}".strip() for option in wanted)
+    lines = [f"usage: {prog} {usage} [OPTIONS]", "", *textwrap.wrap(inspect.getdoc(kind) or "", width)]
+    for title, entries in placed.items():
+        if entries:
+            lines += ["", f"{title}:", *(line for option in entries for line in _lines(option, width))]
+    return "\n".join([*lines, "", f"  {'-h, --help':{COLUMN - 2}}Show this help."])
+
+
+def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
+    """The flags in `arguments` that the verb has not, each with the nearest name, as one line; empty without such."""
+    known = ["--help", "--help-verbose"]
+    for option in options(kind):
+        known += [*option.names, option.off] if option.off else option.names
+    given = dict.fromkeys(word.partition("=")[0] for word in arguments if word.startswith("--") and word != "--")
+    wrong = [word for word in given if word.replace("_", "-") not in known]
+    told = [
+        f"{word} is no flag, " + (f"did you mean {found}?" if (found := near(word, known)) else "") for word in wrong
+    ]
+    return " ".join(f"{text}expected one of {prog} --help;" if text.endswith(" ") else text for text in told).rstrip(
+        ";"
+    )
+
+
+def near(word: str, known: Sequence[str]) -> str:
+    """The known name that is most like the word; empty where none is."""
+    plain = {name.lower().replace("_", "-").replace("colour", "color"): name for name in known}
+    meant = word.lower().replace("_", "-").replace("colour", "color")
+    # a part of a name, such as --shutter, or of one with a dot, such as --fps
+    parts = [name for name in plain if name.endswith(f".{meant[2:]}") or name.startswith(f"{meant}-")]
+    found = parts or difflib.get_close_matches(meant, plain, 1, NEAR)
+    return plain[found[0]] if found and len(meant.lstrip("-")) > 2 else ""
+
+
+def _lines(option: Option, width: int) -> Iterator[str]:
+    head = "  " + f"{', '.join(option.names)} {option.metavar}".strip()
+    told = textwrap.wrap(" ".join(option.told.split()), width - COLUMN, break_on_hyphens=False)
+    if len(head) > COLUMN - 2:
+        yield head
+    elif told:
+        yield f"{head:{COLUMN}}{told.pop(0)}"
+    for line in told:
+        yield f"{'':{COLUMN}}{line}"
+
+
+def _shown(value: object) -> str:
+    return (
+        ",".join(map(str, value))
+        if isinstance(value, tuple)
+        else f"{value:.6g}"
+        if isinstance(value, float)
+        else str(value)
+    )
+
+
+def _marker(marked: Any) -> Any:
+    """The mark that a type of tyro's, such as Positional, puts on another."""
+    return get_args(marked[int])[1]
+
+
+def _metadata(hint: Any) -> tuple[Any, ...]:
+    return tuple(get_args(hint)[1:]) if get_origin(hint) is Annotated else ()
+
+
+def _conf(hint: Any) -> Any:
+    """The facts that tyro's `arg` gives of a flag, None without."""
+    return next((each for each in _metadata(hint) if hasattr(each, "metavar")), None)
+
+
+def _bare(hint: Any) -> Any:
+    """The type without annotations and without None."""
+    while get_origin(hint) is Annotated:
+        hint = get_args(hint)[0]
+    if get_origin(hint) in (Union, UnionType):
+        rest = [each for each in get_args(hint) if each is not type(None)]
+        return _bare(rest[0]) if len(rest) == 1 else Union[tuple(rest)]  # noqa: UP007
+    return hint
+
+
+def _metavar(bare: Any, name: str) -> str:
+    if get_origin(bare) is Literal:
+        return "|".join(map(str, get_args(bare)))
+    return _WORDS.get(bare, name.rpartition(".")[2].upper())
+
+
+def _docstrings(kind: type) -> dict[str, str]:
+    """By field the text below it, in this class or the nearest that it is made from; none without the source."""
+    texts: dict[str, str] = {}
+    for each in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(each):
+            continue
+        try:
+            (tree,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        assert isinstance(tree, ast.ClassDef)
+        for field, text in zip(tree.body, tree.body[1:], strict=False):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(text, ast.Expr)
+                and isinstance(text.value, ast.Constant)
+            ):
+                texts[field.target.id] = str(text.value.value)
+    return texts

@@ -1,0 +1,389 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a USD stage draws its Gaussians: each prim in its own place, and once for each instance of a PointInstancer.
+
+As USD's own renderers do: what is below an instancer is drawn for its instances alone; a prototype may lie elsewhere,
+and is then drawn there too; an instance has the local transform of its prototype's prim, and of the visibility that of
+the prims from there on, with the instancer's. Instances keep their number, or their id where the instancer has ids.
+Between time samples USD interpolates, or follows the velocities.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from bisect import bisect_right
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.errors import InputError
+
+MOST_PLACES = 1_000_000
+"""Prims of Gaussians that a stage may place; more are a slip, or a file that is to fill the memory."""
+_KEPT = 16
+"""Times of which an instancer's places are held."""
+_MOVING = ("positions", "orientations", "orientationsf", "scales")
+_SPEEDS = ("velocities", "angularVelocities")
+_CHOSEN = ("protoIndices", "ids", "invisibleIds")
+
+Key = tuple[int, int]
+"""Of an instance: its id, or number, and that of its prototype."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A prim of Gaussians as it is drawn once. name: its path, of an instance INSTANCER[ID] with the path below the
+    prototype; seat: the instance that it is in."""
+
+    prim: Any
+    name: str
+    seat: Seat | None = None
+
+    def at(self, code: Any) -> tuple[Float64, bool]:
+        """The matrix (4, 4) from the prim to the world, and whether it is seen, at a time code. Raises InputError."""
+        matrix, shown = _seated(self.prim, self.seat, code)
+        # USD's vectors are rows, so its matrices are the transposes of ours
+        return np.array(matrix, np.float64).T, shown
+
+    @property
+    def is_drawn(self) -> bool:
+        """True unless its purpose, or that of an instancer that it is in, is that of a proxy or a guide."""
+        seat, drawn = self.seat, _for_render(self.prim)
+        while seat is not None and drawn:
+            instances = seat.instances
+            seat, drawn = instances.seat, _for_render(instances.prim)
+        return drawn
+
+    @property
+    def moves(self) -> bool:
+        """True if its transform or its visibility may change over time."""
+        if self.seat is None:
+            return any(map(_varies, _above(self.prim, None)))
+        return self.seat.instances.moves or any(map(_varies, _above(self.prim, self.seat.root)))
+
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """The first and the last time at which its transform has a value, or that of what it is in; all times where an
+        instancer has velocities."""
+        times = [time for prim in _above(self.prim, self.seat and self.seat.root) for time in _samples_of(prim)]
+        seat = self.seat
+        while seat is not None:
+            times += seat.instances.reach
+            seat = seat.instances.seat
+        return (min(times), max(times)) if times else None
+
+
+@dataclass(frozen=True, eq=False)
+class Seat:
+    """An instance; root: the prim of its prototype."""
+
+    instances: Instances
+    key: Key
+    root: Any
+
+
+class Instances:
+    """The instances of a PointInstancer, which may be in an instance itself."""
+
+    def __init__(self, prim: Any, name: str, where: str, seat: Seat | None) -> None:
+        """name: its path, or as `Place.name`; where: begins errors. Raises InputError for prototypes that are not
+        there."""
+        from pxr import UsdGeom
+
+        self.prim, self.name, self.where, self.seat = prim, name, f"{where}: {name}", seat
+        self._instancer = UsdGeom.PointInstancer(prim)
+        stage = prim.GetStage()
+        targets = self._instancer.GetPrototypesRel().GetForwardedTargets()
+        self.roots = [stage.GetPrimAtPath(path) for path in targets]
+        if lost := [str(path) for path, root in zip(targets, self.roots, strict=True) if not root]:
+            raise InputError(f"{self.where}: has the prototype {lost[0]}, expected a prim that is there")
+        chosen = [self._instancer.GetProtoIndicesAttr(), self._instancer.GetIdsAttr()]
+        self._times = sorted({float(time) for attribute in chosen for time in attribute.GetTimeSamples()})
+        self._there = [self._keys(time) for time in self._times or [self._first()]]
+        self._known: dict[float, tuple[dict[Key, Any], frozenset[Key]]] = {}
+
+    @property
+    def keys(self) -> list[Key]:
+        """All instances that there are at any time, in the order of their first."""
+        return list(dict.fromkeys(key for keys in self._there for key in keys))
+
+    @property
+    def reach(self) -> list[float]:
+        """Times that say where the instances are."""
+        moved = [time for name in _MOVING for time in self._samples(name)]
+        own = moved + [time for prim in _above(self.prim, self.seat and self.seat.root) for time in _samples_of(prim)]
+        return [-math.inf, math.inf, *own] if moved and any(map(self._has, _SPEEDS)) else own
+
+    @property
+    def moves(self) -> bool:
+        """True if an instance may move, appear or vanish."""
+        if any(self._samples(name) for name in (*_MOVING, *_SPEEDS, *_CHOSEN)):
+            return True
+        above = _above(self.prim, self.seat and self.seat.root)
+        return any(map(_varies, above)) or (self.seat is not None and self.seat.instances.moves)
+
+    def of(self, key: Key, code: Any) -> tuple[Any, bool]:
+        """USD's matrix from the prototype's parent to the world, and whether the instance is seen. One that is not
+        there at the time is where it last was, or will be, and is not seen. Raises InputError."""
+        places, hidden = self._at(code)
+        if key in places:
+            return places[key], key not in hidden
+        now = max(bisect_right(self._times, code.GetValue()) - 1, 0)
+        near = sorted(range(len(self._there)), key=lambda at: (at > now, abs(at - now)))
+        there = next(at for at in near if key in self._there[at])
+        return self._at(_code(self._times[there]))[0][key], False
+
+    def _at(self, code: Any) -> tuple[dict[Key, Any], frozenset[Key]]:
+        """Matrices of the instances, and those that are hidden."""
+        time = code.GetValue()
+        if time not in self._known:
+            if len(self._known) >= _KEPT:
+                self._known.clear()
+            self._known[time] = self._made(code)
+        return self._known[time]
+
+    def _made(self, code: Any) -> tuple[dict[Key, Any], frozenset[Key]]:
+        here = _code(self._first()) if code.IsEarliestTime() else code
+        keys, own = list(self._keys(here.GetValue())), self._own(here)
+        if len(own) != len(keys):
+            raise InputError(
+                f"{self.where} at {here.GetValue():g}: has {len(keys)} protoIndices, expected as many positions, and "
+                "as many orientations and scales or none"
+            )
+        outer, shown = _seated(self.prim, self.seat, code)
+        roots = [_local(root, code) for root in self.roots]
+        mask = list(self._instancer.ComputeMaskAtTime(here)) or [True] * len(keys)
+        hidden = (key for key, seen in zip(keys, mask, strict=True) if not (seen and shown))
+        places = {key: roots[key[1]] * (matrix * outer) for key, matrix in zip(keys, own, strict=True)}
+        return places, frozenset(hidden)
+
+    def _own(self, code: Any) -> list[Any]:
+        """USD's matrices of the instances in the instancer, of its positions, orientations and scales; none where USD
+        finds their numbers to differ.
+
+        Turns are those of the quaternions as xformOp:orient takes them: ComputeInstanceTransformsAtTime shears by what
+        they are off the length of 1, which halves always are.
+        """
+        from pxr import Gf, UsdGeom
+
+        kind = UsdGeom.PointInstancer
+        theirs = kind.ComputeInstanceTransformsAtTime(
+            self._instancer, code, code, kind.ExcludeProtoXform, kind.IgnoreMask
+        )
+        turns = self._get("orientationsf", code) or self._get("orientations", code)
+        scales = self._get("scales", code) or [Gf.Vec3f(1)] * len(theirs)
+        matrices = []
+        for index, matrix in enumerate(theirs):
+            turn = Gf.Matrix4d(1)
+            if self._has("angularVelocities"):
+                turn = _turn_of(matrix, scales[index])
+            elif turns:
+                turn = Gf.Matrix4d(1).SetRotate(Gf.Rotation(Gf.Quatd(turns[index])))
+            own = Gf.Matrix4d(1).SetScale(Gf.Vec3d(scales[index])) * turn
+            matrices.append(own.SetTranslateOnly(matrix.ExtractTranslation()))
+        return matrices
+
+    def _get(self, name: str, code: Any) -> Any:
+        attribute = self.prim.GetAttribute(name)
+        return attribute.Get(code) if attribute else None
+
+    def _keys(self, time: float) -> dict[Key, None]:
+        """The instances at a time, in their order."""
+        code = _code(time)
+        indices = [int(index) for index in self._instancer.GetProtoIndicesAttr().Get(code) or ()]
+        if wrong := [index for index in indices if not 0 <= index < len(self.roots)]:
+            raise InputError(
+                f"{self.where}: has protoIndices of {wrong[0]}, expected 0 to {len(self.roots) - 1}, as it has "
+                f"{len(self.roots)} prototypes"
+            )
+        ids = [int(number) for number in self._instancer.GetIdsAttr().Get(code) or ()]
+        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # as USD does, which takes no ids then
+            ids = list(range(len(indices)))
+        return dict.fromkeys(zip(ids, indices, strict=True))
+
+    def _samples(self, name: str) -> list[float]:
+        attribute = self.prim.GetAttribute(name)
+        return list(attribute.GetTimeSamples()) if attribute else []
+
+    def _has(self, name: str) -> bool:
+        attribute = self.prim.GetAttribute(name)
+        return bool(attribute and attribute.HasAuthoredValue())
+
+    def _first(self) -> float:
+        """The first time that has a value of the instances; 0 where they have values of no time."""
+        return min((time for name in (*_MOVING, *_CHOSEN) for time in self._samples(name)), default=0.0)
+
+
+@dataclass
+class _Found:
+    """Findings in a stage. where: begins errors; unused, shapes: prims that are not drawn, with why, by paths."""
+
+    where: str
+    kinds: Collection[str]
+    places: list[Place] = field(default_factory=list)
+    unused: dict[str, str] = field(default_factory=dict)
+    shapes: dict[str, str] = field(default_factory=dict)
+
+    def walk(self, prims: Any, root: Any, seat: Seat | None, name: str, chain: tuple[Any, ...]) -> None:
+        """Take the prims. root: of the prototype that they are of; name: of the instance; chain: paths of the
+        instancers that they are in. Raises InputError."""
+        from pxr import UsdGeom
+
+        for prim in prims:
+            path = prim.GetPath()
+            own = str(path) if seat is None else name + str(path)[len(str(root.GetPath())) :]
+            if prim.IsA(UsdGeom.PointInstancer):
+                prims.PruneChildren()
+                self._take_instances(Instances(prim, own, self.where, seat), chain)
+            elif prim.GetTypeName() in self.kinds:
+                self.places.append(Place(prim, own, seat))
+                if len(self.places) > MOST_PLACES:
+                    raise InputError(f"{self.where}: places over {MOST_PLACES:,} prims of Gaussians, expected less")
+            elif _is_visible_shape(prim):
+                self.shapes[str(path)] = f"{path} ({prim.GetTypeName()})"
+
+    def _take_instances(self, instances: Instances, chain: tuple[Any, ...]) -> None:
+        from pxr import Usd
+
+        path = instances.prim.GetPath()
+        if path in chain:
+            raise InputError(f"{instances.where}: is in a prototype of its own, expected one that it is not in")
+        used, empty = set(), set()
+        for number, index in instances.keys:
+            root, count = instances.roots[index], len(self.places)
+            used.add(root.GetPath())
+            if index in empty:
+                continue
+            prims, seat = iter(Usd.PrimRange(root, _of_prototypes())), Seat(instances, (number, index), root)
+            self.walk(prims, root, seat, f"{instances.name}[{number}]", (*chain, path))
+            if len(self.places) == count:
+                empty.add(index)  # no Gaussians in it, nor in its other instances
+        for prim in (prim for top in (instances.prim, *instances.roots) for prim in Usd.PrimRange(top, _of_classes())):
+            own = prim.GetPath()
+            if prim.GetTypeName() in self.kinds and (prim.IsAbstract() or not any(map(own.HasPrefix, used))):
+                self.unused[str(own)] = f"{own} (which no instance of {path} draws)"
+
+
+def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[Place], list[str]]:
+    """All prims of these kinds as they are drawn, in the stage's order; and what else a renderer of all of USD would
+    draw, or could not, with why. Raises InputError, which begins with `where`."""
+    from pxr import Usd
+
+    found = _Found(str(where), kinds)
+    found.walk(iter(stage.Traverse(Usd.TraverseInstanceProxies())), None, None, "", ())
+    drawn = {str(place.prim.GetPath()) for place in found.places}
+    unused = [text for path, text in found.unused.items() if path not in drawn]
+    return found.places, [*_lost(stage), *unused, *found.shapes.values()]
+
+
+def _lost(stage: Any) -> list[str]:
+    """Prims that refer to what cannot be opened, each with the file."""
+    lines = []
+    for error in stage.GetCompositionErrors():
+        if type(error).__name__ in ("ErrorInvalidAssetPath", "ErrorInvalidSublayerPath"):
+            file = re.search("@([^@]*)@", str(error))
+            lines.append(f"{error.rootSite.path} (its {file[1] if file else 'file'} cannot be opened)")
+    return lines
+
+
+def _of_prototypes() -> Any:
+    """USD's predicate of what is drawn of a prototype, which need not be defined."""
+    from pxr import Usd
+
+    return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract)
+
+
+def _of_classes() -> Any:
+    """The predicate with classes, of which nothing is drawn."""
+    from pxr import Usd
+
+    return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
+
+
+def _code(time: float) -> Any:
+    from pxr import Usd
+
+    return Usd.TimeCode(time)
+
+
+def _above(prim: Any, root: Any) -> Iterator[Any]:
+    """The prim and what it is in, up to the root, or all."""
+    while prim and not prim.IsPseudoRoot():
+        yield prim
+        if root and prim == root:
+            return
+        prim = prim.GetParent()
+
+
+def _seated(prim: Any, seat: Seat | None, code: Any) -> tuple[Any, bool]:
+    """USD's matrix from the prim to the world, and whether it is seen."""
+    from pxr import UsdGeom
+
+    cache = UsdGeom.XformCache(code)
+    if seat is None:
+        shown = not prim.IsA(UsdGeom.Imageable) or (
+            UsdGeom.Imageable(prim).ComputeVisibility(code) != UsdGeom.Tokens.invisible
+        )
+        return cache.GetLocalToWorldTransform(prim), shown
+    outer, shown = seat.instances.of(seat.key, code)
+    if prim == seat.root:
+        return outer, shown and not _hides(prim, code)
+    inner = cache.ComputeRelativeTransform(prim, seat.root)[0]
+    return inner * outer, shown and not any(_hides(own, code) for own in _above(prim, seat.root))
+
+
+def _local(prim: Any, code: Any) -> Any:
+    from pxr import Gf, UsdGeom
+
+    return UsdGeom.Xformable(prim).GetLocalTransformation(code) if prim.IsA(UsdGeom.Xformable) else Gf.Matrix4d(1)
+
+
+def _turn_of(matrix: Any, scales: Any) -> Any:
+    """The turn of USD's matrix of a scale and a turn that may be sheared a little: the nearest that is none."""
+    from pxr import Gf
+
+    rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]
+    u, _, vt = np.linalg.svd(rows) if np.isfinite(rows).all() else (rows, rows, np.eye(3))
+    return Gf.Matrix4d(1).SetRotate(Gf.Matrix3d(*(u @ vt).ravel().tolist()))
+
+
+def _hides(prim: Any, code: Any) -> bool:
+    from pxr import UsdGeom
+
+    if not prim.IsA(UsdGeom.Imageable):
+        return False
+    return bool(UsdGeom.Imageable(prim).GetVisibilityAttr().Get(code) == UsdGeom.Tokens.invisible)
+
+
+def _for_render(prim: Any) -> bool:
+    from pxr import UsdGeom
+
+    return UsdGeom.Imageable(prim).ComputePurpose() in (UsdGeom.Tokens.default_, UsdGeom.Tokens.render)
+
+
+def _is_visible_shape(prim: Any) -> bool:
+    """True for meshes, curves, points, volumes and other particles that are for renders, and seen."""
+    from pxr import Usd, UsdGeom
+
+    if not (prim.IsA(UsdGeom.Gprim) or str(prim.GetTypeName()).startswith("ParticleField")):
+        return False
+    first = Usd.TimeCode.EarliestTime()
+    return _for_render(prim) and UsdGeom.Imageable(prim).ComputeVisibility(first) != UsdGeom.Tokens.invisible
+
+
+def _varies(prim: Any) -> bool:
+    """True if the prim's own transform or visibility may change over time."""
+    from pxr import UsdGeom
+
+    if prim.IsA(UsdGeom.Xformable) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying():
+        return True
+    return bool(prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).GetVisibilityAttr().ValueMightBeTimeVarying())
+
+
+def _samples_of(prim: Any) -> list[float]:
+    from pxr import UsdGeom
+
+    return list(UsdGeom.Xformable(prim).GetTimeSamples()) if prim.IsA(UsdGeom.Xformable) else []

@@ -1,0 +1,114 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Time deep frames: the kernels, OpenEXR's own writer of the same samples, and all of it.
+
+    python tools/deep_times.py [MODEL CAMERAS] [--size 1920x1080] [--bins 16] [--repeats 5] [--device NAME]
+
+Without MODEL a made-up scene of 200,000 Gaussians. The frame is the first of CAMERAS, rendered once before, so that
+kernels are built. Prints medians in seconds, the samples, and the most main memory of the process while it renders. The
+writer's time is that of OpenImageIO's write of the samples that were read back, from first byte to closed file; it
+works with as many threads as in the frame. Where others use the machine too, processor time says more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import OpenImageIO as oiio
+
+from clsplat.bench.subject import synthetic
+from clsplat.cli.bench import parse_size
+from clsplat.cli.render_job import reshaped
+from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding
+from clsplat.device.context import open_device
+from clsplat.frame.deep_exr import write_deep
+from clsplat.gaussians import Gaussians
+from clsplat.images.colour import Colours
+from clsplat.images.frame_files import Header, deep_spec
+from clsplat.rendering.renderer import Renderer
+from clsplat.sequence.frame_renderer import TRANSFERS
+from clsplat.shots.read import read_shot
+
+
+def main(arguments: list[str]) -> int:
+    """Render, and print the medians."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path, nargs="?")
+    parser.add_argument("cameras", type=Path, nargs="?")
+    parser.add_argument("--size", default="1920x1080")
+    parser.add_argument("--bins", type=int, default=16)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--device")
+    options = parser.parse_args(arguments)
+    size = parse_size(options.size)
+    assert size is not None
+    if options.model is None:
+        subject = synthetic(200_000, *size)
+        gaussians, camera = subject.gaussians, subject.camera
+    else:
+        gaussians, camera = Gaussians.load(options.model), read_shot(options.cameras).frames[0].camera
+    camera, config = reshaped(camera, *size), DeepConfig(options.bins)
+    renderer, encoding = Renderer(open_device(options.device)), Encoding(compression="zips")
+    colours = Colours(ColourConfig(colorspace="lin_rec709"))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "deep.exr"
+        how = (config, encoding, None, colours)
+        write_deep(path, renderer, gaussians, camera.resized(64, 36), *how)
+        totals, kernels, used = [], [], time.process_time()
+        for _ in range(options.repeats):
+            start = time.monotonic()
+            write_deep(path, renderer, gaussians, camera, *how)
+            totals.append(time.monotonic() - start)
+        used = (time.process_time() - used) / options.repeats
+        most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        device = open_device(options.device, profile=True)  # its events take memory
+        renderer = Renderer(device)
+        for _ in range(options.repeats):
+            with device.recorder.recording(wait=False) as stages:
+                write_deep(path, renderer, gaussians, camera, *how)
+            times = [item for record in stages.values() for item in record.kernels.items()]
+            kernels.append(sum(taken for name, taken in times if name not in TRANSFERS) / 1000)
+        again, spec = Path(folder) / "again.exr", deep_spec(*size, encoding, Header())
+        pairs = [_written(path, again, spec) for _ in range(options.repeats)]
+        writes, of_writer = ([pair[which] for pair in pairs] for which in (0, 1))
+        same = path.read_bytes() == again.read_bytes()
+        samples = _samples(path)
+    total, kernel, write = map(statistics.median, (totals, kernels, writes))
+    print(
+        f"{camera.width}x{camera.height}, {options.bins} slices, {samples:,} samples: {total:.2f} s, kernels "
+        f"{kernel:.2f} s, OpenEXR's writer {write:.2f} s ({'the same bytes' if same else 'OTHER BYTES'}); "
+        f"{total / kernel:.2f} of the kernels, {total / (kernel + write):.2f} of both; processor time "
+        f"{used:.2f} s, the writer's {statistics.median(of_writer):.2f} s; {most / 2**20:.0f} MiB"
+    )
+    return int(not same)
+
+
+def _written(path: Path, again: Path, spec: Any) -> tuple[float, float]:
+    """Seconds that the writer takes for the samples of a file, and of processor time."""
+    source = oiio.ImageInput.open(str(path))
+    data = source.read_native_deep_image()
+    source.close()
+    start, used = time.monotonic(), time.process_time()
+    target = oiio.ImageOutput.create(str(again))
+    assert target.open(str(again), spec), target.geterror()
+    assert target.write_deep_image(data), target.geterror()
+    target.close()
+    return time.monotonic() - start, time.process_time() - used
+
+
+def _samples(path: Path) -> int:
+    source = oiio.ImageInput.open(str(path))
+    data = source.read_native_deep_image()
+    source.close()
+    return sum(map(data.samples, range(data.pixels)))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
