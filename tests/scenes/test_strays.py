@@ -25,7 +25,7 @@ from clsplat.viewer.pose import start_of
 
 def spoilt(rows: dict[int, float]) -> list[tuple[np.ndarray, np.ndarray]]:
     """The ring's poses, some of them so many times as far from the origin."""
-    return [moved(pose, centre_of(pose) * rows.get(index, 1.0)) for index, pose in enumerate(poses())]
+    return [moved(pose, centre_of(pose) * rows[index]) if index in rows else pose for index, pose in enumerate(poses())]
 
 
 def without(folder: Path, rows: dict[int, float], model: str) -> Scene:
