@@ -17,7 +17,7 @@ import numpy as np
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.jax.host import on_host, shape_like
-from clsplat.library.checks import Shape, check_shape, degree
+from clsplat.library.checks import Shape, check_shape, degree, plain
 from clsplat.library.checks import sizes as check_sizes
 from clsplat.library.projection import check_given, checked_planes
 from clsplat.library.rasterize import Rasterization, check_channels, checked_modes
@@ -128,7 +128,14 @@ def rasterize(
             floats[name] = floats[name][None]
     if backgrounds is not None and floats["backgrounds"].shape == floats["colors"].shape[-1:]:
         floats["backgrounds"] = jnp.tile(floats["backgrounds"], (len(floats["viewmats"]), 1))
-    return Rasterized(**_rasterize(Call(width, height, tuple(settings.items())), floats))
+    static = tuple((name, plain(value)) for name, value in settings.items())
+    return Rasterized(**_rasterize(Call(_side("width", width), _side("height", height), static), floats))
+
+
+def _side(name: str, given: Any) -> int:
+    if np.ndim(given):
+        raise InputError(f"{name} is {given!r:.80}, expected a whole number: all cameras have one size in JAX")
+    return check_sizes(name, given, 1)[0]
 
 
 @dataclass(frozen=True)
@@ -152,10 +159,6 @@ class Call:
         checked_modes(*(settings[name] for name in ("render_mode", "rasterize_mode", "alpha_max")))
         planes = ("near_plane", "far_plane", "eps2d", "radius_clip", "camera_model")
         checked_planes(*(settings[name] for name in planes))
-        for name, side in (("width", self.width), ("height", self.height)):
-            if np.ndim(side):
-                raise InputError(f"{name} is {side!r:.80}, expected a whole number: all cameras have one size in JAX")
-            check_sizes(name, side, 1)
         check_shape("means", sizes["means"], ("N", 3))
         check_shape("viewmats", sizes["viewmats"], ("C", 4, 4))
         count, views = sizes["means"][0], sizes["viewmats"][0]

@@ -213,7 +213,7 @@ def test_counts(default_device: Device, count: int) -> None:
         ("means", None, "means is None, expected an array"),
         ("scales", None, "scales is None, expected an array, as covars is None too"),
         ("covars", np.zeros((65, 6)), "covars: expected either these, or quaternions and scales"),
-        ("colors", np.zeros((65, 513)), "colors has 513 channels, expected 1 to 512"),
+        ("colors", np.zeros((65, 0)), "colors has 0 channels, expected 1 or more"),
         ("render_mode", "depth", "render_mode is 'depth', expected one of RGB, D"),
         ("rasterize_mode", "smooth", "rasterize_mode is 'smooth', expected one of classic, antialiased"),
         ("camera_model", "lens", "camera_model is 'lens', expected one of pinhole"),
@@ -227,6 +227,13 @@ def test_counts(default_device: Device, count: int) -> None:
 def test_an_argument_that_is_wrong_is_named_before_anything_runs(name: str, value: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         jax.eval_shape(lambda: clsplat.jax.rasterize(**{**cloud(), **SIZE, name: value}))
+
+
+def test_channels_beyond_one_pass_of_the_kernels_and_a_size_of_an_array(default_device: Device) -> None:
+    arrays = {**cloud(), "colors": np.random.default_rng(2).random((65, 515), np.float32), "backgrounds": None}
+    size = {"width": np.array(SIZE["width"]), "height": float(SIZE["height"])}
+    drawn = clsplat.jax.rasterize(**arrays, **size, device=default_device)
+    assert np.array_equal(drawn.images, clsplat.rasterize(**arrays, **SIZE, device=default_device).images)
 
 
 def test_one_camera_and_one_background_as_numpy_takes_them(default_device: Device) -> None:
