@@ -13,6 +13,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
 from clsplat.errors import examples, warn
+from clsplat.rotations import quaternion_of, rotation_from_quaternion
 from clsplat.scenes.data_set import PANORAMA, SHORTEST, SMALLEST, Lens, PosedImage, pixels_of
 
 Named = tuple[str, Camera, Lens]
@@ -26,6 +27,9 @@ LEAST_POINTS = 30
 SEEN, TIMES = 0.25, 4.0
 """Share of the points that the mean picture shows at least if poses are taken another way, and how many times as much
 as the poses as given. Pictures of a survey show a hundredth each, either way."""
+LITTLE, BLIND = 0.01, 0.2
+"""A picture shows nothing of the points with under this share of them; a way in which all pictures show more is told
+from this share of such pictures on. In the captures tried each shows a quarter at least."""
 FACING, MEETING = 0.2, 0.9
 """Shares of the cameras that face one point: at most as given, and at least with the poses turned round."""
 ASTRAY = 0.7
@@ -59,9 +63,9 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
     """Warnings about the cameras of pictures, at any size, by name. points: (N, 3) of the world, if there are any."""
-    cameras = [camera for _, camera, _ in views]
-    points = np.empty((0, 3)) if points is None else points
-    found = (_focal(views), _corner(views), _another_size(views), _poses(cameras, points))
+    flat = [(name, camera) for name, camera, _ in views if camera.projection == "perspective"]
+    points = np.empty((0, 3)) if points is None else points[:: -(-len(points) // POINTS) or 1]
+    found = (_focal(views), _corner(views), _another_size(views), _poses(flat, points))
     return [text for text in found if text]
 
 
@@ -115,35 +119,47 @@ def _another_size(views: Sequence[Named]) -> str:
     )
 
 
-def _poses(cameras: Sequence[Camera], points: Float64) -> str:
+def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
     """A doubt whether the poses mean what they are taken for: by the points that the pictures show if they are taken
-    another way, or without points by the cameras that face one place."""
-    flat = [camera for camera in cameras if camera.projection == "perspective"]
-    flat = flat[:: -(-len(flat) // LOOKED_AT) or 1]
+    another way, or without points by the cameras that face one place. If only some are odd, these."""
+    flat = [camera for _, camera in views[:: -(-len(views) // LOOKED_AT) or 1]]
     if len(flat) < FEWEST:
         return ""
-    shown = points[:: -(-len(points) // POINTS) or 1]
-    if len(shown) >= LEAST_POINTS:
-        given = _seen(flat, shown)
-        best, words = max(((_seen(list(map(how, flat)), shown), words) for words, how in OTHER_WAYS), key=_first)
-        if best < SEEN or best < TIMES * given:
-            return ""
+    if len(points) >= LEAST_POINTS:
+        shares = _shares(flat, points)
+        ways = ((_shares(list(map(how, flat)), points), words) for words, how in OTHER_WAYS)
+        others, words = max(ways, key=lambda way: float(way[0].mean()))
+        given, best = shares.mean(), others.mean()
+        some_blind = (shares < LITTLE).mean() >= BLIND and not (others < LITTLE).any()
+        if best < SEEN or (best < TIMES * given and not some_blind):
+            return _blind(views, points)
         evidence = (
             f"the pictures show {100 * given:.0f} % of the points, and {100 * best:.0f} % if the poses are {words}"
         )
     else:
-        ways = OTHER_WAYS[:2]  # turned axes alone move no camera
         if np.linalg.norm(np.mean([camera.rotation[2] for camera in flat], axis=0)) > ASTRAY:
             return ""
-        best, words = max(((_facing(list(map(how, flat))), words) for words, how in ways), key=_first)
-        if best < MEETING or _facing(flat) > FACING:
+        inverted = ((_facing(list(map(how, flat))), words) for words, how in OTHER_WAYS if words == INVERTED)
+        meeting, words = max(inverted)
+        if meeting < MEETING or _facing(flat) > FACING:
             return ""
-        evidence = f"the cameras face nothing in common, and {100 * best:.0f} % face one place if the poses are {words}"
+        evidence = (
+            f"the cameras face nothing in common, and {100 * meeting:.0f} % face one place if the poses are {words}"
+        )
     return f"{evidence}: is that how they were exported? Export them again, or correct the file"
 
 
-def _first(pair: tuple[float, str]) -> float:
-    return pair[0]
+def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
+    """A doubt about the poses of the pictures that show none of the points, where the others show many."""
+    shares = _shares([camera for _, camera in views], points)
+    blind = shares < LITTLE
+    if not blind.any() or (~blind).sum() < FEWEST or (usual := np.median(shares[~blind])) < SEEN:
+        return ""
+    names = examples(name for (name, _), none in zip(views, blind, strict=True) if none)
+    return (
+        f"{blind.sum():,} of {len(views):,} pictures show none of the points, or nearly, where the others show about "
+        f"{100 * usual:.0f} % ({names}): their poses are in doubt; correct them, or leave them out"
+    )
 
 
 def _inverted(camera: Camera) -> Camera:
@@ -161,18 +177,49 @@ def _inverted_opengl(camera: Camera) -> Camera:
     return replace(turned, rotation=FLIP[:, None] * turned.rotation * FLIP, translation=FLIP * turned.translation)
 
 
+def _of_places(camera: Camera) -> Camera:
+    """The camera whose place was given where its translation is expected."""
+    return replace(camera, translation=-camera.rotation @ camera.translation)
+
+
+def _of_last_w(camera: Camera) -> Camera:
+    """The camera whose quaternion was given as x y z w and read as w x y z."""
+    return replace(camera, rotation=rotation_from_quaternion(np.roll(quaternion_of(camera.rotation), 1)))
+
+
+def _transposed(camera: Camera) -> Camera:
+    return replace(camera, rotation=camera.rotation.T)
+
+
+def _transposed_in_place(camera: Camera) -> Camera:
+    turn = camera.rotation.T
+    return replace(camera, rotation=turn, translation=-turn @ camera.position)
+
+
+def _transposed_opengl(camera: Camera) -> Camera:
+    """As `_transposed_in_place`, of a matrix in OpenGL's axes."""
+    turn = FLIP[:, None] * camera.rotation.T * FLIP
+    return replace(camera, rotation=turn, translation=-turn @ camera.position)
+
+
 INVERTED = "inverted (camera from world in place of world from camera, or the other way round)"
+TRANSPOSED = "of transposed rotations (camera from world in place of world from camera, or the other way round)"
 OTHER_WAYS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
     (INVERTED, _inverted),
     (INVERTED, _inverted_opengl),
     ("in the other camera axes (COLMAP's and OpenCV's have y down and z ahead, OpenGL's y up and z back)", _flipped),
+    ("of the cameras' places where translations are expected", _of_places),
+    ("of quaternions in the order x y z w (COLMAP's is w x y z)", _of_last_w),
+    (TRANSPOSED, _transposed),
+    (TRANSPOSED, _transposed_in_place),
+    (TRANSPOSED, _transposed_opengl),
 )
 """Ways in which poses are mistaken for others, in words and as a change of the camera."""
 
 
-def _seen(cameras: Sequence[Camera], points: Float64) -> float:
-    """Share of the points that a picture shows, the mean over the cameras."""
-    return float(np.mean([pixels_of(points, camera)[2].mean() for camera in cameras]))
+def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:
+    """Share of the points that each picture shows, (cameras,)."""
+    return np.array([pixels_of(points, camera)[2].mean() for camera in cameras])
 
 
 def _facing(cameras: Sequence[Camera]) -> float:

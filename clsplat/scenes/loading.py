@@ -124,7 +124,8 @@ def load_scene(
             near = [view.camera for view in views if view.name not in scene.stray_cameras]
             scene.bounds = camera_bounds(near, data.box)
         scene = without_strays(scene)
-        for doubt in camera_checks([(view.name, view.camera, view.lens) for view in views], scene.points):
+        near_views = [view for view in views if view.name not in scene.stray_cameras]  # those are named
+        for doubt in camera_checks([(view.name, view.camera, view.lens) for view in near_views], scene.points):
             warn(doubt)
     scene.warnings = [plain(str(warning.message)) for warning in caught]
     return scene

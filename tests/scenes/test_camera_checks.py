@@ -130,6 +130,29 @@ def opencv(matrix: list[list[float]]) -> list[list[float]]:
     return (np.array(matrix) * [1, -1, -1, 1]).tolist()
 
 
+WORLDS = [Rotation.from_rotvec(turn).as_matrix() for turn in ([0.3, -0.5, 0.9], [2.0, 0.4, -1.1], [-0.7, 1.8, 0.2])]
+"""Rotations of the world, so that the ring lies in no plane of its axes."""
+ORIGIN = np.array([3.0, -2.0, 4.0])
+"""Of the world: with it in the middle of the ring, a pose that maps it to where it was shows the points however it is
+turned."""
+
+
+def elsewhere(world: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The ring in another world."""
+    turned = [(rotation @ WORLDS[world].T, translation) for rotation, translation in poses()]
+    return [(rotation, translation - rotation @ ORIGIN) for rotation, translation in turned]
+
+
+def cloud_there(world: int) -> tuple[np.ndarray, np.ndarray]:
+    return points()[0] @ WORLDS[world].T + ORIGIN, points()[1]
+
+
+def transposed(matrix: list[list[float]]) -> list[list[float]]:
+    turned = np.array(matrix)
+    turned[:3, :3] = turned[:3, :3].T
+    return turned.tolist()
+
+
 WRONG = {
     "inverted": ([inverted(matrix_of(pose)) for pose in poses()], "inverted (camera from world"),
     "inverted, in OpenCV's axes": ([inverted(opencv(matrix_of(pose))) for pose in poses()], "inverted (camera from"),
@@ -148,6 +171,14 @@ def test_poses_that_are_taken_the_wrong_way_are_told(kind: str, tmp_path: Path) 
     assert "% of the points" in warning
 
 
+@pytest.mark.parametrize("world", range(len(WORLDS)))
+def test_transposed_rotations_are_told(world: int, tmp_path: Path) -> None:
+    matrices = [transposed(matrix_of(pose)) for pose in elsewhere(world)]
+    write_transforms(tmp_path, matrices=matrices, ply_file_path="a.ply")
+    write_cloud(tmp_path / "a.ply", *cloud_there(world))
+    assert [text for text in load_scene(tmp_path).warnings if "if the poses are of transposed rotations" in text]
+
+
 @pytest.mark.parametrize("kind", ["inverted", "inverted, in OpenCV's axes"])
 def test_without_points_by_the_cameras_alone(kind: str, tmp_path: Path) -> None:
     write_transforms(tmp_path, matrices=WRONG[kind][0])
@@ -163,6 +194,43 @@ def test_inverted_poses_of_a_colmap_model_are_told(cloud: Any, tmp_path: Path) -
     turned = [(rotation.T, -rotation.T @ translation) for rotation, translation in poses()]
     scene = load_scene(write_colmap(tmp_path, posed=turned, cloud=cloud))
     assert [text for text in scene.warnings if "if the poses are inverted" in text]
+
+
+@pytest.mark.brings("editors of transforms.json", "some poses wrong, the others right", "named")
+@pytest.mark.parametrize("rows", [[3], [0, 7, 12], list(range(0, 20, 2))])
+def test_pictures_that_show_none_of_the_points_are_named(rows: list[int], tmp_path: Path) -> None:
+    matrices = [matrix_of(pose) for pose in poses()]
+    for row in rows:
+        matrices[row] = opencv(matrices[row])  # looks the other way
+    write_transforms(tmp_path, matrices=matrices, ply_file_path="a.ply")
+    write_cloud(tmp_path / "a.ply", *points())
+    (warning,) = [text for text in load_scene(tmp_path).warnings if "poses" in text]
+    assert (
+        f"{len(rows)} of 20 pictures show none of the points, or nearly, where the others show about 100 %" in warning
+    )
+    assert f"images/view{rows[0]:02}.png" in warning
+
+
+WRONG_COLMAP = {
+    "of the cameras' places": lambda rotation, translation: (rotation, -rotation.T @ translation),
+    "of quaternions in the order x y z w": lambda rotation, translation: (
+        Rotation.from_quat(np.roll(Rotation.from_matrix(rotation).as_quat(), -1)).as_matrix(),
+        translation,
+    ),
+    "of transposed rotations": lambda rotation, translation: (rotation.T, translation),
+}
+
+
+@pytest.mark.brings("hand-written exporters of COLMAP text", "places for translations, x y z w, transposed rotations",
+                    "named, where the origin is not what the cameras look at")  # fmt: skip
+@pytest.mark.parametrize("world", range(len(WORLDS)))
+@pytest.mark.parametrize("kind", WRONG_COLMAP)
+def test_poses_of_a_colmap_model_that_mean_something_else_are_told(kind: str, world: int, tmp_path: Path) -> None:
+    how, cloud, right = WRONG_COLMAP[kind], cloud_there(world), elsewhere(world)
+    scene = load_scene(write_colmap(tmp_path, posed=[how(*pose) for pose in right], cloud=cloud))
+    assert [text for text in scene.warnings if f"if the poses are {kind}" in text]
+    plain = load_scene(write_colmap(tmp_path / "right", posed=right, cloud=cloud))
+    assert not [text for text in plain.warnings if "poses" in text]
 
 
 def away(count: int = 20) -> list[tuple[np.ndarray, np.ndarray]]:
