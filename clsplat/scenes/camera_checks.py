@@ -197,7 +197,7 @@ def _transposed_in_place(camera: Camera) -> Camera:
 
 
 def _transposed_opengl(camera: Camera) -> Camera:
-    """As `_transposed_in_place`, of a matrix in OpenGL's axes."""
+    """The camera of `_transposed_in_place`, of a matrix in OpenGL's axes."""
     turn = FLIP[:, None] * camera.rotation.T * FLIP
     return replace(camera, rotation=turn, translation=-turn @ camera.position)
 
