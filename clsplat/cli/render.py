@@ -68,8 +68,8 @@ class Render(Verb):
 
     groups = RENDER_GROUPS
     model: RunOrModel
-    """A run's folder or a model file; or a shot of several models (.json, docs/shot.md), or a USD stage that places
-    some."""
+    """A run's folder or a model file; a file a frame of a model that changes ('capture.####.ply'); or a shot of several
+    models (.json), or a USD stage that places some. docs/shot.md describes them."""
     output: Annotated[str, arg(aliases=("-o",), metavar="PATTERN")]
     """File names of the images, such as 'out/{name}.png' or 'shot/beauty.####.exr': EXR, PNG, TIFF, JPEG or DPX; or the
     name of a video of all frames, turn.mp4 or, in ProRes, turn.mov. {name} is the image's name without its extension,
@@ -250,6 +250,9 @@ def _read_job(verb: Render) -> Job:
     source = (verb.cameras, verb.path, verb.count, (verb.width, verb.height), verb.usd_camera)
     asked = Asked(*source, verb.lenses or "undistort", verb.warp.distort, verb.up, cast_of, own)
     shots, cast = shots_asked(asked, verb.pairs)
+    if all(len(shot.frames) == 1 for shot in shots.values()):
+        cast = cast_of() if cast is None else cast  # a camera stands still before a model that changes
+        shots = {eye: shot.standing(cast.frames) for eye, shot in shots.items()}
     if verb.deep:
         shots = {eye: shot.without_optics() for eye, shot in shots.items()}
     sampling = options.pictures.sampling

@@ -9,6 +9,7 @@ from pathlib import Path
 from clsplat.config.channels import MATTES
 from clsplat.errors import InputError
 from clsplat.sequence.cast import Cast, load_cast
+from clsplat.sequence.numbered import is_sequence
 from clsplat.shots.layout import is_layout, parse_transform
 
 
@@ -16,6 +17,8 @@ def read_cast(model: Path, transform: str | None, appearance: str | None) -> Cas
     """The models, placed where they are. Raises InputError."""
     if appearance is not None and is_layout(model):
         raise InputError(f"--appearance {appearance}: is of one run's model, {model} is a shot of several")
+    if appearance is not None and is_sequence(model):
+        raise InputError(f"--appearance {appearance}: is of one run's model, {model} is a file a frame")
     track = None if transform is None else parse_transform(transform)
     return load_cast(model, track)
 

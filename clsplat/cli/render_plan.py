@@ -67,7 +67,7 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
     return {
         "model": str(job.model),
         "digest": job.digest,
-        "gaussians": sum(map(len, job.cast.models)),
+        "gaussians": job.cast.count,
         "channels": list(options.channels),
         "deep_bins": options.deep.bins if options.deep else 0,
         "model_colorspace": model,

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models placed in a shot: where each is at a time, how opaque and of which colour, and all of them as one model.
+"""Models placed in a shot: where each is at a time, how opaque and of which colour, at which frame if it changes, and
+all of them as one model.
 
 They are put together before they are drawn, so that they sort and blend with each other as one model's Gaussians do.
 """
@@ -18,6 +19,7 @@ from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec.axes import SLACK
 from clsplat.models.edit import decompose, faded, graded, merge, transform
+from clsplat.models.series import Series
 
 IDENTITY = tuple(np.eye(4)[:3].ravel().tolist())
 LUMA = np.array([0.2126, 0.7152, 0.0722])
@@ -27,11 +29,13 @@ LUMA = np.array([0.2126, 0.7152, 0.0722])
 @dataclass(frozen=True)
 class Placement:
     """A model at a time. matrix: the first three rows of (4, 4), from the model's world to the shot's; opacity: factor
-    from 0, which hides it, to 1; colour: none, or the rows of (3, 4), a matrix and what is added to it."""
+    from 0, which hides it, to 1; colour: none, or the rows of (3, 4), a matrix and what is added to it; frame: at which
+    the Gaussians of a `Series` are taken, None for those of a model that does not change."""
 
     matrix: tuple[float, ...] = IDENTITY
     opacity: float = 1.0
     colour: tuple[float, ...] = ()
+    frame: float | None = None
 
     @property
     def transform(self) -> Float64:
@@ -49,7 +53,7 @@ class Placement:
             both = then[:, :3] @ first
             both[:, 3] += then[:, 3]
             colour = tuple(both.ravel().tolist())
-        return Placement(matrix, self.opacity * outer.opacity, colour)
+        return Placement(matrix, self.opacity * outer.opacity, colour, self.frame)
 
 
 State = tuple[Placement, ...]
@@ -65,6 +69,22 @@ class Track(Protocol):
     @property
     def reach(self) -> tuple[float, float] | None:
         """The first and the last frame at which the source says where the model is; None for one that stands still."""
+
+
+@dataclass(frozen=True, eq=False)
+class Changing:
+    """The `Track` of a model that changes, at the same frames as it is placed."""
+
+    inner: Track
+
+    def at(self, frame: float) -> Placement:
+        """The placement, with the frame of the Gaussians."""
+        return replace(self.inner.at(frame), frame=float(frame))
+
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """That of the placement."""
+        return self.inner.reach
 
 
 def rows_of(matrix: Float64) -> tuple[float, ...]:
@@ -132,18 +152,23 @@ def _step(now: Placement, before: Placement) -> Float64:
     return matrix
 
 
-def near_of(models: Sequence[Gaussians], state: State) -> float:
+def kind_of(model: Gaussians | Series) -> Gaussians:
+    """A model that is drawn as this one: itself, or of one that changes one of no Gaussians."""
+    return model.kind if isinstance(model, Series) else model
+
+
+def near_of(models: Sequence[Gaussians | Series], state: State) -> float:
     """The near plane of the models in this state, hidden ones too: the least of theirs."""
     return min(
         model.near if placement.matrix == IDENTITY else decompose(placement.transform, SLACK)[0] * model.near
-        for model, placement in zip(models, state, strict=True)
+        for model, placement in zip(map(kind_of, models), state, strict=True)
     )
 
 
 class Ensemble:
     """All models of a shot as one, of states that follow each other: what stays is made once. One thread's."""
 
-    def __init__(self, models: Sequence[Gaussians]) -> None:
+    def __init__(self, models: Sequence[Gaussians | Series]) -> None:
         self.models = tuple(models)
         self._placed: list[tuple[Placement, Gaussians] | None] = [None] * len(self.models)
         self._last: tuple[State, Gaussians] | None = None
@@ -158,18 +183,26 @@ class Ensemble:
 
     def moved(self, state: State, after: State) -> Gaussians | None:
         """Gaussians with the means that those of `state` have in the state `after`; None where nothing moves."""
-        if [placement.matrix for placement in state] == [placement.matrix for placement in after]:
+        if [(now.matrix, now.frame) for now in state] == [(then.matrix, then.frame) for then in after]:
             return None
-        return merge(
-            [
-                placed(replace(model, sh=model.sh[:, :1]), Placement(placement.matrix))
-                for model, placement in zip(self.models, after, strict=True)
-            ]
-        )
+        moved = []
+        for model, now, then in zip(self.models, state, after, strict=True):
+            if isinstance(model, Series):
+                assert now.frame is not None
+                assert then.frame is not None
+                there = model.moved(now.frame, then.frame)
+            else:
+                there = model
+            moved.append(placed(replace(there, sh=there.sh[:, :1]), Placement(then.matrix)))
+        return merge(moved)
 
     def _one(self, index: int, placement: Placement) -> Gaussians:
         before = self._placed[index]
         if before is None or before[0] != placement:
             self._placed[index] = None
-            before = self._placed[index] = placement, placed(self.models[index], placement)
+            model = self.models[index]
+            if isinstance(model, Series):
+                assert placement.frame is not None
+                model = model.at(placement.frame)
+            before = self._placed[index] = placement, placed(model, placement)
         return before[1]

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The models of a job: one file, those of a shot, or those that a USD stage places. Without a device."""
+"""The models of a job: one file or a file a frame, those of a shot, or those that a USD stage places. Without a
+device."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from clsplat.errors import InputError
+from clsplat.errors import InputError, warn
 from clsplat.files import digest
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import colour_space, format_of
-from clsplat.models.placed import Ensemble, Placement, State, Track, gone_on, near_of
+from clsplat.models.placed import Changing, Ensemble, Placement, State, Track, gone_on, kind_of, near_of
+from clsplat.models.series import Series
 from clsplat.runs.run import model_file
+from clsplat.sequence.numbered import digest_of_name, is_sequence, open_sequence
 from clsplat.sequence.task import RenderOptions, Task, end_before, model_times
+from clsplat.shots.frame_numbers import ranges
 from clsplat.shots.layout import KeyedTrack, Volume, Within, is_layout, read_layout
 from clsplat.shots.read import USD
 from clsplat.shots.stage import read_stage
@@ -26,22 +30,49 @@ class Cast:
 
     path: of the file that says so; models: in their own worlds; names: of each; digest: SHA-256 of what they are read
     from, of a model file alone that of the file; space: the colour space of all; tracks: their placements, None for a
-    model that is taken as it is; files: of the models, none of a stage; volumes: of each model, those that have mattes.
+    model that is taken as it is; files: of the models, none of a stage; volumes: of each model, those that have mattes;
+    numbered: the files of each model by frames, none of one that does not change.
     """
 
     path: Path
-    models: tuple[Gaussians, ...]
+    models: tuple[Gaussians | Series, ...]
     names: tuple[str, ...]
     digest: str
     space: str
     tracks: tuple[Track, ...] | None = None
     files: tuple[Path, ...] = ()
     volumes: tuple[tuple[Volume, ...], ...] = ()
+    numbered: tuple[dict[int, Path], ...] = ()
 
     @property
-    def drawn(self) -> Gaussians | tuple[Gaussians, ...]:
+    def drawn(self) -> Gaussians | tuple[Gaussians | Series, ...]:
         """The models as a `FrameRenderer` takes them."""
-        return self.models[0] if self.tracks is None else self.models
+        return self.one if self.tracks is None else self.models
+
+    @property
+    def one(self) -> Gaussians:
+        """The model that is taken as it is."""
+        return self.still[0]
+
+    @property
+    def still(self) -> tuple[Gaussians, ...]:
+        """The models that do not change: all of them, but for those that are `Series`."""
+        return tuple(model for model in self.models if not isinstance(model, Series))
+
+    @property
+    def count(self) -> int:
+        """Gaussians of all models, of one that changes those of its first sample."""
+        return sum(model.count if isinstance(model, Series) else len(model) for model in self.models)
+
+    @property
+    def changing(self) -> bool:
+        """True if a model changes over time."""
+        return any(isinstance(model, Series) for model in self.models)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The numbers of the files of models that change, rising."""
+        return tuple(sorted({number for files in self.numbered for number in files}))
 
     def state(self, frame: float) -> State | None:
         """Placements at a frame, None where there are none. Raises InputError for one that cannot be."""
@@ -50,11 +81,12 @@ class Cast:
     def at(self, frame: float) -> Gaussians:
         """All models at a frame, as one."""
         state = self.state(frame)
-        return self.models[0] if state is None else Ensemble(self.models).at(state)
+        return self.one if state is None else Ensemble(self.models).at(state)
 
     def seen(self, tasks: Sequence[Task], options: RenderOptions) -> list[Task]:
         """The tasks with the placements of their models, and cameras as these want them. Raises InputError."""
         known: dict[Placement | State, Placement | State] = {}  # what is the same is held once
+        self._check_numbers([task.number for task in tasks])
         placed = []
         for task in tasks:
             views = [self._seen(view, options, known) for view in task.views]
@@ -63,7 +95,7 @@ class Cast:
 
     def _seen(self, task: Task, options: RenderOptions, known: dict[Placement | State, Placement | State]) -> Task:
         """A view with its placements."""
-        model, times = self.models[0], model_times(task, options)
+        model, times = kind_of(self.models[0]), model_times(task, options)
         if self.tracks is None:
             return task.seen_by(model, dict.fromkeys(times, model.near))
         states: dict[float, State] = {}
@@ -77,16 +109,47 @@ class Cast:
             states[time] = known.setdefault(kept, kept)  # type: ignore[arg-type, assignment]
         nears = {time: near_of(self.models, state) for time, state in states.items()}
         seen = task.seen_by(replace(model, near=nears[times[0]]), nears)
-        return replace(seen, placed=states)
+        return replace(seen, placed=states, files=self._files_of(states.values()))
+
+    def _files_of(self, states: Iterable[State]) -> tuple[Path, ...]:
+        """The files that models which change are read from for these states, whose samples are expected from now on."""
+        found: dict[Path, None] = {}
+        for state in states:
+            for index, placement in enumerate(state):
+                if isinstance(series := self.models[index], Series) and placement.frame is not None:
+                    series.expect([placement.frame])
+                    paths = list(self.numbered[index].values()) if self.numbered else []
+                    found.update(dict.fromkeys(paths[sample] for sample in series.sources(placement.frame) if paths))
+        return tuple(found)
+
+    def _check_numbers(self, numbers: Sequence[int]) -> None:
+        """Raise InputError for frames beyond a sequence of files. Warns of those that have none of their own."""
+        for path, files in zip(self.files, self.numbered, strict=False):
+            if not files:
+                continue
+            first, last, have = min(files), max(files), f"there are the frames {ranges(list(files))}"
+            if beyond := [number for number in numbers if not first <= number <= last]:
+                raise InputError(
+                    f"{path}: has no file of the frame(s) {ranges(sorted(set(beyond)))}; {have}; give --frames "
+                    f"{first}-{last}, or cameras of these frames"
+                )
+            if missing := sorted({number for number in numbers if number not in files}):
+                warn(f"{path}: has no file of the frame(s) {ranges(missing)}, made of the files beside them; {have}")
 
 
 def load_cast(path: Path, transform: KeyedTrack | None = None) -> Cast:
-    """The models that MODEL means, a run, a model file, a shot of several models or a USD stage; transform: of all.
+    """The models that MODEL means, a run, a model file, a file a frame, a shot of several models or a USD stage;
+    transform: of all.
 
     Raises InputError for what cannot be read, and for models of several colour spaces or ways of drawing.
     """
     if is_layout(path):
         cast = _of_layout(path)
+    elif is_sequence(path):
+        series, files = open_sequence(path)
+        space, track = colour_space(next(iter(files.values()))), Changing(KeyedTrack(str(path)))
+        digested = digest_of_name(path)
+        cast = Cast(path, (series,), (path.stem,), digested, space, (track,), (path,), numbered=(files,))
     else:
         file = model_file(path)
         stage = read_stage(file) if file.suffix.lower() in USD and format_of(file).name == "OpenUSD" else None
@@ -100,36 +163,70 @@ def load_cast(path: Path, transform: KeyedTrack | None = None) -> Cast:
     return replace(cast, tracks=tuple(Within(track, transform) for track in inner))
 
 
+@dataclass(frozen=True)
+class _Opened:
+    """A model of a shot, read. file: of the model, or the pattern of its files."""
+
+    model: Gaussians | Series
+    digest: str
+    space: str
+    file: Path
+    numbered: dict[int, Path]
+
+
+def _opened(path: Path) -> _Opened:
+    if is_sequence(path):
+        series, files = open_sequence(path)
+        return _Opened(series, digest_of_name(path), colour_space(next(iter(files.values()))), path, files)
+    if is_layout(path):
+        raise InputError(f"{path}: is no model file, expected one")
+    file = model_file(path)
+    return _Opened(Gaussians.load(file), digest(file), colour_space(file), file, {})
+
+
 def _of_layout(path: Path) -> Cast:
     """The models of a shot; those of one file are read once."""
     entries = read_layout(path)
-    files: dict[Path, tuple[Gaussians, str, str]] = {}
+    known: dict[Path, _Opened] = {}
     sums = hashlib.sha256()
+    found = []
     for entry in entries:
         where = f"{path}: model '{entry.name}'"
         try:
-            if is_layout(entry.path):
-                raise InputError(f"{entry.path}: is no model file, expected one")
-            file = model_file(entry.path)
-            if file not in files:
-                files[file] = Gaussians.load(file), digest(file), colour_space(file)
+            if entry.path not in known:
+                known[entry.path] = _opened(entry.path)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
-        sums.update(files[file][1].encode())
-    found = [files[model_file(entry.path)] for entry in entries]
-    first, _, space = found[0]
-    for entry, (model, _, own) in zip(entries, found, strict=True):
-        where = f"{path}: model '{entry.name}'"
-        if own != space:
-            raise InputError(f"{where}: is of the colour space {own}, expected {space} as '{entries[0].name}' is")
-        if model.antialiased != first.antialiased:
-            raise InputError(f"{where}: is {_not(model.antialiased)}antialiased, '{entries[0].name}' is otherwise")
-        if model.by_rays != first.by_rays:
-            raise InputError(f"{where}: is {_not(model.by_rays)}drawn along rays, '{entries[0].name}' is otherwise")
-    names, tracks = tuple(entry.name for entry in entries), tuple(entry.track for entry in entries)
-    models, volumes = tuple(model for model, _, _ in found), tuple(entry.volumes for entry in entries)
-    paths = tuple(model_file(entry.path) for entry in entries)
-    return Cast(path, models, names, sums.hexdigest(), space, tracks, paths, volumes)
+        found.append(known[entry.path])
+        sums.update(found[-1].digest.encode())
+    space, first = found[0].space, kind_of(found[0].model)
+    for entry, opened in zip(entries, found, strict=True):
+        where, kind = f"{path}: model '{entry.name}'", kind_of(opened.model)
+        if opened.space != space:
+            raise InputError(
+                f"{where}: is of the colour space {opened.space}, expected {space} as '{entries[0].name}' is"
+            )
+        if kind.antialiased != first.antialiased:
+            raise InputError(f"{where}: is {_not(kind.antialiased)}antialiased, '{entries[0].name}' is otherwise")
+        if kind.by_rays != first.by_rays:
+            raise InputError(f"{where}: is {_not(kind.by_rays)}drawn along rays, '{entries[0].name}' is otherwise")
+        if entry.volumes and isinstance(opened.model, Series):
+            raise InputError(f"{where}: has 'mattes' and changes over time, expected one model for all frames")
+    tracks = tuple(
+        Changing(entry.track) if isinstance(opened.model, Series) else entry.track
+        for entry, opened in zip(entries, found, strict=True)
+    )
+    return Cast(
+        path,
+        tuple(opened.model for opened in found),
+        tuple(entry.name for entry in entries),
+        sums.hexdigest(),
+        space,
+        tracks,
+        tuple(opened.file for opened in found),
+        tuple(entry.volumes for entry in entries),
+        tuple(opened.numbered for opened in found),
+    )
 
 
 def _not(is_so: bool) -> str:

@@ -76,7 +76,7 @@ class _Held:
             cast = load_cast(Path(job.model))
             if cast.digest != job.digest:
                 raise InputError(f"{job.model}: has SHA-256 {cast.digest[:12]} on a worker, expected {job.digest[:12]}")
-            model = cast.models if job.placed else cast.models[0]
+            model = cast.models if job.placed else cast.one
             mattes = mattes_of(cast, job.options.channels, job.options.ids_from)
             if names_of(mattes) != job.options.mattes:
                 raise InputError(f"{job.model}: has other mattes on a worker than it had when the job began")

@@ -22,7 +22,8 @@ from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import exposed
-from clsplat.models.placed import Ensemble
+from clsplat.models.placed import Ensemble, kind_of
+from clsplat.models.series import Series
 from clsplat.rendering.renderer import Renderer
 from clsplat.selftest.result import CHANNELS, DEEP, FORWARD, HOLDOUT, RAYS
 from clsplat.selftest.trust import require
@@ -66,17 +67,17 @@ class FrameRenderer:
     def __init__(
         self,
         renderer: Any,
-        models: Gaussians | Sequence[Gaussians],
+        models: Gaussians | Sequence[Gaussians | Series],
         options: RenderOptions,
         mattes: Mapping[str, Matte] | None = None,
     ) -> None:
         """renderer: a `Renderer`; models: one that is taken as it is, or those that the tasks place; mattes: by the
         names of their channels. Raises InputError for settings and colour spaces that make no sense."""
         self.options = options
-        several = list(models) if isinstance(models, Sequence) else [models]
+        several: list[Gaussians | Series] = list(models) if isinstance(models, Sequence) else [models]
         if options.gains:
-            several = [exposed(model, options.gains) for model in several]
-        self._renderer, gaussians = renderer, several[0]
+            several = [model if isinstance(model, Series) else exposed(model, options.gains) for model in several]
+        self._renderer, gaussians = renderer, kind_of(several[0])
         self._ensemble = Ensemble(several)
         self._rays_tested = False
         how: dict[str, Any] = {"background": options.background, "recorded": options.recorded, "mattes": mattes}
@@ -150,7 +151,7 @@ class FrameRenderer:
         to, None if nothing moves there."""
         ensemble, middle = self._ensemble, sampling_of(task, self.options).middle
         if (placed := task.placed) is None:
-            return lambda time: ensemble.models[0], (None, None)
+            return lambda time: kind_of(ensemble.models[0]), (None, None)
 
         def moved(channel: str, time: float) -> Gaussians | None:
             return ensemble.moved(placed[middle], placed[time]) if channel in self.options.channels else None
@@ -180,7 +181,7 @@ class FrameRenderer:
 
 
 def open_frame_renderer(
-    models: Gaussians | Sequence[Gaussians],
+    models: Gaussians | Sequence[Gaussians | Series],
     options: RenderOptions,
     rasterizer: RasterizerConfig,
     *,

@@ -25,6 +25,10 @@ def mattes_of(cast: Cast, channels: Collection[str], ids_from: str = "") -> dict
     """The mattes among the channels, by their names; ids_from: the property of the models' files that semantic ids
     are of. Raises InputError."""
     made = {}
+    if cast.changing and (asked := [name for name in MATTES if name in channels]):
+        raise InputError(
+            f"--channels {asked[0]}: {cast.path} changes over time, expected models whose Gaussians stay the same"
+        )
     if "objects" in channels:
         made["objects"] = _objects(cast)
     if "semantic" in channels:
@@ -47,7 +51,7 @@ def names_of(mattes: dict[str, Matte]) -> tuple[MatteNames, ...]:
 def _objects(cast: Cast) -> Matte:
     """An object for each model, and one for each of its volumes, which go before it."""
     names, owners = list(cast.names), []
-    for index, model in enumerate(cast.models):
+    for index, model in enumerate(cast.still):
         own = np.full(len(model), index, np.int32)
         for volume in reversed(cast.volumes[index] if cast.volumes else ()):  # the first counts
             own[volume.holds(model)] = len(names)
@@ -61,7 +65,7 @@ def _semantic(cast: Cast, ids_from: str) -> Matte:
     if not cast.files:
         raise InputError(f"--ids-from {ids_from}: {cast.path} is a stage, expected PLY files that have the property")
     columns: list[NDArray[np.int64]] = []
-    for file, model in zip(cast.files, cast.models, strict=True):
+    for file, model in zip(cast.files, cast.still, strict=True):
         with unpacked(file) as (opened, form):
             if form.name != "3DGS PLY":
                 found = f"{file} is {form.name}, expected a 3DGS PLY that has the property"

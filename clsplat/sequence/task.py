@@ -93,7 +93,7 @@ class Task:
     picture is bent as; holdout: an absolute path, None where nothing is held out; placed: of the models, by the time in
     frames from the frame, at all `model_times` of it; None for one that stands as it is; nears: the models' near plane
     at these times, none where the camera has its own; ends: numbers of the first and the last frame of its shot, None
-    for a shot of one.
+    for a shot of one; files: absolute paths, of models that have a file a frame.
     """
 
     number: int
@@ -113,6 +113,7 @@ class Task:
     placed: Mapping[float, State] | None = None
     nears: Mapping[float, float] = field(default_factory=dict)
     ends: tuple[int, int] | None = None
+    files: tuple[Path, ...] = ()
 
     @property
     def key(self) -> str:
@@ -364,6 +365,8 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     if (lens := lens_of(task, options)) is not None:
         bends = lens.stmap.digest if isinstance(lens, ByMap) else task.lens
         more += [bends, task.at(sampling.middle)]
+    if task.files:
+        made += ("files", [_digest_at(str(path), _changed(path)) for path in task.files])
     if task.placed is not None:
         more.append([task.placed[time] for time in model_times(task, options)])
     return digest_of(cameras, made, encoding, colour, pictures.framing, used, *more)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from glob import escape, glob
 from pathlib import Path, PurePosixPath
 
 from clsplat.errors import InputError
@@ -84,6 +85,24 @@ def _stem(name: str) -> str:
         if trouble := name_trouble(text):
             raise InputError(f"image name {name!r} {trouble}, expected one for a file in the output folder")
     return stem
+
+
+def has_number(pattern: str) -> bool:
+    """True if a path has a field for a frame's number in it."""
+    return any(match["word"] in (None, "frame") for match in FIELD.finditer(pattern))
+
+
+def numbered_files(pattern: str) -> dict[int, Path]:
+    """The files that there are of a pattern such as `model.####.ply`, by the frame's number, in rising order. Several
+    fields, as of a folder a frame, are of one number. Raises InputError for a field that is not known."""
+    check_pattern(pattern)
+    pieces = FIELD.sub("\0", pattern).split("\0")
+    number = re.compile(r"(-?\d+)".join(map(re.escape, pieces)))
+    found = {}
+    for text in glob("*".join(map(escape, pieces))):  # noqa: PTH207
+        if (match := number.fullmatch(text)) and path_of(pattern, int(match[1]), "") == Path(text):
+            found[int(match[1])] = Path(text)
+    return dict(sorted(found.items()))
 
 
 def check_pattern(pattern: str) -> None:

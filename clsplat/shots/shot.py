@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import ceil, floor, isfinite
@@ -55,6 +55,14 @@ class Shot:
     def cameras(self) -> list[Camera]:
         """The camera of every frame."""
         return [frame.camera for frame in self.frames]
+
+    def standing(self, numbers: Sequence[int]) -> Shot:
+        """Of one frame, the same camera in the frames of these numbers; other shots as they are."""
+        if len(self.frames) != 1 or not numbers:
+            return self
+        return replace(
+            self, frames=tuple(replace(self.frames[0], number=number, name=f"{number:04d}") for number in numbers)
+        )
 
     def only(self, text: str) -> Shot:
         """The frames that `text`, such as 1-100:2, lists and the shot has; a warning where it lists others too.

@@ -8,7 +8,6 @@ they lead. Neither metersPerUnit nor upAxis changes anything.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,13 @@ from typing import Any
 import numpy as np
 
 from clsplat.errors import examples, warn
+from clsplat.files import digest
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec.soundness import sound
 from clsplat.models.formats.usd import TYPE, gaussians_of, open_stage, readable, space_of, splats_of, survive
 from clsplat.models.formats.usd_places import Place
-from clsplat.models.placed import IDENTITY, Placement, checked, rows_of
+from clsplat.models.placed import IDENTITY, Changing, Placement, Track, checked, rows_of
+from clsplat.models.series import Series
 
 ARRAYS = ("positions", "orientations", "scales", "opacities", "radiance:sphericalHarmonicsCoefficients")
 COLOURS = ("radiance:sphericalHarmonicsDegree", "primvars:displayColor", "primvars:displayOpacity")
@@ -55,9 +56,9 @@ class StageModels:
     """The Gaussians of a stage, prim by prim, in their own coordinates, those of an instanced prim once for each
     instance. names: of their places; digest: SHA-256 of what they are read from; space: of their colours."""
 
-    models: tuple[Gaussians, ...]
+    models: tuple[Gaussians | Series, ...]
     names: tuple[str, ...]
-    tracks: tuple[StageTrack, ...]
+    tracks: tuple[Track, ...]
     digest: str
     space: str
 
@@ -84,26 +85,46 @@ def read_here(path: Path) -> StageModels | None:
         still = not any(place.moves for place in places)
         seen = all(place.at(time)[1] for place in places)
         layers = [layer for layer in stage.GetUsedLayers() if layer != stage.GetSessionLayer()]
-        if still and seen and len(layers) == 1 and len(drawn) == len(places):
+        same = not any(_sample_times(place.prim) for place in places)
+        if still and same and seen and len(layers) == 1 and len(drawn) == len(places):
             return None
         places = drawn or places
         prims = {place.prim.GetPath(): place.prim for place in places}
-        if animated := [f"{name} of {own}" for own, prim in prims.items() for name in _animated(prim)]:
-            warn(f"{path}: not applied: the animation of {examples(animated)}; they are those of the first time")
         space, sums = space_of(path, list(prims.values())), hashlib.sha256()
-        known: dict[Any, Gaussians] = {}
+        known: dict[Any, Gaussians | Series] = {}
         for place in places:
             own = place.prim.GetPath()
             if own not in known:
-                where = f"{path}: {own}"
-                known[own] = sound(gaussians_of(where, place.prim, time, space), where)
+                known[own] = _model_of(path, stage, place.prim, space)
                 _add(sums, place.prim, time)
             elif place.seat is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
-        tracks = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]
+        models = tuple(known[place.prim.GetPath()] for place in places)
+        if any(isinstance(model, Series) for model in models):  # samples are read when they are drawn
+            for name in sorted(str(layer.realPath) for layer in layers):
+                sums.update(digest(Path(name)).encode() if name else b"")
+        tracks: list[Track] = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]
     del diagnostics
-    models, names = tuple(known[place.prim.GetPath()] for place in places), tuple(place.name for place in places)
-    return StageModels(models, names, tuple(tracks), sums.hexdigest(), space)
+    tracks = [
+        Changing(track) if isinstance(model, Series) else track for model, track in zip(models, tracks, strict=True)
+    ]
+    return StageModels(models, tuple(place.name for place in places), tuple(tracks), sums.hexdigest(), space)
+
+
+def _model_of(path: Path, stage: Any, prim: Any, space: str) -> Gaussians | Series:
+    """The Gaussians of a prim, at its time samples if it has any. stage: is held by these, as USD closes it with its
+    last reference."""
+    from pxr import Usd
+
+    where, times = f"{path}: {prim.GetPath()}", _sample_times(prim)
+
+    def read(code: Any, held: Any = stage) -> Gaussians:  # noqa: ARG001
+        with readable(path):
+            return sound(gaussians_of(where, prim, code, space), where)
+
+    if not times:
+        return read(Usd.TimeCode.EarliestTime())
+    return Series(times, lambda index: read(Usd.TimeCode(times[index])), where, held=True)
 
 
 def _attributes(prim: Any) -> list[Any]:
@@ -112,8 +133,10 @@ def _attributes(prim: Any) -> list[Any]:
     return [attribute for attribute in attributes if attribute and attribute.HasValue()]
 
 
-def _animated(prim: Any) -> Sequence[str]:
-    return [attribute.GetName() for attribute in _attributes(prim) if attribute.ValueMightBeTimeVarying()]
+def _sample_times(prim: Any) -> list[float]:
+    """The time codes at which the prim's arrays have samples, rising; none for arrays that do not change."""
+    changing = [attribute for attribute in _attributes(prim) if attribute.ValueMightBeTimeVarying()]
+    return sorted({float(time) for attribute in changing for time in attribute.GetTimeSamples()})
 
 
 def _add(sums: Any, prim: Any, time: Any) -> None:

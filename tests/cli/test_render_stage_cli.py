@@ -212,14 +212,6 @@ def test_wrong_stages_are_one_line(stage: Usd.Stage, tmp_path: Path, capsys: Cap
     assert not (tmp_path / "none").exists()
 
 
-def test_what_is_animated_and_not_applied_is_told(stage: Usd.Stage, tmp_path: Path, capsys: Capture) -> None:
-    prim = stage.GetPrimAtPath("/Asset/Gaussians")
-    for code in (1, 2):
-        prim.GetAttribute("positions").Set(np.asarray(MODEL.means) + code, code)
-    assert render(stage, tmp_path, "--frames 1") == 0
-    assert "not applied: the animation of positions of /Asset/Gaussians" in capsys.readouterr().err
-
-
 def test_only_frames_in_which_something_moves_are_made_again(stage: Usd.Stage, tmp_path: Path, capsys: Capture) -> None:
     moving(stage.GetPrimAtPath("/Asset"))
     assert render(stage, tmp_path, "--frames 1-3") == 0

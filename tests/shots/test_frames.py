@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from clsplat.errors import InputError
-from clsplat.shots.frame_numbers import output_paths, parse_frames, path_of, ranges
+from clsplat.shots.frame_numbers import has_number, numbered_files, output_paths, parse_frames, path_of, ranges
 
 
 @pytest.mark.parametrize(
@@ -146,3 +146,32 @@ def test_names_stay_in_the_folder(name: str) -> None:
 def test_a_name_that_is_none() -> None:
     with pytest.raises(InputError, match="is empty"):
         output_paths("out/{name}.png", [(1, "")])
+
+
+@pytest.mark.parametrize(
+    ("pattern", "numbers"),
+    [
+        ("a.####.ply", [1, 2, 10000]),
+        ("a.%04d.ply", [1, 2, 10000]),
+        ("a.<F4>.ply", [1, 2, 10000]),
+        ("a.{frame}.ply", [7, 10000]),
+        ("a.#.ply", [7, 10000]),
+        ("b.##.ply", [-1]),
+        ("f_##/m_##.ply", [3]),
+        ("[x]*_{frame:02}.ply", [5]),
+        ("c.####.ply", []),
+    ],
+)
+def test_files_by_their_numbers(pattern: str, numbers: list[int], tmp_path: Path) -> None:
+    files = ["a.0001.ply", "a.0002.ply", "a.10000.ply", "a.7.ply", "a.00003.ply", "a.x.ply", "b.-1.ply", "[x]*_05.ply"]
+    for name in [*files, "x_05.ply", "f_03/m_03.ply", "f_04/m_03.ply"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = numbered_files(f"{tmp_path}/{pattern}")
+    assert list(found) == numbers
+    assert all(path == path_of(f"{tmp_path}/{pattern}", number, "") for number, path in found.items())
+
+
+def test_which_names_have_a_number() -> None:
+    assert all(map(has_number, ("a.####.ply", "f_##/a.ply", "a_%d.ply", "a.@@.ply", "a.$F.ply", "a{frame}.ply")))
+    assert not any(map(has_number, ("a.ply", "a_{name}.ply", "a@b.ply", "50%.ply")))
