@@ -18,8 +18,8 @@ from clsplat.errors import InputError, warn
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
-KEPT = 2
-"""Samples that are held, beside the one that is read ahead."""
+ALONE, PAIR = 2, 3
+"""Samples that are held once one was asked for, or two that follow each other: with the one that is read ahead."""
 LIKE = 0.25
 """Gaussians keep their numbers from one sample to the next if the median change of a row is at most this part of the
 median difference of two rows: of means, scales and colours each. What is tracked is at a few hundredths, models that
@@ -65,7 +65,7 @@ class Series:
                 return self._beyond(frame, inside)
             index, share = self._place(frame)
             if share == 0:
-                return self._sample(index)
+                return self._sample(index, ALONE)
             if not self._follows(index):
                 return self._sample(index + round(share))
             return between(self._sample(index), self._sample(index + 1), share)
@@ -116,15 +116,19 @@ class Series:
         wanted = {index for frame in frames for index in self.sources(frame)}
         self._wanted = sorted({*self._wanted, *wanted})
 
-    def _sample(self, index: int) -> Gaussians:
-        """The sample, of those that are held or from its file; the next that is expected begins to be read."""
+    def _sample(self, index: int, most: int = PAIR) -> Gaussians:
+        """The sample, of those that are held or from its file; the next that is expected begins to be read. most: that
+        are held then, those that were not asked for the longest go."""
         future = self._future(index)
-        later = bisect_right(self._wanted, index)
-        if later < len(self._wanted):
-            self._future(self._wanted[later])
         self._known.move_to_end(index)
-        while len(self._known) > KEPT + 1:
-            self._known.popitem(last=False)
+        later = self._wanted[bisect_right(self._wanted, index) :][:1]
+        oldest = [other for other in self._known if other not in (index, *later)]
+        for other in oldest[
+            : max(len({*self._known, *later}) - most, 0)
+        ]:  # its memory is free before the next takes some
+            del self._known[other]
+        for other in later:
+            self._future(other)
         return future.result()
 
     def _future(self, index: int) -> Future[Gaussians]:

@@ -17,7 +17,7 @@ from tiny import hidden_model
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
-from clsplat.models.series import KEPT, Series, between, follows
+from clsplat.models.series import ALONE, PAIR, Series, between, follows
 
 MODEL = hidden_model(60)
 STEP = np.array([0.02, 0.0, -0.03], np.float32)
@@ -144,15 +144,18 @@ def test_samples_are_read_once_and_few_are_held() -> None:
         return made
 
     made = series(24, read)
+    assert sum(each() is not None for each in alive) == 1
     made.expect([float(frame) for frame in range(1, 25)])
     most = 0
     for frame in range(1, 25):
         made.at(frame)
+        alone = sum(each() is not None for each in alive)
+        assert alone <= ALONE
         if frame < 24:
             made.at(frame + 0.25)
         most = max(most, sum(each() is not None for each in alive))
     assert reads == dict.fromkeys(range(24), 1)
-    assert most <= KEPT + 1
+    assert most <= PAIR
 
 
 def test_the_next_that_is_expected_is_read_ahead() -> None:
