@@ -6,7 +6,7 @@
     gaussians.save("model.ply")
     image = clsplat.render(gaussians, scene.views[0].camera).image
 
-The public names are loaded when they are first used, so that `import clsplat` and `clsplat --help` are quick.
+The public names are loaded on first use, so that `import clsplat` and `clsplat --help` are quick.
 """
 
 from __future__ import annotations
@@ -54,12 +54,7 @@ _MODULES = {
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from importlib.metadata import PackageNotFoundError, version
-
-        try:
-            value: Any = version("clsplat")
-        except PackageNotFoundError:  # a checkout on the path that is not installed
-            value = "0+unknown"
+        value: Any = import_module("clsplat.version").package_version()
     elif name in _MODULES:
         value = getattr(import_module(_MODULES[name]), name)
     else:

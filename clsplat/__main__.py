@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m clsplat`, and the command `clsplat`: the command line; signals are heard while that is imported."""
+"""The command line: `clsplat` and `python -m clsplat`. Signals are already handled while it is imported."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import sys
 
 
 def main() -> int:
-    """Run the command line in `sys.argv`; returns the exit status."""
+    """Run the command line in `sys.argv`. Returns the exit status."""
     try:
         from clsplat.process import fill_closed_streams, terminable
 
         fill_closed_streams()
         output = sys.stdout
         if isinstance(output, io.TextIOWrapper) and output.errors == "strict":
-            output.reconfigure(errors="backslashreplace")  # a path may have letters that the stream's encoding lacks
+            output.reconfigure(errors="backslashreplace")  # a path may have characters that the stream's encoding lacks
 
         with terminable():
             from clsplat.cli.main import main as run
@@ -23,7 +23,7 @@ def main() -> int:
             return run()
     except KeyboardInterrupt as error:  # before the command line could catch it
         print("clsplat: interrupted", file=sys.stderr)
-        return 128 + getattr(error, "number", 2)  # as `process.status_of`, which may not be there yet
+        return 128 + getattr(error, "number", 2)  # like `process.status_of`, which may not be imported yet
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat.train`: the training, and the report of its run; and `clsplat.devices`."""
+"""`clsplat.train` and `clsplat.devices`."""
 
 from __future__ import annotations
 
@@ -16,14 +16,20 @@ from clsplat.report.page import write_last
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
-from clsplat.training.loop import Between, Session, StepReport, begin, checked
+from clsplat.training.loop import Between, StepReport, TrainingSession
+from clsplat.training.preparation import begin, checked
 from clsplat.training.trainer import Trainer
 
 
 def devices() -> list[DeviceInfo]:
-    """The OpenCL devices of this machine, as `clsplat devices` lists them: index, name, platform, version, kind,
-    compute_units, memory_bytes, and the shape of kernels. What other calls take as `device` is an index as text, "cpu",
-    "gpu", or a part of a name, platform or version."""
+    """List the OpenCL devices of this machine, like `clsplat devices`.
+
+    Returns
+    -------
+    list of DeviceInfo
+        Index, name, platform, version, kind, compute_units, memory_bytes, and the shape of kernels. Other calls take as
+        `device` an index as text, "cpu", "gpu", or a part of a name, platform or version.
+    """
     return list_devices()
 
 
@@ -39,20 +45,48 @@ def train(
     on_plan: Callable[[Plan], None] | None = None,
     between: Between | None = None,
 ) -> Gaussians:
-    """Train on a scene; returns the model.
+    """Train a model of a scene.
 
-    config: the run's, or else the defaults, unless given; a given one is written to the run. device: an open one, or a
-    name as `clsplat devices` lists them; several, or names with commas between, share the views of a step
-    (`TrainConfig.batch`). max_device_mem: the most of each one's memory to use, such as "256MiB". run: a folder for
-    metrics, checkpoints, held-out renders and the model; None writes nothing. resume: go on from the run's latest
-    checkpoint; without it a run that has been trained is refused. on_step: called every REPORT_EVERY steps. on_plan:
-    called with the use of device memory, before the first step and when it changes. between: called before each step;
-    it may render the trainer's model, and its time is not counted.
+    Parameters
+    ----------
+    scene : Scene
+        Photographs with cameras, see `load_scene`.
+    config : TrainConfig, optional
+        Settings, which are written to the run. None means the run's, or else the defaults.
+    device : Device, str or sequence of Device, optional
+        An open device, or a name as `clsplat devices` lists them. Several devices, or names separated by commas, share
+        the views of a step (`TrainConfig.batch`).
+    max_device_mem : str or int, optional
+        Largest amount of each device's memory to use, in bytes or such as "256MiB".
+    run : Run, optional
+        A folder for metrics, checkpoints, held-out renders and the model. None writes nothing.
+    resume : bool
+        Continue from the run's latest checkpoint. If False, a run that has been trained is refused.
+    on_step : callable, optional
+        Called with a report every REPORT_EVERY steps.
+    on_plan : callable, optional
+        Called with the memory plan before the first step and after each change.
+    between : callable, optional
+        Called before each step. It may render the trainer's model, and its time is not counted.
 
-    Raises InputError for a scene without views, a scene that is not the resumed run's, and a run that another process
-    writes. Raises ClsplatError where numbers are not finite again and again (docs/decisions/0016-never-a-nan.md);
-    values that could be repaired give a warning. Raises Interrupted, a KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP,
-    after a checkpoint has been written.
+    Returns
+    -------
+    Gaussians
+        The trained model.
+
+    Raises
+    ------
+    InputError
+        If the scene has no views, is not the resumed run's scene, or another process writes the run.
+    ClsplatError
+        If numbers are repeatedly not finite (docs/decisions/0016-never-a-nan.md). Values that were repaired give a
+        warning.
+    Interrupted
+        A KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP, after a checkpoint has been written.
+
+    Notes
+    -----
+    Kerbl et al. 2023; docs/gradients.md has the equations, docs/decisions/ the changes to the method.
     """
     config = checked(scene, config, run, resume=resume)
     with nullcontext() if run is None else locked(run.path, "train"):
@@ -60,7 +94,7 @@ def train(
         config = config.on_devices(1 + len(further), explicit=resume)
         trainer = Trainer(begin(scene, config, run, resume=resume), config, first, further=further)
         with closing(trainer):
-            session = Session(trainer, run, on_step, on_plan)
+            session = TrainingSession(trainer, run, on_step, on_plan)
             if resume:
                 session.resume()
             model = session.train(between)
@@ -70,7 +104,7 @@ def train(
 
 
 def _opened(device: Device | str | Sequence[Device] | None, limit: int | None) -> list[Device]:
-    """The devices, with `limit` bytes of memory each. Raises InputError for what is none."""
+    """The devices, with `limit` bytes of memory each. Raises InputError for an argument that names no device."""
     if device is None or isinstance(device, str):
         with of_argument():
             return open_devices(device, limit)

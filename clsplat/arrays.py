@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Types of arrays, a name for each kind of element; and arrays of parsed JSON."""
+"""Array types, one per element type, and arrays from parsed JSON."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 
 
 def numbers(given: Any) -> Float64:
-    """The array of a list of numbers, or of lists of them; (0,) for what is none. True and false are no numbers."""
+    """The array of a list of numbers, or of nested lists; (0,) for any other value. Booleans are not numbers."""
     rows = given if isinstance(given, list) else []
     if any(isinstance(value, bool) for row in rows for value in (row if isinstance(row, list) else [row])):
         return np.empty(0)

@@ -4,106 +4,130 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, cast
 
 import numpy as np
 
 from clsplat.arrays import Float32, Float64
+from clsplat.cameras.equirectangular import Equirectangular
+from clsplat.cameras.fisheye import BentFisheye, Fisheye
+from clsplat.cameras.model import CameraModel, LensModel
+from clsplat.cameras.orthographic import Orthographic
+from clsplat.cameras.perspective import Perspective, PerspectiveByRays
 from clsplat.errors import InputError
 
 Projection = Literal["perspective", "orthographic", "equirectangular", "fisheye"]
 
 
-@dataclass(frozen=True)
-class ProjectionKind:
-    """Properties of a projection.
+CAMERA_MODELS: tuple[CameraModel, ...] = (
+    Perspective(
+        "perspective",
+        lenses=(
+            LensModel("SIMPLE_PINHOLE", 0, "PINHOLE", 0),
+            LensModel("PINHOLE"),
+            LensModel("SIMPLE_RADIAL", 1, "OPENCV", 4),
+            LensModel("RADIAL", 2, "OPENCV", 4),
+            LensModel("SIMPLE_DIVISION", 1, "DIVISION", 1),
+        ),
+        transforms=(
+            *("", "PERSPECTIVE", "SIMPLE_PINHOLE", "PINHOLE"),
+            *("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+        ),
+        nerfstudio=("perspective",),
+        usd=("", "perspective", "pinhole"),
+        gsplat="pinhole",
+    ),
+    Orthographic(
+        "orthographic", defines={"ORTHOGRAPHIC": True}, usd=("orthographic",), gsplat="ortho", ewa="ORTHOGRAPHIC"
+    ),
+    Equirectangular(
+        "equirectangular",
+        defines={"RAYS": True, "EQUIRECTANGULAR": True},
+        lenses=(LensModel("EQUIRECTANGULAR"),),
+        transforms=("EQUIRECTANGULAR",),
+        nerfstudio=("equirectangular",),
+    ),
+    Fisheye(
+        "fisheye",
+        defines={"RAYS": True, "FISHEYE_RAYS": True},
+        lenses=(
+            LensModel("SIMPLE_FISHEYE", 0, "FISHEYE", 0),
+            LensModel("FISHEYE"),
+            LensModel("SIMPLE_RADIAL_FISHEYE", 1, "OPENCV_FISHEYE", 4),
+            LensModel("RADIAL_FISHEYE", 2, "OPENCV_FISHEYE", 4),
+            LensModel("OPENCV_FISHEYE", 4),
+        ),
+        transforms=("FISHEYE", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+        nerfstudio=("fisheye",),
+        gsplat="fisheye",
+        ewa="FISHEYE",
+    ),
+    BentFisheye("fisheye", "radial", defines={"RAYS": True, "FISHEYE_RAYS": True, "BENT_FISHEYE": True}),
+    PerspectiveByRays("perspective", "by_rays", defines={"RAYS": True, "PERSPECTIVE_RAYS": True}),
+)
+"""Every camera model. docs/cameras.md (Adding a camera model) lists the parts of a row."""
 
-    flat: True if there is an image plane; defines: those that the kernels are built with.
-    """
+PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAMERA_MODELS if not model.option}
+"""The usual model of each projection, by its name, in the order of messages and the self-test."""
 
-    flat: bool = True
-    defines: Mapping[str, object] = field(default_factory=dict)
-
-    @property
-    def rays(self) -> bool:
-        """True if Gaussians are ellipses on planes of their own, at which a pixel looks along its ray, and kernels have
-        distances for depths; else they are on the image's plane, and depth is z."""
-        return "RAYS" in self.defines
-
-
-PROJECTIONS: dict[Projection, ProjectionKind] = {
-    "perspective": ProjectionKind(),
-    "orthographic": ProjectionKind(defines={"ORTHOGRAPHIC": True}),
-    "equirectangular": ProjectionKind(flat=False, defines={"RAYS": 1}),
-    "fisheye": ProjectionKind(flat=False, defines={"RAYS": 2}),
-}
-"""Every projection. Its equations are in kernels/project*.cl and, in float64, in clsplat/reference/cameras.py."""
-
-BENT_FISHEYE = ProjectionKind(flat=False, defines={"RAYS": 2, "KANNALA_BRANDT": True})
-"""The fisheye with coefficients (`Camera.radial`)."""
-
-PERSPECTIVE_BY_RAYS = ProjectionKind(defines={"RAYS": 3})
-"""The pinhole that shows what a fisheye shows (`Camera.by_rays`)."""
-
-KINDS = (*PROJECTIONS.values(), BENT_FISHEYE, PERSPECTIVE_BY_RAYS)
-"""Every kind that a camera may have."""
-
-LEAST_SLOPE = 0.1
-"""Pixels a radian, in those of the axis, from which on a fisheye's picture counts as folded over: it has nothing there,
-and float32 finds the angle of every pixel before."""
-
-FRAME_CLAMP = 0.3
-NEAR = 0.01
-"""World units: the near plane of a camera that has none of its own, before a model that has none either."""
-NEARS = 100.0
-"""Near planes in the extent of a scene that is too small for the usual one."""
-NO_ROTATION = 1e-2
-"""Most that R^T R may differ from 1: poses are typed with few digits, or float32's."""
-LARGEST_FOCAL = 1e12
-"""Pixels: float32 has no digits left of a position long before."""
+JACOBIAN_CLAMP_HALF_FRAMES = 0.3
+DEFAULT_NEAR_PLANE = 0.01
+"""World units: the default near plane, for cameras and models without their own."""
+MIN_NEAR_PLANES_PER_EXTENT = 100.0
+"""A scene whose extent is less than this many near planes gets a smaller near plane."""
+ROTATION_TOLERANCE = 1e-2
+"""Largest allowed difference between R^T R and 1. Poses are typed with few digits, or are float32."""
+MAX_FOCAL_PX = 1e12
+"""Pixels. Well below this, float32 has no digits left for a position."""
 
 
 @dataclass(frozen=True)
 class Window:
     """Place of a picture in its frame, in pixels.
 
-    x, y: its first pixel, negative beyond the frame's left and upper edge; width, height: of the frame; clamp: how far
-    beyond the frame's edges the projection's Jacobian still follows a Gaussian's mean, in halves of the frame's size;
-    more only for a picture that shows more.
+    x, y: its first pixel, negative beyond the frame's left and upper edges.
+    width, height: size of the frame.
+    clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
+    follows a Gaussian's mean. Larger only for a picture that shows more.
     """
 
     x: int
     y: int
     width: int
     height: int
-    clamp: float = FRAME_CLAMP
+    clamp: float = JACOBIAN_CLAMP_HALF_FRAMES
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera and its pose; a pinhole unless `projection` says otherwise.
+    """A camera and its pose. It is a pinhole unless `projection` says otherwise.
 
-    width, height: image size in pixels; fx, fy: pixels a unit of what the projection maps, see below; cx, cy: the
-    principal point in pixels, measured from the image's top left corner, so that the centre of the first pixel is
-    (0.5, 0.5); rotation (3, 3), translation (3,): `cam_from_world`, x_cam = rotation @ x_world + translation.
+    Attributes ---------- width, height : int Image size, pixels. fx, fy : float Pixels per unit of the projected
+    coordinates, see Notes. cx, cy : float Principal point, pixels from the image's top left corner; the first pixel's
+    centre is at (0.5, 0.5). rotation : (3, 3) float64 x_cam = rotation @ x_world + translation (COLMAP's
+    `cam_from_world`). translation : (3,) float64 World units. near, far : float World units. Gaussians are drawn if the
+    depths of their means are between them. Depth is z; for fisheye and equirectangular it is the distance. The default
+    near, DEFAULT_NEAR_PLANE, stands for the model's (`Gaussians.near`). projection : str "perspective", "orthographic",
+    "equirectangular" or "fisheye" (equidistant). window : Window, optional Set if the picture is a part of a frame, or
+    extends beyond it. width and height are then the picture's, and cx and cy are measured from the frame's corner.
+    radial : (k1, k2, k3, k4) Coefficients of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP). All
+    0: equidistant. by_rays : bool True for a perspective camera that draws Gaussians along the rays of its pixels, like
+    fisheye and panorama. For a model that was trained so (`Gaussians.by_rays`).
 
-    projection, and what a pixel is a multiple of there (docs/cameras.md has the equations): perspective, x/z and y/z;
-    orthographic, x and y, so 1 / fx is world units a pixel; fisheye (equidistant), the angle from the axis in radians;
-    equirectangular, longitude and latitude in radians. near, far: depths in world units between which something is
-    seen, by their means; depth is z, for fisheye and equirectangular the distance. A near of NEAR, the default,
-    stands for the model's (`Gaussians.near`).
+    Notes
+    -----
+    The projected coordinates are, by projection (docs/cameras.md has the equations):
 
-    radial: k1 to k4 of a fisheye (Kannala and Brandt; OpenCV's and COLMAP's OPENCV_FISHEYE): the angle t from the axis
-    is t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from it; 0 for the equidistant one.
+    - perspective: x/z and y/z.
+    - orthographic: x and y, so that 1 / fx is world units per pixel.
+    - fisheye: the angle from the axis, radians.
+    - equirectangular: longitude and latitude, radians.
 
-    by_rays: True for a perspective camera that draws Gaussians as the fisheye and the panorama do, along the rays of
-    its pixels, for a model that was trained so (`Gaussians.by_rays`).
+    With `radial`, a point at angle t from the axis is t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from the
+    principal point.
 
-    window: where the picture is a part of a frame, or more than it: width and height are the picture's, cx and cy are
-    measured from the frame's corner. What both show has the same bits where x and y are multiples of a tile and the
+    Picture and frame have the same bits in their common part if the window's x and y are multiples of a tile and the
     Jacobian's clamp is the same (docs/pictures.md).
     """
 
@@ -115,7 +139,7 @@ class Camera:
     cy: float
     rotation: Float64
     translation: Float64
-    near: float = NEAR
+    near: float = DEFAULT_NEAR_PLANE
     far: float = math.inf
     projection: Projection = "perspective"
     window: Window | None = None
@@ -123,23 +147,32 @@ class Camera:
     by_rays: bool = False
 
     @property
-    def kind(self) -> ProjectionKind:
-        """The properties of its projection."""
-        if self.by_rays:
-            return PERSPECTIVE_BY_RAYS
-        return BENT_FISHEYE if any(self.radial) else PROJECTIONS[self.projection]
+    def model(self) -> CameraModel:
+        """Its camera model: properties, formulas and kernels."""
+        for model in CAMERA_MODELS:
+            if model.option and model.projection == self.projection and np.any(getattr(self, model.option)):
+                return model
+        return PROJECTIONS[self.projection]
 
-    @cached_property
+    @property
+    def is_pinhole(self) -> bool:
+        """True if its picture is an undistorted photograph's, on the image plane or by rays."""
+        return self.model.is_pinhole
+
+    @property
     def fold(self) -> tuple[float, float]:
-        """The largest angle from its axis, radians, that a fisheye shows, and its distance there in focal lengths."""
-        if not any(self.radial):
-            return math.pi, math.pi
-        powers = 2 * np.arange(5)
-        factors = np.array([1.0, *self.radial])
-        angles = np.linspace(0.0, math.pi, 4097)
-        folded = (((1 + powers) * factors) @ angles ** powers[:, None]) < LEAST_SLOPE
-        angle = float(angles[np.argmax(folded) - 1]) if folded.any() else math.pi
-        return angle, float(angle * (factors @ angle**powers))
+        """The largest angle from the axis that a fisheye shows, in radians, and its radius there in focal lengths."""
+        return self.model.fold(self.radial)
+
+    @property
+    def frustum_limits(self) -> Float64:
+        """Lower and upper bound of x/z and y/z in the Jacobian, ((x, y), (x, y)): eq. (3) of docs/gradients.md."""
+        window = self.window or Window(0, 0, self.width, self.height)
+        size = np.array([window.width, window.height], np.float64)
+        focal = np.array([self.fx, self.fy], np.float64)
+        centre = np.array([self.cx, self.cy], np.float64)
+        margin = window.clamp * 0.5 * size / focal
+        return np.stack([-centre / focal - margin, (size - centre) / focal + margin])
 
     @property
     def position(self) -> Float64:
@@ -148,7 +181,7 @@ class Camera:
         return centre
 
     def check(self) -> None:
-        """Raise InputError naming the value that no camera has."""
+        """Raise InputError, which names the value, if the camera is not valid."""
         for name in ("width", "height"):
             side = getattr(self, name)
             if isinstance(side, bool) or not isinstance(side, int | np.integer) or side < 1:
@@ -165,7 +198,7 @@ class Camera:
             if not np.isfinite(values).all():
                 raise InputError(f"camera: {name} has numbers that are not finite: {values.tolist()}")
         rotation = np.asarray(self.rotation, np.float64)
-        if (off := float(np.abs(rotation.T @ rotation - np.eye(3)).max())) > NO_ROTATION:
+        if (off := float(np.abs(rotation.T @ rotation - np.eye(3)).max())) > ROTATION_TOLERANCE:
             raise InputError(
                 f"camera: rotation is none, its axes are {off:.2g} off right angles or length 1, expected that of "
                 "cam_from_world; a scale does not belong in it"
@@ -177,23 +210,31 @@ class Camera:
     def _check_projection(self) -> None:
         if self.projection not in PROJECTIONS:
             raise InputError(f"camera: projection is {self.projection!r}, expected one of {', '.join(PROJECTIONS)}")
-        for name, of, other in (("radial", "fisheye", any(self.radial)), ("by_rays", "perspective", self.by_rays)):
-            if other and self.projection != of:
+        for model in CAMERA_MODELS:
+            if model.option and model.projection != self.projection and np.any(getattr(self, model.option)):
                 raise InputError(
-                    f"camera: {name} is {getattr(self, name)} of a camera that is {self.projection}, expected {of}"
+                    f"camera: {model.option} is {getattr(self, model.option)} of a camera that is {self.projection}, "
+                    f"expected {model.projection}"
                 )
         if len(self.radial) != 4 or not all(math.isfinite(value) for value in self.radial):
             raise InputError(f"camera: radial is {self.radial}, expected four finite numbers")
 
+    def through(self, model: CameraModel, radial: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Camera:
+        """The same intrinsics and pose, projected by the usual model of another projection, with its coefficients."""
+        k1, k2, k3, k4 = radial
+        return replace(self, projection=cast("Projection", model.projection), radial=(k1, k2, k3, k4), by_rays=False)
+
     def from_origin(self, origin: Float64) -> Camera:
-        """The same view, for coordinates of the world that are counted from origin (3,)."""
+        """The same view, for world coordinates relative to origin (3,)."""
         if not origin.any():
             return self
         return replace(self, translation=self.translation + self.rotation @ origin)
 
     def moved(self, motion: Float64) -> Camera:
-        """The camera after a motion (6,): a turn about its centre, in radians about the world's axes, and a shift along
-        them. It sees what it would see if the world had made them instead, the shift last: (140) of docs/gradients.md.
+        """The camera after a motion (6,): a turn about its centre, in radians about the world's axes, then a shift
+        along them.
+
+        The view is the same as if the world had made the opposite motion: (140) of docs/gradients.md.
         """
         turn, shift = np.asarray(motion, np.float64).reshape(2, 3)
         x, y, z = turn
@@ -208,39 +249,73 @@ class Camera:
         return replace(self, rotation=rotation, translation=translation)
 
     def refocused(self, log: float, x: float, y: float) -> Camera:
-        """The same view with focal lengths times e^log, its principal point moved by x and y of the old ones."""
+        """The same view with focal lengths times e^log, and the principal point moved by x and y old focal lengths."""
         factor, moved = math.exp(log), (self.cx + x * self.fx, self.cy + y * self.fy)
         return replace(self, fx=self.fx * factor, fy=self.fy * factor, cx=moved[0], cy=moved[1])
 
     def before(self, near: float) -> Camera:
-        """The same view of a model whose near plane is at `near`: that counts unless the camera has its own."""
-        return replace(self, near=near) if self.near == NEAR != near else self
+        """The same view with a model's near plane, unless the camera has its own."""
+        return replace(self, near=near) if self.near == DEFAULT_NEAR_PLANE != near else self
 
     def along_rays(self, by_rays: bool) -> Camera:
-        """The same view of a model that is drawn along rays, or is not; for another projection than perspective the
-        camera itself."""
-        changes = self.projection == "perspective" and by_rays != self.by_rays
+        """The same view of a model that is drawn along rays, or not. Cameras that are not perspective are returned
+        unchanged.
+        """
+        changes = self.is_pinhole and by_rays != self.by_rays
         return replace(self, by_rays=by_rays) if changes else self
 
     def depths_of_distances(self) -> Float32 | None:
-        """Cosines (height, width) at the pixels of a perspective camera, where kernels have distances: times these they
-        are depths, z. None where kernels have the depth."""
+        """Factors (height, width) that turn a perspective camera's distances into depths, z: cosines.
+
+        None if the kernels compute depths.
+        """
         return self.cosines() if self.by_rays else None
 
     def cosines(self) -> Float32 | None:
-        """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels; None
-        for other projections, whose depths are not along rays or are distances."""
-        if self.projection != "perspective":
+        """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels.
+
+        None for other projections, whose depths are not along rays or are distances.
+        """
+        if not self.is_pinhole:
             return None
         x, y = (self.window.x, self.window.y) if self.window else (0, 0)
         a = (x + np.arange(self.width) + 0.5 - self.cx) / self.fx
         b = (y + np.arange(self.height) + 0.5 - self.cy) / self.fy
         return (1 / np.sqrt(1 + a**2 + b[:, None] ** 2)).astype(np.float32)
 
-    def resized(self, width: int, height: int) -> Camera:
-        """The same view on another pixel grid: pixel centres at +0.5 make this a pure scaling.
+    def depths_of(self, points: Float64) -> Float64:
+        """Depths (N,) of points (N, 3), world coordinates: along the optical axis of a camera with an image plane, else
+        distances. Files have these."""
+        local = points @ self.rotation.T + self.translation
+        return np.asarray(local[:, 2] if self.model.flat else np.linalg.norm(local, axis=1))
 
-        Raises ValueError where a window's edges would not be on it.
+    def drawn_depths(self, offsets: Float64) -> Float64:
+        """Depths (N,) by which Gaussians are ordered. offsets: (N, 3), from the camera's centre, along the world's
+        axes."""
+        return np.asarray(
+            np.linalg.norm(offsets, axis=1) if self.model.along_rays else offsets @ self.rotation[2], np.float64
+        )
+
+    def reshaped(self, width: int, height: int) -> Camera:
+        """The camera in another size.
+
+        A change of shape, even by rounding, keeps the vertical field of view and the pixel aspect ratio.
+        The picture then shows more or less to the left and right, so all sizes of one shape show the same.
+        A panorama shows all directions in any shape.
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        if width * self.height == height * self.width or self.model.wraps:
+            return self.resized(width, height)
+        scale = height / self.height
+        middle = 0.5 * width + (self.cx - 0.5 * self.width) * scale
+        fx, fy, cy = self.fx * scale, self.fy * scale, self.cy * scale
+        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=middle, cy=cy)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on another pixel grid. Since pixel centres are at +0.5, this is a pure scaling.
+
+        Raises ValueError if a window's edges would not be on the grid.
         """
         sx, sy = width / self.width, height / self.height
         window = self.window
@@ -267,14 +342,21 @@ def focal_length(fov: float, size: float, projection: Projection = "perspective"
 
     Raises ValueError for an angle that the projection cannot show, and for orthographic, which has none.
     """
-    if projection == "orthographic":
-        raise ValueError("an orthographic camera has no angle of view")
-    if 0 < fov < size / LARGEST_FOCAL:
-        raise ValueError(f"angle of view {math.degrees(fov):g} degrees, for a focal length of over {LARGEST_FOCAL:g}")
-    if projection == "perspective":
-        if not 0 < fov < math.pi:
-            raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and less than 180")
-        return 0.5 * size / math.tan(0.5 * fov)
-    if not 0 < fov <= 2 * math.pi * (1 + 1e-12):
-        raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and at most 360")
-    return size / fov
+    model = PROJECTIONS[projection]
+    if model.parallel:
+        raise ValueError(f"{model.named} camera has no angle of view")
+    if 0 < fov < size / MAX_FOCAL_PX:
+        raise ValueError(f"angle of view {math.degrees(fov):g} degrees, for a focal length of over {MAX_FOCAL_PX:g}")
+    return model.focal_length(fov, size)
+
+
+def model_with(column: str, value: object) -> CameraModel | None:
+    """The camera model that has `value` among the names of a column, such as "usd"; None if there is none."""
+    return next((model for model in CAMERA_MODELS if value in getattr(model, column)), None)
+
+
+def names_of(column: str) -> tuple[str, ...]:
+    """All names of a column, those of panoramas last."""
+    return tuple(
+        name for model in sorted(CAMERA_MODELS, key=lambda each: each.wraps) for name in getattr(model, column)
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors that a user can meet. The command line turns them into one line and an exit status."""
+"""Errors that a user can meet. The command line turns them into one line and an exit status."""
 
 from __future__ import annotations
 
@@ -17,24 +17,27 @@ class ClsplatError(Exception):
 
 
 def plain(text: str) -> str:
-    """`text` as one line that any terminal shows as it is: names in hostile files may hold anything."""
+    """`text` as one printable line for any terminal, since names in hostile files may contain anything."""
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
 
 
 def warn(text: str) -> None:
-    """Warn in one line, as of the calling line: the command line shows the warnings of this package's modules."""
+    """Warn in one line, attributed to the caller's line.
+
+    The command line shows the warnings of this package's modules.
+    """
     warnings.warn(plain(text), stacklevel=2)
 
 
 def examples(names: Iterable[object], most: int = 3) -> str:
-    """The first of a list for a line of text, and how many more there are."""
+    """The first items of a list as text, and the number of further ones."""
     listed = [str(name) for name in names]
     more = len(listed) - most
     return ", ".join(listed[:most]) + (f" and {more:,} more" if more > 0 else "")
 
 
 def amount(nbytes: int) -> str:
-    """A number of bytes for a line of text, in a unit that leaves two digits or more."""
+    """A number of bytes as text, in a unit that leaves two digits or more."""
     for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
         if nbytes >= 10 * unit or (unit == 2**30 and nbytes >= unit):
             return f"{nbytes / unit:,.1f} {name}" if unit == 2**30 else f"{nbytes / unit:,.0f} {name}"
@@ -42,7 +45,10 @@ def amount(nbytes: int) -> str:
 
 
 class InputError(ClsplatError):
-    """A file, folder or argument is wrong (exit status 2). The message, one line, names it, and what was expected."""
+    """A file, folder or argument is wrong (exit status 2).
+
+    The message is one line: the wrong value, and the expected one.
+    """
 
     exit_status = 2
 
@@ -51,20 +57,21 @@ class InputError(ClsplatError):
 
 
 class WriteError(ClsplatError, OSError):
-    """A file that cannot be written: the system's error number, the reason in plain words, the file's name.
+    """A file cannot be written. It has the system's error number, the reason in plain words, and the file's name.
 
-    Exit status 2 where the name is to blame."""
+    Exit status 2 if the name is wrong, else 1.
+    """
 
     def __init__(self, number: int, reason: str, path: str) -> None:
         OSError.__init__(self, number, reason, path)
-        self.exit_status = 2 if number in _NAME else 1
+        self.exit_status = 2 if number in _BAD_PATH_ERRNOS else 1
 
     def __str__(self) -> str:
         return plain(f"{self.filename}: cannot be written: {self.strerror}")
 
 
-_NAME = (errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG)
-_REASONS = {
+_BAD_PATH_ERRNOS = (errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG)
+_REASON_BY_ERRNO = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk's quota is used up",
     errno.EFBIG: "the file is larger than may be written here",
@@ -82,17 +89,17 @@ _REASONS = {
 
 def reason_of(error: OSError) -> str:
     """The system's reason for an error, in plain words."""
-    return _REASONS.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
+    return _REASON_BY_ERRNO.get(error.errno or 0) or error.strerror or str(error) or type(error).__name__
 
 
 def system_trouble(error: OSError) -> str:
-    """One line about an error of the system that has no message of ours: the file, and why."""
+    """One line about a system error without a message of ours: the file and the reason."""
     names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
     return plain(": ".join([" to ".join(names), reason_of(error)] if names else [reason_of(error)]))
 
 
 def switched_on(variable: str) -> bool:
-    """True if a variable of the environment is 1; unset, empty and 0 are no. Raises InputError for anything else."""
+    """True if an environment variable is 1, False if it is unset, empty or 0. Raises InputError for any other value."""
     value = os.environ.get(variable, "")
     if value not in ("", "0", "1"):
         raise InputError(f"{variable}={value}: expected 1, or 0")
@@ -100,12 +107,12 @@ def switched_on(variable: str) -> bool:
 
 
 class DeviceError(InputError):
-    """No OpenCL device, or not the one asked for."""
+    """There is no OpenCL device, or not the requested one."""
 
 
 @contextmanager
 def of_argument() -> Iterator[None]:
-    """Errors of the flag --device within, as of the argument `device` of a call in Python."""
+    """Rename the flag --device to the Python argument `device` in errors that are raised inside."""
     try:
         yield
     except DeviceError as error:
@@ -113,8 +120,11 @@ def of_argument() -> Iterator[None]:
 
 
 class KernelBuildError(ClsplatError):
-    """A driver refused a kernel. The message has the device, the options and the log's first error; `log` and `source`,
-    with its lines numbered as the log counts them, have the rest, which CLSPLAT_DEBUG=1 shows."""
+    """A driver refused a kernel.
+
+    The message has the device, the options and the log's first error. `log` has the whole log, and `source` the source
+    with the line numbers of the log. CLSPLAT_DEBUG=1 shows both.
+    """
 
     def __init__(self, message: str, log: str, source: str) -> None:
         super().__init__(message)
@@ -126,8 +136,8 @@ class KernelBuildError(ClsplatError):
 
 
 class DriverError(ClsplatError):
-    """A driver aborted, hung, or gave what is no kernel. The message has the driver, the shape and the kernel."""
+    """A driver aborted, hung, or returned an invalid kernel. The message has the driver, the shape and the kernel."""
 
 
 class CapacityError(ClsplatError):
-    """A buffer would be larger than the device allows, or all of them together than --max-device-mem does."""
+    """A buffer would exceed the device's limit, or all buffers together the limit --max-device-mem."""

@@ -12,22 +12,41 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float32, Float64
-from clsplat.camera import NEAR, Camera
+from clsplat.camera import DEFAULT_NEAR_PLANE, Camera
 
 MAX_SH_DEGREE = 3
 
 
 @dataclass(eq=False)
 class Gaussians:
-    """N Gaussians.
+    """A model: N Gaussians. All parameters are C-contiguous float32.
 
-    means (N, 3); quaternions (N, 4), w x y z, not normalised; log_scales (N, 3), natural logs of the standard
-    deviations; opacity_logits (N,); sh (N, K, 3), K = (degree + 1)^2 real SH coefficients per channel,
-    colour = 0.5 + sum of basis times coefficient. All float32, C-contiguous. origin (3,) float64: the place in the
-    world that the means count from; 0 but for scenes far from it, which float32 would blur (docs/decisions/0017). near:
-    where cameras without a near plane of their own begin to see, world units (docs/decisions/0019). antialiased: True
-    for a model that is drawn with the filter of docs/gradients.md, section 13, as it was trained; by_rays: True for one
-    that perspective cameras draw along the rays of their pixels (`Camera.by_rays`), as it was trained.
+    Attributes
+    ----------
+    means : (N, 3) float32
+        World units, relative to `origin`.
+    quaternions : (N, 4) float32
+        w, x, y, z, not normalised.
+    log_scales : (N, 3) float32
+        Natural logarithms of the standard deviations in world units.
+    opacity_logits : (N,) float32
+        Logits of the opacities.
+    sh : (N, K, 3) float32
+        K = (degree + 1)^2 real SH coefficients per channel. Colour = 0.5 + sum of basis times coefficient.
+    origin : (3,) float64
+        Origin of the means in the world. It is 0 except for scenes far from the world's origin, which float32 would
+        blur (docs/decisions/0017).
+    near : float
+        Near plane for cameras without their own, world units (docs/decisions/0019).
+    antialiased : bool
+        True for a model that was trained, and is drawn, with the filter of docs/gradients.md, section 13.
+    by_rays : bool
+        True for a model that was trained, and is drawn by perspective cameras, along the rays of pixels
+        (`Camera.by_rays`).
+
+    Notes
+    -----
+    Kerbl et al. 2023. The parameters are stored like in 3DGS files (docs/conventions.md).
     """
 
     means: Float32
@@ -36,7 +55,7 @@ class Gaussians:
     opacity_logits: Float32
     sh: Float32
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
-    near: float = NEAR
+    near: float = DEFAULT_NEAR_PLANE
     antialiased: bool = False
     by_rays: bool = False
 
@@ -49,16 +68,21 @@ class Gaussians:
         return round(float(np.sqrt(self.sh.shape[1]))) - 1
 
     def arrays(self) -> dict[str, Any]:
-        """The parameters, float32, by their names, in the order of the class."""
-        return {group.field: getattr(self, group.field) for group in GROUPS.values()}
+        """The parameters, float32, by name, in the order of the class."""
+        return {group.field: getattr(self, group.field) for group in PARAMETER_GROUPS.values()}
 
     def local(self, camera: Camera) -> Camera:
-        """A camera in the world as one that counts from where the means do, with the model's near plane, which draws as
-        the model wants it."""
+        """A world camera relative to the model's origin, with the model's near plane and way of drawing."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def check(self) -> None:
-        """Raise ValueError naming the array whose dtype or shape is not as the class says."""
+        """Check dtypes and shapes.
+
+        Raises
+        ------
+        ValueError
+            If an array is not as the class describes; it names the array.
+        """
         for name, array in {**self.arrays(), "origin": self.origin}.items():
             if not isinstance(array, np.ndarray):
                 raise ValueError(f"{name} is a {type(array).__name__}, expected a NumPy array")
@@ -66,7 +90,9 @@ class Gaussians:
         coefficients = self.sh.shape[1] if self.sh.ndim == 3 else 0
         if coefficients not in [(degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1)]:
             raise ValueError(f"sh has shape {self.sh.shape}, expected (N, 1, 4, 9 or 16, 3)")
-        shapes = {group.field: (count, *group.shape) for group in GROUPS.values()} | {"sh": (count, coefficients, 3)}
+        shapes = {group.field: (count, *group.shape) for group in PARAMETER_GROUPS.values()} | {
+            "sh": (count, coefficients, 3)
+        }
         for name, array in self.arrays().items():
             shape = shapes[name]
             if array.dtype != np.float32 or array.shape != shape:
@@ -78,63 +104,94 @@ class Gaussians:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Gaussians:
-        """Read a model file of any format, see `clsplat.models.formats`. Raises InputError naming the file and the
-        trouble."""
+        """Read a model file of any format of `clsplat.models.formats`.
+
+        Parameters
+        ----------
+        path : str or path
+            The file.
+
+        Returns
+        -------
+        Gaussians
+            The model.
+
+        Raises
+        ------
+        InputError
+            If the file is missing or wrong; it names the file and the reason.
+        """
         from clsplat.models.formats import load
 
         return load(path)
 
     def save(self, path: str | os.PathLike[str], *, sh_degree: int | None = None, comments: Sequence[str] = ()) -> None:
-        """Write a model file in the format of its ending, atomically, see `clsplat.models.formats`.
+        """Write a model file in the format of its extension, atomically (see `clsplat.models.formats`).
 
-        Of formats that have room for it: sh_degree, pad with zero coefficients up to this degree; the model's own where
-        it is not given. comments: lines of the header, such as `colour.comment`.
+        Parameters
+        ----------
+        path : str or path
+            The file.
+        sh_degree : int, optional
+            Pad with zero coefficients up to this degree, in formats that store several. None means the model's own.
+        comments : sequence of str
+            Lines for the header, in formats with one, such as `colour.comment`.
+
+        Raises
+        ------
+        InputError
+            If no format with this extension can be written.
+        WriteError
+            If the file cannot be written.
         """
         from clsplat.models.formats import save
 
         save(path, self, sh_degree=sh_degree, comments=comments)
 
 
-SH_LIMIT = 1e7
-"""No SH coefficient may be larger: a colour that project.cl does not draw for its size has one that is."""
-LIMIT = 1e19
-"""No parameter may be larger: its square is to be a float32."""
+MAX_SH_COEFFICIENT = 1e7
+"""Largest SH coefficient. A colour too large for project.cl to draw has a coefficient above it."""
+MAX_PARAMETER = 1e19
+"""Largest parameter, so that its square fits in float32."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """A parameter array that Adam steps.
+    """A parameter array that Adam updates.
 
-    field: the array of `Gaussians` that holds it; shape: the floats of one Gaussian, -1 for the SH coefficients after
-    the constant one; rate: its learning rate in `OptimiserConfig`; limit: the bound that magnitudes stay under.
+    field: the array of `Gaussians` that holds it.
+    shape: shape of one Gaussian's row; -1 stands for the SH coefficients after the constant one.
+    rate: name of its learning rate in `OptimiserConfig`.
+    limit: magnitudes stay below this bound.
     """
 
     field: str
     shape: tuple[int, ...]
     rate: str
-    limit: float = LIMIT
+    limit: float = MAX_PARAMETER
 
 
-GROUPS: dict[str, Group] = {
+PARAMETER_GROUPS: dict[str, Group] = {
     "means": Group("means", (3,), "means_rate"),
     "quaternions": Group("quaternions", (4,), "quaternions_rate"),
     "log_scales": Group("log_scales", (3,), "scales_rate"),
     "opacity_logits": Group("opacity_logits", (), "opacities_rate"),
-    "sh_dc": Group("sh", (3,), "sh_dc_rate", SH_LIMIT),
-    "sh_rest": Group("sh", (-1, 3), "sh_rest_rate", SH_LIMIT),
+    "sh_dc": Group("sh", (3,), "sh_dc_rate", MAX_SH_COEFFICIENT),
+    "sh_rest": Group("sh", (-1, 3), "sh_rest_rate", MAX_SH_COEFFICIENT),
 }
 """The parameter groups on the device, in the order of the kernels' arguments. SH is split into its constant and the
-rest."""
+rest.
+"""
 
 
 def group_shapes(count: int, coefficients: int) -> dict[str, tuple[int, ...]]:
-    """The arrays of `count` Gaussians with `coefficients` SH coefficients a channel."""
+    """Shapes of the arrays of `count` Gaussians with `coefficients` SH coefficients per channel."""
     return {
         name: (count, *(coefficients - 1 if axis < 0 else axis for axis in group.shape))
-        for name, group in GROUPS.items()
+        for name, group in PARAMETER_GROUPS.items()
     }
 
 
 def floats_of(coefficients: int) -> int:
-    """The floats of one Gaussian's parameters."""
+    """Number of floats of one Gaussian's parameters."""
     return sum(prod(shape) for shape in group_shapes(1, coefficients).values())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differences between systems in how processes are started and asked to end."""
+"""How processes are started and asked to end, on each operating system."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import Any
 
+MAX_SIGNAL_WAIT_SECONDS = 0.5
+"""Longest wait of the main thread in seconds: on some systems a signal does not end a wait, and is handled after it."""
+
 
 def apart() -> dict[str, Any]:
     """Arguments of `subprocess.Popen` for a process that a Ctrl-C on this terminal does not reach."""
@@ -23,7 +26,7 @@ def apart() -> dict[str, Any]:
 
 
 def endings() -> tuple[signal.Signals, ...]:
-    """The signals beside Ctrl-C that ask a process to end: from managers of jobs, and from a terminal that closes.
+    """Signals other than Ctrl-C that ask a process to end: from job managers, and from a terminal that closes.
 
     Windows has no SIGTERM from outside; its signal is Ctrl-Break. Ignored signals, as under nohup, are left out.
     """
@@ -33,7 +36,7 @@ def endings() -> tuple[signal.Signals, ...]:
 
 
 class Interrupted(KeyboardInterrupt):
-    """A Ctrl-C, or the signal of this number in its place."""
+    """Ctrl-C, or the signal with this number."""
 
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__()
@@ -41,19 +44,21 @@ class Interrupted(KeyboardInterrupt):
 
 
 def status_of(error: KeyboardInterrupt) -> int:
-    """The exit status of an interrupted process, by the convention of shells: 130 for Ctrl-C."""
+    """The exit status of an interrupted process, by the shells' convention: 130 for Ctrl-C."""
     return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
 
 
 def interrupt(number: int, _frame: FrameType | None) -> None:
-    """A handler of signals that raises Interrupted."""
+    """A signal handler that raises Interrupted."""
     raise Interrupted(number)
 
 
 @contextmanager
 def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], object]) -> Iterator[dict[int, Any]]:
-    """Inside, these signals call the handler; yields what they did before. None of them does outside the main thread:
-    Python handles signals there."""
+    """Install a handler for these signals inside. Yields the previous handlers.
+
+    Outside the main thread it does nothing, since Python handles signals only there.
+    """
     if threading.current_thread() is not threading.main_thread():
         numbers = ()
     before = {number: signal.signal(number, handler) or signal.SIG_DFL for number in numbers}
@@ -65,15 +70,17 @@ def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], o
 
 
 def terminable() -> AbstractContextManager[object]:
-    """Inside, a signal that asks the process to end is a Ctrl-C: temporary files go, and children end."""
+    """Treat a signal that asks the process to end like Ctrl-C inside: temporary files are removed, and children end."""
     return handled(endings(), interrupt)
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Inside, signals that ask the process to end wait; afterwards the first that came is raised. Handlers that a
-    library installs inside are removed, in the main thread, as `handled`. Threads that a library starts inside have
-    these signals blocked for good, and so have the programs that they run."""
+    """Delay signals that ask the process to end; afterwards the first one is raised.
+
+    Handlers that a library installs inside are removed, in the main thread, like in `handled`. Threads that a library
+    starts inside have these signals blocked permanently, and so have the programs that they run.
+    """
     came: list[int] = []
 
     def note(number: int, _frame: FrameType | None) -> None:
@@ -89,15 +96,17 @@ def undisturbed() -> Iterator[None]:
                 for number in before:
                     signal.signal(number, note)
                 if sys.platform != "win32" and mask is not None:
-                    signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # signals that have waited come now
+                    signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # pending signals arrive now
     finally:
         if came:
             signal.raise_signal(came[0])
 
 
 def fill_closed_streams() -> None:
-    """Open a null device for a standard input, output or error that the process was started without (`>&-`). Otherwise
-    the next file that is opened takes its number, and a library's prints go into that file."""
+    """Open a null device for standard input, output or error if the process was started without it (`>&-`).
+
+    Otherwise the next opened file gets its number, and a library's prints go into that file.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -108,11 +117,13 @@ def fill_closed_streams() -> None:
                 os.close(opened)
             os.set_inheritable(number, True)
         if getattr(sys, name) is None:
-            stream = open(os.devnull, "r" if number == 0 else "w", encoding="utf-8")  # noqa: SIM115  # for good
+            stream = open(os.devnull, "r" if number == 0 else "w", encoding="utf-8")  # noqa: SIM115  # stays open
             setattr(sys, name, stream)
 
 
 def reader_has_gone(error: OSError, *, windows: bool = sys.platform == "win32") -> bool:
-    """True if a write failed because the reader of our output has ended, as `| head` does. Windows then reports an
-    invalid argument, without a file's name."""
+    """True if a write failed because the reader of our output has ended, as with `| head`.
+
+    Windows then reports an invalid argument, without a file name.
+    """
     return isinstance(error, BrokenPipeError) or (windows and error.errno == errno.EINVAL and error.filename is None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds; and tables of text."""
+"""Progress on standard error: a live bar on a terminal, else a plain line every ten seconds. Also tables of text."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
 Progress = Callable[[str, float | None], None]
-"""A listener: the text of a stage, and the part of it that is done, None where that is not known."""
-PLAIN_INTERVAL = 10.0
+"""A progress callback: the text of a stage, and the fraction that is done, None if unknown."""
+PLAIN_LINE_SECONDS = 10.0
 """Seconds between plain lines."""
-SMOOTHING = 0.1
+METRIC_SMOOTHING_WEIGHT = 0.1
 """Weight of the newest report in the shown PSNR and loss, which jump from view to view."""
-RECENT = 20.0
-"""Seconds of training that the shown rate is of."""
+RATE_WINDOW_SECONDS = 20.0
+"""Seconds of training over which the shown rate is averaged."""
 
 
-class Forecast(Protocol):
-    """A teller of the time that is left, for `TrainProgress` (`training.forecast.Forecast`)."""
+class RemainingTime(Protocol):
+    """An estimator of the remaining time, for `TrainProgress` (`training.forecast.Forecast`)."""
 
     def see(self, report: Any) -> None:
         """Take a report."""
@@ -36,8 +36,8 @@ class Forecast(Protocol):
         """Seconds from the last report to the end, or None."""
 
 
-class Counted(float):
-    """A fraction that is told as a count: 12 of 25 stand. total: at least 1."""
+class CountedFraction(float):
+    """A fraction that is reported as a count, such as "12 of 25 stand". total: at least 1."""
 
     def __new__(cls, done: int, total: int, verb: str) -> Self:
         """The fraction done / total, at most 1."""
@@ -49,11 +49,11 @@ class Counted(float):
 
 
 def no_progress(text: str, fraction: float | None = None) -> None:
-    """A listener that passes over everything."""
+    """A progress callback that does nothing."""
 
 
 class _Bar:
-    """A context manager with a live bar where standard error is a terminal; `live` is None elsewhere."""
+    """A context manager with a live bar if standard error is a terminal. Otherwise `live` is None."""
 
     live: RichProgress | None = None
 
@@ -62,7 +62,7 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # frames are counted, and alike; what is left of steps is in their description
+            # frames are counted and take similar times; the remaining time of steps is in their description
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(
@@ -82,10 +82,12 @@ class _Bar:
 
 
 class TrainProgress(_Bar):
-    """Progress of a training of `total` steps; call it with each `training.loop.StepReport`, every step or now and
-    then. forecast: tells what is left; without one each step is taken to be like the last ones."""
+    """Progress of a training of `total` steps. Call it with each `training.loop.StepReport`, every step or less often.
 
-    def __init__(self, total: int, forecast: Forecast | None = None) -> None:
+    forecast: estimates the remaining time. Without it, steps are assumed to take as long as the last ones.
+    """
+
+    def __init__(self, total: int, forecast: RemainingTime | None = None) -> None:
         super().__init__(f"step 0/{total}", total)
         self.total, self.forecast = total, forecast
         self.last: Any = None
@@ -101,23 +103,23 @@ class TrainProgress(_Bar):
     def __call__(self, report: Any) -> None:
         if self.last is None:
             self.loss, self.psnr = report.loss, report.psnr
-        elif report.step <= self.last.step:  # a training that has returned to a checkpoint
+        elif report.step <= self.last.step:  # training went back to a checkpoint
             self.recent.clear()
         self.last = report
         self.recent.append(report)
-        while len(self.recent) > 2 and report.seconds - self.recent[1].seconds >= RECENT:
+        while len(self.recent) > 2 and report.seconds - self.recent[1].seconds >= RATE_WINDOW_SECONDS:
             self.recent.popleft()
         if self.forecast is not None:
             self.forecast.see(report)
-        self.loss += SMOOTHING * (report.loss - self.loss)
-        self.psnr += SMOOTHING * (report.psnr - self.psnr)
+        self.loss += METRIC_SMOOTHING_WEIGHT * (report.loss - self.loss)
+        self.psnr += METRIC_SMOOTHING_WEIGHT * (report.psnr - self.psnr)
         if self.live is not None:
             self.live.update(self.task, completed=report.step, description=f"{self._numbers()}{self._left()}")
-        elif time.monotonic() - self.printed_at >= PLAIN_INTERVAL and self.rate() > 0:
+        elif time.monotonic() - self.printed_at >= PLAIN_LINE_SECONDS and self.rate() > 0:
             self._print_line()
 
     def rate(self) -> float:
-        """Steps a second of the last RECENT seconds; 0 before there are two reports."""
+        """Steps per second over the last RATE_WINDOW_SECONDS seconds; 0 before there are two reports."""
         if len(self.recent) < 2 or self.recent[-1].seconds <= self.recent[0].seconds:
             return 0.0
         first, last = self.recent[0], self.recent[-1]
@@ -139,16 +141,16 @@ class TrainProgress(_Bar):
         return "" if seconds is None else f"  {duration(seconds)} left"
 
     def _print_line(self) -> None:
-        with suppress(OSError):  # its reader has gone: a training goes on, or comes to its checkpoint
+        with suppress(OSError):  # the reader has gone: training continues, or reaches its checkpoint
             print(f"{self._numbers()}{self._left()}", file=sys.stderr, flush=True)
         self.printed_at, self.printed_step = time.monotonic(), self.last.step
 
 
 class StageProgress:
-    """Progress of work in named stages: call it with the stage and the fraction done, or None where that is unknown.
+    """Progress of work in named stages. Call it with the stage and the fraction done, or None if unknown.
 
-    A fraction that is `Counted` is told as a count, and the last of a stage always. after: seconds in which nothing is
-    said, for work that is mostly quick.
+    A `CountedFraction` fraction is reported as a count, and the last one of a stage is always reported.
+    after: seconds without any output at the start, for work that is mostly quick.
     """
 
     def __init__(self, after: float = 0.0) -> None:
@@ -160,28 +162,29 @@ class StageProgress:
         now = time.monotonic()
         if now < self.silent_until:
             return
-        if isinstance(fraction, Counted):
+        if isinstance(fraction, CountedFraction):
             text = f"{stage}: {fraction.text}"
         else:
             text = stage if fraction is None else f"{stage} {100 * fraction:.0f} %"
         if stage != self.stage and self.untold:
             self._tell(self.untold)
-        if stage != self.stage or now - self.printed_at >= PLAIN_INTERVAL or fraction == 1.0:
+        if stage != self.stage or now - self.printed_at >= PLAIN_LINE_SECONDS or fraction == 1.0:
             self._tell(text)
             self.stage, self.printed_at, self.untold = stage, now, ""
         else:
-            self.untold = text if isinstance(fraction, Counted) else ""
+            self.untold = text if isinstance(fraction, CountedFraction) else ""
 
     def _tell(self, text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
 class FrameProgress(_Bar):
-    """Progress of frames; call it with each `sequence.task.Record` when its file is complete.
+    """Progress of frames. Call it with each `sequence.task.Record` when its file is complete.
 
-    total: frames, skipped ones too; style: auto, a bar on standard error where that is a terminal, and a line for each
-    frame written, with the time left, on `lines` unless that is None or both are one terminal; json, an object a line
-    there; openjd, what Open Job Description takes for progress; none.
+    total: number of frames, skipped ones included.
+    style: "auto", a bar on standard error if that is a terminal, and a line for each written frame on `lines`, with the
+      remaining time. No lines if `lines` is None, or if both are the same terminal.
+      "json": one object per line on `lines`. "openjd": progress lines of Open Job Description. "none": nothing.
     """
 
     def __init__(
@@ -216,8 +219,10 @@ class FrameProgress(_Bar):
         print(text, file=self.lines, flush=True)
 
     def _left(self) -> str:
-        """The time that is left, if frames go on as they did. The first one counts only until there is another: kernels
-        may be built in its time. Empty where there is less than half a second."""
+        """The remaining time, if frames take as long as before; empty if it is less than half a second.
+
+        The first frame counts only until there is a second one, since kernels may be built during it.
+        """
         now = time.monotonic()
         if self.written == 1:
             self.first_at = now
@@ -234,7 +239,7 @@ def duration(seconds: float) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> list[str]:
-    """A line for each row. The columns `left` are aligned to the left, the others to the right."""
+    """One line per row. The columns `left` are left-aligned, the others right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = ["<" if index in left else ">" for index in range(len(widths))]
     line = "  ".join(f"{{:{side}{width}}}" for side, width in zip(sides, widths, strict=True))

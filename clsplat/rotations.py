@@ -9,7 +9,7 @@ from clsplat.arrays import Float64
 
 
 def rotation_from_quaternion(quaternion: Float64) -> Float64:
-    """(3, 3) of a unit quaternion (4,), w x y z."""
+    """Rotation matrix (3, 3) of a unit quaternion (4,), w x y z."""
     w, x, y, z = quaternion
     return np.array(
         [
@@ -21,7 +21,7 @@ def rotation_from_quaternion(quaternion: Float64) -> Float64:
 
 
 def quaternion_of(rotation: Float64) -> Float64:
-    """w x y z, w at least 0, of a rotation (3, 3)."""
+    """Unit quaternion w x y z, with w at least 0, of a rotation (3, 3)."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()

@@ -1,19 +1,19 @@
-// Adam on one parameter group, by gradients that are in memory: where they are looked at before. A step of training has
-// it in project_grad.cl. It leaves the gradients zero, as project_grad writes the rows of visible Gaussians alone.
+// Adam on one parameter group, from gradients in memory. The usual training step is fused into project_grad.cl. These
+// kernels serve steps that use the gradients in between, and they add up the gradients of a batch, one view at a time.
 //
-// The gradients of a batch of views are added up here as well, one view after the other.
+// The step zeroes the gradients it has used, because project_grad writes only the rows of visible Gaussians.
 //
-// Owner: A work-item owns LANES elements that follow each other (adam), or LANES rows (adam_visible), an element
-//   (add_view) or a row (join_view).
-// Launch: One work-item for each such piece, in groups of 64; those beyond the last piece do nothing.
+// Owner: A work-item owns LANES consecutive elements (adam), LANES rows (adam_visible), an element (add_view) or a row
+//   (join_view).
+// Launch: One work-item for each such piece, in groups of 64; work-items past the end do nothing.
 // Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `readback`
-//   (READBACK_SIZE) counts. Scalars are those of Step. Shapes are above each kernel.
+//   (READBACK_SIZE) counts refused elements. The scalars are those of Step. Shapes are above each kernel.
 // Equations: docs/gradients.md, (42).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/adam.h"
 
-// The group as a flat array, LANES elements a work-item. parameters, gradients, first, second (n).
+// The group as a flat array, LANES elements per work-item. parameters, gradients, first, second (n).
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, const float limit2, __global uint *readback, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second) {
@@ -31,7 +31,7 @@ __kernel void adam(const ulong n, const float rate, const float root, const floa
 }
 
 #ifdef WIDTH
-// Only the rows of visible Gaussians, LANES rows a work-item (OptimiserConfig.sparse); gradients of the others are zero
+// Only the rows of visible Gaussians, LANES rows per work-item (OptimiserConfig.sparse); the other gradients are zero
 // already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
                            const float epsilon, const float limit2, __global uint *readback,
@@ -64,8 +64,8 @@ __kernel void adam_visible(const uint n, const float rate, const float root, con
   }
 }
 
-// One view's gradients added to those of the views before it, an element a work-item. The gradients of rows that the
-// view does not show are not looked at. tile_counts (n / WIDTH): 0 where hidden; gradients, sums (n).
+// Adds one view's gradients to the sums of the earlier views, one element per work-item. Rows of Gaussians that the
+// view does not show are not read. tile_counts (n / WIDTH): 0 where hidden; gradients, sums (n).
 __kernel void add_view(const ulong n, __global const uint *tile_counts, __global const float *gradients,
                        __global float *sums) {
   const size_t i = get_global_id(0);
@@ -73,7 +73,7 @@ __kernel void add_view(const ulong n, __global const uint *tile_counts, __global
 }
 #endif
 
-// tile_counts (n) of one view -> shown (n): not 0 where this view or one before it shows the Gaussian.
+// tile_counts (n) of one view -> shown (n): nonzero where this view or an earlier one shows the Gaussian.
 __kernel void join_view(const uint n, __global const uint *tile_counts, __global uint *shown) {
   const size_t i = get_global_id(0);
   if (i < n) shown[i] |= tile_counts[i];

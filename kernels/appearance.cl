@@ -1,28 +1,28 @@
 // Exposure and white balance of photographs: a gain for each channel, its gradient, and Adam's step.
 //
-// Owner: A work-item owns a pixel (remove_gains), sixteen pixels below each other (gain_sums), a column of these
+// Owner: A work-item owns a pixel (remove_gains), sixteen pixels of a column (gain_sums), a column of their sums
 //   (column_sums), or one entry of one photograph (move_gains, centre_gains). Sums have one order on every device.
 //   Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x sums; a work-item for each of the `count` entries.
-// Buffers: Planes (3, rows, stride) of colour, or the loss by it; logs, start, first, second, moved, gains
-//   (photographs, entries), of which the first three are logs to base 2, and what follows are mixes (ppisp.cl);
-//   begins (photographs + 1), others, weights: rows of a sparse matrix; partials (sums, tiles_y, stride); columns
-//   (sums, stride), of which the entries' begin at `at`. Shapes of the kernels are above each.
+// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient by it. logs, start, first, second, moved, gains
+//   (photographs, entries): the first three entries are base-2 logs of gains, the rest are colour mixes (ppisp.cl).
+//   begins (photographs + 1), others, weights: rows of a sparse matrix. partials (sums, tiles_y, stride); columns
+//   (sums, stride), where the photograph's entries begin at row `at`. Shapes are above each kernel.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
 
 #define MOST_LOG 16.0f
-#define MOST_MIX 0.2f // of which any six can be undone
+#define MOST_MIX 0.2f // limit at which any six mixes can be undone
 
-// gains, target -> target, the photograph, exposed as the model is.
+// gains, target -> target: the photograph divided by its gains, so that it has the model's exposure.
 __kernel void remove_gains(const int photograph, const int stride, const int plane, __global const float *gains,
                            __global float *target) {
   const size_t at = (size_t)stride * get_global_id(1) + get_global_id(0);
   for (int c = 0; c < 3; ++c) target[(size_t)plane * c + at] /= gains[3 * photograph + c];
 }
 
-// image, gradient by image -> partials of the gradient by logs over ln 2.
+// image, gradient by image -> partials of the gradient by the logs, divided by ln 2.
 __kernel void gain_sums(const int height, const int stride, const int plane, const int tiles_y,
                         __global const float *image, __global const float *gradient, __global float *partials) {
   const int x = get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
@@ -45,8 +45,8 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// columns of one photograph, logs, start, begins, others, weights -> moved; first and second in place. All
-// photographs move: the others' gradient is 0. Mixes move at the part `slow` of the rate.
+// columns of one photograph, logs, start, begins, others, weights -> moved; first and second in place. All photographs
+// move; the gradient of the others is 0. Mixes move at `slow` times the rate.
 __kernel void move_gains(const int count, const int entries, const int photograph, const int stride, const int at,
                          const float rate, const float slow, const float root, const float beta1, const float beta2,
                          const float epsilon, __global const uint *readback, __global const float *columns,
@@ -61,7 +61,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean of all that are pulled is nobody's to hold
+    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean offset of the pulled photographs is left free
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);
     for (int k = begin; k < end; ++k) {
@@ -70,13 +70,13 @@ __kernel void move_gains(const int count, const int entries, const int photograp
     }
     g = added(g, pull);
   }
-  if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
+  if (!(g * g < INFINITY)) g = 0.0f; // a view with non-finite values teaches nothing
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));
   first[i] = m, second[i] = v;
   moved[i] = logs[i] - (c < 3 ? rate : slow * rate) * m / fma1(sqrt(v), root, epsilon);
 }
 
-// moved -> logs, of which each entry has the mean 0 if they are centred; gains, 2^logs.
+// moved -> logs, each entry with mean 0 over the photographs if `centred`; gains: 2^logs.
 __kernel void centre_gains(const int count, const int entries, const int centred, __global const uint *readback,
                            __global const float *moved, __global float *logs, __global float *gains) {
   const int i = get_global_id(0), c = i % entries;

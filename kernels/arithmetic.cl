@@ -1,10 +1,10 @@
-// Division, square root, fused multiply-add and denormals, as the other kernels take them for granted, for `clsplat
-// selftest`.
+// The arithmetic that the other kernels rely on, for `clsplat selftest`: division, square root, fused multiply-add and
+// denormals.
 //
-// Owner: A work-item owns LANES elements that follow each other.
-// Launch: One work-item for each LANES elements, in groups of 64; those beyond the last do nothing.
+// Owner: A work-item owns LANES consecutive elements.
+// Launch: One work-item for each LANES elements, in groups of 64; work-items past the end do nothing.
 // Buffers: a, b, c (n), n a multiple of LANES, without units -> out (4, n): a / b, sqrt(b), a b + c with one rounding,
-//   and 2^-100 a times 2^-40, which is denormal where denormals are kept.
+//   and 2^-100 a times 2^-40, which is denormal if the device keeps denormals.
 // Equations: none.
 #include "shared/math.h"
 #include "shared/lanes.h"

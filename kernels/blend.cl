@@ -1,19 +1,17 @@
-// Blending front to back until alpha saturates: the image from each tile's list of Gaussians.
+// Front-to-back blending until a pixel's alpha saturates: the image from each tile's list of Gaussians.
 //
-// Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each only the
-//   cells that its ellipse reaches and that have a pixel left to fill. On a GPU (LANES == 1) each work-item has pixels
-//   of its own, and the group fetches Gaussians in batches (Kerbl et al.'s own scheme). The bits are the same.
+// Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each Gaussian
+//   only the open cells that its ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels, and the
+//   group fetches Gaussians in batches, as in Kerbl et al. Both give the same bits.
 // Launch: One group of ITEMS work-items for each tile, the first for first_tile, in row-major order (a band of tiles,
 //   or all).
-// Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), camera
-//   with RAYS -> image (3, height, width) of colour; transmittance (height, width): what is left at the end, 0 to 1;
-//   stops (height, width): the sorted index from which on the pixel takes no more, -1 in padding. Sizes are padded to
-//   whole tiles, and padding is black. With NEARNESS nearness (height, width): the sum of weight over depth, 0 in
-//   padding. cells_from_sorted (pairs): the cells of the tile, as bits, in which the Gaussian
-//   contributes, for the gradient to go through.
+// Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), with RAYS
+//   camera -> image (3, height, width): colour; transmittance (height, width): final value, 0 to 1; stops (height,
+//   width): the first sorted index that the pixel does not take, -1 in padding; with NEARNESS nearness (height, width):
+//   the sum of weight over depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs): bits of the tile's cells
+//   that the Gaussian contributes to, for the backward pass. Planes are padded to whole tiles, with black.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
-// section 6
-//   and algorithm 2.
+//   section 6 and algorithm 2.
 #include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -23,7 +21,7 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#ifdef NO_EARLY_STOP // RasterizerConfig.early_stop: go on behind an opaque tile, to no effect
+#ifdef NO_EARLY_STOP // RasterizerConfig.early_stop: continue past opaque pixels, with the same result
 #define GOES_ON(open) 1
 #else
 #define GOES_ON(open) ((open) != 0)
@@ -33,15 +31,15 @@
 #else
 #define RECORD(statements)
 #endif
-// By ellipse few vectors are visited in vain: the test costs more than they.
-#if defined(RECORD_CELLS) && VECTORS > 1 // a cell of two vectors is open as long as one of them is
-#define CONTRIBUTES(mask) REACHED_CELLS((mask) & MASKL(pixels[cell].t > 0.0f))
+// With ellipse-tested cells few vectors are visited in vain, and the test would cost more than it saves.
+#if defined(RECORD_CELLS) && VECTORS > 1 // a cell of two vectors stays open while one of them is open
+#define CONTRIBUTES(mask) RECORDED((mask) & MASKL(pixels[cell].t > 0.0f))
 #elif defined(RECORD_CELLS)
-#define CONTRIBUTES(mask) REACHED_CELLS(mask)
+#define CONTRIBUTES(mask) RECORDED(mask)
 #elif defined(CELLS_BY_ELLIPSE)
 #define CONTRIBUTES(mask) 1
 #else
-#define CONTRIBUTES(mask) REACHES(mask)
+#define CONTRIBUTES(mask) ANYL(mask)
 #endif
 #ifdef COUNT_PAIRS // a build for `clsplat bench`
 #define COUNT(statements) statements
@@ -49,8 +47,8 @@
 #define COUNT(statements)
 #endif
 
-// `t` is the transmittance of pixels that go on and 0 in those that are finished, whose own is put aside in `kept`:
-// there no alpha has a weight, and no test is needed.
+// `t` is the transmittance of open pixels and 0 in finished ones, whose final value moves to `kept`. With t = 0 every
+// weight is 0 there, and no test is needed.
 typedef struct {
   floatL t, kept, red, green, blue;
   intL stop;
@@ -59,7 +57,8 @@ typedef struct {
 #endif
 } Pixels;
 
-// Adds the tile's i-th pair to a cell that it reaches; returns whether that fills the last pixel of the cell.
+// Adds the tile's i-th pair to a cell that it reaches. Returns true if the last open pixel of the cell is finished by
+// it.
 static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, float c_green,
                                float c_blue NEAR_PARAMETER) {
   const floatL before = p->t;
@@ -76,7 +75,7 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, floa
   p->near = fmaL(weight, (floatL)(c_near), p->near);
 #endif
   p->t = AS_FLOATL(AS_INTL(after) & goes_on);
-  const intL ended = AS_INTL(before) & ~goes_on; // a positive number's bits, or none
+  const intL ended = AS_INTL(before) & ~goes_on; // the bits of a positive number, or 0
   if (!ANYL(ended)) return 0;
   p->kept = ended != 0 ? before : p->kept;
   p->stop = ended != 0 ? (intL)(i) : p->stop;
@@ -125,7 +124,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
 
 #if ITEMS == 1
   int i = begin;
-  Reach reach, second; // two at a time, ahead of their use: else each waits for the end of the last one's cells
+  Reach reach, second; // loaded two at a time, ahead of their use, so that neither load waits for the previous cells
   for (; i < end && GOES_ON(open); ++i) {
     const int turn = (i - begin) & 1;
     if (!turn) {
@@ -154,10 +153,10 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   RECORD(for (; i < end; ++i) cells_from_sorted[i] = 0;)
 #else
 #define OPEN_CELLS(open)                                                                                               \
-  int open = 0; /* a positive number's bits, or none */                                                                \
+  int open = 0; /* the bits of a positive number, or 0 */                                                              \
   ALL_CELLS(cell) open |= AS_INTL(pixels[cell].t);
   __local Staged staged[BATCH];
-  __local int busy[2]; // items with a pixel to fill, of this batch and the next
+  __local int busy[2]; // items with an open pixel, for this batch and the next
   if (ITEM < 2) busy[ITEM] = 0;
   BARRIER_LOCAL();
   for (int batch = begin, turn = 0; batch < end; batch += BATCH, turn ^= 1) {
@@ -169,7 +168,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     BARRIER_LOCAL();
     if (busy[turn] == 0) break;
     if (ITEM == 0) busy[turn ^ 1] = 0;
-    for (int j = 0; j < count; ++j) { // to its end: Intel's runtime for CPUs reads for items that have left a loop
+    for (int j = 0; j < count; ++j) { // no early exit: Intel's CPU runtime reads for items that left a loop
       OPEN_CELLS(open)
       const int i = batch + j;
       SPLAT_STAGED(staged[j])

@@ -1,18 +1,18 @@
 // The gradient of blending, back to front: partial sums for each pair of a tile and a Gaussian.
 //
-// Owner: A group owns a tile and writes one slot for each of its pairs, at a place of its own: no atomics on global
-//   memory.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's. An item has pixels; with
-//   BY_GAUSSIAN it has one Gaussian after the other.
-// Buffers: blend's, its transmittance and stops, image_gradient (3, height, width): of the loss by colour,
-//   with ALPHA_GRADIENT a fourth plane: by what is left for the background, with NEARNESS a last one: by the sum of
-//   weight over depth; slot_from_sorted (pairs) -> slots (pairs,
-//   SLOT_STRIDE), every one of them: sums over the tile's pixels in blend's whitened units (49).
+// Owner: A group owns a tile and writes one slot for each of its pairs. No two groups share a slot, so there are no
+//   atomics on global memory.
+// Launch: As in blend.cl, one group of ITEMS work-items for each tile, the first for first_tile. An item owns pixels;
+//   with BY_GAUSSIAN it owns one Gaussian after another.
+// Buffers: blend's inputs, its transmittance and stops; image_gradient (3, height, width): the loss's gradient by
+//   colour, with ALPHA_GRADIENT a fourth plane by the final transmittance, with NEARNESS a last plane by nearness;
+//   slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), all written: sums over the tile's pixels, in the whitened
+//   units of (49).
 // Equations: docs/gradients.md, (14), (22) to (26), (48), (49), (55) and (122); with RAYS docs/cameras.md, (21).
 //
-// Per pixel, from the last Gaussian to the first: transmittance is recovered by division, and `behind` holds what comes
-// after (sum of weight times colour, background included) as seen by the pixel's gradient. The sums over pixels are
-// moments of g = alpha * dL/dalpha in (u, v); with CONTRIBUTIONS there is the sum of the weights too (55).
+// Each pixel goes from its last Gaussian to its first. Transmittance is recovered by division. `behind` is the sum of
+// weight times colour behind the current Gaussian, background included, dotted with the pixel's gradient. The sums over
+// pixels are moments of g = alpha * dL/dalpha in (u, v); with CONTRIBUTIONS also the sum of the weights (55).
 #include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -24,24 +24,23 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-// RasterizerConfig.gradient_skip; contributions are of all cells.
-#if defined(NO_GRADIENT_SKIP) || defined(CONTRIBUTIONS)
+#ifdef CONTRIBUTIONS // they need every cell, also those without a gradient
 #define LIVE(cells, live) (cells)
 #else
 #define LIVE(cells, live) ((cells) & (live))
 #endif
-#ifdef RECORD_CELLS // by blend: each cell that is visited has a pixel that takes the Gaussian
+#ifdef RECORD_CELLS // by blend: each visited cell has a pixel that takes the Gaussian
 #define CONTRIBUTES(mask) 1
 #define REACHED_AT_FIRST recorded
 #define ADD_REACHED(mask, cell)
 #else
-#define CONTRIBUTES(mask) REACHES(mask)
+#define CONTRIBUTES(mask) ANYL(mask)
 #define REACHED_AT_FIRST 0
-#define ADD_REACHED(mask, cell) reached |= REACHED_CELLS(mask) << FIRST_RECORDED(cell);
+#define ADD_REACHED(mask, cell) reached |= RECORDED(mask) << FIRST_RECORDED(cell);
 #endif
 
-// 1 / x for x in [0.01, 1]. In a group by Newton's steps, to 2e-7 of it, where a division takes twice as many
-// instructions and rounds as the driver likes.
+// 1 / x for x in [0.01, 1]. Groups use Newton's method, with a relative error of 2e-7: a division takes twice as many
+// instructions, and its rounding depends on the driver.
 #if ITEMS == 1
 #define INVERSE(x) (1.0f / (x))
 #else
@@ -53,7 +52,7 @@ static inline float inverse_of(float x) {
 }
 #endif
 
-// State of the cells' pixels on the way to the front; the image's gradient there.
+// State of the cells' pixels during the walk to the front, and the image's gradient there.
 typedef struct {
   floatL t[OWNED], behind[OWNED], red[OWNED], green[OWNED], blue[OWNED];
   intL stop[OWNED];
@@ -62,12 +61,12 @@ typedef struct {
 #endif
 } Pixels;
 
-// A pair in a cell's pixels: g, and the pair's weight in the colour.
+// A pair's share in a cell's pixels: g, and its blending weight.
 typedef struct {
   floatL g, weight;
 } Share;
 
-// Takes a pair out of a cell's pixels, by its alpha before the cap, 0 in the lanes that did not take it.
+// Removes a pair from a cell's pixels. `uncapped` is its alpha before the cap, 0 in lanes that did not take it.
 static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red, float c_green,
                              float c_blue NEAR_PARAMETER) {
   const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
@@ -90,8 +89,8 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
 }
 
 #ifdef RAYS
-// The mean's fields are of the gradient on its tangent plane: it is not linear in (u, v), as the plane turns with the
-// mean, (21) of docs/cameras.md.
+// The fields of the mean hold the gradient on its tangent plane. It is not linear in (u, v), because the plane turns
+// with the mean: (21) of docs/cameras.md.
 static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
   const floatL q = fmaL(u, u, v * v);
   const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;
@@ -104,7 +103,7 @@ static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, floa
 }
 #endif
 
-// Adds the gradients of a vector of the shape to a pair's sums (SLOT_STRIDE).
+// Adds the gradients of one vector of pixels (at `place`) to a pair's sums (SLOT_STRIDE).
 #define IN_PLACE(cells, place) (((const floatS *)(cells))[place])
 static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floatS g, floatS weight, floatS u, floatS v,
                                  float l11, float l12, float l22) {
@@ -128,7 +127,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #endif
 }
 
-// Alpha of the i-th pair of the tile's list in a cell's pixels.
+// ALPHA_IN: alpha of the tile's i-th pair in a cell's pixels.
 #ifdef RAYS
 #define WHITENING_HERE                                                                                                 \
   float whitening[3];                                                                                                  \
@@ -140,7 +139,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
   floatL u, v;                                                                                                         \
   const floatL power = offset_of_ray(ray_x[cell], ray_y[cell], ray_z[cell], splat, &u, &v);                            \
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);                            \
-  u = AS_FLOATL(AS_INTL(u) & taken); /* of a ray that goes away from the mean they are nothing */                      \
+  u = AS_FLOATL(AS_INTL(u) & taken); /* undefined for rays that point away from the mean */                            \
   v = AS_FLOATL(AS_INTL(v) & taken);
 #else
 #define WHITENING_HERE
@@ -154,8 +153,8 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < pixels.stop[cell]);
 #endif
 
-// The pair in the pixels of the cells that it reaches. Where a work-item walks many cells there is a loop for each of
-// three tasks: with short chains and few registers a processor has more cells under way (docs/performance.md).
+// Processes a pair in the cells that it reaches. A work-item with many cells runs three short loops instead of one:
+// short dependency chains and few registers keep more cells in flight (docs/performance.md).
 #if LANES >= 8 && !defined(RAYS)
 #define TAKE_PAIR(reach)                                                                                               \
   floatL alpha_of[CELLS], u_of[CELLS], g_of[CELLS], weight_of[CELLS];                                                  \
@@ -195,11 +194,11 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #elif ITEMS > 1
 #include "shared/item_sums.h"
 
-// Pairs whose sums over the group's items are made together: as many as give most items a row.
+// Pairs whose sums over the group's items are made together: enough to give most items a row.
 #define TOGETHER (SUBGROUP > 1 && ITEMS > SLOT_STRIDE ? ITEMS / SLOT_STRIDE : ITEMS < 256 ? 3 : 1)
 #endif
 
-// The gradient by a pixel's transmittance at the end; background: of what is behind.
+// The gradient by a pixel's final transmittance; background: the part that comes through the background.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4
@@ -237,7 +236,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     const int stop = stops[pixel];
     float t = 0.0f;
     Fixed f = {0.0f, 0.0f, 0.0f, as_float(stop)};
-    if (stop >= 0) { // in padding nobody has written a gradient
+    if (stop >= 0) { // in padding no gradient is written
       t = transmittance[pixel];
       f.x = image_gradient[pixel];
       f.y = image_gradient[plane + pixel];
@@ -257,11 +256,11 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   PIXEL_TABLES
   RAY_TABLES
   Pixels pixels;
-  uint live = 0; // of what is recorded, cells with a pixel that has a gradient
+  uint live = 0; // recorded cells with a pixel that has a gradient
   ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
     const intL stop = LOAD_CELL(int, stops + pixel, stride);
-    const intL inside = MASKL(stop >= 0); // in padding nobody has written a gradient, and 0 * NaN is not 0
+    const intL inside = MASKL(stop >= 0); // in padding no gradient is written, and 0 * NaN is not 0
     const floatL t = LOAD_CELL(float, transmittance + pixel, stride);
     const floatL red = AS_FLOATL(LOAD_CELL(int, (__global const int *)image_gradient + pixel, stride) & inside);
     const floatL green =
@@ -295,11 +294,8 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   }
 #endif
   RAISE_TO_GROUP_MAX(last)
-#ifdef NO_LAST_CONTRIBUTOR // RasterizerConfig.last_contributor: begin at the end of the list, to no effect
-  last = end;
-#endif
 
-  for (int first = last; first < end; first += ITEMS) { // no item leaves it alone: Intel's runtime would read for it
+  for (int first = last; first < end; first += ITEMS) { // all items stay: Intel's runtime reads for absent ones
     const int i = first + (int)get_local_id(0);
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[min(i, end - 1)];
     if (i < end)
@@ -345,11 +341,11 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #endif
   }
 #elif defined(BY_GAUSSIAN)
-  __local Staged staged[ITEMS]; // by an item for itself, all at once
+  __local Staged staged[ITEMS]; // each entry is used by the item that stages it
   float sums[SLOT_STRIDE];
   for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
   Walker walker = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, begin - 1, 0, 0};
-  for (int turn = last; turn > (last > begin ? begin - ITEMS : begin); turn -= ITEMS) { // the last one has no new pairs
+  for (int turn = last; turn > (last > begin ? begin - ITEMS : begin); turn -= ITEMS) { // the last turn adds no pairs
     const int next = max(turn - 1 - ITEM, begin);
     stage(staged + ITEM, gaussian_from_sorted[next], slot_from_sorted[next], splats, tile_x, tile_y);
     for (int round = 0; round < ITEMS; ++round) {
@@ -384,7 +380,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   __local Staged staged[BATCH];
   __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
   for (int batch = last; batch > begin; batch -= BATCH) {
-    const int count = min(BATCH, batch - begin); // of the pairs before `batch`, the last one first
+    const int count = min(BATCH, batch - begin); // of the pairs before `batch`, last one first
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
       stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], splats, tile_x, tile_y);

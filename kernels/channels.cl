@@ -1,15 +1,14 @@
-// The channels beside colour: features blended with the weights of the image, and what needs the order of the
-// Gaussians: depths at which a pixel is first hit and half opaque, how many it takes and which weighs most.
+// Auxiliary channels: features blended with the image's weights, and values that depend on the order of the Gaussians.
+// The latter are the depths of the first hit and of half opacity, the number of Gaussians, and the heaviest one.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
-// Buffers: blend's ranges, gaussian_from_sorted, splats and stops, features (n, FEATURES) of features.cl, camera with
-//   RAYS -> planes (PLANES, height, width): mean features by weight, in their units, those from FEATURE_NORMAL on of
-//   unit length; depth of the median and of the first, in world units. whole (2, height, width): count, and the index
-//   of the Gaussian with the largest weight, the first of those, -1 for none. All else is 0 where nothing was added,
-//   and in padding.
-//   With HOLDOUT the weights are those that the surfaces of held.h let through, and a Gaussian of which they let
-//   nothing through does not count.
+// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Buffers: blend's ranges, gaussian_from_sorted, splats and stops; features (n, FEATURES) of features.cl; with RAYS
+//   camera -> planes (PLANES, height, width): weighted means of the features, in their units, three planes at
+//   FEATURE_NORMAL normalised; then median depth and first depth, in world units. whole (2, height, width): the number
+//   of Gaussians, and the index of the one with the largest weight, the first on ties, -1 for none. All else is 0 where
+//   nothing was added, and in padding. With HOLDOUT the weights are multiplied by the light that the surfaces of held.h
+//   let through; Gaussians that are fully hidden do not count.
 // Equations: docs/channels.md, (60) to (67); with HOLDOUT docs/pictures.md, (75); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -40,7 +39,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
   intL stop[OWNED], count[OWNED], heaviest[OWNED];
   int last = begin;
 #ifdef HOLDOUT
-  floatL cut[OWNED]; // what the surfaces have taken
+  floatL cut[OWNED]; // light that the surfaces have absorbed
   Held held[OWNED];
   ALL_CELLS(cell) {
     cut[cell] = (floatL)(0.0f);
@@ -72,7 +71,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
       intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop[cell]);
       if (ANYL(taken)) {
         const floatL before = t[cell];
-#ifdef HOLDOUT // nothing is let through behind where nothing was
+#ifdef HOLDOUT // a Gaussian behind an opaque surface does not count
         const floatL through = let_through(depth, held + cell, held_surfaces);
         taken &= MASKL(through > 0.0f);
 #endif
@@ -92,7 +91,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
         median[cell] = halving ? (floatL)(depth) : median[cell];
         const intL opening = taken & MASKL(count[cell] == 0);
         nearest[cell] = opening ? (floatL)(depth) : nearest[cell];
-        count[cell] -= taken; // -1 where taken
+        count[cell] -= taken; // taken is -1 where true
         const intL heavier = taken & MASKL(weight > largest[cell]);
         largest[cell] = heavier ? weight : largest[cell];
         heaviest[cell] = heavier ? (intL)((int)gaussian) : heaviest[cell];

@@ -1,11 +1,11 @@
-// A picture in slices by depth, which each pixel has where its light is taken: as many slices as are asked for, cut so
-// that the most by which the light in front of any depth is off comes out as small as it can be.
+// A deep image: each pixel's light in slices by depth. Up to `bins` slices are cut so that the largest error of the
+// light in front of any depth is as small as possible.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
-// Buffers: share, 1 / (DEEP_LEVELS bins); blend's ranges, gaussian_from_sorted, splats, transmittance and stops; camera
-//   with RAYS -> planes (bins, DEEP_SIZE, height, width): colour associated with alpha, alpha, depth of the slice in
-//   world units. All 0 behind a pixel's last slice.
+// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Buffers: share: 1 / (DEEP_LEVELS bins); blend's ranges, gaussian_from_sorted, splats, transmittance and stops; with
+//   RAYS camera -> planes (bins, DEEP_SIZE, height, width): premultiplied colour, alpha, and the slice's depth in world
+//   units. All 0 after a pixel's last slice.
 // Equations: docs/pictures.md, (70) to (74).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -14,24 +14,9 @@
 #include "shared/cells.h"
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
+#include "shared/slices.h"
 
-#define STEPS 8                          // slacks are tried in two walks of the list, in this many steps each
-#define TRIED (STEPS - 1)                // at once
-#define WALKS 3                          // of which the last makes the slices
-#define FIRST_STEP (DEEP_LEVELS / STEPS) // in levels; STEPS * STEPS is DEEP_LEVELS
-
-// Goes on by a Gaussian that takes the light from `before` to `after`, (73). open: the light with which a slice begins,
-// or minus the light behind the Gaussian whose depth is the slice's, once that is known. may_begin: of the lanes that
-// take it, those where another slice may begin. Returns those where it begins one.
-static inline intL begins_slice(floatL *open, floatL before, floatL after, floatL slack, intL taken, intL may_begin) {
-  const intL placed = taken & MASKL(*open - before > slack);
-  const floatL now = placed ? -before : *open;
-  const intL begins = may_begin & MASKL(now < 0.0f) & MASKL(-now - after > slack);
-  *open = begins ? before : now;
-  return begins;
-}
-
-// Writes the slice of each lane of `which` behind those that it has, and begins an empty one.
+// Appends the current slice in the lanes of `which`, and begins an empty one there.
 static inline void write_slices(Lanes *values, IntLanes *slices, intL which, __global float *planes, size_t plane,
                                 size_t stride) {
   IntLanes written;
@@ -61,7 +46,7 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
   RAY_TABLES
   floatL t[OWNED], unit[OWNED], level[OWNED], open[OWNED][TRIED];
   intL stop[OWNED], counts[OWNED][TRIED];
-  Lanes values[OWNED][DEEP_SIZE]; // of the slice; DEEP_ALPHA: its transmittance
+  Lanes values[OWNED][DEEP_SIZE]; // of the current slice; DEEP_ALPHA holds its transmittance
   IntLanes slices[OWNED];
   int last = begin;
   ALL_CELLS(cell) {
@@ -103,7 +88,7 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
           if (walk < WALKS - 1) {
             for (int k = 0; k < TRIED; ++k) {
               const floatL slack = unit[cell] * (level[cell] + (float)(step * (k + 1)));
-              counts[cell][k] -= begins_slice(open[cell] + k, before, after, slack, taken, taken); // -1 where it does
+              counts[cell][k] -= begins_slice(open[cell] + k, before, after, slack, taken, taken); // -1 where it begins
             }
           } else {
             Lanes *slice = values[cell];

@@ -1,9 +1,9 @@
-// Statistics that adaptive density control reads, the marking of rows by them, and the moving that it orders.
+// Adaptive density control: the statistics that it reads, the marking of rows, and the copying of rows.
 //
-// Owner: A work-item owns a Gaussian, in gather_rows a row that is written.
-// Launch: One work-item for each Gaussian or row, in groups of 64; those beyond the last do nothing.
-// Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient of the mean on the image, per pixel; splats (n,
-//   SPLAT_SIZE) in pixels. Statistics (n) are added to in place. Shapes of the rest are above each kernel.
+// Owner: A work-item owns a Gaussian, in gather_rows an output row.
+// Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
+// Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient by the mean's position on the image, per pixel;
+//   splats (n, SPLAT_SIZE) in pixels. Statistics (n) are accumulated in place. The other shapes are above each kernel.
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -12,18 +12,18 @@
 #include "shared/rays.h"
 #endif
 
-// Norm of the gradient of mean i on the image, (n, 2) in pixels, brought to NDC (docs/gradients.md, equation 43).
+// Norm of the i-th row of `screen` (n, 2), per pixel, converted to NDC (docs/gradients.md, equation 43).
 static inline float ndc_norm(__global const float *screen, const size_t i, const float x_scale, const float y_scale) {
   const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];
   return sqrt(fma1(gx, gx, gy * gy));
 }
 
-// One work-item a Gaussian; those with tiles are seen. screen (n, 2): gradient of the mean on the image in pixels;
-// x_scale, y_scale to NDC -> gradient_sums (n): norms added up; seen (n): views; radii (n): largest radius in pixels
-// at 3 sigma. A view in which one of them is not finite does not count, here and below.
+// Gaussians with tiles are seen. screen (n, 2): gradient by the mean's position on the image, per pixel; x_scale,
+// y_scale convert to NDC -> gradient_sums (n): sums of norms; seen (n): views; radii (n): largest radius in pixels at 3
+// sigma. Here and below, a view with a value that is not finite does not count.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
 #ifdef RAYS
-                                 const float pixels, // a radian's
+                                 const float pixels, // per radian
 #endif
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums, __global float *seen,
@@ -46,16 +46,8 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   radii[i] = radii[i] > radius ? radii[i] : radius;
 }
 
-// As density_statistics -> agreeing (n): views in which the norm is at least the threshold.
-__kernel void view_agreement(const uint n, const float x_scale, const float y_scale, const float threshold,
-                             __global const uint *tile_counts, __global const float *screen, __global float *agreeing) {
-  const size_t i = get_global_id(0);
-  if (i >= n || tile_counts[i] == 0) return;
-  if (ndc_norm(screen, i, x_scale, y_scale) >= threshold) agreeing[i] += 1.0f;
-}
-
-// contributions (n): of the Gaussians with tiles, in pixels; area: what a pixel counts -> totals, largest (n), over
-// views.
+// contributions (n): of the Gaussians with tiles, in pixels; area: full-size pixels per pixel -> totals, largest (n),
+// over the views.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
                                       __global float *largest) {
@@ -67,29 +59,25 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
   largest[i] = largest[i] > contribution ? largest[i] : contribution;
 }
 
-// Mean gradients of what may be densified. seen, agreeing (n): views; agreeing has to be over its edge; least_total,
-// least_row: what has less, or as much and no later row, is useless, as is what no view has over contribution_edge ->
-// scores (n): the mean gradient where it is over its edge; else UNWANTED; USELESS. Where a mean is not finite it is 0.
-__kernel void density_scores(const uint n, const float gradient_edge, const float agreeing_edge,
-                             const float contribution_edge, const float least_total, const uint least_row,
+// Scores of the Gaussians for densification. seen (n): views -> scores (n): the mean gradient if it is over
+// gradient_edge, else UNWANTED; USELESS if no view has a contribution over contribution_edge. A mean that is not finite
+// counts as 0.
+__kernel void density_scores(const uint n, const float gradient_edge, const float contribution_edge,
                              __global const float *gradient_sums, __global const float *seen,
-                             __global const float *agreeing, __global const float *whole_totals,
                              __global const float *whole_largest, __global const float *current_largest,
                              __global float *scores) {
   const size_t i = get_global_id(0);
   if (i >= n) return;
   const float mean = gradient_sums[i] / (seen[i] < 1.0f ? 1.0f : seen[i]);
   const float gradient = fabs(mean) < INFINITY ? mean : 0.0f;
-  const bool wanted = gradient > gradient_edge && agreeing[i] > agreeing_edge;
-  const float total = whole_totals[i];
-  const bool useless = (current_largest[i] <= contribution_edge && whole_largest[i] <= contribution_edge) ||
-                       total < least_total || (total == least_total && i <= least_row);
+  const bool wanted = gradient > gradient_edge;
+  const bool useless = current_largest[i] <= contribution_edge && whole_largest[i] <= contribution_edge;
   scores[i] = useless ? USELESS : wanted ? gradient : UNWANTED;
 }
 
-// Marks of rows first to first + count of the n. scores, radii (n); log_scales (count, 3), logits (count): of
-// these rows; strongest, strongest_row: a score has to be more, or as much in no later row -> marks (3, n), 0 or 1: the
-// row stays, it gets a clone, it becomes two halves.
+// Marks `count` of the n rows, beginning at row `first`. scores, radii (n); log_scales (count, 3), logits (count): of
+// these rows; strongest, strongest_row: scores above `strongest` qualify, and equal ones up to row strongest_row ->
+// marks (3, n), 0 or 1: the row stays, is cloned, is split.
 __kernel void density_marks(const uint n, const uint first, const uint count, const float strongest,
                             const uint strongest_row, const float large_edge, const float transparent_edge,
                             const float oversized_edge, const float oversized_half_edge, const float radius_edge,
@@ -108,9 +96,9 @@ __kernel void density_marks(const uint n, const uint first, const uint count, co
   marks[2 * (size_t)n + i] = !gone && wanted && large && !(largest > oversized_half_edge);
 }
 
-// marks (3, n), places (3, n): their prefix sums, counts[0]: their sum -> rows (2 n): which row of the n each new one
-// is a copy of; those that stay in order, then clones, then all first halves, then all second ones, with FRESH but for
-// the first kind; counts[1]: rows that are split.
+// marks (3, n); places (3, n): their prefix sums; counts[0]: the sum of marks -> rows (2 n): the source row of each new
+// row; counts[1]: the number of splits. Order: rows that stay, clones, all first halves, all second halves; all but the
+// rows that stay carry the flag FRESH.
 __kernel void density_rows(const uint n, __global const uint *marks, __global const uint *places, __global uint *rows,
                            __global uint *counts) {
   const size_t i = get_global_id(0);
@@ -125,7 +113,8 @@ __kernel void density_rows(const uint n, __global const uint *marks, __global co
   if (i == 0) counts[1] = splits;
 }
 
-// rows (count): which row of `from` each row of `to` is a copy of; those with FRESH are full of `fresh` where `renews`.
+// rows (count): the source row in `from` of each row of `to`. With `renews`, rows flagged FRESH are filled with
+// `fresh`.
 __kernel void gather_rows(const uint count, const uint width, const uint renews, const float fresh,
                           __global const uint *rows, __global const float *from, __global float *to) {
   const uint j = get_global_id(0);

@@ -1,20 +1,20 @@
-// From visible Gaussians to one (tile, Gaussian) pair for each tile that an ellipse reaches, in order of depth, so that
-// a stable sort by tile alone leaves each tile's Gaussians front to back.
+// Emits one (tile, Gaussian) pair for each tile that the ellipse of a visible Gaussian reaches, in order of depth. A
+// stable sort by tile alone then leaves each tile's Gaussians front to back.
 //
-// Owner: A group owns a chunk of Gaussians in compact_visible. Elsewhere a work-item owns a Gaussian, in order_pairs a
-//   pair.
+// Owner: A group owns a chunk of Gaussians in visible_sums and compact_visible. Elsewhere a work-item owns a Gaussian,
+//   in order_pairs a pair.
 // Launch: One group of ITEMS work-items for each chunk; elsewhere one work-item for each Gaussian or pair, in groups of
 //   64.
-// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n), counts of pairs and their
-//   scan. Shapes of the rest are above each kernel.
-// Equations: docs/gradients.md, (47), by shared/tile.h, which project.cl counts with.
+// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n): pairs of each Gaussian, and
+//   their scan. The other shapes are above each kernel.
+// Equations: docs/gradients.md, (47), through shared/tile.h, which project.cl uses to count.
 #include "shared/math.h"
 #include "shared/group.h"
 #include "shared/count.h"
 #include "shared/tile.h"
 #include "shared/prefetch.h"
 
-// What tile_span gives, of the tiles [first_tile, end_tile) in row-major order.
+// tile_span, restricted to the tiles [first_tile, end_tile) in row-major order.
 static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, int first_tile, int end_tile, int *x0,
                              int *x1) {
   tile_span(e, ty, part, tiles_x, x0, x1);
@@ -22,8 +22,8 @@ static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, in
   *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
 }
 
-// shown, tile_counts (n) -> sums (2, groups): how many Gaussians of the chunk are visible, and their pairs, at most
-// 0xffffffff; the first four of readback become zero. A group owns a chunk.
+// shown, tile_counts (n) -> sums (2, groups): the chunk's visible Gaussians and their pairs, at most 0xffffffff; the
+// first four entries of readback become zero. A group owns a chunk.
 GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const uint *shown,
                                  __global const uint *tile_counts, __global uint *sums, __global uint *readback) {
   __local uint scratch[ITEMS];
@@ -42,10 +42,11 @@ GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const 
 }
 
 // shown, tile_counts (n), sums (2, groups) -> slots (n): scan of the tile counts; gaussian_from_visible, depth_keys
-// (visible); the first four of readback, zero before: numbers of the visible and of pairs, the complement of the
-// smallest key, the largest. A positive float's bits sort as it does. A group owns a chunk.
-// BY_CAPACITY: a pass stops that has more than `capacity` pairs, or comes after elements that Adam has refused, and so
-// do all that follow, until the host has seen it: they have no visible Gaussians, and no step changes the model.
+// (visible). The first four entries of readback, zero before: visible Gaussians, pairs, the complement of the smallest
+// key, and the largest key. The bits of positive floats sort like the floats. A group owns a chunk.
+//
+// BY_CAPACITY: a pass stops if it has more than `capacity` pairs, or if Adam has refused an element before it. All
+// later passes stop too, until the host has reacted: they have no visible Gaussians, and no step changes the model.
 GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *shown,
                                     __global const uint *tile_counts, __global const float *splats,
                                     __global const uint *sums, __global uint *slots,
@@ -99,8 +100,8 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   }
 }
 
-// order (visible): by depth -> gaussian_from_rank, counts (visible). BY_CAPACITY: tile_counts (n) of a pass that has
-// stopped become zero, so that statistics see nothing of it.
+// order (visible): by depth -> gaussian_from_rank, counts (visible). BY_CAPACITY: the tile_counts (n) of a stopped pass
+// become zero, so that it adds nothing to statistics.
 __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __global const uint *gaussian_from_visible,
                            __global uint *tile_counts, __global uint *gaussian_from_rank, __global uint *counts
 #ifdef BY_CAPACITY
@@ -119,8 +120,8 @@ __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __glob
   counts[rank] = tile_counts[i];
 }
 
-// tile_counts (n): on the whole image -> counts (tiles), zeroed before: how many Gaussians each tile's list will have.
-// Sums of integers are the same in any order.
+// tile_counts (n): on the whole image -> counts (tiles), zero before: the length of each tile's list. Integer sums do
+// not depend on the order of the atomics.
 __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, __global const uint *tile_counts,
                             __global const float *splats, __global uint *counts) {
   const uint i = get_global_id(0);
@@ -155,10 +156,10 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
   band_counts[i] = count;
 }
 
-// offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys (pairs) and
-// pair_ids (pairs): slot and Gaussian; pairs in order of depth. A Gaussian's slots follow each other, and Gaussians'
-// slots the Gaussians, so that what is summed over slots streams through memory.
-// Only tiles from first_tile to before end_tile, from which keys count.
+// offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys (pairs),
+// pair_ids (pairs): slot and Gaussian. Pairs are in order of depth. Slots are consecutive within a Gaussian and follow
+// the order of the Gaussians, so that sums over slots stream through memory. Only the tiles [first_tile, end_tile) get
+// pairs; keys count from first_tile.
 __kernel void duplicate(ELEMENTS(visible), const int tiles_x, const int tiles_y, const int first_tile,
                         const int end_tile, __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,
@@ -185,8 +186,8 @@ __kernel void duplicate(ELEMENTS(visible), const int tiles_x, const int tiles_y,
   }
 }
 
-// gaussian_from_visible (visible), slots as above -> tile_keys, depth_keys, gaussian_from_slot (pairs): a pair for each
-// slot, in order of Gaussians.
+// gaussian_from_visible (visible), slots as above -> tile_keys, depth_keys, gaussian_from_slot (pairs): one pair per
+// slot, in the order of the Gaussians.
 __kernel void duplicate_slots(const uint visible, const int tiles_x, const int tiles_y, const int first_tile,
                               const int end_tile, __global const uint *gaussian_from_visible,
                               __global const uint *slots, __global const float *splats, __global uint *tile_keys,

@@ -1,10 +1,9 @@
-// EWA projection with gsplat's conventions: each Gaussian to its mean, depth, conic and radii on the image of a camera.
+// EWA projection with gsplat's conventions: the mean, depth, conic and radii of each Gaussian on a camera's image.
 //
 // Owner: A work-item owns LANES Gaussians.
-// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
-// Buffers: means (n, 3) in world units, quaternions (n, 4) w x y z, not normalised, and scales (n, 3) in world units,
-// or
-//   with COVARIANCES the upper triangles (n, 6) xx, xy, xz, yy, yz, zz; camera (EWA_SIZE); with OPACITIES opacities
+// Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
+// Buffers: means (n, 3) in world units. quaternions (n, 4) w x y z, not normalised, and scales (n, 3) in world units;
+//   or with COVARIANCES the upper triangles (n, 6) xx, xy, xz, yy, yz, zz. camera (EWA_SIZE); with OPACITIES opacities
 //   (n), 0 to 1 -> radii (n, 2) in whole pixels, 0 where culled; means2d (n, 2) in pixels; depths (n) in world units;
 //   conics (n, 3) a, b, c in 1 / px^2; with COMPENSATED compensations (n), 0 to 1. Rows of culled Gaussians are zero.
 // Equations: docs/gradients.md, (150) to (158), with (56) and (57); Zwicker et al. 2001 and 2004 for the model, Ye et
@@ -14,11 +13,11 @@
 #include "shared/elementary.h"
 #include "shared/ewa.h"
 
-// Standard deviations that a Gaussian's box has at most.
+// The largest half side of a Gaussian's box, in standard deviations.
 #define EXTEND 3.33f
 #define LARGEST_RADIUS 1e9f
 
-// focal * ratio + centre, rounded once.
+// focal * ratio + centre, rounded once. rest, focal_low, centre_low: the low parts of the two-float operands.
 static inline floatL place2(floatL ratio, floatL rest, float focal, float focal_low, float centre, float centre_low) {
   const Double c = {(floatL)(centre), fmaL((floatL)(focal), rest, (floatL)(centre_low))};
   return multiply_add2(focal, focal_low, ratio, c).high;

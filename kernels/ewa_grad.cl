@@ -1,14 +1,16 @@
-// The gradient of EWA projection: from those by what is on the image to those by Gaussians and by the camera's numbers.
+// The gradient of EWA projection: from gradients by the projected values to gradients by the Gaussians and the camera.
 //
 // Owner: A work-item owns LANES Gaussians.
-// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
-// Buffers: what ewa.cl reads but opacities, and radii (n, 2); d_means2d (n, 2), d_depths (n), d_conics (n, 3), of b as
-//   one number, with COMPENSATED d_compensations (n) -> d_means (n, 3), d_quaternions (n, 4) and d_scales (n, 3), or
-//   d_covariances (n, 6), of an off-diagonal number for both its places; with ADDED to what is there. Culled rows are
-//   zero, with ADDED as they were. With BY_CAMERA by_camera (BY_CAMERA_SIZE, padded): what each Gaussian says of the
-//   twelve numbers of the view matrix, row by row and then the shift, of fx, fy, cx and cy; zero from n on.
+// Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
+// Buffers: ewa.cl's inputs except opacities; radii (n, 2); d_means2d (n, 2), d_depths (n), d_conics (n, 3), with b as
+//   one number; with COMPENSATED d_compensations (n) -> d_means (n, 3); d_quaternions (n, 4) and d_scales (n, 3), or
+//   d_covariances (n, 6), where an off-diagonal entry has the gradient of both its places. With ADDED they are added to
+//   the arrays. Culled rows are zero, with ADDED unchanged. With BY_CAMERA by_camera (BY_CAMERA_SIZE, padded): each
+//   Gaussian's gradient by the camera's numbers, zero from n on. These are the view matrix row by row, then its
+//   translation, then fx, fy, cx and cy.
 // Equations: docs/gradients.md, (159) to (166), with (58) to (60).
 #include "shared/math.h"
+#define NEEDS_GRADIENT
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/ewa.h"
@@ -136,7 +138,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   }
   FOR_AXES(k) {
     const int l = (k + 1) % 3, m = (k + 2) % 3;
-    const floatL tu = fmaL(uu, wu[k], uv * wv[k]), tv = fmaL(uv, wu[k], vv * wv[k]); // times the scale
+    const floatL tu = fmaL(uu, wu[k], uv * wv[k]), tv = fmaL(uv, wu[k], vv * wv[k]); // without the scale
     const floatL along = fmaL(wu[k], tu, wv[k] * tv), variance = p.s[k] * p.s[k];
     d_scale[k].all = p.s[k] * along;
     d_size = fmaL(variance, along, d_size);
@@ -171,7 +173,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   d_size = fmaL((floatL)(2.0f), thinner, d_size);
 #endif
 
-  // (165), (166): the mean in the camera, by its place on the image, by the Jacobian and by its depth.
+  // (165), (166): the mean in the camera's frame, through its position on the image, the Jacobian and its depth.
   const floatL d_u = GATHER(d_means2d, 2, 0), d_v2 = GATHER(d_means2d, 2, 1);
   floatL d_x, d_y, d_z;
 #ifdef FISHEYE
@@ -190,17 +192,12 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
   d_y = fmaL(p.away, g_y, fmaL(p.bend, fmaL(2.0f * p.y, by_j2[1], p.x * mixed), -(by_j2[2] * p.inverse))) +
         p.y * outwards;
   d_z = -(by_away * p.inverse) + 2.0f * fmaL(by_bend * p.inverse, p.inverse, p.z * by_inverse);
-#elif defined(ORTHOGRAPHIC)
-  d_x = p.jx * d_u;
-  d_y = p.jy * d_v2;
-  d_z = (floatL)(0.0f);
 #else
-  const floatL ratio_x = p.x / p.z, ratio_y = p.y / p.z;
-  const floatL by_j02 = dot_row(d_t1, camera + EWA_R20) / p.z, by_j12 = dot_row(d_t2, camera + EWA_R20) / p.z;
-  const floatL free_x = ratio_x == p.rx ? by_j02 : (floatL)(0.0f), free_y = ratio_y == p.ry ? by_j12 : (floatL)(0.0f);
-  d_x = p.jx * (d_u - free_x);
-  d_y = p.jy * (d_v2 - free_y);
-  d_z = -fmaL(d_x, ratio_x, fmaL(d_y, ratio_y, d_size / p.z));
+  const floatL at[3] = {p.x, p.y, p.z}, limited[2] = {p.rx, p.ry};
+  const floatL by_j02 = dot_row(d_t1, camera + EWA_R20), by_j12 = dot_row(d_t2, camera + EWA_R20);
+  floatL by_mean[3], beyond[2];
+  mean_gradient(at, limited, p.jx, p.jy, d_u, d_v2, by_j02, by_j12, d_size, by_mean, beyond);
+  d_x = by_mean[0], d_y = by_mean[1], d_z = by_mean[2];
 #endif
   d_z += GATHER(d_depths, 1, 0);
 
@@ -246,15 +243,14 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
 #ifdef FISHEYE
   d_fx = fmaL(p.x * p.away, d_u, d_fx);
   d_fy = fmaL(p.y * p.away, d_v2, d_fy);
-#elif defined(ORTHOGRAPHIC)
+#elif defined(PARALLEL_RAYS)
   d_fx = fmaL(p.x, d_u, d_fx);
   d_fy = fmaL(p.y, d_v2, d_fy);
-#else // a limit is a place on the image, which moves with the principal point
-  const floatL beyond_x = by_j02 - free_x, beyond_y = by_j12 - free_y;
-  d_fx = fmaL(ratio_x, d_u, fmaL(p.rx, beyond_x, d_fx));
-  d_fy = fmaL(ratio_y, d_v2, fmaL(p.ry, beyond_y, d_fy));
-  d_cx += beyond_x;
-  d_cy += beyond_y;
+#else // the clamp's limit is a position on the image, which moves with the principal point
+  d_fx = fmaL(p.x / p.z, d_u, fmaL(p.rx, beyond[0], d_fx));
+  d_fy = fmaL(p.y / p.z, d_v2, fmaL(p.ry, beyond[1], d_fy));
+  d_cx += beyond[0];
+  d_cy += beyond[1];
 #endif
   STORE_BY_CAMERA(FX, 0, d_fx);
   STORE_BY_CAMERA(FY, 0, d_fy);

@@ -1,12 +1,13 @@
-// Bilateral grids of photographs: the render sliced by a photograph's grid of colour maps, its gradient, Adam's step.
+// Bilateral grids of photographs: the render sliced by a photograph's grid of colour maps, its gradient, and Adam's
+// step.
 //
-// Owner: A work-item owns a pixel (slice, slice_gradient), a channel of a column of the grid in one line of the image
-//   (line_sums), one coefficient of one photograph's grid (grid_sums, move_grid), or of all (centre_grids). Sums have
-//   one order on every device. Built with one lane.
-// Launch: Grids of stride x rows, width x height and columns x height x 3; a work-item for each of the coefficients.
-// Buffers: Planes (3, rows, stride) of colour, or the loss by it; grids, first, second (photographs, GRID_LEVELS,
-//   GRID_ROWS, GRID_COLUMNS, 3, 4); lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS); by_grid of one photograph.
-//   Shapes of the kernels are above each.
+// Owner: A work-item owns a pixel (slice, slice_gradient); a channel, a grid column and an image line (line_sums); one
+//   coefficient of one photograph's grid (grid_sums, move_grid) or of all grids (centre_grids). Sums have one order on
+//   every device. Built with one lane.
+// Launch: Grids of stride x rows, width x height and columns x height x 3; a work-item for each coefficient.
+// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient by it; grids, first, second (photographs,
+//   GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4); lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS); by_grid: the gradient
+//   by one photograph's grid. Shapes are above each kernel.
 // Equations: docs/gradients.md, "Bilateral grids".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -22,12 +23,12 @@ static inline float luminance_of(const float r, const float g, const float b) {
   return fma1(0.299f, r, fma1(0.587f, g, 0.114f * b));
 }
 
-// Where a luminance is among the levels. What is no number is at the first.
+// The coordinate of a luminance among the levels; NaN maps to the first level.
 static inline float level_of(const float luminance) {
   return luminance > 0.0f ? min(luminance, 1.0f) * (GRID_LEVELS - 1) : 0.0f;
 }
 
-// The map of a pixel, and its derivative by the level: bilinear in each of two levels, then between these.
+// A pixel's colour map and its derivative by the level: bilinear within two levels, then linear between them.
 static inline void pixel_map(const float u, const float v, const float level, __global const float *grid, float *map,
                              float *risen) {
   const int i = min((int)u, GRID_COLUMNS - 2), j = min((int)v, GRID_ROWS - 2), l = min((int)level, GRID_LEVELS - 2);
@@ -45,7 +46,7 @@ static inline void pixel_map(const float u, const float v, const float level, __
   }
 }
 
-// grids, image -> seen: the image with each pixel's colour map put on it.
+// grids, image -> seen: the image with each pixel's colour map applied.
 __kernel void slice(const int photograph, const int stride, const int plane, const float across, const float down,
                     __global const float *grids, __global const float *image, __global float *seen) {
   const int x = get_global_id(0), y = get_global_id(1);
@@ -59,7 +60,7 @@ __kernel void slice(const int photograph, const int stride, const int plane, con
         fma1(map[4 * c], r, fma1(map[4 * c + 1], g, fma1(map[4 * c + 2], b, map[4 * c + 3])));
 }
 
-// grids, image, gradient by seen -> gradient by image, in its place.
+// grids, image, gradient by seen -> gradient by image, in place.
 __kernel void slice_gradient(const int photograph, const int stride, const int plane, const float across,
                              const float down, __global const float *grids, __global const float *image,
                              __global float *gradient) {
@@ -85,7 +86,7 @@ __kernel void slice_gradient(const int photograph, const int stride, const int p
   gradient[2 * (size_t)plane + at] = fma1(0.114f, by_luminance, by_blue);
 }
 
-// image, gradient by seen -> lines: sums over the pixels of a line, by the weights of columns and levels.
+// image, gradient by seen -> lines: sums over the pixels of a line, weighted by column and level.
 __kernel void line_sums(const int width, const int stride, const int plane, const float across,
                         __global const float *image, __global const float *gradient, __global float *lines) {
   const int i = get_global_id(0), y = get_global_id(1), c = get_global_id(2);
@@ -109,7 +110,7 @@ __kernel void line_sums(const int width, const int stride, const int plane, cons
   for (int k = 0; k < 4 * GRID_LEVELS; ++k) line[k] = sums[k];
 }
 
-// The pull of a coefficient's neighbours on one axis, step apart.
+// The smoothness gradient of a coefficient from its neighbours on one axis, `step` floats away.
 static inline float pull(__global const float *value, const int place, const int count, const int step) {
   float sum = 0.0f;
   if (place > 0) sum += value[0] - value[-step];
@@ -117,7 +118,7 @@ static inline float pull(__global const float *value, const int place, const int
   return sum;
 }
 
-// lines, a photograph's grid -> by_grid: sums over the lines by the weights of rows, and the variation's gradient.
+// lines, a photograph's grid -> by_grid: sums over the lines, weighted by row, plus the gradient of the variation.
 __kernel void grid_sums(const int photograph, const int height, const float down, const float weight,
                         __global const float *grids, __global const float *lines, __global float *by_grid) {
   const int at = get_global_id(0);
@@ -149,13 +150,13 @@ __kernel void move_grid(const int photograph, const float rate, const float root
   if (item >= GRID_FLOATS || readback[READBACK_STOPPED]) return;
   const size_t at = (size_t)photograph * GRID_FLOATS + item;
   float g = by_grid[item];
-  if (!(g * g < INFINITY)) g = 0.0f; // of a view with something that is not finite nothing is learnt
+  if (!(g * g < INFINITY)) g = 0.0f; // a view with non-finite values teaches nothing
   const float m = fma1(beta1, first[at], (1.0f - beta1) * g), v = fma1(beta2, second[at], (1.0f - beta2) * (g * g));
   first[at] = m, second[at] = v;
   grids[at] -= rate * m / fma1(sqrt(v), root, epsilon);
 }
 
-// All photographs' grids, in place: their mean becomes the identity.
+// Centres all photographs' grids in place: their mean becomes the identity.
 __kernel void centre_grids(const int photographs, __global const uint *readback, __global float *grids) {
   const int item = get_global_id(0);
   if (item >= GRID_FLOATS || readback[READBACK_STOPPED]) return;

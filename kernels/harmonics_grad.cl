@@ -1,12 +1,12 @@
 // The gradient of colours from spherical harmonics, by the coefficients and by the directions.
 //
 // Owner: A work-item owns LANES Gaussians.
-// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
-// Buffers: what harmonics.cl reads; d_colours (n, 3); with CAMERA colours (n, 3), as harmonics.cl wrote them: what is 0
-//   there has no gradient -> d_sh (n, coefficients, 3), zero from `used` on, with ADDED to what is there; with
-//   BY_DIRECTION d_directions (n, 3), by a mean where there is a camera, with ADDED_DIRECTIONS to what is there. What
-//   the mask hides is zero, or stays as it was. With BY_CENTRE by_centre (3, padded): what each says of the camera's
-//   centre, zero from n on.
+// Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
+// Buffers: harmonics.cl's inputs; d_colours (n, 3); with CAMERA colours (n, 3), as harmonics.cl wrote them: channels
+//   that are 0 there have no gradient -> d_sh (n, coefficients, 3), zero from `used` on, with ADDED added to the array;
+//   with BY_DIRECTION d_directions (n, 3), with CAMERA by the mean, with ADDED_DIRECTIONS added to the array. Masked
+//   rows are zero, or unchanged where values are added. With BY_CENTRE by_centre (3, padded): each Gaussian's gradient
+//   by the camera's centre, zero from n on.
 // Equations: docs/gradients.md, (38) to (40), (168).
 #include "shared/math.h"
 #include "shared/lanes.h"

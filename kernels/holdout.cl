@@ -1,10 +1,10 @@
-// A picture held out: of the light that blend.cl adds up, what the surfaces of other elements let through.
+// Holdout: renders the light of blend.cl that the surfaces of other elements let through.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
-// Buffers: blend's ranges, gaussian_from_sorted, splats, background and stops; the surfaces of held.h; camera with RAYS
-//   -> blend's image (3, height, width) and transmittance (height, width), written anew: colour, and what is left of 1
-//   beside the alpha that is seen. Pixels without a surface in front of a Gaussian keep their bits.
+// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Buffers: blend's ranges, gaussian_from_sorted, splats, background and stops; the surfaces of held.h; with RAYS camera
+//   -> blend's image (3, height, width) and transmittance (height, width), overwritten: colour, and 1 minus the visible
+//   alpha. Pixels without a surface in front of a Gaussian keep their bits.
 // Equations: docs/pictures.md, (75) to (77).
 #define HOLDOUT
 #include "shared/math.h"

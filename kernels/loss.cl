@@ -1,23 +1,22 @@
 // The loss (1 - weight) L1 + weight (1 - SSIM) and its gradient. SSIM has the usual 11 x 11 Gaussian window, sigma 1.5,
-// zeros outside the image. The window is separable: vertical first, into local memory, then horizontal. A second pair
-// of windows convolves the three partial derivatives, the adjoint of the first.
+// with zeros outside the image. The window is separable: vertical first, into local memory, then horizontal. A second
+// pair of passes, the adjoint of the first, convolves the three partial derivatives.
 //
-// Owner: A group owns blocks of one channel. At ITEMS == 1 it goes down a block by ROWS rows, keeps the derivatives of
-//   LOSS_RING rows, and works out anew those that other blocks have too. Else a block is ROWS x COLUMNS pixels, and the
-//   derivatives of the image are written between two launches.
-// Launch: At ITEMS == 1 any number of groups, which share the blocks out; else a group of ITEMS for each block. Blocks
-//   are numbered across, then down, then by channel.
-// Buffers: image, target (3, rows, stride) in colour, padded to whole tiles, zero in the padding; partials at
-//   ITEMS == 1 (groups, LOSS_RING, 3, field), else (3, 3, height, stride), kind first;
-//   gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its square: one
-//   a block, at ITEMS == 1 one for each of its rows.
+// Owner: A group owns blocks of one channel. With ITEMS == 1 it goes down a block ROWS rows at a time and keeps the
+//   derivatives of LOSS_RING rows; rows shared with other blocks are recomputed. Otherwise a block is ROWS x COLUMNS
+//   pixels, and the image's derivatives are written between two launches.
+// Launch: With ITEMS == 1 any number of groups, which share the blocks; otherwise a group of ITEMS for each block.
+//   Blocks are numbered across, then down, then by channel.
+// Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; partials: with ITEMS == 1
+//   (groups, LOSS_RING, 3, field), otherwise (3, 3, height, stride), kind first; gradient (3, rows, stride), 0 right of
+//   the image; sums (3, ...) of SSIM, of |image - target| and of its square: one per block, with ITEMS == 1 per row of
+//   a block.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
 //
-// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So whatever a window is added up of counts from the
-// pixel in its middle (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is one of
-// differences between a pixel and its neighbours.
+// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So a window sums differences from its centre pixel
+// (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is a sum of differences too.
 #if ITEMS == 1 && LANES == 8 && defined(FMA_BY_CONTRACTION)
-#undef LANES // Two vectors at once: a window's sums are chains of additions, each of which waits for the one before.
+#undef LANES // Two vectors at once: a window's sum is a chain of dependent additions.
 #define LANES 16
 #endif
 #include "shared/math.h"
@@ -32,7 +31,7 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
                                  2.13005538e-1f, 2.66011725e-1f, 2.13005538e-1f, 1.09360690e-1f,
                                  3.60007721e-2f, 7.59875814e-3f, 1.02838008e-3f};
 
-// Columns on either side of a block that a window reaches, in whole vectors.
+// Columns on either side of a block that a window reaches, rounded up to whole vectors.
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
 #if ITEMS == 1
 #define ROWS LOSS_ROWS
@@ -57,8 +56,8 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 #define STORE_NEAR(x, p) (*(__local floatU *)(p) = (x))
 #endif
 
-// Columns x0 to x1 of one channel. partials: where its derivatives are, `pitch` floats from row to row, `field` from
-// one to the next, beginning at the column x_partials.
+// Columns x0 to x1 of one channel. partials: its derivatives, `pitch` floats between rows and `field` floats between
+// fields, starting at column x_partials.
 typedef struct {
   __global const float *image, *target;
   __global float *partials;
@@ -69,9 +68,9 @@ typedef struct {
 #define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
 #define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
 
-// Body for the item's vectors of `rows` rows, with `margin` columns on either side: x, row, and `near_at`. One item
-// goes down the rows first, as their vertical windows share pixels, and has a row after the other for horizontal ones
-// (LINES).
+// Loop body over the item's vectors of `rows` rows, with `margin` columns on either side; defines x, row and `near_at`.
+// A single item takes vertical windows column by column, because neighbouring rows share pixels, and horizontal windows
+// one row at a time (LINES).
 #if ITEMS == 1
 #define LINES 1
 #define FOR_VECTORS(block, margin, rows)                                                                               \
@@ -89,13 +88,13 @@ typedef struct {
 #endif
 #define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) < 0 || (y) >= (block).height)
 
-// The taps of a window around the row y that are inside the image, one past the last in y.
+// The taps [x, y) of a window around row y that are inside the image.
 static inline int2 taps_inside(const Block block, const int y) {
   return (int2)(max(0, REACH - y), min(TAPS, block.height + REACH - y));
 }
 
-// near = the vertical windows around y and the rows below: means of x and y, variances of x and y, covariance; 0
-// outside the image.
+// near = vertical windows around row y and the rows below: means of image and target, their variances, and the
+// covariance; 0 outside the image.
 static inline void moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
@@ -104,7 +103,7 @@ static inline void moments(const Block block, const int margin, const int y, __l
       continue;
     }
     const int2 taps = taps_inside(block, y + row);
-    float beyond = 0.0f; // what of the window is outside the image, where all is 0
+    float beyond = 0.0f; // weight of the taps outside the image, where all is 0
     for (int tap = 0; tap < taps.x; ++tap) beyond += window[tap];
     for (int tap = taps.y; tap < TAPS; ++tap) beyond += window[tap];
     const uint here = PIXEL_AT(block, x, y + row);
@@ -129,8 +128,8 @@ static inline void moments(const Block block, const int margin, const int y, __l
   }
 }
 
-// near -> partials: dSSIM by the mean of x as far as it counts from the pixel in the middle, twice that by the
-// variance, and by the covariance, 0 right of the image. Returns the item's sum of SSIM over the block's own columns.
+// near -> partials: dSSIM by the mean of the image (relative to the centre pixel), twice dSSIM by its variance, and
+// dSSIM by the covariance. All are 0 right of the image. Returns the item's sum of SSIM over the block's own columns.
 static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
   FOR_VECTORS(block, margin, LINES) {
@@ -138,7 +137,7 @@ static inline float derivatives(const Block block, const int margin, const int y
     if (OUTSIDE(block, x, y + row)) continue;
     const uint here = PIXEL_AT(block, x, y + row);
     const floatL p = LOADL(block.image + here), q = LOADL(block.target + here);
-    floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1; // off: means from p and q
+    floatL off1 = (floatL)(0.0f), off2 = off1, var1 = off1, var2 = off1, covariance = off1; // off: means minus p and q
     for (int tap = 0; tap < TAPS; ++tap) {
       __local const float *in = near_at + (tap - REACH);
       const floatL e1 = LOAD_NEAR(in) - p, e2 = LOAD_NEAR(in + NEAR_FIELD) - q;
@@ -173,8 +172,8 @@ static inline float derivatives(const Block block, const int margin, const int y
   return sumL(total);
 }
 
-// near = the partials' vertical windows, the first with what the pixels differ by from the one in the middle; image and
-// target; 0 outside the image.
+// near = vertical windows of the partials, then image and target; 0 outside the image. The first window also takes in
+// the other two, times the pixels' differences from the centre pixel.
 static inline void adjoint_moments(const Block block, const int margin, const int y, __local float *near) {
   FOR_VECTORS(block, margin, ROWS) {
     VECTOR(block)
@@ -206,8 +205,8 @@ static inline void adjoint_moments(const Block block, const int margin, const in
   }
 }
 
-// near -> gradient, a plane. Returns the item's sums of |image - target| and of its square. l1_scale and ssim_scale are
-// the weights over the number of pixels and channels.
+// near -> gradient, one plane. Returns the item's sums of |image - target| and of its square. l1_scale and ssim_scale
+// are the loss weights divided by the number of pixels and channels.
 static inline float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
                                  __local float *near, __global float *gradient) {
   floatL absolute = (floatL)(0.0f), squares = absolute;
@@ -237,8 +236,8 @@ static inline float2 differences(const Block block, const int y, const float l1_
 }
 
 #if ITEMS == 1
-// image, target -> gradient, sums; blocks of block_rows x columns, at most COLUMNS; field: at least
-// columns + 2 MARGIN.
+// image, target -> gradient, sums. Blocks are block_rows x columns, at most COLUMNS wide; field: at least columns + 2
+// MARGIN.
 GROUP __kernel void loss(const int width, const int height, const int stride, const int plane, const int columns,
                          const int block_rows, const int field, const float l1_scale, const float ssim_scale,
                          __global const float *image, __global const float *target, __global float *partials,
@@ -257,7 +256,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
     block.x0 = index % across * columns, block.x1 = min(block.x0 + columns, stride);
     block.x_partials = block.x0 - MARGIN;
     __global float *ssims = sums + (size_t)height * across * channel + index % across;
-    int next = y0 - REACH; // the row whose derivatives come next, above the image too: so the ring has room for all
+    int next = y0 - REACH; // next row of derivatives, also above the image, so that the ring has room
     for (int y = y0; y < y1; y += ROWS) {
       for (; next < min(height, y + ROWS + REACH); next += ROWS) {
         moments(block, 2 * MARGIN, next, near);
@@ -277,7 +276,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
   }
 }
 #else
-// The sum of a value over the group, in a fixed tree, for its first item.
+// The group's sum of a value in a fixed tree, returned to its first item.
 static inline float sum_of_group(const float value, __local float *scratch) {
   const int item = get_local_id(0);
   barrier(CLK_LOCAL_MEM_FENCE);

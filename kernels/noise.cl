@@ -1,22 +1,23 @@
-// Noise on the means of Gaussians that are nearly transparent, along their own ellipsoids: what is not seen has no
-// gradient to find its place by.
+// Noise on the means of nearly transparent Gaussians, along their own ellipsoids: an invisible Gaussian has no gradient
+// that could move it.
 //
-// Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
-// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
-// Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n) -> means (n, 3), world units. first_row: the first
-//   one's in the model; key0, key1: the step's; amount: 1 over world units; dead: opacity; highest: the logit from
-//   which on a mean stays; readback (READBACK_SIZE). After a pass that has stopped (duplicate.cl) nothing changes.
+// Owner: A work-item owns a Gaussian. Built with one lane; every shape gives the same bits.
+// Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
+// Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n) -> means (n, 3), world units. first_row: the
+//   model's row of the first Gaussian; key0, key1: the step's key; amount: in 1 / world units; dead: an opacity;
+//   highest: means with at least this logit stay; readback (READBACK_SIZE). After a stopped pass (duplicate.cl) nothing
+//   changes.
 // Equations: docs/gradients.md, (92) and (93).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/random.h"
 
-#define HALVES 8              // uniform numbers of 16 bits in a sum
-#define WORDS (HALVES / 2)    // with two in each
-#define SPREAD 1.86881232e-5f // one over the standard deviation of the sum, sqrt(HALVES (2^32 - 1)/12)
+#define HALVES 8              // uniform 16-bit numbers in a sum
+#define WORDS (HALVES / 2)    // two in each
+#define SPREAD 1.86881232e-5f // 1 / the sum's standard deviation, sqrt(HALVES (2^32 - 1)/12)
 
-// Number `index` of those of a row: (93). Its sum is a whole number under 2^23, so that it is rounded once.
+// The row's random number `index`: (93). Its sum is an integer under 2^23, so that it is rounded only once.
 static inline float normal(uint row_word, uint index) {
   int sum = -(HALVES * 65535) / 2;
   for (uint k = 0; k < WORDS; ++k) {
@@ -38,7 +39,7 @@ __kernel void add_noise(const uint n, const uint first_row, const uint key0, con
   const float e0 = normal(row_word, 0), e1 = normal(row_word, 1), e2 = normal(row_word, 2);
   const float by = amount * sigmoidL(100.0f * (dead - sigmoidL(logit)));
 
-  // A column of the rotation after the other: the axis, times the variance along it, times what eta has of it.
+  // For each column of the rotation: the axis, times the variance along it, times eta's component along it.
   __global const float *q = quaternions + 4 * (size_t)i;
   __global const float *l = log_scales + 3 * (size_t)i;
   __global float *mean = means + 3 * (size_t)i;
@@ -55,7 +56,7 @@ __kernel void add_noise(const uint n, const uint first_row, const uint key0, con
     const float along = fma1(axes[k][0], e0, fma1(axes[k][1], e1, axes[k][2] * e2)) * s * s * by;
     for (int j = 0; j < 3; ++j) moved[j] = fma1(axes[k][j], along, moved[j]);
   }
-  // As Adam, it leaves no mean that is not finite.
+  // Like Adam, it leaves no mean that is not finite.
   if (!(moved[0] * moved[0] < limit2 && moved[1] * moved[1] < limit2 && moved[2] * moved[2] < limit2)) return;
   for (int j = 0; j < 3; ++j) mean[j] = moved[j];
 }

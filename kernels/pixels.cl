@@ -1,12 +1,13 @@
-// Images between the planes of blending, padded to whole tiles, and arrays with a pixel's values side by side.
+// Conversion between blending's planes, padded to whole tiles, and arrays with a pixel's values side by side.
 //
 // Owner: A work-item owns a pixel.
-// Launch: One work-item for each pixel of the image, row by row, in groups of 64; those beyond the last do nothing.
-// Buffers: image (3, rows, stride), transmittance (rows, stride) -> pixels (height, width, depth): its first values, of
-//   which there are 3 at most; alpha (height, width), 0 to 1. Back: d_pixels (height, width, depth), with
-//   ALPHA_GRADIENT d_alpha (height, width) -> image_gradient (3, rows, stride) of blend_grad.cl, 0 in planes that have
-//   no value, with ALPHA_GRADIENT a fourth: by the transmittance. Padding is left as it is.
+// Launch: One work-item for each pixel of the image, row by row, in groups of 64; work-items past the end do nothing.
+// Buffers: image (3, rows, stride), transmittance (rows, stride) -> pixels (height, width, depth): up to three values,
+//   the first of each pixel; alpha (height, width), 0 to 1. Backward: d_pixels (height, width, depth), with
+//   ALPHA_GRADIENT d_alpha (height, width) -> image_gradient (3, rows, stride) of blend_grad.cl, 0 in planes without a
+//   value; with ALPHA_GRADIENT a fourth plane, by the transmittance. Padding is not written.
 // Equations: docs/gradients.md, (177).
+#include "shared/layouts.h"
 
 __kernel void pixels_from_planes(const int width, const int height, const int depth, const int stride,
                                  __global const float *image, __global const float *transmittance,

@@ -1,17 +1,18 @@
-// The gradient by the camera's pose, from those by the model that the camera sees, and sums of that by its lens.
+// The gradient by a camera's pose, from the gradients by the model; also sums of the gradient by its lens.
 //
-// Owner: A work-item owns POSE_ROWS Gaussians (pose_rows, lens_rows), then as many of these sums (pose_sums), one
-//   behind the other. Built with one lane: its bits are those of any shape.
-// Launch: One work-item for each POSE_ROWS Gaussians, then for each of the `width` columns of as many sums, until one
+// Owner: A work-item owns POSE_ROWS consecutive Gaussians (pose_rows, lens_rows), then POSE_ROWS consecutive sums
+//   (pose_sums). Built with one lane; every shape gives the same bits.
+// Launch: One work-item for each POSE_ROWS Gaussians; then one for each of `width` columns of POSE_ROWS sums, until one
 //   row is left.
-// Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3), and the gradients by
-//   means, by quaternions and by sh_dc (n, 3), of which the rows without tiles are not read -> sums
-//   (ceil(n / POSE_ROWS), 6), from first_block on: by the turn about the world's axes, then by the shift along them.
-//   by_lens (n, 4) of project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
+// Buffers: tile_counts (n), means (n, 3), quaternions (n, 4), sh_rest (n, coefficients - 1, 3). The gradients by means,
+//   quaternions and sh_dc (n, 3), whose rows without tiles are not read -> sums (ceil(n / POSE_ROWS), 6), from row
+//   first_block on: by the rotation about the world's axes, then by the translation along them. by_lens (n, 4) of
+//   project_grad.cl -> sums (ceil(n / POSE_ROWS), 4).
 // Equations: docs/gradients.md, (140) to (142), (144).
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/sh.h"
+#include "shared/camera.h"
 
 __kernel void pose_rows(const uint n, const uint first_block, const int coefficients, __constant float *camera,
                         __global const uint *tile_counts, __global const float *means,
@@ -30,20 +31,17 @@ __kernel void pose_rows(const uint n, const uint first_block, const int coeffici
     shift[1] += gy;
     shift[2] += gz;
 
-    // (142). The gradient by the direction of the view, which is that of the mean's, or all Gaussians' own.
+    // (142): the gradient by the view direction, which depends on the mean, or is one for all Gaussians.
     const float distance = sqrt(fma1(x, x, fma1(y, y, z * z)));
-#ifdef ORTHOGRAPHIC
-    const float ux = camera[CAMERA_R20], uy = camera[CAMERA_R21], uz = camera[CAMERA_R22];
-#else
-    const float ux = x / distance, uy = y / distance, uz = z / distance;
-#endif
+    const float ux = SEEN_ALONG(x, distance, camera[CAMERA_R20]), uy = SEEN_ALONG(y, distance, camera[CAMERA_R21]),
+                uz = SEEN_ALONG(z, distance, camera[CAMERA_R22]);
     const float red = d_sh_dc[3 * i] / SH_CONSTANT, green = d_sh_dc[3 * i + 1] / SH_CONSTANT,
                 blue = d_sh_dc[3 * i + 2] / SH_CONSTANT;
     __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
     float weight[16], by[3];
     for (int k = 1; k < coefficients; ++k, f += 3) weight[k] = fma1(red, f[0], fma1(green, f[1], blue * f[2]));
     sh_direction_gradient(coefficients, ux, uy, uz, weight, by);
-    // That by the mean turns with the direction, not with the camera.
+    // The mean's gradient through the view direction turns with that direction, not with the camera.
     const float across_x = uy * by[2] - uz * by[1], across_y = uz * by[0] - ux * by[2],
                 across_z = ux * by[1] - uy * by[0];
 

@@ -1,6 +1,6 @@
-// One wrapper for each shared function, so that tests can call it alone; a device is opened with probe_fma.
+// Wrappers that let tests call the shared functions one by one; probe_fma also runs when a device is opened.
 //
-// Owner: A work-item owns an element; the one of probe_fma all of them.
+// Owner: A work-item owns an element; in probe_fma one work-item owns all.
 // Launch: One work-item for each element; probe_fma a single one.
 // Buffers: Above each kernel, without units.
 // Equations: none.
@@ -9,13 +9,13 @@
 #include "shared/elementary.h"
 #include "shared/sh.h"
 
-// out[LANES], out[LANES..2 LANES): what fma1 and fmaL make of factor * factor + addend.
+// out[0..LANES), out[LANES..2 LANES): factor * factor + addend by fmaL and by fma1.
 __kernel void probe_fma(__global float *out, const float factor, const float addend) {
   STOREL(fmaL((floatL)(factor), (floatL)(factor), (floatL)(addend)), out);
   for (int lane = 0; lane < LANES; ++lane) out[LANES + lane] = fma1(factor, factor, addend);
 }
 
-// x (n) -> out (4, n): expL, log2L, sigmoidL and exp2L, each in the first lane.
+// x (n) -> out (4, n): expL, log2L, sigmoidL and exp2L, each from the first lane.
 __kernel void probe_elementary(__global const float *x, __global float *out, const uint n) {
   const uint i = get_global_id(0);
   Lanes values[4];
@@ -26,7 +26,7 @@ __kernel void probe_elementary(__global const float *x, __global float *out, con
   for (uint k = 0; k < 4; ++k) out[k * n + i] = values[k].lane[0];
 }
 
-// bits (n) of halves -> out (n, 4): as floats, in every lane.
+// bits (n) of halves -> out (n, 4): the values as floats, in every lane.
 __kernel void probe_half(__global const ushort *bits, __global float *out) {
   const uint i = get_global_id(0);
   const float4 value = float_from_half((int4)(bits[i]));

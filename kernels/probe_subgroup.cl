@@ -1,8 +1,8 @@
-// What the items of a sub-group exchange: whether a driver's shuffles are those that subgroup.h counts on.
+// The exchange within sub-groups: shows whether a driver's shuffles work as subgroup.h expects.
 //
-// Owner: A group of ITEMS work-items, of which each has a place in every row.
+// Owner: A group of ITEMS work-items; each item has a place in every row.
 // Launch: One group.
-// Buffers: out (log2 SUBGROUP, ITEMS): in row k the number of the item that item i got from, by bit k.
+// Buffers: out (log2 SUBGROUP, ITEMS): row k holds the number of the item that item i received from, through bit k.
 // Equations: none.
 #include "shared/group.h"
 #include "shared/subgroup.h"

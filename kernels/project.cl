@@ -1,14 +1,13 @@
-// Projection of perspective and orthographic cameras: each Gaussian to its ellipse, colour, depth and number of tiles.
+// Projection for perspective and orthographic cameras: each Gaussian's ellipse, colour, depth and number of tiles.
 //
-// Owner: A work-item owns LANES Gaussians: in vectors as far as all have the same to do, then the visible ones by
-//   turns.
-// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
-// Buffers: means (n, 3) in world units, quaternions (n, 4) w x y z, log_scales (n, 3), opacity_logits (n), sh_dc (n,
-//   3), sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
-//   visible; tile_counts (n): 0 where culled. With KEEP_CULLED shown (n): 1 where a splat is written, also of those
-//   that have no tile. Of a model that is held: with SH_DEGREES sh_degrees (n): the highest that is looked at. With
-//   THINNED a Gaussian is left out whose word is under the threshold, and factor multiplies the other opacities;
-//   model_row: the first one's row in the model; key0, key1: the step's.
+// Owner: A work-item owns LANES Gaussians. The common part runs in vectors, the rest one visible Gaussian at a time.
+// Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
+// Buffers: means (n, 3) in world units; quaternions (n, 4) w x y z; log_scales (n, 3); opacity_logits (n); sh_dc (n,
+//   3); sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
+//   visible; tile_counts (n): 0 where culled. With NO_FRUSTUM_CULL shown (n): 1 where a splat is written, also of
+//   Gaussians without a tile. With SH_DEGREES sh_degrees (n): the highest SH degree that each Gaussian uses. With
+//   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the other
+//   opacities; model_row: the model's row of the first Gaussian; key0, key1: the step's key.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
 #include "shared/math.h"
@@ -22,19 +21,12 @@
 #include "shared/random.h"
 #endif
 
-// True for a Gaussian that goes on though it reaches no tile (RasterizerConfig.frustum_cull, opacity_cull).
-#if defined(NO_FRUSTUM_CULL)
-#define KEEP_CULLED 1
-#elif defined(NO_OPACITY_CULL)
-#define KEEP_CULLED !opaque.lane[lane]
-#endif
-
 __kernel void project(const uint n, const int coefficients, const int tiles_x, const int tiles_y,
                       __constant float *camera, __global const float *means, __global const float *quaternions,
                       __global const float *log_scales, __global const float *opacity_logits,
                       __global const float *sh_dc, __global const shT *sh_rest, __global float *splats,
                       __global uint *tile_counts
-#ifdef KEEP_CULLED
+#ifdef NO_FRUSTUM_CULL
                       ,
                       __global uint *shown
 #endif
@@ -49,7 +41,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 ) {
   ROWS_OF_ITEM(n)
   for (uint lane = 0; lane < lanes_used; ++lane) tile_counts[first_row + lane] = 0;
-#ifdef KEEP_CULLED
+#ifdef NO_FRUSTUM_CULL
   for (uint lane = 0; lane < lanes_used; ++lane) shown[first_row + lane] = 0;
 #endif
   Projection p;
@@ -68,13 +60,8 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   floatL dx = FROM_CAMERA(means, X, 0), dy = FROM_CAMERA(means, Y, 1), dz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(dx, dx, fmaL(dy, dy, dz * dz)));
   const intL seen = (length > 0.0f) & (length < FARTHEST);
-  IntLanes opaque, valid;
-  opaque.all = opacity > ALPHA_MIN;
-#ifdef NO_OPACITY_CULL
-  valid.all = p.valid & seen;
-#else
-  valid.all = p.valid & opaque.all & seen;
-#endif
+  IntLanes valid;
+  valid.all = p.valid & (opacity > ALPHA_MIN) & seen;
   if (!ANYL(valid.all)) return;
 
   Lanes field[SPLAT_SIZE];
@@ -94,19 +81,9 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
   field[SPLAT_HALF_H].all = sqrt(budget * p.syy) / WHITEN;
   field[SPLAT_DEPTH].all = p.z;
   field[SPLAT_INVERSE_L11].all = 1.0f / l11;
-#ifdef NO_OPACITY_CULL // an extent of less than nothing: no tile, whatever the setting of `extent`
-  field[SPLAT_HALF_W].all = opacity > ALPHA_MIN ? field[SPLAT_HALF_W].all : (floatL)(-1e30f);
-  field[SPLAT_HALF_H].all = opacity > ALPHA_MIN ? field[SPLAT_HALF_H].all : (floatL)(-1e30f);
-#endif
-#ifdef ORTHOGRAPHIC // (17)
-  dx = (floatL)(camera[CAMERA_R20]);
-  dy = (floatL)(camera[CAMERA_R21]);
-  dz = (floatL)(camera[CAMERA_R22]);
-#else
-  dx = dx / length;
-  dy = dy / length;
-  dz = dz / length;
-#endif
+  dx = (floatL)(SEEN_ALONG(dx, length, camera[CAMERA_R20]));
+  dy = (floatL)(SEEN_ALONG(dy, length, camera[CAMERA_R21]));
+  dz = (floatL)(SEEN_ALONG(dz, length, camera[CAMERA_R22]));
   Lanes basis[16];
   sh_basis(SH_USED(coefficients), dx, dy, dz, &basis[0].all);
 
@@ -119,8 +96,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     for (uint k = 0; k < sizeof(fields) / sizeof(fields[0]); ++k) splat[fields[k]] = field[fields[k]].lane[lane];
     const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
     const uint count = tile_count(&e, tiles_x);
-#ifdef KEEP_CULLED
-    if (count == 0 && !(KEEP_CULLED)) continue;
+#ifdef NO_FRUSTUM_CULL // RasterizerConfig.frustum_cull: kept without a tile
     shown[i] = 1;
 #else
     if (count == 0) continue;
@@ -131,7 +107,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
 #ifndef UNGUARDED
     if (!colour_is_drawn(colour)) {
       tile_counts[i] = 0;
-#ifdef KEEP_CULLED
+#ifdef NO_FRUSTUM_CULL
       shown[i] = 0;
 #endif
       continue;

@@ -1,30 +1,33 @@
-// The gradient of projection: sums a Gaussian's slots in the order of its tiles, then the chain rule back to its
-// parameters. project_step takes Adam's step with it at once: no gradient is in memory.
+// The gradient of projection: sums a Gaussian's slots in the order of its tiles, then applies the chain rule back to
+// its parameters. project_step fuses Adam's step into it, so that no gradient goes to memory.
 //
-// Owner: A work-item owns LANES Gaussians, of which project_grad leaves those that are not visible; in add_slots one.
-//   A group of project_step owns ROWS of them, so that it walks each of the model's arrays in order.
-// Launch: One work-item for each LANES Gaussians, or for each one, in groups of 64; those beyond the last do nothing.
-//   project_step: groups of one item, or with one lane of ROWS.
-// Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums by Gaussian (n, SLOT_STRIDE);
-//   tile_counts, first_slots (n): its scan; the parameters, splats and camera as in project.cl -> screen (n, 2): of the
-//   mean on the image, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): what each adds to the image,
-//   sums of its blending weights over all pixels. With LENS by_lens (n, 4): what each says of the logs of the camera's
-//   focal lengths and of its principal point, per pixel. project_grad: gradients of the parameters, of the same shapes,
-//   in loss per unit of each. Rows of Gaussians that are not visible are left as they are. project_step, built with
-//   ADAM: the parameters and their moments `first` and `second`, of the same shapes; `readback` (READBACK_SIZE) counts,
-//   and the scalars are those of Step, one a group where they differ. The gradient of a Gaussian that is not visible is
-//   zero, or with SPARSE its row stays as it is. After a pass that has stopped (duplicate.cl) nothing changes. With
-//   PENALTIES the gradient has that of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
+// Owner: A work-item owns LANES Gaussians, in add_slots one; project_grad skips those that are not visible. A group of
+//   project_step owns ROWS Gaussians and walks each of the model's arrays in order.
+// Launch: One work-item for each LANES Gaussians, or for each one, in groups of 64; work-items past the end do nothing.
+//   project_step: groups of one item, or with one lane of ROWS items.
+// Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums (n, SLOT_STRIDE); tile_counts,
+//   first_slots (n): its scan; parameters, splats and camera as in project.cl -> screen (n, 2): gradient by the mean's
+//   image position, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): each Gaussian's blending
+//   weights, summed over all pixels. With LENS by_lens (n, 4): each Gaussian's gradient by the logs of the focal
+//   lengths and by the principal point, per pixel. project_grad: gradients in the parameters' shapes, in loss per unit;
+//   rows that are not visible stay unchanged. project_step, built with ADAM: parameters, moments `first` and `second`;
+//   `readback` (READBACK_SIZE); the scalars of Step, one per group where they differ. Rows that are not visible have a
+//   zero gradient, with SPARSE they stay unchanged. After a stopped pass (duplicate.cl) nothing changes. With PENALTIES
+//   the gradient includes that of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
-//   (145). With RAYS docs/cameras.md, (22) to (29); with ORTHOGRAPHIC (20).
+//   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"
+#ifdef RAYS
+#define NEEDS_TANGENTS
+#else
+#define NEEDS_GRADIENT
+#endif
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/splat.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
 #ifdef RAYS
-#include "shared/angles.h"
 #include "shared/rays.h"
 #include "shared/tangent.h"
 #endif
@@ -34,8 +37,8 @@
 #endif
 
 #ifndef ADAM
-// Sums that band after band of tiles goes on with: tile_counts, first_slots (n), slots (pairs) of one band
-// -> sums (n, SLOT_STRIDE). From the first band to the last these are the additions that project_grad makes by itself.
+// Adds one band's slots to running sums. tile_counts, first_slots (n), slots (pairs) of the band -> sums (n,
+// SLOT_STRIDE). Over all bands in order these are the same additions that project_grad makes.
 __kernel void add_slots(const uint n, __global const uint *tile_counts, __global const uint *first_slots,
                         __global const float *slots, __global float *sums) {
   const uint i = get_global_id(0);
@@ -114,7 +117,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 #define SH_FLOATS (3 * SH_HIGHER) // of a Gaussian's higher SH bands
 
 #if LANES > 1
-// Adam's step of LANES rows, or of those up to n: gradients (LANES, width), zero in rows that are not `shown`.
+// Adam's step of LANES rows, or fewer at the end of n. gradients (LANES, width): zero in rows that are not `shown`.
 static inline void step_rows(const uint n, const uint first_row, const uint width, const int *shown,
                              const float *gradients, Step s, Stepped model) {
   const size_t begin = (size_t)first_row * width;
@@ -130,7 +133,7 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 #else
 #define TAKEN(k) (intL)(-1)
 #endif
-  ulong left = 0; // vectors with an element that is refused, or with one beyond the last row
+  ulong left = 0; // vectors with a refused element, or with one past the last row
   for (uint k = 0; k < width; ++k) {
     const floatL g = *(const floatL *)(gradients + k * LANES);
     if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k), s, model)) left |= (ulong)1 << k;
@@ -171,7 +174,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   Gradients d;
   const uint sh_width = 3 * (coefficients - 1);
 #if LANES > 1
-  // A group of the model's arrays after the other, each in runs that are long enough for a processor to fetch ahead.
+  // One array of the model after another, in runs that are long enough for the processor's prefetcher.
   const uint begin = get_global_id(0) * BLOCKS * LANES;
   if (begin >= n || readback[READBACK_STOPPED]) return;
   int shown[ROWS];
@@ -213,7 +216,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #endif
 
 #else // LANES == 1
-  // Gradients of a group's Gaussians, row by row; then its items walk the model's arrays side by side.
+  // The gradients of a group's Gaussians, row by row; then its items walk the model's arrays side by side.
   __local float by_mean[3 * ROWS], by_quaternion[4 * ROWS], by_log_scale[3 * ROWS];
   __local float by_opacity[ROWS], by_colour[3 * ROWS], basis[SH_HIGHER * ROWS];
   __local int in_view[ROWS];
@@ -232,7 +235,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #ifndef NO_SH_REST
   FOR_HIGHER(k, SH_USED(coefficients)) basis[SH_HIGHER * me + k - 1] = any ? d.basis[k].all : 0.0f;
 #endif
-  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // a row is read by one item and written by others
+  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // a row has one reader and several writers
 #ifdef SPARSE
 #define TAKEN(row) in_view[row]
 #else

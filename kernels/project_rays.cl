@@ -1,113 +1,35 @@
-// Projection along rays, for equirectangular (RAYS == 1), fisheye (RAYS == 2) and perspective (RAYS == 3) cameras: each
-// Gaussian to its ellipse on the plane that touches the sphere of directions at its mean's, where perspective bends it
-// least; there is no pole and no seam.
+// Projection along rays, for the camera models with RAYS. Each Gaussian becomes an ellipse on the tangent plane of the
+// direction sphere at its mean, where perspective distorts it least. There is no pole and no seam.
 //
-// Owner: A work-item owns a Gaussian. Built with one lane: its bits are those of any shape.
-// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
-// Buffers: As in project.cl, but for what that can leave out of a model that is held -> splats (n, RAY_SIZE),
-//   directions in the camera's axes and distance in world units; tile_counts (n).
+// Owner: A work-item owns a Gaussian. Built with one lane; every shape gives the same bits.
+// Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
+// Buffers: As in project.cl, without NO_FRUSTUM_CULL -> splats (n, RAY_SIZE), directions in the camera's axes and
+//   distance in world units; tile_counts (n).
 // Equations: docs/cameras.md, (8) to (14), (18), (19), (30), (32); colour docs/gradients.md, (12).
 #include "shared/math.h"
+#define NEEDS_TANGENTS
+#define NEEDS_BOXES
 #include "shared/lanes.h"
 #include "shared/elementary.h"
 #include "shared/tile.h"
 #include "shared/gaussian.h"
 #include "shared/sh.h"
-#include "shared/angles.h"
 #include "shared/rays.h"
 #include "shared/tangent.h"
 #ifdef THINNED
 #include "shared/random.h"
 #endif
 
-// Slack of a box in pixels, over TILE_SLACK: what float32 angles lose of a picture 32768 wide.
+// Slack of a box in pixels, on top of TILE_SLACK: the rounding of float32 angles in a picture 32768 pixels wide.
 #define BOX_SLACK 0.1f
-#define NO_END 1e15f
-#define LEAST_AHEAD 1e-4f // of a direction's length; less is beyond every picture
-
-typedef struct {
-  float low_x, high_x, low_y, high_y; // in pixels, not clamped
-  int whole_rows;                     // it goes all the way round
-} Box;
-
-#if RAYS == 3
-// (32), one side: where directions within an angle, of the sine `sine`, of one with the coordinates along and z are on
-// the image, in focal lengths; without an end where they reach beyond the camera's plane.
-static inline void side_of(float along, float z, float sine, float *low, float *high) {
-  const float level = sqrt(fma1(along, along, z * z));
-  *low = -NO_END;
-  *high = NO_END;
-  if (!(sine < 0.999f * level)) return;
-  const float ratio = sine / level, cosine = sqrt(1.0f - ratio * ratio);
-  const float ahead_low = fma1(cosine, z, ratio * along), ahead_high = fma1(cosine, z, -(ratio * along));
-  if (ahead_low > LEAST_AHEAD * level) *low = fma1(cosine, along, -(ratio * z)) / ahead_low;
-  if (ahead_high > LEAST_AHEAD * level) *high = fma1(cosine, along, ratio * z) / ahead_high;
-}
-#endif
-
-// The box of all directions within an angle of f whose tangent is `reach`.
-static inline void box_of(const float *f, float reach, __constant float *camera, Box *t) {
-  const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
-  const float cx = camera[CAMERA_CX] - camera[CAMERA_WINDOW_X], cy = camera[CAMERA_CY] - camera[CAMERA_WINDOW_Y];
-  const float sine = reach / sqrt(fma1(reach, reach, 1.0f));
-  t->whole_rows = 0;
-#if RAYS == 3
-  side_of(f[0], f[2], sine, &t->low_x, &t->high_x);
-  side_of(f[1], f[2], sine, &t->low_y, &t->high_y);
-  t->low_x = fma1(fx, t->low_x, cx);
-  t->high_x = fma1(fx, t->high_x, cx);
-  t->low_y = fma1(fy, t->low_y, cy);
-  t->high_y = fma1(fy, t->high_y, cy);
-#else
-  const float cap = quarter_atan(reach, 1.0f);
-#if RAYS == 1
-  const float level = sqrt(fma1(f[0], f[0], f[2] * f[2]));
-  const float latitude = f[1] < 0.0f ? -quarter_atan(-f[1], level) : quarter_atan(f[1], level);
-  const float longitude = f[0] < 0.0f ? -half_atan(-f[0], f[2]) : half_atan(f[0], f[2]);
-  t->low_y = fma1(fy, latitude - cap, cy);
-  t->high_y = fma1(fy, latitude + cap, cy);
-  if (!(sine < 0.999f * level)) { // a pole is in it, or nearly
-    t->whole_rows = 1;
-    t->low_x = t->high_x = 0.0f;
-    return;
-  }
-  const float ratio = sine / level;
-  const float half_width = quarter_atan(ratio, sqrt(1.0f - ratio * ratio));
-  t->low_x = fma1(fx, longitude - half_width, cx);
-  t->high_x = fma1(fx, longitude + half_width, cx);
-#else
-  const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
-  const float theta = half_atan(across, f[2]);
-  const float far = theta + cap < FARTHEST_ANGLE(camera) ? theta + cap : FARTHEST_ANGLE(camera);
-  const float outer = radius_of(far, camera);
-  float middle_x = 0.0f, middle_y = 0.0f, half_x = outer, half_y = outer;
-  if (sine < 0.999f * across && theta > cap && theta + cap < FARTHEST_ANGLE(camera)) {
-    // the part of a ring about the axis, in a rectangle along the mean's direction from it
-    const float ratio = sine / across, cosine = sqrt(1.0f - ratio * ratio);
-    const float c = f[0] / across, s = f[1] / across;
-    const float near = radius_of(theta - cap, camera) * cosine;
-    const float middle = 0.5f * (near + outer), along = 0.5f * (outer - near), aside = outer * ratio;
-    middle_x = middle * c;
-    middle_y = middle * s;
-    half_x = fma1(fabs(c), along, fabs(s) * aside);
-    half_y = fma1(fabs(s), along, fabs(c) * aside);
-  }
-  t->low_x = fma1(fx, middle_x - half_x, cx);
-  t->high_x = fma1(fx, middle_x + half_x, cx);
-  t->low_y = fma1(fy, middle_y - half_y, cy);
-  t->high_y = fma1(fy, middle_y + half_y, cy);
-#endif
-#endif
-}
-
-// The box's tiles, as `ellipse_of` takes them.
+// Stores the box's tiles as `ellipse_of` reads them.
 static inline void store_box(const Box *t, int width, int height, int tiles_x, int tiles_y, __constant float *camera,
                              __global float *splat) {
   int x0 = 0, x1 = tiles_x;
   if (!t->whole_rows) {
     float low = t->low_x - BOX_SLACK, high = t->high_x + BOX_SLACK;
-#if RAYS == 1
-    // The part that is shown begins here and ends a turn on; the picture may be less.
+#ifdef WRAPS
+    // The shown part is one full turn from here; the picture may be narrower.
     const float turn = 2.0f * HALF_TURN * camera[CAMERA_FX], begin = 0.5f * ((float)width - turn);
     const float shift = turn * floor((low - begin) / turn);
     low -= shift;
@@ -116,7 +38,7 @@ static inline void store_box(const Box *t, int width, int height, int tiles_x, i
     const int last = wraps ? end_cell(high - turn, (float)TILE, tiles_x) : 0;
     x0 = first_cell(low, (float)TILE, tiles_x);
     x1 = wraps ? tiles_x : max(x0, end_cell(high, (float)TILE, tiles_x));
-    if (last >= x0) { // its ends meet
+    if (last >= x0) { // its two ends meet
       x0 = wraps ? 0 : x0;
     } else if (last > 0) {
       x0 = x0 == tiles_x ? 0 : x0;

@@ -1,7 +1,8 @@
-// Where each tile's pairs begin and end in the sorted list, and the slot and the Gaussian of each pair there.
+// Each tile's range of pairs in the sorted list, and the slot and the Gaussian of each sorted pair.
 //
-// Owner: A work-item owns a place in the sorted list; it writes a range's end where its neighbour has another tile.
-// Launch: One work-item for each pair, in groups of 64; those beyond the last do nothing.
+// Owner: A work-item owns a place in the sorted list. It writes a range's start or end where its neighbour has another
+//   tile.
+// Launch: One work-item for each pair, in groups of 64; work-items past the end do nothing.
 // Buffers: tile_keys, pair_from_sorted (pairs), sorted; pair_ids (pairs): slot and Gaussian, by depth -> ranges (tiles,
 //   2), zeroed before; slot_from_sorted, gaussian_from_sorted (pairs). All are indices.
 // Equations: none.

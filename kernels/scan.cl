@@ -1,5 +1,5 @@
-// Exclusive prefix sum of unsigned integers: the sum of each chunk, then the scan inside each chunk, whose group adds
-// up the sums of the chunks before it. A single chunk is one launch, scan_chunks alone.
+// Exclusive prefix sum of unsigned integers: the sum of each chunk, then the scan inside each chunk, whose group first
+// adds the sums of the earlier chunks. A single chunk needs scan_chunks alone.
 //
 // Owner: A group owns one chunk.
 // Launch: One group of ITEMS work-items for each chunk.
@@ -18,7 +18,7 @@ GROUP __kernel void scan_sums(ELEMENTS(n), const uint chunk, __global const uint
   if (get_local_id(0) == 0) sums[get_group_id(0)] = sum;
 }
 
-// values (n), sums (groups) -> out (n); total[0]: the sum of all, or 0xffffffff where that does not fit 32 bits
+// values (n), sums (groups) -> out (n); total[0]: the total, or 0xffffffff if it does not fit 32 bits
 GROUP __kernel void scan_chunks(ELEMENTS(n), const uint chunk, __global const uint *values, __global const uint *sums,
                                 __global uint *out, __global uint *total) {
   FIND_ELEMENTS(n)

@@ -1,10 +1,10 @@
-// Bitonic sort of a short array by one group in local memory, in a single launch: what a radix sort's dozen launches
-// cost more than. Ties go by value, which makes it stable where values are positions.
+// Bitonic sort of a short array in a single launch, by one group in local memory. For short arrays, a radix sort's
+// dozen launches cost more. Ties go by value, so the sort is stable because values are positions.
 //
 // Owner: The group owns the array, a work-item every ITEMS-th pair to compare.
 // Launch: One group of ITEMS work-items.
-// Buffers: keys (n) -> keys_out, values_out (n): sorted, the value being the position in keys; k, v (padded) in local
-//   memory, padded a power of two and at least n.
+// Buffers: keys (n) -> keys_out, values_out (n): sorted; a value is the position in keys. k, v (padded) in local
+//   memory; padded: a power of two, at least n.
 // Equations: none; Batcher's bitonic network.
 #include "shared/math.h"
 #include "shared/group.h"

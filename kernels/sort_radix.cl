@@ -1,21 +1,19 @@
-// One pass of a stable least-significant-digit radix sort in three launches: the histogram of each chunk, the scan of
-// each digit's counts over the chunks, the scatter. It needs no forward progress between groups. Where one item has
-// all keys, one launch does all passes.
+// One pass of a stable least-significant-digit radix sort in three launches: each chunk's histogram, the scan of each
+// digit's counts over the chunks, the scatter. It needs no forward progress between groups. If one item has all keys,
+// one launch does all passes.
 //
-// Owner: A group owns a chunk; in radix_offsets some digits. In the scatter a group of one item takes its keys one
-// after
-//   the other; a larger one takes tiles of TILE keys, sorts each by its digit in local memory, and writes a digit's
-//   keys side by side.
+// Owner: A group owns a chunk; in radix_offsets some digits. In the scatter, a group of one item takes its keys one by
+//   one. A larger group takes tiles of TILE keys, sorts each by digit in local memory, and writes a digit's keys side
+//   by side.
 // Launch: One group of ITEMS work-items for each chunk, or for each `rows` digits.
 // Buffers: keys, values (n), histograms (digits, groups), totals (digits) -> keys_out, values_out (n); counters
-// (digits)
-//   in local memory.
+//   (digits) in local memory.
 // Equations: none; docs/decisions/0001-split-sort.md.
 #include "shared/math.h"
 #include "shared/group.h"
 #include "shared/count.h"
 
-// Keys count from `base`, which is no larger than any of them.
+// Digits are taken from key - `base`, where base is at most the smallest key.
 #define DIGIT(key) ((((key) - base) >> shift) & (digits - 1))
 
 #if ITEMS == 1
@@ -39,8 +37,8 @@ GROUP __kernel void radix_histogram(ELEMENTS(n), const uint chunk, const uint ba
   }
 }
 
-// histograms (digits, groups): each digit's counts become how many keys with it are in the chunks before; totals
-// (digits): how many there are in all. A group owns `rows` digits.
+// histograms (digits, groups): each count becomes the number of keys with the same digit in earlier chunks; totals
+// (digits): each digit's count over all chunks. A group owns `rows` digits.
 GROUP __kernel void radix_offsets(const uint groups, const uint digits, const uint rows, __global uint *histograms,
                                   __global uint *totals) {
   __local uint scratch[ITEMS];
@@ -64,8 +62,8 @@ GROUP __kernel void radix_offsets(const uint groups, const uint digits, const ui
       __global const uint *keys, __global const uint *values, __global const uint *histograms,                         \
       __global const uint *totals, __global uint *keys_out, __global uint *values_out, __local uint *places
 
-// The chunk's keys, values (n), histograms and totals as radix_offsets leaves them -> keys_out, values_out (n);
-// identity != 0 takes positions for values. places[digit]: where the next key with the digit goes.
+// The chunk's keys, values (n), histograms and totals from radix_offsets -> keys_out, values_out (n). identity != 0
+// uses positions as values. places[digit]: the destination of the next key with this digit.
 #if ITEMS == 1
 static inline void scatter(const uint begin, const uint end, const uint base, const uint shift, const uint digits,
                            const int identity, __global const uint *keys, __global const uint *values,
@@ -89,7 +87,7 @@ GROUP __kernel void radix_scatter(SCATTER) {
   scatter(begin, end, base, shift, digits, identity, keys, values, keys_out, values_out, places);
 }
 
-// keys (n) -> keys and positions in arrays 0 if the number of passes is odd, else in arrays 1.
+// keys (n) -> keys and positions, in the arrays 0 if the number of passes is odd, else in the arrays 1.
 GROUP __kernel void radix_sort(ELEMENTS(n), const uint base, const uint digit_bits, const uint passes,
                                __global const uint *keys, __global uint *keys0, __global uint *values0,
                                __global uint *keys1, __global uint *values1, __local uint *places) {
@@ -112,15 +110,15 @@ GROUP __kernel void radix_sort(ELEMENTS(n), const uint base, const uint digit_bi
   }
 }
 #else
-// RUN: keys of a tile that an item ranks, neighbours in it. WORDS: an item's counters of 16 values of four bits, two to
-// a word. Arrays of local memory have a gap after each 32 words, so that 32 items that read 8 or 16 words apart find
-// them in 32 banks.
+// RUN: consecutive keys of a tile that one item ranks. WORDS: an item's counters, one for each value of four bits, two
+// to a word. Arrays in local memory have a gap after each 32 words, so that 32 items that read 8 or 16 words apart use
+// 32 different banks.
 #define RUN 16
 #define WORDS 8
 #define TILE (RUN * ITEMS)
 #define GAPPED(i) ((i) + ((i) >> 5))
 
-// Stable sort of the tile by the four bits from `shift` on.
+// Stable sort of the tile by the four bits that start at `shift`.
 static inline void sort_tile(uint shift, __local uint *tile, __local uint *counters, __local uint *scratch) {
   const uint item = get_local_id(0);
   uint entries[RUN], ranks[RUN], words[WORDS], all;
@@ -158,7 +156,7 @@ static inline void sort_tile(uint shift, __local uint *tile, __local uint *count
   BARRIER_LOCAL();
 }
 
-// Digits of at most 8 bits.
+// For digits of at most 8 bits.
 GROUP __kernel void radix_scatter(SCATTER) {
   FIND_ELEMENTS(n)
   __local uint tile[GAPPED(TILE)]; // digit << 16 | position in the tile
@@ -178,13 +176,13 @@ GROUP __kernel void radix_scatter(SCATTER) {
   }
   for (uint tile_begin = begin; tile_begin < end; tile_begin += TILE) {
     const uint count = min((uint)TILE, end - tile_begin);
-    // What lies beyond the last key has the largest digit, and so stays behind all keys.
+    // Padding after the last key gets the largest digit, so that the stable sort leaves it behind all keys.
     for (uint i = item; i < TILE; i += ITEMS) {
       tile[GAPPED(i)] = (i < count ? DIGIT(keys[tile_begin + i]) : digits - 1) << 16 | i;
     }
     BARRIER_LOCAL();
     for (uint bits = 0; digits >> bits > 1; bits += 4) sort_tile(16 + bits, tile, counters, scratch);
-    // While the tile is written, places[digit] is less by the position of the digit's first key in it.
+    // During the writing of a tile, places[digit] is reduced by the tile position of the digit's first key.
     for (uint i = item; i < count; i += ITEMS) {
       const uint digit = tile[GAPPED(i)] >> 16;
       if (i == 0 || tile[GAPPED(i - 1)] >> 16 != digit) places[digit] -= i;

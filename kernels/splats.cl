@@ -1,12 +1,11 @@
-// Projected Gaussians that come as arrays to splats: the whitening of a conic, the extent and the tiles of its ellipse.
+// Splats from projected Gaussians in arrays: the whitening of a conic, and its ellipse's extent and tiles.
 //
-// Owner: A work-item owns LANES Gaussians: in vectors as far as all have the same to do, then those that are drawn by
-//   turns.
-// Launch: One work-item for each LANES Gaussians, in groups of 64; those beyond the last do nothing.
-// Buffers: radii (n, 2) in whole pixels, of which one that is 0 culls; means2d (n, 2) in pixels, conics (n, 3): a, b, c
-//   of the inverse covariance, opacities (n) in [0, 1], depths (n), values (n, width): colour is the first three, 0
-//   where there are fewer -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With
-//   LISTED every splat is written, as others have made the lists: those that are not drawn have an alpha of nothing.
+// Owner: A work-item owns LANES Gaussians. The common part runs in vectors, the rest one visible Gaussian at a time.
+// Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
+// Buffers: radii (n, 2) in whole pixels, a 0 culls; means2d (n, 2) in pixels; conics (n, 3): a, b, c of the inverse
+//   covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three are the colour, missing ones
+//   are 0 -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With LISTED the caller has
+//   made the tile lists, so every splat is written; culled ones have an alpha of 0.
 // Equations: docs/gradients.md, (170) to (172), with (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -14,12 +13,12 @@
 #include "shared/splat.h"
 #include "shared/tile.h"
 
-// Conics from and to which float32 has their determinant, and means that have a place in pixels.
+// Limits within which float32 can represent a conic's determinant, and of a mean's position in pixels.
 #define LEAST_CONIC 1e-15f
 #define LARGEST_CONIC 1e15f
 #define FARTHEST_PIXEL 1e9f
 
-// Part of a c that rounding a, b and c leaves unknown of the determinant.
+// Fraction of a c by which rounding of a, b and c may change the determinant.
 #define ROUNDING 5.9604645e-8f
 
 // log2 of an alpha that no pixel takes.
@@ -34,7 +33,8 @@ __kernel void splats(const uint n, const int tiles_x, const int tiles_y, const i
   const floatL a = GATHER(conics, 3, 0), b = GATHER(conics, 3, 1), c = GATHER(conics, 3, 2);
   const floatL opacity = GATHER(opacities, 1, 0);
 
-  // (170): a c - b^2 to the last bit. What rounding made singular is as thin as float32 can tell.
+  // (170): a c - b^2 to the last bit. A conic that rounding made singular gets the smallest determinant that float32
+  // resolves.
   const floatL bb = b * b, ac = a * c;
   const floatL exact = fmaL(a, c, -bb) + fmaL(-b, b, bb), least = ROUNDING * ac;
   const floatL det = exact > least ? exact : least;

@@ -1,12 +1,13 @@
-// The gradient of splats: sums a Gaussian's slots in the order of its tiles, then the chain rule back to the arrays.
+// The gradient of splats: sums a Gaussian's slots in the order of its tiles, then applies the chain rule back to the
+// arrays.
 //
 // Owner: A work-item owns one Gaussian.
-// Launch: One work-item for each Gaussian, in groups of 64; those beyond the last do nothing.
-// Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments, the gradients by VALUES
-//   values, with ABSOLUTE_GRADIENTS those of the mean; tile_counts, first_slots (n): its scan; splats of splats.cl ->
-//   d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit of each, d_values (n, width): its columns from
-//   `first` on, of which there are VALUES at most, absolute (n, 2): of means2d. Rows of Gaussians that reach no tile
-//   are zero. add_values: of slots (pairs, VALUES), d_values alone.
+// Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
+// Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments, gradients by VALUES
+//   values, with ABSOLUTE_GRADIENTS absolute gradients by the mean; tile_counts, first_slots (n): its scan; splats of
+//   splats.cl -> d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit; d_values (n, width): up to
+//   VALUES columns, from `first` on; absolute (n, 2): by means2d. Rows of Gaussians without tiles are zero. add_values:
+//   slots (pairs, VALUES) -> d_values alone.
 // Equations: docs/gradients.md, (173) to (176).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -23,7 +24,7 @@
 #endif
 #define ABSOLUTE (SLOT_RED + VALUES)
 
-// The sums of a Gaussian's slots, of `fields` each.
+// Adds up a Gaussian's `count` slots of `fields` floats each.
 static inline void add_up(uint count, __global const float *slot, int fields, float *sums) {
   for (int field = 0; field < fields; ++field) sums[field] = 0.0f;
   for (uint k = 0; k < count; ++k, slot += fields)
@@ -49,13 +50,13 @@ __kernel void splats_grad(const uint n, const int width, const int first, __glob
   const uint count = tile_counts[i];
   float sums[FIELDS], by_mean[2] = {0.0f, 0.0f}, by_conic[3] = {0.0f, 0.0f, 0.0f}, by_opacity = 0.0f;
   add_up(count, slots + (size_t)FIELDS * (count > 0 ? first_slots[i] : 0), FIELDS, sums);
-  if (count > 0) { // nobody has written the splats of others
+  if (count > 0) { // the splats of other Gaussians are not written
     __global const float *splat = splats + (size_t)SPLAT_SIZE * i;
     const float l11 = splat[SPLAT_L11], l12 = splat[SPLAT_L12], l22 = splat[SPLAT_L22];
     by_mean[0] = -INVERSE_WHITEN2 * (l11 * sums[SLOT_GU]); // (173)
     by_mean[1] = -INVERSE_WHITEN2 * fma1(l12, sums[SLOT_GU], l22 * sums[SLOT_GV]);
-    // (174): the moments of the offsets in pixels. In a needle's that along it is by far the largest, and is added
-    // last.
+    // (174): moments of the offsets in pixels. In a needle the moment along its axis is by far the largest, and is
+    // added last.
     const float in_x = splat[SPLAT_INVERSE_L11], in_y = 1.0f / l22, lean = l12 * in_y;
     const float uv = fma1(-lean, sums[SLOT_GVV], sums[SLOT_GUV]);
     const float uu = fma1(-lean, sums[SLOT_GUV] + uv, sums[SLOT_GUU]);

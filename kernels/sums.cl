@@ -1,9 +1,9 @@
-// Sums along the rows of an array, in one order on every device: those of what each Gaussian says of a camera.
+// Sums along an array's rows, in one order on every device: the Gaussians' gradients by the numbers of a camera.
 //
 // Owner: A work-item owns SUM_ROWS neighbouring numbers of a row.
-// Launch: One work-item for each SUM_ROWS numbers of each row, in groups of 64; those beyond the last do nothing.
+// Launch: One work-item for each SUM_ROWS numbers of each row, in groups of 64; work-items past the end do nothing.
 // Buffers: parts (rows, padded), padded a multiple of SUM_ROWS -> sums (rows, stride), stride at least padded /
-//   SUM_ROWS; what is left of a row of sums is zero.
+//   SUM_ROWS; the rest of a row of sums is zero.
 // Equations: docs/gradients.md, section 23.
 #include "shared/math.h"
 

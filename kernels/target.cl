@@ -1,17 +1,17 @@
-// A photograph into the blend's layout, alpha composited over the background that the render gets.
+// Copies a photograph into blend's layout, with its alpha composited over the render's background.
 //
-// Owner: A work-item owns OWNED pixels of a row of the padded planes: a tile's row where there are vectors, else one.
+// Owner: A work-item owns OWNED pixels of a row of the padded planes: a tile's row if there are vectors, otherwise one.
 // Launch: A grid of stride / OWNED x rows, whole tiles.
-// Buffers: source (height, width, channels), bytes or floats, interleaved; background (3) -> planes (3, rows, stride)
-//   of colour in [0, 1] where the source is bytes, 0 in padding; with ALPHA a fourth plane, of alpha. With MASKED the
-//   source's fifth channel is 0 where a pixel does not count: its planes are 0, and so is the render's image
-//   (3, rows, stride), and its stop (rows, stride) is -1, as in padding, so that the gradient of blending passes it.
+// Buffers: source (height, width, channels), bytes or floats, interleaved; background (3) -> planes (3, rows, stride):
+//   colour, in [0, 1] for bytes, 0 in padding; with ALPHA a fourth plane, of alpha. With MASKED the source's fifth
+//   channel is 0 in pixels that do not count. There the planes and the render's image (3, rows, stride) become 0, and
+//   its stop (rows, stride) becomes -1, as in padding, so that blend_grad skips the pixel.
 // Equations: alpha c + (1 - alpha) background.
 #include "shared/math.h"
 
 #ifdef BYTES
 typedef uchar source_t;
-#define SAMPLE(x) ((float)(x) * (1.0f / 255.0f)) // as OpenImageIO does, to the bit
+#define SAMPLE(x) ((float)(x) * (1.0f / 255.0f)) // the same bits as OpenImageIO
 #else
 typedef float source_t;
 #define SAMPLE(x) (x)
@@ -27,7 +27,7 @@ typedef float source_t;
 #define OPAQUE_ROWS
 typedef uchar16 uchar16U __attribute__((aligned(1)));
 typedef float16 float16U __attribute__((aligned(4)));
-// The colours of a tile's row, three bytes a pixel.
+// The colours of a tile's row, three bytes per pixel.
 static inline void opaque_row(__global const uchar *source, const int plane, __global float *planes) {
   __global const uchar16U *from = (__global const uchar16U *)source;
   const uchar16 a = from[0], b = from[1], c = from[2];

@@ -1,9 +1,9 @@
-// Any number of values a Gaussian blended with the weights of the image, VALUES of them in a pass.
+// Blends any number of values per Gaussian with the image's weights, VALUES of them in a pass.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance goes through the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
 // Buffers: blend's ranges, gaussian_from_sorted, splats and stops, with RECORD_CELLS its cells_from_sorted; values (n,
-//   depth), background (depth) -> pixels (height, width, depth): the values from `first` on of each pixel.
+//   depth), background (depth) -> pixels (height, width, depth): VALUES values of each pixel, from `first` on.
 // Equations: docs/gradients.md, (177), with (14) to (16).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -17,7 +17,7 @@
 // Adds the i-th pair to a cell of pixels.
 static inline void add_values(floatL power, intL stop, int i, __global const float *own, floatL *t, floatL *sums) {
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < stop);
-  if (!REACHES(taken)) return;
+  if (!ANYL(taken)) return;
   const floatL before = *t, alpha = alpha_where(taken, power), weight = before * alpha;
   *t = fmaL(-before, alpha, before);
   FOR_VALUES(k) sums[k] = fmaL(weight, (floatL)(own[k]), sums[k]);

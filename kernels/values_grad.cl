@@ -1,14 +1,15 @@
-// The gradient of blending any number of values, back to front: partial sums for each pair, of VALUES values a pass.
+// The gradient of blending any number of values, back to front: partial sums for each pair, for VALUES values in a
+// pass.
 //
-// Owner: A group owns a tile and writes one slot for each of its pairs, as in blend_grad.cl; in gradient_by_cell a
-//   tile's pixels.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as blend's.
+// Owner: A group owns a tile and writes one slot for each of its pairs, as in blend_grad.cl; in gradient_by_cell it
+//   owns a tile's pixels.
+// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
 // Buffers: gradient_by_cell: d_pixels (height, width, depth), background (depth), with ALPHA_GRADIENT d_alpha (height,
-//   width) -> by_cell (tiles, (depth + 1) * TILE * TILE): a cell's gradients one behind the other, by the values and
-//   by the transmittance at the end, background included; 0 in padding. values_grad: blend_grad's lists and planes,
-//   value_rows (n, depth), by_cell -> slots (pairs, FIELDS), every one of them: sums over the tile's pixels of the
-//   gradients by the values from `first` on; with GEOMETRY before them g and its moments, by all values, and with
-//   ABSOLUTE_GRADIENTS behind them those of the mean.
+//   width) -> by_cell (tiles, (depth + 1) * TILE * TILE): for each cell its gradients by all values, then by the final
+//   transmittance, background included; 0 in padding. values_grad: blend_grad's lists and planes, value_rows (n,
+//   depth), by_cell -> slots (pairs, FIELDS), all written: sums over the tile's pixels of the gradients by VALUES
+//   values, from `first` on. With GEOMETRY g and its moments come first, from all values; with ABSOLUTE_GRADIENTS the
+//   mean's absolute gradients come last.
 // Equations: docs/gradients.md, (178) to (180), with (22) to (26), (48) and (49).
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -33,7 +34,7 @@
 #define FIELDS ABSOLUTE
 #endif
 
-// A tile's floats in by_cell, and those of one value in a cell: side by side in a vector, or in items.
+// A tile's floats in by_cell, and the place of one value in a cell: lanes, or items, are side by side.
 #define BY_TILE ((size_t)(depth + 1) * (TILE * TILE))
 #if ITEMS == 1
 #define IN_CELL(cell, k) (((cell) * (depth + 1) + (k)) * LANES)
@@ -73,7 +74,8 @@ typedef struct {
   intL stop;
 } Pixels;
 
-// The pixels' gradient by what a Gaussian's values give them: four sums, as one would be a chain.
+// The sum over all values of the pixels' gradient times a Gaussian's values. Four partial sums, because one would be a
+// single chain of dependent additions.
 static inline floatL shade_of(__global const float *by_pixels, int depth, int cell, __global const float *own) {
   floatL shade[4];
   for (int k = 0; k < 4; ++k) shade[k] = (floatL)(0.0f);
@@ -85,13 +87,13 @@ static inline floatL shade_of(__global const float *by_pixels, int depth, int ce
   return (shade[0] + shade[1]) + (shade[2] + shade[3]);
 }
 
-// Takes the i-th pair out of a cell's pixels, and adds their gradients to its sums (FIELDS).
+// Removes the i-th pair from a cell's pixels, and adds their gradients to the pair's sums (FIELDS).
 static inline void take_pair(Pixels *p, int i, floatL u, floatL v, float l11, float l12, float l22, float log2o,
                              __global const float *by_pixels, int depth, int first, int cell, __global const float *own,
                              floatL *sums) {
   const floatL power = log2_alpha(u, v, log2o);
   const intL taken = MASKL(power >= LOG2_ALPHA_MIN) & MASKL((intL)(i) < p->stop);
-  if (!REACHES(taken)) return;
+  if (!ANYL(taken)) return;
   const floatL uncapped = AS_FLOATL(AS_INTL(exp2L(power)) & taken);
   const floatL alpha = uncapped < ALPHA_MAX ? uncapped : (floatL)(ALPHA_MAX);
   const floatL inverse = 1.0f / (1.0f - alpha), before = p->t * inverse, weight = alpha * before;
@@ -120,7 +122,7 @@ static inline void take_pair(Pixels *p, int i, floatL u, floatL v, float l11, fl
 
 #if ITEMS > 1
 #undef SLOT_STRIDE
-#define SLOT_STRIDE FIELDS // of item_sums.h: the sums of a pair
+#define SLOT_STRIDE FIELDS // the sums of a pair, for item_sums.h
 #include "shared/item_sums.h"
 #define TOGETHER (3 * SLOT_STRIDE * ROW <= 4096 ? 3 : 1) // pairs whose sums are made together, in 16 KiB
 #endif
@@ -177,7 +179,7 @@ GROUP SUBGROUPED __kernel void values_grad(const int first_tile, const int tiles
   __local Staged staged[BATCH];
   __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
   for (int batch = last; batch > begin; batch -= BATCH) {
-    const int count = min(BATCH, batch - begin); // of the pairs before `batch`, the last one first
+    const int count = min(BATCH, batch - begin); // of the pairs before `batch`, last one first
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
       stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], splats, tile_x, tile_y);

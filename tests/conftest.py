@@ -6,15 +6,11 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
-
 from opencl_drivers import use_every_driver
 
 use_every_driver()

@@ -11,7 +11,8 @@ from systems import posix
 
 from clsplat.cli.main import one_line
 from clsplat.errors import InputError, WriteError
-from clsplat.files import atomic_write, atomic_writer, open_input
+from clsplat.files.atomic import atomic_write, atomic_writer
+from clsplat.files.documents import open_input
 
 
 def test_replaces_the_file(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import io
 import os
 import shutil
 import subprocess
@@ -89,7 +90,9 @@ def _call(command: list[str], *, quiet: bool = False) -> int:
 
 
 if __name__ == "__main__":
-    sys.stdout.reconfigure(encoding=sys.getfilesystemencoding(), errors=sys.getfilesystemencodeerrors())  # as paths are
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        encoding, errors = sys.getfilesystemencoding(), sys.getfilesystemencodeerrors()  # as paths are
+        sys.stdout.reconfigure(encoding=encoding, errors=errors)
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("extras", nargs="*", metavar="EXTRA", help="as pyproject.toml names them: test, dev, docs, ...")
     print(set_up(tuple(parser.parse_args().extras)))

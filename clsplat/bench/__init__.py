@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements of stages, settings and shapes."""
+"""Benchmarks of kernel stages, rasterizer settings and kernel shapes."""

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run time against error, for every switch of the rasterizer: what `clsplat bench --plot` measures and draws."""
+"""Run time against error for every switch of the rasterizer: measurements and table of `clsplat bench --plot`."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -14,46 +14,48 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.bench.stages import held_kind, picture_of, trainer_of
-from clsplat.bench.subject import Subject
+from clsplat.bench.workload import Subject
 from clsplat.camera import Camera
-from clsplat.config.presets import PRESETS
+from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
-from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import PLAIN_SLOTS
 from clsplat.progress import Progress, aligned, no_progress
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
 from clsplat.rendering.memory_needs import plan_step
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.renderer import held_sh
 from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 
-CROP = 192
-"""Side in pixels of what is compared with the float64 reference, in the middle of the image; smaller ones are whole."""
-ALL_OFF = "all exact switches off"
-"""Of several values that a switch can have, the one that does most."""
-PSNR_MAX = 160.0
-"""PSNR of equal images, which would be infinite."""
-MAY_CHANGE_BITS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Settings whose values approximate, all but that of `exact`. Of `extent` one value does: 3sigma."""
+REFERENCE_CROP_SIDE_PX = 192
+"""Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
+ALL_EXACT_SWITCHES_OFF = "all exact switches off"
+"""Setting without any exact switch. A switch with several values takes the one with the largest effect."""
+MAX_PSNR_DB = 160.0
+"""PSNR in dB reported for equal images, whose PSNR is infinite."""
+APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
+"""Settings that approximate at any value but the `exact` preset's. `extent` approximates at 3sigma only."""
 
 
 def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
-    """PSNR over all pixels and channels in dB, at most PSNR_MAX, and the largest absolute difference. Compared in
-    float64, not clamped."""
+    """PSNR over all pixels and channels in dB, up to the limit for equal images, and largest absolute difference.
+
+    Computed in float64, without clamping.
+    """
     difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
     mse = float(np.mean(np.square(difference)))
-    psnr = min(-10 * float(np.log10(mse)), PSNR_MAX) if mse > 0 else PSNR_MAX
+    psnr = min(-10 * float(np.log10(mse)), MAX_PSNR_DB) if mse > 0 else MAX_PSNR_DB
     return {"psnr": psnr, "max_abs": float(np.abs(difference).max())}
 
 
 def settings() -> dict[str, BenchSwitches]:
-    """The points of the plot: presets, and each switch away from its default alone, and the exact ones together."""
-    named = {f"preset {name}": config.switches() for name, config in PRESETS.items()}
+    """Settings to measure: presets, each switch off its default alone, and all exact switches together."""
+    named = {f"preset {name}": config.switches() for name, config in RASTERIZER_PRESETS.items()}
     flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
     changes: dict[str, dict[str, Any]] = {
         "extent constant": {"extent": "constant"},
@@ -63,7 +65,7 @@ def settings() -> dict[str, BenchSwitches]:
         "key-bits all": {"key_bits": "all"},
         **{f"no {flag.replace('_', '-')}": {flag: False} for flag in flags},
     }
-    changes[ALL_OFF] = {key: value for change in changes.values() for key, value in change.items()}
+    changes[ALL_EXACT_SWITCHES_OFF] = {key: value for change in changes.values() for key, value in change.items()}
     changes["extent 3sigma"] = {"extent": "3sigma"}
     changes.update({f"sh-degree-limit {degree}": {"sh_degree_limit": degree} for degree in (0, 1, 2)})
     changes.update({f"sh-tolerance {steps}/255": {"sh_tolerance": steps / 255} for steps in (4, 16, 64)})
@@ -78,9 +80,11 @@ def settings() -> dict[str, BenchSwitches]:
 
 
 def approximate(config: RasterizerConfig) -> bool:
-    """True if a setting that may change bits differs from that of the `exact` preset."""
-    exact = PRESETS["exact"]
-    return config.extent == "3sigma" or any(getattr(config, key) != getattr(exact, key) for key in MAY_CHANGE_BITS)
+    """True if a setting that may change bits differs from the `exact` preset's value."""
+    exact = RASTERIZER_PRESETS["exact"]
+    return config.extent == "3sigma" or any(
+        getattr(config, key) != getattr(exact, key) for key in APPROXIMATING_SETTINGS
+    )
 
 
 def compare(
@@ -91,60 +95,105 @@ def compare(
     repeat: int = 5,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Run time against error of each setting: median times of a frame and of a training step, the settings taken in
-    turn; the frame's difference from the float64 reference on a crop, and from the exact preset's frame on the whole
-    image. Where both are among the settings, also how many times faster all exact switches together make them.
+    """Measure run time against error of each setting.
+
+    Times are medians of a frame and of a training step, measured in turns.
+    Errors are differences from the float64 reference on a crop, and from the exact preset's frame on the whole image.
+    If exact and all exact switches off are among the settings, the result has their ratio of times too.
     """
     say = progress or no_progress
-    if subject.camera.kind.rays:
+    if subject.camera.model.along_rays:
         raise InputError(
             f"{subject.name}: its pictures are drawn along rays, expected a model and a camera of the image's plane"
         )
     tried = {name: config.switches() for name, config in (candidates or settings()).items()}
-    trainer, camera = trainer_of(subject, device, PRESETS["exact"]), subject.camera
-    model, work = trainer.parameters, trainer.rasterizer.work
-    background = upload(device, np.zeros(3, np.float32))
-    width, height = min(CROP, camera.width), min(CROP, camera.height)
+    camera = subject.camera
+    comparison = _Comparison(subject, device, tried)
+    width, height = min(REFERENCE_CROP_SIDE_PX, camera.width), min(REFERENCE_CROP_SIDE_PX, camera.height)
     x0, y0 = (camera.width - width) // 2, (camera.height - height) // 2
     crop = (x0, y0, width, height)
     say("float64 reference", None)
     reference = reference_crop(subject.gaussians, camera, crop)
+    exact = comparison.exact
 
     def errors(picture: Float32) -> dict[str, dict[str, float]]:
         part = picture[y0 : y0 + height, x0 : x0 + width]
         return {"against_float64": error_of(part, reference), "against_exact": error_of(picture, exact)}
 
-    def draw(rasterizer: Rasterizer) -> Frame:
-        held = models[held_kind(rasterizer.config)]
-        return rasterizer.forward(held, camera, background, backward=False)
-
-    def step(rasterizer: Rasterizer) -> None:
-        trainer.settle()
-        trainer.rasterizer = rasterizer
-        trainer.train_step()
-
-    models: dict[tuple[object, ...], AnyGaussians] = {held_kind(PRESETS["exact"]): model}
-    for config in tried.values():
-        if (kind := held_kind(config)) not in models:
-            models[kind] = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
-    exact = picture_of(draw(trainer.rasterizer))
-    rasterizers = {name: Rasterizer(device, config, work) for name, config in tried.items()}
-    size = (model.count, model.coefficients, [camera])
-    for rasterizer in rasterizers.values():
-        rasterizer.follow(plan_step(device, *size, rasterizer.config, fields=PLAIN_SLOTS, agreement=False))
     differences = {}
-    for done, (name, rasterizer) in enumerate(rasterizers.items()):
-        say("settings", done / len(rasterizers))
-        differences[name] = errors(picture_of(draw(rasterizer)))
-        step(rasterizer)
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in rasterizers}
-    for done in range(repeat):
-        say("times", done / repeat)
-        for name, rasterizer in rasterizers.items():
-            _, frame_ms = device.timed(partial(draw, rasterizer))
-            _, step_ms = device.timed(partial(step, rasterizer))
-            times[name].append((frame_ms, step_ms))
+    for done, (name, rasterizer) in enumerate(comparison.rasterizers.items()):
+        say("settings", done / len(tried))
+        differences[name] = errors(picture_of(comparison.draw(rasterizer)))
+        comparison.step(rasterizer)
+    times = comparison.times(repeat, say)
     whole = (width, height) == (camera.width, camera.height)
+    points = _points(tried, times, differences, "against_float64" if whole else "against_exact")
+    exact_name = next(
+        (name for name, config in tried.items() if config == RASTERIZER_PRESETS["exact"].switches()), None
+    )
+    return {
+        "exact": exact_name,
+        "exact_switches_faster": _exact_switches_faster(points, exact_name),
+        "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
+        "crop": list(crop),
+        "exact_against_float64": errors(exact)["against_float64"],
+        "points": list(points.values()),
+    }
+
+
+class _Comparison:
+    """Rasterizers of several settings that draw the same frame and do the same training step.
+
+    exact: the exact preset's frame.
+    """
+
+    def __init__(self, subject: Subject, device: Device, tried: Mapping[str, BenchSwitches]) -> None:
+        self._device, self._camera = device, subject.camera
+        self._trainer = trainer_of(subject, device, RASTERIZER_PRESETS["exact"])
+        self._background = upload(device, np.zeros(3, np.float32))
+        model, work = self._trainer.parameters, self._trainer.rasterizer.work
+        self._models: dict[tuple[object, ...], AnyGaussians] = {held_kind(RASTERIZER_PRESETS["exact"]): model}
+        for config in tried.values():
+            if (kind := held_kind(config)) not in self._models:
+                held = held_sh(subject.gaussians, config)
+                self._models[kind] = upload_gaussians(device, subject.gaussians, held)
+        self.exact = picture_of(self.draw(self._trainer.rasterizer))
+        self.rasterizers = {name: Rasterizer(device, config, work) for name, config in tried.items()}
+        size = (model.count, model.coefficients, [self._camera])
+        for rasterizer in self.rasterizers.values():
+            rasterizer.follow(plan_step(device, *size, rasterizer.config, fields=PLAIN_SLOTS))
+
+    def draw(self, rasterizer: Rasterizer) -> ForwardPass:
+        held = self._models[held_kind(rasterizer.config)]
+        return rasterizer.forward(held, self._camera, self._background, backward=False)
+
+    def step(self, rasterizer: Rasterizer) -> None:
+        self._trainer.settle()
+        self._trainer.rasterizer = rasterizer
+        self._trainer.train_step()
+
+    def times(self, repeat: int, say: Progress) -> dict[str, list[tuple[float, float]]]:
+        """Times of frame and step in ms, for each setting `repeat` times, the settings in turns."""
+        times: dict[str, list[tuple[float, float]]] = {name: [] for name in self.rasterizers}
+        for done in range(repeat):
+            say("times", done / repeat)
+            for name, rasterizer in self.rasterizers.items():
+                _, frame_ms = self._device.timed(partial(self.draw, rasterizer))
+                _, step_ms = self._device.timed(partial(self.step, rasterizer))
+                times[name].append((frame_ms, step_ms))
+        return times
+
+
+def _points(
+    tried: Mapping[str, BenchSwitches],
+    times: Mapping[str, Sequence[tuple[float, float]]],
+    differences: Mapping[str, Mapping[str, Mapping[str, float]]],
+    against: str,
+) -> dict[str, dict[str, Any]]:
+    """Record of each setting: median times, errors, and True for the settings on the Pareto front.
+
+    against: the difference that is the setting's error.
+    """
     points: dict[str, dict[str, Any]] = {}
     for name, config in tried.items():
         frame_ms, iteration_ms = map(statistics.median, zip(*times[name], strict=True))
@@ -154,35 +203,37 @@ def compare(
             "frame_ms": frame_ms,
             "iteration_ms": iteration_ms,
             **differences[name],
-            **differences[name]["against_float64" if whole else "against_exact"],
+            **differences[name][against],
         }
     on_front = front([(point["frame_ms"], point["psnr"]) for point in points.values()])
     for point, best in zip(points.values(), on_front, strict=True):
         point["on_front"] = best
-    exact_name = next((name for name, config in tried.items() if config == PRESETS["exact"].switches()), None)
-    faster = None
-    if exact_name is not None and ALL_OFF in points:
-        on, off = points[exact_name], points[ALL_OFF]
-        faster = {key: off[f"{key}_ms"] / on[f"{key}_ms"] for key in ("frame", "iteration")}
-    return {
-        "exact": exact_name,
-        "exact_switches_faster": faster,
-        "error_is_against": "the float64 reference" if whole else "the exact preset's frame",
-        "crop": list(crop),
-        "exact_against_float64": errors(exact)["against_float64"],
-        "points": list(points.values()),
-    }
+    return points
+
+
+def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str | None) -> dict[str, float] | None:
+    """Ratios of times without and with all exact switches, None unless both were measured.
+
+    exact: name of the exact preset among the points.
+    """
+    if exact is None or ALL_EXACT_SWITCHES_OFF not in points:
+        return None
+    on, off = points[exact], points[ALL_EXACT_SWITCHES_OFF]
+    return {key: off[f"{key}_ms"] / on[f"{key}_ms"] for key in ("frame", "iteration")}
 
 
 def front(points: list[tuple[float, float]]) -> list[bool]:
-    """Of (cost, quality) pairs those that none beats in one without losing in the other."""
+    """True for each (cost, quality) pair that no other pair dominates: the Pareto front."""
     return [
         not any(c <= cost and q >= quality and (c < cost or q > quality) for c, q in points) for cost, quality in points
     ]
 
 
 def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
-    """A part of the frame in float64, over black, (height, width, 3): the twin, but for Gaussians that cannot reach."""
+    """Crop of the frame by the float64 reference, over black, (height, width, 3).
+
+    Gaussians that do not reach the crop are skipped.
+    """
     x, y, width, height = crop
     degree, antialiased = gaussians.sh_degree, gaussians.antialiased
     projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=antialiased)
@@ -194,7 +245,7 @@ def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, i
 
 
 def settings_table(result: dict[str, Any]) -> str:
-    """Table of what `compare` measured, for people."""
+    """Text table of a result of `compare`."""
     rows: list[tuple[str, ...]] = [("setting", "ms", "step ms", "PSNR dB", "largest", "front")]
     for point in result["points"]:
         psnr = "same bits" if point["max_abs"] == 0 else f"{point['psnr']:.1f}"

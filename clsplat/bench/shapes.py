@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search for the quickest shape of the kernels on a device.
+"""Search for the quickest kernel shape on a device.
 
-Each candidate runs in a process of its own, as a driver may abort. `clsplat tune` keeps the answer (device/shapes.py).
-The search does not start by itself at the first use: gradients have the same bits only within a shape, and a trial that
-another load disturbed would change what a seed gives.
+Each candidate runs in its own process, because a driver may abort.
+`clsplat tune` saves the result (device/drivers/shapes.py).
+The search never starts by itself. Gradients have the same bits only within a shape.
+A trial disturbed by other load would thus change the results of a seed.
 """
 
 from __future__ import annotations
@@ -16,33 +17,39 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clsplat.bench.subject import synthetic
+from clsplat.bench.workload import synthetic
 from clsplat.device import cl
 from clsplat.device.buffers import upload
-from clsplat.device.child import Child, end_with_parent, patience, python_module, tell
 from clsplat.device.context import Device, all_devices
-from clsplat.device.shapes import Shape, candidates, default_shape, save_shape
+from clsplat.device.drivers.shapes import Shape, candidates, default_shape, save_shape
+from clsplat.device.drivers.worker_process import Child, end_with_parent, patience, python_module, tell
 from clsplat.errors import DriverError
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 
-WORKLOAD = (50_000, 640, 480)
-"""Gaussians, width and height of what is drawn."""
-ENOUGH = 0.97
-"""A shape takes the default's place at this part of its time or less: what is nearer may be the trial's noise."""
+TRIAL_WORKLOAD = (50_000, 640, 480)
+"""Number of Gaussians, width and height of the trial's frame."""
+REPLACEMENT_TIME_RATIO = 0.97
+"""Largest ratio of times at which a shape replaces the default. A smaller gain may be noise of the trial."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """ms: a frame and its gradient, None where the driver failed or took too long."""
+    """Result of one candidate.
+
+    ms: time of a frame and its gradient; None if the driver failed or took too long.
+    """
 
     shape: Shape
     ms: float | None
 
 
 def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tuple[list[Trial], Shape]:
-    """Try the candidates on the device, the `index`-th of all, and keep the quickest. Raises DriverError where none
-    works, and OSError."""
+    """Try the candidates on a device and save the quickest.
+
+    index: the device's index among all devices.
+    Raises DriverError if no candidate works, and OSError.
+    """
     trials = []
     for shape in candidates(device):
         progress(shape)
@@ -59,13 +66,13 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
 
 
 def choose(trials: list[Trial]) -> Shape:
-    """The quickest; the first, which is the default, unless another is clearly quicker."""
+    """The quickest shape, if it is clearly quicker than the first, which is the default; else the default."""
     default = trials[0]
     timed = [(trial.ms, trial.shape) for trial in trials if trial.ms is not None]
     if not timed:
         return default.shape
     ms, shape = min(timed, key=lambda trial: trial[0])
-    return shape if default.ms is None or ms <= ENOUGH * default.ms else default.shape
+    return shape if default.ms is None or ms <= REPLACEMENT_TIME_RATIO * default.ms else default.shape
 
 
 def _in_a_process(index: int, shape: Shape) -> float | None:
@@ -77,8 +84,8 @@ def _in_a_process(index: int, shape: Shape) -> float | None:
     return float(answer["ms"]) if answer is not None else None
 
 
-def measure(device: Device, workload: tuple[int, int, int] = WORKLOAD, repeat: int = 7) -> float:
-    """Median milliseconds of a frame and its gradient on a made-up scene."""
+def measure(device: Device, workload: tuple[int, int, int] = TRIAL_WORKLOAD, repeat: int = 7) -> float:
+    """Median milliseconds of a frame and its gradient on a synthetic scene."""
     subject = synthetic(*workload)
     rasterizer = Rasterizer(device)
     gaussians = upload_gaussians(device, subject.gaussians)

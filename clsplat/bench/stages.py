@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat bench`: what each stage of a frame and of a training step costs, held against the device's own limits, and
-run time against error for every switch of the rasterizer.
+"""`clsplat bench`: cost of each stage of a frame and of a training step, compared with the device's own limits.
 
-docs/performance.md says what each figure means.
+docs/performance.md explains each figure.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,26 +17,26 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.bench.subject import Subject
+from clsplat.bench.workload import Subject
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.profile import Calls, StageRecord
-from clsplat.gaussians import GROUPS, floats_of
+from clsplat.gaussians import PARAMETER_GROUPS, floats_of
 from clsplat.progress import Progress, aligned, no_progress
-from clsplat.rendering.rasterizer import Frame
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.renderer import Renderer, held_sh
-from clsplat.scenes.data_set import Lens
+from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene, View
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.device_gaussians import upload_gaussians
-from clsplat.stages.limit import Limits, measure_limits
+from clsplat.stages.peak import Limits, measure_limits
 from clsplat.training.trainer import Trainer
 
-FORWARD = ("transfers", "project", "duplicate", "ranges", "blend")
-"""Stages that are measured in a frame; the others in a training step."""
-GAUSSIAN_BYTES = 4 * floats_of(16) * 4
-"""Bytes of a Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
+FRAME_STAGES = ("transfers", "project", "duplicate", "ranges", "blend")
+"""Stages measured in a frame. All others are measured in a training step."""
+TRAINING_BYTES_PER_GAUSSIAN = 4 * floats_of(16) * 4
+"""Bytes per Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
 
 
 def bench(
@@ -49,8 +48,10 @@ def bench(
     limits: Limits | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure every stage; returns what `clsplat bench --json` prints. The device's queue should have been made with
-    profiling."""
+    """Measure every stage and return the document of `clsplat bench --json`.
+
+    The device's queue should have been created with profiling.
+    """
     say = progress or no_progress
     config = (config or RasterizerConfig()).switches()
     say("limits", None)
@@ -58,38 +59,21 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # a frame's, not a training step's
+    if held_kind(config) != held_kind(RasterizerConfig()):  # for the frame only
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
-    def draw() -> Frame:
+    def draw() -> ForwardPass:
         return rasterizer.forward(gaussians, subject.camera, trainer.background, backward=False)
 
     frame = draw()
     visible = int(np.count_nonzero(frame.projected.tile_counts.get()))
-    listed = contributing = evaluated = 0
-    for band in frame.bands:
-        part = rasterizer.part(frame, band)
-        listed += part.counted.pairs
-        drawn = (part.lists, frame.projected.splats, frame.background, subject.camera)
-        added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
-        contributing, evaluated = contributing + added, evaluated + looked_at
-    frame_ms, frame_host, in_frame, by_wall = _measure(device, draw, repeat)
-    frame_calls = calls_of(device, draw)
+    pairs = _pairs_of(rasterizer, frame)
+    of_frame = _measure(device, draw, repeat)
     say("training step", None)
-    iteration_ms, iteration_host, in_step, _ = _measure(device, trainer.train_step, repeat)
-    iteration_calls = calls_of(device, trainer.train_step)
+    of_step = _measure(device, trainer.train_step, repeat)
 
-    stages = {name: record for name, record in in_frame.items() if name in FORWARD}
-    stages.update({name: record for name, record in in_step.items() if name not in stages})
-    table: dict[str, dict[str, Any]] = {}
-    for name, record in stages.items():
-        rate = 1e3 * record.bytes / record.ms if record.ms > 0 else 0.0
-        shares = {"bytes_per_second": rate, "share_of_copy": rate / limits.copy_bytes_per_second}
-        table[name] = asdict(record) | shares
-    for name, limit in (("blend", limits.pairs_per_second), ("blend_grad", limits.gradient_pairs_per_second)):
-        if name in table and table[name]["ms"] > 0:
-            rate = 1e3 * contributing / table[name]["ms"]
-            table[name].update(pairs_per_second=rate, share_of_arithmetic=rate / limit)
+    stages = {name: record for name, record in of_frame.stages.items() if name in FRAME_STAGES}
+    stages.update({name: record for name, record in of_step.stages.items() if name not in stages})
     return {
         "device": device.name,
         "driver": device.driver,
@@ -103,32 +87,76 @@ def bench(
         "height": subject.camera.height,
         "repeat": repeat,
         "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        "timer": "wall" if by_wall else "events",
-        "frame_ms": frame_ms,
-        "iteration_ms": iteration_ms,
-        "frame_host_ms": frame_host,
-        "iteration_host_ms": iteration_host,
-        "frame_calls": asdict(frame_calls),
-        "iteration_calls": asdict(iteration_calls),
-        "stages": table,
-        "pairs": {"listed": listed, "contributing": contributing, "evaluated": evaluated},
+        "timer": "wall" if of_frame.by_wall else "events",
+        "frame_ms": of_frame.wall_ms,
+        "iteration_ms": of_step.wall_ms,
+        "frame_host_ms": of_frame.host_ms,
+        "iteration_host_ms": of_step.host_ms,
+        "frame_calls": asdict(of_frame.calls),
+        "iteration_calls": asdict(of_step.calls),
+        "stages": _table(stages, limits, pairs["contributing"]),
+        "pairs": pairs,
         "limit": asdict(limits),
     }
 
 
+def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
+    """Numbers of a frame's (tile, Gaussian) pairs and (pixel, Gaussian) pairs, by kind."""
+    listed = contributing = evaluated = 0
+    for band in frame.bands:
+        part = rasterizer.part(frame, band)
+        listed += part.counted.pairs
+        drawn = (part.lists, frame.projected.splats, frame.background, frame.camera)
+        added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
+        contributing, evaluated = contributing + added, evaluated + looked_at
+    return {"listed": listed, "contributing": contributing, "evaluated": evaluated}
+
+
+def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int) -> dict[str, dict[str, Any]]:
+    """Record of each stage with its rates, and their shares of the device's limits.
+
+    contributing: number of pairs that change a pixel.
+    """
+    table: dict[str, dict[str, Any]] = {}
+    for name, record in stages.items():
+        rate = 1e3 * record.bytes / record.ms if record.ms > 0 else 0.0
+        shares = {"bytes_per_second": rate, "share_of_copy": rate / limits.copy_bytes_per_second}
+        table[name] = asdict(record) | shares
+    for name, limit in (("blend", limits.pairs_per_second), ("blend_grad", limits.gradient_pairs_per_second)):
+        if name in table and table[name]["ms"] > 0:
+            rate = 1e3 * contributing / table[name]["ms"]
+            table[name].update(pairs_per_second=rate, share_of_arithmetic=rate / limit)
+    return table
+
+
 def calls_of(device: Device, work: Callable[[], object]) -> Calls:
-    """Counts of what `work` gives the device's queue; it has been done before, so that all is built and allocated."""
+    """Count the queue calls of `work`. It must have run before, so that kernels are built and memory is allocated."""
     before = replace(device.calls)
     work()
     return device.calls.since(before)
 
 
-def _measure(
-    device: Device, work: Callable[[], object], repeat: int
-) -> tuple[float, float, dict[str, StageRecord], bool]:
-    """Wall time in ms with nothing recorded, and this thread's processor time then; the stages; True if their times are
-    of the wall, as the driver's events give none. Medians over `repeat` rounds: plain, with events, and waiting at the
-    seams of the stages."""
+@dataclass(frozen=True)
+class _Cost:
+    """Cost of a frame or a training step. Times are medians.
+
+    wall_ms, host_ms: wall time, and processor time of this thread.
+    calls: queue calls.
+    by_wall: True if the stages' times are wall times, as the driver's events carry none.
+    """
+
+    wall_ms: float
+    host_ms: float
+    calls: Calls
+    stages: dict[str, StageRecord]
+    by_wall: bool
+
+
+def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
+    """Measure the cost of `work`, in `repeat` rounds.
+
+    Each round runs plain, with events, and waiting between stages. Wall and processor time are of the plain run.
+    """
     for _ in range(2):
         work()
     walls: list[float] = []
@@ -155,35 +183,36 @@ def _measure(
         kernels = {kernel: statistics.median(run.get(kernel, 0.0) for run in times) for kernel in record.kernels}
         total = statistics.median(waits if by_wall else [sum(run.values()) for run in times])
         medians[name] = replace(record, kernels=kernels, ms=total, wall_ms=statistics.median(waits))
-    return statistics.median(walls), statistics.median(hosts), medians, by_wall
+    return _Cost(statistics.median(walls), statistics.median(hosts), calls_of(device, work), medians, by_wall)
 
 
 @dataclass(frozen=True, eq=False)
 class _Picture(View):
-    """A view whose pixels are in memory."""
+    """View whose pixels are in memory."""
 
     pixels: Float32 = field(kw_only=True)
 
-    def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:  # noqa: ARG002  # of one size
+    # the pixels have one size
+    def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:  # noqa: ARG002
         return self.pixels
 
 
 def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:
-    """A trainer whose steps do all the work of a real one and leave the model as it is: every rate is zero."""
+    """Trainer whose steps do all the work of training but leave the model unchanged: every learning rate is zero."""
     camera = subject.camera
     photograph = subject.photograph
-    if photograph is None:  # the frame mirrored: a picture like it, with a gradient everywhere
+    if photograph is None:  # the mirrored frame: similar content, with a gradient everywhere
         mirrored = Renderer(device, config=config).render(subject.gaussians, camera).image[:, ::-1]
         photograph = np.rint(255 * np.clip(mirrored, 0, 1)).astype(np.uint8)
     lens = Lens("PINHOLE", camera.width, camera.height, (camera.fx, camera.fy, camera.cx, camera.cy))
     pixels = photograph * np.float32(1 / 255)
     view = _Picture("bench", camera, Path("bench"), "train", lens, pixels=pixels)
     scene = Scene("bench", [view], np.zeros((0, 3)), np.zeros((0, 3), np.float32), (np.zeros(3), np.ones(3)))
-    still = {group.rate: 0.0 for group in GROUPS.values()}
+    still = {group.rate: 0.0 for group in PARAMETER_GROUPS.values()}
     settings = TrainConfig(
         sh_degree=subject.gaussians.sh_degree,
         warmup=(),
-        optimiser=OptimiserConfig(means_rate_end=0.0, **still),  # type: ignore[arg-type]  # all of them are floats
+        optimiser=OptimiserConfig(means_rate_end=0.0, **still),  # type: ignore[arg-type]  # all rates are floats
         density=DensityConfig(every=0),
         rasterizer=config,
         masks=subject.masks.masks,
@@ -192,20 +221,20 @@ def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Tr
     return Trainer(scene, settings, device, subject.gaussians)
 
 
-def picture_of(frame: Frame) -> Float32:
-    """(H, W, 3) on the host."""
+def picture_of(frame: ForwardPass) -> Float32:
+    """The frame's image on the host, (H, W, 3)."""
     camera = frame.camera
     planes: Float32 = frame.blended.image.get()[:, : camera.height, : camera.width]
     return np.ascontiguousarray(planes.transpose(1, 2, 0))
 
 
 def held_kind(config: RasterizerConfig) -> tuple[object, ...]:
-    """The switches of which a model on the device depends."""
+    """Values of the switches that determine how a model is stored on the device."""
     return config.sh_tolerance, config.sh_storage
 
 
 def table(result: dict[str, Any]) -> str:
-    """Text table of what `bench` measured."""
+    """Text table of a result of `bench`."""
     stages, limit, pairs = result["stages"], result["limit"], result["pairs"]
     driver, size = result["driver"].split("  ")[0], f"{result['width']}x{result['height']}"
     arithmetic, gradient, copying = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m clsplat.cli`, which is `python -m clsplat`."""
+"""Entry point of `python -m clsplat.cli`, equal to `python -m clsplat`."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat bench`: the time of each stage."""
+"""`clsplat bench`: time of each stage."""
 
 from __future__ import annotations
 
@@ -15,52 +15,52 @@ from tyro.conf import Positional, arg
 from clsplat.cli.options import DeviceOptions, Flag, Verb, with_given
 from clsplat.cli.session import Services
 from clsplat.config.checks import check_rules, parse_bytes
-from clsplat.config.presets import PRESETS, Preset
+from clsplat.config.presets import RASTERIZER_PRESETS, Preset
 from clsplat.config.rasterizer import BenchSwitches
 from clsplat.errors import InputError
 
 
 @dataclass(frozen=True)
-class Bench(Verb):
+class BenchVerb(Verb):
     """Measure each stage of a frame and of a training step, and the device's own limits in the same run.
 
-    docs/performance.md says what the figures mean.
+    docs/performance.md explains the figures.
     """
 
     source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL")] = None
-    """A scene as training starts it, a run, or a model file; a made-up scene if not given."""
+    """A scene as training starts it, a run, or a model file. If not given: a synthetic scene."""
     gaussians: int = 200_000
-    """Gaussians of the made-up scene."""
+    """Gaussians of the synthetic scene."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
-    """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the made-up scene."""
+    """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the synthetic scene."""
     repeat: int = 5
-    """Measurements of each kind of frame and step; the median of their times is printed."""
+    """Number of measurements of each kind of frame and step. Times are their medians."""
     preset: Preset = "default"
-    """Bundle of rasterizer settings: exact and default approximate nothing, fast does a little. A --rasterizer flag
-    overrides it."""
+    """Bundle of rasterizer settings: exact and default approximate nothing, fast approximates a little. A --rasterizer
+    flag overrides it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Measure every setting of the rasterizer too, and draw two plots, .svg or .png. For NAME.svg: NAME-switches.svg,
-    what each exact switch is worth, and NAME-error.svg, time against error of the approximate settings."""
+    """Measure every setting of the rasterizer too, and draw two plots, .svg or .png. For NAME.svg: NAME-switches.svg
+    with the gain of each exact switch, and NAME-error.svg with time against error of the approximate settings."""
     overwrite: Flag = False
-    """Replace plots that are there."""
+    """Replace existing plots."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
     json: Flag = False
     """Print the result as JSON."""
     rasterizer: BenchSwitches = field(default_factory=BenchSwitches)
 
-    def completed(self, given: Collection[str]) -> Bench:
-        """The rasterizer's settings are those of the preset."""
-        switches = PRESETS[self.preset].switches()
+    def completed(self, given: Collection[str]) -> BenchVerb:
+        """Take the rasterizer's settings from the preset, apart from those given as flags."""
+        switches = RASTERIZER_PRESETS[self.preset].switches()
         return replace(self, rasterizer=with_given(switches, self.rasterizer, given, "rasterizer."))
 
 
-def run(verb: Bench, services: Services) -> int:
-    """Measure. What can be wrong with the call is found before anything is."""
+def run(verb: BenchVerb, services: Services) -> int:
+    """Measure. Errors in the call are found before the measurements."""
     from clsplat.bench import settings as tradeoff
     from clsplat.bench import stages as bench_stages
-    from clsplat.bench import subject as bench_subject
+    from clsplat.bench import workload as bench_subject
     from clsplat.bench.plots import check_plot, plot_files, plot_settings
-    from clsplat.files import check_new
+    from clsplat.files.atomic import check_new
     from clsplat.progress import StageProgress
 
     size, limit = parse_size(verb.size), parse_bytes(verb.device.max_device_mem)
@@ -74,7 +74,7 @@ def run(verb: Bench, services: Services) -> int:
         raise InputError(f"{verb.source}: no such file or folder, expected a scene, a run or a model file")
     progress = StageProgress()
     device = services.require(services.open_device(verb.device.selector, limit, profile=True))
-    most = int(device.cl_device.global_mem_size) // bench_stages.GAUSSIAN_BYTES
+    most = int(device.cl_device.global_mem_size) // bench_stages.TRAINING_BYTES_PER_GAUSSIAN
     if verb.source is None and verb.gaussians > most:
         raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, which fill {device.name}'s memory")
     if verb.source is None:
@@ -98,7 +98,7 @@ def run(verb: Bench, services: Services) -> int:
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
-    """(width, height) of WIDTHxHEIGHT. Raises InputError."""
+    """Parse WIDTHxHEIGHT to (width, height). Raises InputError."""
     if text is None:
         return None
     words = text.split("x")

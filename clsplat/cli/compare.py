@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat compare`: runs side by side."""
+"""`clsplat compare`: comparison of runs."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from clsplat.errors import InputError, warn
 
 
 @dataclass(frozen=True)
-class Compare(Verb):
-    """Print runs side by side: scores, Gaussians, times, and the settings that differ."""
+class CompareVerb(Verb):
+    """Compare runs in a table: scores, Gaussians, times, and the settings that differ."""
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
-    """Folders of runs, two or more."""
+    """Folders of two or more runs."""
     output: OutputFile = None
-    """Write a page too, with the curves overlaid and time against error: one HTML file that loads nothing else."""
+    """Also write a page with overlaid curves and time against error: one self-contained HTML file."""
     overwrite: Flag = False
-    """Replace the page that is there."""
+    """Replace an existing page."""
     json: Flag = False
     """Print JSON instead of the table."""
 
 
-def run(verb: Compare, _: Services) -> int:
-    """Print runs side by side, and write their page."""
-    from clsplat.files import atomic_write
+def run(verb: CompareVerb, _: Services) -> int:
+    """Print the comparison, and write its page."""
+    from clsplat.files.atomic import atomic_write
     from clsplat.report import check_page
     from clsplat.report.compare import compare_runs, comparison_page, comparison_table
     from clsplat.runs.run import Run

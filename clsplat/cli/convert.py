@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat convert`: a model file to another format, edited on the way."""
+"""`clsplat convert`: conversion of a model file to another format, with optional edits."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from tyro.conf import Positional, arg
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import Rule, check_rules
+from clsplat.config.cli_defaults import TEST_EVERY
 from clsplat.config.masks import NO_MASKS
-from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, warn
-from clsplat.files import check_new, is_file, read_document
+from clsplat.files.atomic import check_new
+from clsplat.files.documents import is_file, read_document
 from clsplat.progress import StageProgress
-from clsplat.selftest.result import FORWARD
+from clsplat.selftest.result import FORWARD_STAGES
 
 if TYPE_CHECKING:
     from clsplat.arrays import Float32, Float64
@@ -30,20 +31,20 @@ if TYPE_CHECKING:
 
     NamedModel = tuple[Path, Gaussians]
 
-QUICK = 2.0
-"""Seconds that writing a file may take without a word."""
-NEAR_SLACK = 0.05
-"""A part of a near plane: where a file has none it follows from positions, which a format may have rounded."""
-MAX_MATRIX = 1 << 16
-"""Bytes of a file with a matrix."""
+SILENT_WRITE_SECONDS = 2.0
+"""Seconds that writing a file may take before progress is shown."""
+NEAR_PLANE_RELATIVE_TOLERANCE = 0.05
+"""Relative tolerance of near planes. A file without one gets it from positions, which a format may have rounded."""
+MAX_MATRIX_FILE_BYTES = 1 << 16
+"""Size limit in bytes of a matrix file."""
 
 
 @dataclass(frozen=True)
-class Convert(Verb):
-    """Write a model in another format, by the files' endings, and say what was lost; or edit it on the way.
+class ConvertVerb(Verb):
+    """Convert a model to the format of the output file's ending, with optional edits, and report the loss.
 
-    Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. A device is
-    needed for --scene and --prune-contribution alone. docs/formats.md has the formats.
+    Edits are made in this order: merge, crop, prune, transform, rotate, scale, translate, drop-sh. Only --scene and
+    --prune-contribution need a device. docs/formats.md describes the formats.
     """
 
     source: RunOrModel
@@ -51,50 +52,50 @@ class Convert(Verb):
     target: Annotated[Positional[Path], arg(metavar="OUTPUT")]
     """The file to write."""
     overwrite: Flag = False
-    """Replace a file that is there, the source too."""
+    """Replace an existing file, even the source."""
     activated: Annotated[Literal["opacities", "scales", "both"] | None, arg(metavar="opacities|scales|both")] = None
-    """Take the source's opacities, 0 to 1, to 100 or to 255, or its scales as they are, for a file that has them in
-    place of the logits and logs that belong there: a warning says where that seems so."""
+    """Read the source's opacities (0 to 1, to 100 or to 255), its scales, or both as plain values. This is for a file
+    that stores them in place of the usual logits and logarithms. A warning names files that seem to."""
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
-    """Keep the Gaussians with their middle in this box. Write --crop=-1,... if it begins with a negative number."""
+    """Keep the Gaussians whose mean lies in this box. Write --crop=-1,... if it begins with a negative number."""
     crop_sphere: Annotated[str | None, arg(metavar="X,Y,Z,R")] = None
-    """Keep the Gaussians with their middle in this sphere."""
+    """Keep the Gaussians whose mean lies in this sphere."""
     prune_opacity: Annotated[float | None, arg(metavar="FLOAT")] = None
-    """Leave out Gaussians whose opacity is less than this, 0 to 1."""
+    """Leave out Gaussians with an opacity below this, 0 to 1."""
     prune_contribution: Annotated[float | None, arg(metavar="PIXELS")] = None
-    """Leave out Gaussians that add less than this to the picture of every one of --cameras: alpha times transmittance,
-    summed over the picture, in pixels, as --density.min-contribution in training."""
+    """Leave out Gaussians that contribute less than this to every picture of --cameras: alpha times transmittance,
+    summed over the picture, in pixels, like --density.min-contribution in training."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
-    """Cameras for --prune-contribution, any that `clsplat render` takes."""
+    """Cameras for --prune-contribution, in any format that `clsplat render` reads."""
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None
-    """Move the model by a 4 x 4 matrix of rotation, one scale and translation (a mirror is allowed too), row by row:
-    16 numbers with commas, or a text file with them. Spherical harmonics are turned too."""
+    """Transform the model by a 4 x 4 matrix: rotation, uniform scale, translation, and a mirror if wanted. 16 numbers
+    row by row, separated by commas, or a text file with them. Spherical harmonics are rotated too."""
     rotate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """Turn the model by these degrees about the world's x axis, then its y, then its z axis, by the right-hand rule.
-    Spherical harmonics are turned too. Write --rotate=-90,0,0 if it begins with a negative number."""
+    """Rotate the model by these angles in degrees about the world's x axis, then y, then z, by the right-hand rule.
+    Spherical harmonics are rotated too. Write --rotate=-90,0,0 if it begins with a negative number."""
     scale: Annotated[float | None, arg(metavar="FLOAT")] = None
     """Multiply positions and sizes by this factor, about the world's origin."""
     translate: Annotated[str | None, arg(metavar="X,Y,Z")] = None
-    """Move the model by this much. Write --translate=-1,0,0 if it begins with a negative number."""
+    """Translate the model. Write --translate=-1,0,0 if it begins with a negative number."""
     drop_sh: Annotated[int | None, arg(metavar="DEGREE")] = None
-    """Leave out the spherical harmonics (colour by direction) beyond this degree, 0 to 3."""
+    """Leave out spherical harmonics (view-dependent colour) above this degree, 0 to 3."""
     up: Annotated[Literal["y", "z"] | None, arg(metavar="y|z")] = None
-    """Axis that a USD stage names as up; y if not given. The model stays as it is, --rotate turns it."""
+    """Up axis that a USD stage declares; y if not given. The model is not rotated: use --rotate for that."""
     spz_version: Annotated[Literal[2, 3, 4] | None, arg(metavar="2|3|4")] = None
-    """Version of an SPZ file, 3 if not given. 4 is smaller by up to a tenth, and PlayCanvas's engine reads no other;
-    Spark, Babylon.js and older three.js refuse it. docs/formats.md has who reads which."""
+    """Version of an SPZ file; 3 if not given. Version 4 is up to a tenth smaller, and the only one that PlayCanvas's
+    engine reads. Spark, Babylon.js and older three.js refuse it. docs/formats.md lists the readers of each version."""
     sh_bits: Annotated[str | None, arg(metavar="BITS|BITS,BITS")] = None
-    """Bits of an SPZ file's spherical harmonics, of band 1 and of those above, 1 to 8: fewer are a smaller file of less
-    true reflections. 6,6 if not given; 5,4 is what SPZ's own library keeps."""
+    """Bits of an SPZ file's spherical harmonics, 1 to 8, for band 1 and for the bands above. Fewer bits make a smaller
+    file with less accurate reflections. 6,6 if not given; SPZ's own library uses 5,4."""
     scene: ScenePath = None
-    """Measure PSNR on this scene's held-out views before and after, and of the two renders against each other. Of the
-    scene of a run, pixels that its masks leave out do not count."""
+    """Measure PSNR on this scene's held-out views before and after, and between the two renders. For a run's own scene,
+    masked-out pixels do not count."""
     test_every: int = TEST_EVERY
-    """Every n-th view of --scene by name is held out; 0: all its views are measured."""
+    """Every n-th view of --scene by name is held out. 0: all its views are measured."""
     resolution: int = 0
-    """Longest image side for --scene; 0: the images' size up to 1600."""
+    """Longest image side for --scene, in pixels. 0: the images' size up to 1600."""
     background: Literal["black", "white"] = "black"
     """Background behind the Gaussians and behind images with alpha, for --scene."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
@@ -102,8 +103,8 @@ class Convert(Verb):
     """Print the result as JSON."""
 
 
-def run(verb: Convert, services: Services) -> int:
-    """Read, edit, write, read back. What is wrong with the call is found before anything is written."""
+def run(verb: ConvertVerb, services: Services) -> int:
+    """Read, edit, write and read back. Errors in the call are found before anything is written."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
@@ -122,24 +123,24 @@ def run(verb: Convert, services: Services) -> int:
     if not target_format.floats:
         edited = edit.without_empty_bands(edited)
     comments = () if space == colour.SRGB else (colour.comment(space),)
-    save(verb.target, edited, comments=comments, progress=StageProgress(after=QUICK), **options)
+    save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
-    read = load(verb.target, doubts=False)  # the source was told of
-    if not isclose(read.near, edited.near, rel_tol=NEAR_SLACK):
+    read = load(verb.target, doubts=False)  # without warnings: those on the source were printed already
+    if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(
             f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
             f"will take {read.near:.4g}"
         )
     if read.antialiased != edited.antialiased:
         warn(
-            f"{verb.target}: {target_format.name} has no place for antialiasing; readers will draw what is small or "
-            "far away too thick"
+            f"{verb.target}: {target_format.name} has no place for antialiasing; readers will draw small or distant "
+            "Gaussians too thick"
         )
     if read.by_rays != edited.by_rays:
         warn(
-            f"{verb.target}: {target_format.name} has no place for drawing along rays; readers will show what is large "
-            "and beside the picture as a haze"
+            f"{verb.target}: {target_format.name} has no place for drawing along rays; readers will show large "
+            "Gaussians outside the picture as a haze"
         )
     written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
     result: dict[str, Any] = {
@@ -163,8 +164,8 @@ def run(verb: Convert, services: Services) -> int:
     return 0
 
 
-def _check(verb: Convert) -> None:
-    """Raise InputError for a number out of its range, and for flags that lack their companion."""
+def _check(verb: ConvertVerb) -> None:
+    """Raise InputError for a number out of range, or a flag without its companion."""
     from clsplat.gaussians import MAX_SH_DEGREE
 
     rules: tuple[Rule, ...] = (
@@ -181,7 +182,7 @@ def _check(verb: Convert) -> None:
     names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
     if verb.scene is None and names:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise InputError(f"{flags}: of measuring on a scene, expected --scene with it")
+        raise InputError(f"{flags}: for measuring on a scene, expected --scene with it")
 
 
 def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:
@@ -192,9 +193,9 @@ def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]
 
 
 def _edited(
-    verb: Convert, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
+    verb: ConvertVerb, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
 ) -> Gaussians:
-    """The source's Gaussians after all edits, in the order that --help names. Raises InputError where none is left."""
+    """Apply all edits to the source, in the order that --help names. Raises InputError if no Gaussian is left."""
     from clsplat.models import edit
 
     gaussians = source[1]
@@ -208,22 +209,22 @@ def _edited(
     return gaussians if verb.drop_sh is None else edit.drop_sh(gaussians, verb.drop_sh)
 
 
-def _of_format(verb: Convert, target: Format) -> dict[str, Any]:
-    """Options of the target's format alone. Raises InputError for one that is of another format."""
-    options: dict[str, Any] = {}
-    for flag, value, name, format_name in (
+def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
+    """Options for the target's format. Raises InputError for a flag of another format."""
+    flags = (
         ("up", verb.up and verb.up.upper(), "up_axis", "OpenUSD"),
         ("spz-version", verb.spz_version, "version", "SPZ"),
         ("sh-bits", _sh_bits(verb.sh_bits), "sh_bits", "SPZ"),
-    ):
-        if value is not None and target.name != format_name:
-            raise InputError(f"--{flag}: is of {format_name} files, {verb.target} is {target.name}")
-        options |= {name: value} if value is not None else {}
-    return options
+    )
+    given = [row for row in flags if row[1] is not None]
+    for flag, _, _, format_name in given:
+        if target.name != format_name:
+            raise InputError(f"--{flag}: is for {format_name} files, but {verb.target} is {target.name}")
+    return {name: value for _, value, name, _ in given}
 
 
 def _sh_bits(text: str | None) -> tuple[int, int] | None:
-    """Bits of band 1 and of those above, of "6" or "5,4". Raises InputError."""
+    """Parse "6" or "5,4" to the bits of band 1 and of the higher bands. Raises InputError."""
     if text is None:
         return None
     words = [word.strip() for word in text.split(",")]
@@ -233,7 +234,7 @@ def _sh_bits(text: str | None) -> tuple[int, int] | None:
 
 
 def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
-    """Warn where a model that is merged is in another colour space, or far from the source."""
+    """Warn if a merged model has another colour space, or is far from the source."""
     import numpy as np
 
     from clsplat.models import edit
@@ -242,28 +243,28 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
     (path, other), (first_path, first) = merged, source
     space, expected = colour_space(path), colour_space(first_path)
     if space != expected:
-        warn(
-            f"--merge {path}: its colours are of {space}, those of {first_path} of {expected}, as which all will count"
-        )
+        warn(f"--merge {path}: its colours are {space}, but those of {first_path} are {expected}; all count as these")
     distance = float(np.linalg.norm(other.origin - first.origin))
-    if len(other) and distance > edit.FAR * float(other.means.std(axis=0).max()):
+    if len(other) and distance > edit.MAX_WORLD_OFFSET_SIZES * float(other.means.std(axis=0).max()):
         step = float(np.spacing(np.float32(distance)))
         warn(
-            f"--merge {path}: counts from a place {distance:.6g} world units from that of {first_path}; its positions "
-            f"are rounded to {step:.2g}. Is only one of the two georeferenced?"
+            f"--merge {path}: its origin is {distance:.6g} world units from that of {first_path}; its positions are "
+            f"rounded to {step:.2g}. Is only one of the two georeferenced?"
         )
 
 
-def _similarity(verb: Convert) -> Float64 | None:
-    """--transform, --rotate, --scale and --translate, in this order, as one (4, 4); None without them. Raises
-    InputError."""
+def _similarity(verb: ConvertVerb) -> Float64 | None:
+    """Product of --transform, --rotate, --scale and --translate, in this order, as (4, 4); None without them.
+
+    Raises InputError.
+    """
     import numpy as np
 
     from clsplat.models import edit
 
     steps: list[Float64] = []
     if (text := verb.transform) is not None:
-        words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX) if is_file(text) else text
+        words = read_document(Path(text), "a text file of 16 numbers", MAX_MATRIX_FILE_BYTES) if is_file(text) else text
         steps.append(np.array(_numbers("transform", words, 16)).reshape(4, 4))
         try:
             edit.decompose(steps[0])
@@ -284,7 +285,7 @@ def _similarity(verb: Convert) -> Float64 | None:
 
 
 def _numbers(flag: str, text: str, count: int) -> list[float]:
-    """Finite numbers with commas or blanks between them, brackets passed over. Raises InputError."""
+    """Parse finite numbers, separated by commas or spaces; brackets are ignored. Raises InputError."""
     words = text.translate(str.maketrans("[],;", "    ")).split()
     try:
         values = [float(word) for word in words]
@@ -295,8 +296,8 @@ def _numbers(flag: str, text: str, count: int) -> list[float]:
     return values
 
 
-def _thinned(verb: Convert, services: Services, gaussians: Gaussians) -> Gaussians:
-    """Cropped and pruned. Raises InputError where nothing is left."""
+def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gaussians:
+    """Crop and prune. Raises InputError if no Gaussian is left."""
     from clsplat.models import edit
     from clsplat.rendering.contributions import largest_contributions
     from clsplat.shots import choose_shot
@@ -327,10 +328,12 @@ def _thinned(verb: Convert, services: Services, gaussians: Gaussians) -> Gaussia
 
 
 def _measured(
-    verb: Convert, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
+    verb: ConvertVerb, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
 ) -> dict[str, Any]:
-    """PSNR in dB of the model as it was read and of the one that was written, against the photographs and against each
-    other: of each view, and the means. The cameras of the written model move along with it."""
+    """PSNR in dB before and after conversion, against the photographs and against each other.
+
+    The result has each view's values and their means. The cameras of the converted model move with it.
+    """
     import numpy as np
 
     from clsplat.evaluation.held_out import photograph_of
@@ -345,7 +348,7 @@ def _measured(
     own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
     masks = run.config.mask_use if run is not None and own else NO_MASKS
     scene = load_scene(services, verb.scene, verb.resolution, verb.test_every, masks, missing="skip")
-    renderer = services.renderer(services.require(device, FORWARD))
+    renderer = services.renderer(services.require(device, FORWARD_STAGES))
     background = background_colour(verb.background)
 
     def images(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Float32]:

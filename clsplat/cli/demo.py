@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat demo`: the whole pipeline on a scene of its own."""
+"""`clsplat demo`: the whole pipeline on a synthetic scene."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from tyro.conf import arg
 
 from clsplat.cli.options import DeviceChoice, Flag, Output, Verb
 from clsplat.cli.session import Services
+from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
-from clsplat.config.verbs import DEMO_ITERATIONS
 
 
 @dataclass(frozen=True)
-class Demo(Verb):
+class DemoVerb(Verb):
     """Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable."""
 
     output: Output
-    """Folder for everything the demo makes: a new one, or one that a demo has made, which is made anew."""
+    """Folder for all results: a new one, or one of an earlier demo, whose content is replaced."""
     iterations: int = DEMO_ITERATIONS
-    """Training steps. A few hundred show that all works, and less of the scene."""
+    """Training steps. A few hundred are enough to test the pipeline, but show less of the scene."""
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
     json: Flag = False
     """Print the evaluation as JSON on standard output."""
 
 
-def run(verb: Demo, services: Services) -> int:
+def run(verb: DemoVerb, services: Services) -> int:
     """Run the demo, after the device's self-test."""
     TrainConfig(iterations=verb.iterations).check()
     verb.device.trusted(services)

@@ -15,17 +15,17 @@ from clsplat.progress import aligned
 
 
 @dataclass(frozen=True)
-class Devices(Verb):
+class DevicesVerb(Verb):
     """List the OpenCL devices."""
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = None
-    """List only the one that this names, as other verbs' --device does: an index, cpu, gpu, or a part of a name.
-    If not given: all of them."""
+    """List only this device, named as for other verbs' --device: an index, cpu, gpu, or part of a name. If not given:
+    all devices."""
     json: Flag = False
     """Print a JSON array instead of the table."""
 
 
-def run(verb: Devices, _: Services) -> int:
+def run(verb: DevicesVerb, _: Services) -> int:
     """Print the table of devices."""
     devices = chosen_devices(verb.device)
     if verb.json:
@@ -34,7 +34,7 @@ def run(verb: Devices, _: Services) -> int:
     rows = [("", "name", "kind", "units", "memory", "platform", "version", "shape")]
     for info in devices:
         memory = f"{info.memory_bytes / 2**30:.1f} GiB"
-        version = info.version.split("  ")[0]  # PoCL lists its build options after two spaces
+        version = info.version.split("  ")[0]  # PoCL appends its build options after two spaces
         words = (info.name, info.kind, str(info.compute_units), memory, info.platform, version, info.shape)
         rows.append((str(info.index), *words))
     print("\n".join(aligned(rows, left=range(len(rows[0])))))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat doctor`: what is installed, what is missing, and what to do about it."""
+"""`clsplat doctor`: installed and missing parts, and advice on installing them."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from dataclasses import asdict, dataclass
 from importlib import metadata
 from typing import TYPE_CHECKING
 
-import clsplat
 from clsplat.cli.options import Flag, Verb
 from clsplat.cli.session import Services
 from clsplat.progress import aligned
+from clsplat.version import package_version
 
 if TYPE_CHECKING:
-    from clsplat.device.installation import Finding
+    from clsplat.device.drivers.diagnostics import Diagnostic
 
 _REQUIREMENT = re.compile(r"([A-Za-z0-9_.-]+).*?(?:extra == ['\"](\w+)['\"])?$")
 
 
 @dataclass(frozen=True)
-class Doctor(Verb):
-    """Say what is installed and what is missing: packages, OpenCL drivers, devices, GPUs without a driver; and what to
-    install for them on this system.
+class DoctorVerb(Verb):
+    """List installed and missing packages, OpenCL drivers, devices and GPUs without a driver, with installation advice
+    for this system.
 
-    Exit status 1 where something is missing without which nothing runs. Drivers are loaded in processes of their own,
-    so that one which aborts is named. `clsplat selftest` then tests what a driver computes.
+    The exit status is 1 if anything essential is missing. Drivers are loaded in processes of their own, so that a
+    driver that aborts can be named. `clsplat selftest` tests the results of a driver.
     """
 
     json: Flag = False
     """Print a JSON array instead of the lines."""
 
 
-def run(verb: Doctor, _: Services) -> int:
-    """Print the findings; 1 if something is missing without which nothing runs."""
+def run(verb: DoctorVerb, _: Services) -> int:
+    """Print the findings. Returns 1 if anything essential is missing."""
     everything = lines()
     missing = [line for line in everything if line.state == "missing"]
     if verb.json:
@@ -58,55 +58,55 @@ def run(verb: Doctor, _: Services) -> int:
     return 1 if missing else 0
 
 
-def lines() -> list[Finding]:
-    """Everything that is said of the installation."""
-    from clsplat.device.installation import findings
+def lines() -> list[Diagnostic]:
+    """All findings on the installation."""
+    from clsplat.device.drivers.diagnostics import findings
 
     return [*_system(), *_packages(), *findings(), *_variables()]
 
 
-def _system() -> list[Finding]:
-    from clsplat.device.installation import Finding
+def _system() -> list[Diagnostic]:
+    from clsplat.device.drivers.diagnostics import Diagnostic
 
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"
     python = f"Python {platform.python_version()}, {sys.prefix}"
     return [
-        Finding("clsplat", "ok", clsplat.__version__),
-        Finding("system", "ok", system),
-        Finding("python", "ok", python),
+        Diagnostic("clsplat", "ok", package_version()),
+        Diagnostic("system", "ok", system),
+        Diagnostic("python", "ok", python),
     ]
 
 
-def _packages() -> list[Finding]:
-    """A line for each package that clsplat needs, and for each extra whether its packages are there."""
-    from clsplat.device.installation import Finding
+def _packages() -> list[Diagnostic]:
+    """Findings on the packages that clsplat requires, and on the packages of each extra."""
+    from clsplat.device.drivers.diagnostics import Diagnostic
 
     try:
         requirements = metadata.requires("clsplat") or []
     except metadata.PackageNotFoundError:
-        return [Finding("package", "note", "clsplat runs from a folder and is not installed", "pip install .")]
-    findings: list[Finding] = []
+        return [Diagnostic("package", "note", "clsplat runs from a folder and is not installed", "pip install .")]
+    findings: list[Diagnostic] = []
     extras: dict[str, list[tuple[str, str]]] = {}
     for text in requirements:
         match = _REQUIREMENT.match(text)
         assert match is not None, text
         name, extra = match[1], match[2]
-        if name == "clsplat" or (";" in text and not extra):  # of some systems alone
+        if name == "clsplat" or (";" in text and not extra):  # needed on some systems only
             continue
         version = _version(name)
         if extra:
             extras.setdefault(extra, []).append((name, version))
         elif version:
-            findings.append(Finding("package", "ok", f"{name} {version}"))
+            findings.append(Diagnostic("package", "ok", f"{name} {version}"))
         else:
-            findings.append(Finding("package", "missing", name, f"pip install '{text}'"))
+            findings.append(Diagnostic("package", "missing", name, f"pip install '{text}'"))
     for extra, packages in extras.items():
         if extra in ("test", "dev"):
             continue
         lacking = [name for name, version in packages if not version]
         text = ", ".join(f"{name} {version or 'not installed'}" for name, version in packages)
         advice = f"if wanted: pip install 'clsplat[{extra}]'" if lacking else ""
-        findings.append(Finding(f"[{extra}]", "note" if lacking else "ok", text, advice))
+        findings.append(Diagnostic(f"[{extra}]", "note" if lacking else "ok", text, advice))
     return findings
 
 
@@ -117,10 +117,10 @@ def _version(name: str) -> str:
         return ""
 
 
-def _variables() -> list[Finding]:
-    """Variables of the environment that change which driver is taken, or how."""
-    from clsplat.device.installation import Finding
-    from clsplat.device.quirks import VARIABLES
+def _variables() -> list[Diagnostic]:
+    """Environment variables that change the choice or the behaviour of a driver."""
+    from clsplat.device.drivers.diagnostics import Diagnostic
+    from clsplat.device.drivers.quirks import DRIVER_VARIABLES
 
-    names = sorted(name for name in os.environ if name.startswith("CLSPLAT_") or name in VARIABLES)
-    return [Finding("variable", "note", f"{name}={os.environ[name]}") for name in names]
+    names = sorted(name for name in os.environ if name.startswith("CLSPLAT_") or name in DRIVER_VARIABLES)
+    return [Diagnostic("variable", "note", f"{name}={os.environ[name]}") for name in names]

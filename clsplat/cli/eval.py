@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat eval`: a model measured on held-out views."""
+"""`clsplat eval`: evaluation of a model on held-out views."""
 
 from __future__ import annotations
 
@@ -17,39 +17,45 @@ from clsplat.config.training import Missing, TrainConfig
 from clsplat.errors import CapacityError, InputError, warn
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from clsplat.camera import Camera
+    from clsplat.runs.run import Run
+    from clsplat.scenes.scene import Scene, View
 
 
 @dataclass(frozen=True)
-class Eval(Verb):
-    """Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS where the extra is installed.
+class EvalVerb(Verb):
+    """Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.
 
-    Given a run, eval.json and test/ are written anew.
+    For a run, eval.json and test/ are replaced.
     """
 
     model: RunOrModel
-    """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
+    """A run's folder or a model file. A file in a run's folder has that run's settings."""
     scene: ScenePath = None
-    """Folder with the scene; the one the run was trained on if not given."""
+    """Folder with the scene. If not given: the one that the run was trained on."""
     test_every: OptionalInt = None
-    """Every n-th view by name is held out, and measured. If not given: the run's setting, else 8."""
+    """Every n-th view by name is held out and measured. If not given: the run's setting, else 8."""
     resolution: OptionalInt = None
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
     missing: Annotated[Missing | None, arg(metavar="few|skip|error")] = None
-    """Pictures that the scene lists and that are not there, as of train. If not given: the run's setting, else few."""
+    """Treatment of pictures that the scene lists but that are missing, as for train. If not given: the run's setting,
+    else few."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians and behind images with alpha. If not given: the run's setting, else black."""
     corrected: Flag = False
-    """Tell PSNR of the affine map of colours that fits each photograph best, too; of a run with --appearance it always
-    is told."""
+    """Also report PSNR after the affine colour map that fits each photograph best. For a run with --appearance it is
+    always reported."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
     json: Flag = False
     """Print the result as JSON, as in eval.json."""
 
 
-def run(verb: Eval, services: Services) -> int:
+def run(verb: EvalVerb, services: Services) -> int:
     """Measure. A run's folder is locked."""
     from clsplat.runs.locks import locked
     from clsplat.runs.run import is_run
@@ -58,20 +64,17 @@ def run(verb: Eval, services: Services) -> int:
         return _evaluate(verb, services)
 
 
-def _evaluate(verb: Eval, services: Services) -> int:
+def _evaluate(verb: EvalVerb, services: Services) -> int:
     from clsplat.evaluation.depths import keep_depths
-    from clsplat.evaluation.held_out import evaluate
+    from clsplat.evaluation.held_out import EvaluatedModel, evaluate
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
     from clsplat.models.formats import colour_space
-    from clsplat.report import NAME
+    from clsplat.report import REPORT_FILE_NAME
     from clsplat.report.page import write_last
-    from clsplat.runs import scene_record
     from clsplat.runs.appearance import looks_of_run
-    from clsplat.runs.refined import through_refined
     from clsplat.runs.run import model_file, run_of
-    from clsplat.scenes import doubts
-    from clsplat.selftest.result import FORWARD
+    from clsplat.selftest.result import FORWARD_STAGES
 
     verb.device.check()
     file = model_file(verb.model)
@@ -82,15 +85,9 @@ def _evaluate(verb: Eval, services: Services) -> int:
     source = verb.scene or (trained.scene if trained else None)
     if source is None:
         raise InputError(f"{verb.model}: the scene it was trained on is not known, expected --scene SCENE")
-    resolution = config.resolution if verb.resolution is None else verb.resolution
-    test_every = config.test_every if verb.test_every is None else verb.test_every
     device = verb.device.open(services)
-    missing = verb.missing or config.missing
-    scene = load_scene(services, source, resolution, test_every, config.mask_use, config.lenses, missing)
-    views = through_refined([view for view in scene.views if view.split == "test"], trained)
-    if not views:
-        raise InputError(f"{source}: no view is held out with --test-every {test_every}")
-    device = services.require(device, FORWARD)
+    scene, views = _held_out(verb, services, source, trained)
+    device = services.require(device, FORWARD_STAGES)
     tell_of_lpips()
     renderer = services.renderer(device, config=config.rasterizer)
     background = background_colour(verb.background or config.background)
@@ -103,11 +100,7 @@ def _evaluate(verb: Eval, services: Services) -> int:
         result = renderer.render(model, camera)
         return result.image, result.alpha
 
-    warnings = scene_record.of_evaluation(trained, views) if trained else []
-    with suppress(CapacityError):
-        warnings.append(doubts.of_pictures(draw, views, "held-out"))
-    for text in filter(None, warnings):
-        warn(text)
+    _warn_of_doubts(trained, draw, views)
     seen = looks_of_run(trained)
     model_record = given_run.model_record() if given_run else {}
     result = evaluate(
@@ -115,29 +108,60 @@ def _evaluate(verb: Eval, services: Services) -> int:
         views,
         background,
         given_run.test_path if given_run else None,
-        step=model_record.get("step"),
-        gaussians=len(gaussians),
-        seconds=model_record.get("seconds"),
+        model=EvaluatedModel(model_record.get("step"), len(gaussians), model_record.get("seconds")),
         space=colour_space(file),
         corrected=verb.corrected or config.appearance != "none",
     )
     if given_run:
         given_run.write_eval(result)
-        if (given_run.path / NAME).exists():
+        if (given_run.path / REPORT_FILE_NAME).exists():
             with suppress(CapacityError):
                 keep_depths(render, gaussians, views, result["views"], given_run.depth_path)
             write_last(given_run, scene, gaussians)
-    if verb.json:
-        print(json.dumps(result, indent=2))
-        return 0
-    for record in result["views"]:
-        print(f"{record['name']}  {_scores(record)}")
-    print_summary(result)
+    _print_result(result, as_json=verb.json)
     return 0
 
 
+def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | None) -> tuple[Scene, list[View]]:
+    """The scene, with the run's settings unless flags set others, and its held-out views. Raises InputError."""
+    from clsplat.runs.refined_lenses import through_refined
+
+    config = trained.config if trained else TrainConfig()
+    resolution = config.resolution if verb.resolution is None else verb.resolution
+    test_every = config.test_every if verb.test_every is None else verb.test_every
+    missing = verb.missing or config.missing
+    scene = load_scene(services, source, resolution, test_every, config.mask_use, config.lenses, missing)
+    views = through_refined([view for view in scene.views if view.split == "test"], trained)
+    if not views:
+        raise InputError(f"{source}: no view is held out with --test-every {test_every}")
+    return scene, views
+
+
+def _warn_of_doubts(
+    trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
+) -> None:
+    """Warn of scores that do not count as held-out scores, and of pictures that look wrong."""
+    from clsplat.runs import scene_record
+    from clsplat.scenes.analysis import sanity_checks
+
+    warnings = scene_record.of_evaluation(trained, views) if trained else []
+    with suppress(CapacityError):
+        warnings.append(sanity_checks.of_pictures(draw, views, "held-out"))
+    for text in filter(None, warnings):
+        warn(text)
+
+
+def _print_result(result: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(result, indent=2))
+        return
+    for record in result["views"]:
+        print(f"{record['name']}  {_scores(record)}")
+    print_summary(result)
+
+
 def tell_of_lpips() -> None:
-    """Print, before the work, why there will be no LPIPS, if so."""
+    """Print, before the work, the reason if LPIPS will be missing."""
     from clsplat.evaluation.metrics import prepare_lpips
 
     if reason := prepare_lpips():
@@ -145,7 +169,7 @@ def tell_of_lpips() -> None:
 
 
 def print_summary(result: dict[str, Any]) -> None:
-    """Print the mean scores of eval.json, where there are any."""
+    """Print the mean scores of eval.json, if it has any."""
     if result["views"]:
         print(f"{len(result['views'])} held-out views  {_scores(result['mean'])}  {result['gaussians']:,} Gaussians")
 

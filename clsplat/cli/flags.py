@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The flags of a verb, read from its dataclass: help in groups by what they are for, and near names for wrong ones."""
+"""Flags of a verb, read from its dataclass: grouped help, and suggestions for misspelt flags."""
 
 from __future__ import annotations
 
@@ -18,19 +18,23 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from tyro.conf import FlagCreatePairsOff, Positional, Suppress
 
 Groups = tuple[tuple[str, tuple[str, ...]], ...]
-"""Titles with names of flags, which may end in `*`. A flag is in the first group that names it."""
-OTHERS = "Others"
-COLUMN = 24
-"""Where the text of a flag begins; what is named longer has it a line below."""
-NEAR = 0.75
-"""Likeness, 0 to 1, from which a flag is taken for the one that was meant."""
-_WORDS = {int: "INT", float: "FLOAT", str: "STR"}
+"""Titles with names of flags, which may end in `*`. A flag is listed in the first group that names it."""
+OTHER_FLAGS_TITLE = "Others"
+HELP_TEXT_COLUMN = 24
+"""Column of the help text. A longer flag name has its text on the next line."""
+MIN_FLAG_SIMILARITY = 0.75
+"""Smallest similarity, 0 to 1, at which a known flag is suggested for an unknown one."""
+_METAVARS = {int: "INT", float: "FLOAT", str: "STR"}
 
 
 @dataclass(frozen=True)
 class Option:
-    """A flag, or an argument without one. names: of the command line, none for an argument; text: its docstring; off:
-    the name that switches it off, where there is one."""
+    """A flag, or a positional argument.
+
+    names: on the command line; empty for a positional argument.
+    text: its docstring.
+    off: name of the flag that switches it off, if there is one.
+    """
 
     names: tuple[str, ...]
     metavar: str
@@ -41,12 +45,12 @@ class Option:
 
     @property
     def key(self) -> str:
-        """The long name without its hyphens, of an argument its metavar."""
+        """The long name without hyphens; the metavar of a positional argument."""
         return self.names[-1].removeprefix("--") if self.names else self.metavar
 
     @property
     def told(self) -> str:
-        """Text with what counts where the flag is not given, unless that is nothing or the text says it."""
+        """Help text with the default, unless the default is nothing."""
         silent = self.default is None or self.default is False or self.default in ("", ())
         if self.required:
             return f"{self.text} (required)"
@@ -54,7 +58,7 @@ class Option:
 
 
 def options(kind: type, prefix: str = "") -> Iterator[Option]:
-    """The flags of a dataclass, those of dataclasses within it too, in the order of its fields."""
+    """Flags of a dataclass and its nested dataclasses, in the order of the fields."""
     hints, texts = get_type_hints(kind, include_extras=True), _docstrings(kind)
     for field in dataclasses.fields(kind):
         hint, conf = hints[field.name], _conf(hints[field.name])
@@ -80,14 +84,20 @@ def options(kind: type, prefix: str = "") -> Iterator[Option]:
 
 
 def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None) -> str:
-    """The help of a verb, its flags in groups; width: of the lines, by the terminal if not given."""
+    """Help of a verb, with its flags in groups.
+
+    width: of the lines; the terminal's if not given.
+    """
     width = min(width or shutil.get_terminal_size().columns, 100)
     every = list(options(kind))
-    placed: dict[str, list[Option]] = {title: [] for title in (*(title for title, _ in groups), OTHERS)}
+    placed: dict[str, list[Option]] = {title: [] for title in (*(title for title, _ in groups), OTHER_FLAGS_TITLE)}
     for option in every:
-        title = next((title for title, names in groups if any(fnmatchcase(option.key, name) for name in names)), OTHERS)
+        title = next(
+            (title for title, names in groups if any(fnmatchcase(option.key, name) for name in names)),
+            OTHER_FLAGS_TITLE,
+        )
         placed[title].append(option)
-    for title, names in groups:  # as the table lists them
+    for title, names in groups:  # in the order of the table
         order = {option.key: index for index, name in enumerate(names) for option in every if option.key == name}
         placed[title].sort(key=lambda option: order.get(option.key, len(every)))
     wanted = [option for option in every if option.required]
@@ -96,11 +106,11 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
     for title, entries in placed.items():
         if entries:
             lines += ["", f"{title}:", *(line for option in entries for line in _lines(option, width))]
-    return "\n".join([*lines, "", f"  {'-h, --help':{COLUMN - 2}}Show this help."])
+    return "\n".join([*lines, "", f"  {'-h, --help':{HELP_TEXT_COLUMN - 2}}Show this help."])
 
 
 def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
-    """The flags in `arguments` that the verb has not, each with the nearest name, as one line; empty without such."""
+    """One-line message on unknown flags in `arguments`, with the nearest names; empty if all are known."""
     known = ["--help", "--help-verbose"]
     for option in options(kind):
         known += [*option.names, option.off] if option.off else option.names
@@ -115,24 +125,24 @@ def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
 
 
 def near(word: str, known: Sequence[str]) -> str:
-    """The known name that is most like the word; empty where none is."""
+    """The known name that is most similar to the word; empty if none is similar enough."""
     plain = {name.lower().replace("_", "-").replace("colour", "color"): name for name in known}
     meant = word.lower().replace("_", "-").replace("colour", "color")
-    # a part of a name, such as --shutter, or of one with a dot, such as --fps
+    # part of a name, such as --shutter, or of a name with a dot, such as --fps
     parts = [name for name in plain if name.endswith(f".{meant[2:]}") or name.startswith(f"{meant}-")]
-    found = parts or difflib.get_close_matches(meant, plain, 1, NEAR)
+    found = parts or difflib.get_close_matches(meant, plain, 1, MIN_FLAG_SIMILARITY)
     return plain[found[0]] if found and len(meant.lstrip("-")) > 2 else ""
 
 
 def _lines(option: Option, width: int) -> Iterator[str]:
     head = "  " + f"{', '.join(option.names)} {option.metavar}".strip()
-    told = textwrap.wrap(" ".join(option.told.split()), width - COLUMN, break_on_hyphens=False)
-    if len(head) > COLUMN - 2:
+    told = textwrap.wrap(" ".join(option.told.split()), width - HELP_TEXT_COLUMN, break_on_hyphens=False)
+    if len(head) > HELP_TEXT_COLUMN - 2:
         yield head
     elif told:
-        yield f"{head:{COLUMN}}{told.pop(0)}"
+        yield f"{head:{HELP_TEXT_COLUMN}}{told.pop(0)}"
     for line in told:
-        yield f"{'':{COLUMN}}{line}"
+        yield f"{'':{HELP_TEXT_COLUMN}}{line}"
 
 
 def _shown(value: object) -> str:
@@ -146,7 +156,7 @@ def _shown(value: object) -> str:
 
 
 def _marker(marked: Any) -> Any:
-    """The mark that a type of tyro's, such as Positional, puts on another."""
+    """The marker that a type of tyro's, such as Positional, adds to another type."""
     return get_args(marked[int])[1]
 
 
@@ -155,7 +165,7 @@ def _metadata(hint: Any) -> tuple[Any, ...]:
 
 
 def _conf(hint: Any) -> Any:
-    """The facts that tyro's `arg` gives of a flag, None without."""
+    """Settings of a flag from tyro's `arg`; None without it."""
     return next((each for each in _metadata(hint) if hasattr(each, "metavar")), None)
 
 
@@ -172,11 +182,11 @@ def _bare(hint: Any) -> Any:
 def _metavar(bare: Any, name: str) -> str:
     if get_origin(bare) is Literal:
         return "|".join(map(str, get_args(bare)))
-    return _WORDS.get(bare, name.rpartition(".")[2].upper())
+    return _METAVARS.get(bare, name.rpartition(".")[2].upper())
 
 
 def _docstrings(kind: type) -> dict[str, str]:
-    """By field the text below it, in this class or the nearest that it is made from; none without the source."""
+    """Docstring of each field, from the class or its nearest base class; empty without source code."""
     texts: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(each):

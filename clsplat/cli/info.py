@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat info`: what a model file holds."""
+"""`clsplat info`: description of a model file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from clsplat.cli.session import Services
 
 
 @dataclass(frozen=True)
-class Info(Verb):
-    """Say what a model file holds: format, count, SH, bounds, scales, opacities, colour space, what is not finite."""
+class InfoVerb(Verb):
+    """Describe a model file: format, count, SH, bounds, scales, opacities, colour space and values that are not
+    finite."""
 
     model: RunOrModel
     """A run's folder or a model file of any format."""
@@ -20,8 +21,8 @@ class Info(Verb):
     """Print the result as JSON."""
 
 
-def run(verb: Info, _: Services) -> int:
-    """Print it."""
+def run(verb: InfoVerb, _: Services) -> int:
+    """Print the description."""
     from clsplat.models.info import model_info, text
     from clsplat.runs.run import model_file
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: from the arguments to the exit status.
+"""The command line: from arguments to exit status.
 
-Exit status: 0 done, 1 the work failed, 2 the call or its input is wrong, 130 interrupted, 128 and the signal's number
-where another one did that (docs/interruptions.md). Trouble is one line on standard error; CLSPLAT_DEBUG=1 shows the
-traceback as well. With --json an error is an object on standard output too: its message as "error", and the "status".
+Exit status: 0 success, 1 the work failed, 2 wrong call or input, 130 interrupted.
+Another signal gives 128 plus its number (docs/interruptions.md).
+Errors are one line on standard error; CLSPLAT_DEBUG=1 adds the traceback.
+With --json an error is also an object on standard output: its message as "error", and the "status".
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from clsplat.cli.parsing import as_json, parse, report, tell, verb_module
 from clsplat.cli.session import Services
 from clsplat.errors import ClsplatError, InputError, switched_on, system_trouble
 from clsplat.process import reader_has_gone, status_of, terminable
+from clsplat.version import package_version
 
 
 def main(arguments: Sequence[str] | None = None, services: Services | None = None) -> int:
-    """Run one command line, `sys.argv` if none is given; returns the exit status."""
+    """Run one command line, `sys.argv` if none is given. Returns the exit status."""
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())
-        sys.stdout.flush()  # at the interpreter's end a reader that has gone would be a traceback
+        sys.stdout.flush()  # now: at interpreter exit a closed pipe would print a traceback
     except OSError as error:
-        if not reader_has_gone(error):  # a file that standard output goes to cannot be written
+        if not reader_has_gone(error):  # standard output goes to a file that cannot be written
             tell(f"clsplat: error: standard output: {system_trouble(error)}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -48,13 +50,11 @@ def _run(arguments: list[str], services: Services) -> int:
         warnings.filterwarnings("always", category=UserWarning, module=r"clsplat\b|__main__")
         try:
             if arguments == ["--version"]:
-                import clsplat
-
-                print(f"clsplat {clsplat.__version__}")
+                print(f"clsplat {package_version()}")
                 return 0
             with terminable():
                 verb = parse(arguments)
-                return int(verb_module(type(verb).__name__.lower()).run(verb, services))
+                return int(verb_module(type(verb).__name__.removesuffix("Verb").lower()).run(verb, services))
         except SystemExit as error:  # --help, or a wrong call that has been reported
             return error.code if isinstance(error.code, int) else 1
         except KeyboardInterrupt as error:
@@ -83,7 +83,7 @@ def _run(arguments: list[str], services: Services) -> int:
 
 
 def one_line(error: BaseException) -> str:
-    """The error's message without line breaks."""
+    """The error's message on one line."""
     if isinstance(error, OSError) and not isinstance(error, ClsplatError):
         return system_trouble(error)
     if isinstance(error, MemoryError) and not isinstance(error, ClsplatError):
@@ -92,5 +92,5 @@ def one_line(error: BaseException) -> str:
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    """Print a warning in one line, in place of `warnings.showwarning`, which would print the line of code as well."""
+    """Print a warning on one line. Replaces `warnings.showwarning`, which prints the source line as well."""
     print(f"clsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several verbs have in common, and the base of every verb's arguments."""
+"""Options shared by several verbs, and the base class of every verb's arguments."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from clsplat.cli.flags import Groups
 from clsplat.config.checks import device_names, parse_bytes
-from clsplat.config.verbs import HOST, PORT
+from clsplat.config.cli_defaults import VIEWER_HOST, VIEWER_PORT
 
 if TYPE_CHECKING:
     from clsplat.cli.session import Services
@@ -29,13 +29,15 @@ Settings = TypeVar("Settings")
 
 
 class Verb:
-    """Arguments of a verb. Its module in `clsplat.cli` has the verb's name, and a function `run` that does it. groups:
-    of its help, where its flags are too many for one list."""
+    """Arguments of a verb (subcommand). Its module in `clsplat.cli` has the verb's name and a function `run`.
+
+    groups: of its help, if it has too many flags for one list.
+    """
 
     groups: ClassVar[Groups] = ()
 
     def completed(self, given: Collection[str]) -> Verb:
-        """The arguments with the settings of a run or a bundle where no flag is `given`. Raises InputError."""
+        """Fill in the settings of a run or a bundle for flags that are not in `given`. Raises InputError."""
         del given
         return self
 
@@ -45,51 +47,51 @@ class DeviceChoice:
     """The device to work on."""
 
     selector: Annotated[str | None, arg(name="device", metavar="DEVICE")] = None
-    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them.
-    If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
+    """OpenCL device: an index, cpu, gpu, or part of a name, as listed by `clsplat devices`. If not given:
+    CLSPLAT_DEVICE, else the first GPU, else the first device."""
 
     def open(self, services: Services) -> Device:
-        """The device, not yet tested. Raises DeviceError."""
+        """Open the device, without the self-test. Raises DeviceError."""
         return services.open_device(self.selector)
 
     def trusted(self, services: Services, *stages: Sequence[str]) -> Device:
-        """The device after the short self-test. Raises InputError, DeviceError and DriverError."""
+        """Open the device and run the short self-test. Raises InputError, DeviceError and DriverError."""
         return services.require(self.open(services), *stages)
 
 
 @dataclass(frozen=True)
 class DeviceOptions(DeviceChoice):
-    """The device to work on, and how much of its memory to use."""
+    """The device to work on, and its memory limit."""
 
     max_device_mem: Memory = None
-    """Most device memory to use, such as 256MiB or 2G. What needs more is done in pieces: slower, with the same result.
-    If not given: all that the device has."""
+    """Limit of device memory, such as 256MiB or 2G. Work that needs more is done in pieces: slower, with the same
+    result. If not given: all of the device's memory."""
 
     def open(self, services: Services) -> Device:
-        """The device with its memory limit, not yet tested. Raises InputError and DeviceError."""
+        """Open the device with its memory limit, without the self-test. Raises InputError and DeviceError."""
         return services.open_device(self.selector, parse_bytes(self.max_device_mem))
 
     def check(self) -> None:
-        """Raise InputError for a limit that is no size, before anything is read."""
+        """Raise InputError for a malformed memory limit, before anything is read."""
         parse_bytes(self.max_device_mem)
 
 
 @dataclass(frozen=True)
 class SeveralDevices(DeviceOptions):
-    """The devices to work on, and how much of the memory of each to use."""
+    """The devices to work on, and the memory limit of each."""
 
     selector: Annotated[str | None, arg(name="device", metavar="DEVICE,...")] = None
-    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them; several, with commas,
-    have a view of each step (see --batch), and 0/0,0/1 are the halves of device 0, where its driver divides it.
+    """OpenCL device: an index, cpu, gpu, or part of a name, as listed by `clsplat devices`. Several, separated by
+    commas, each take one view of a step (see --batch). 0/0,0/1 are the halves of device 0, if its driver can divide it.
     If not given: CLSPLAT_DEVICE, else the first GPU, else the first device."""
 
     @property
     def count(self) -> int:
-        """Number of devices that are named."""
+        """Number of devices named."""
         return len(device_names(self.selector))
 
     def open_all(self, services: Services) -> list[Device]:
-        """The devices with their memory limits, not yet tested. Raises InputError and DeviceError."""
+        """Open the devices with their memory limits, without the self-test. Raises InputError and DeviceError."""
         if self.count == 1:
             return [self.open(services)]
         return services.open_devices(self.selector, parse_bytes(self.max_device_mem))
@@ -97,18 +99,18 @@ class SeveralDevices(DeviceOptions):
 
 @dataclass(frozen=True)
 class PageOptions:
-    """Address of a page for the browser."""
+    """Address of the viewer's page."""
 
-    host: Annotated[str, arg(metavar="ADDRESS")] = HOST
-    """Address that the page is served at: this machine alone, unless another is given."""
-    port: int = PORT
-    """Port of the page; 0 is any that is free."""
+    host: Annotated[str, arg(metavar="ADDRESS")] = VIEWER_HOST
+    """Address at which the page is served. By default only this machine can reach it."""
+    port: int = VIEWER_PORT
+    """Port of the page; 0 takes any free port."""
     paths: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder in which the page may save camera paths; they can be downloaded without it."""
+    """Folder in which the page may save camera paths. Without it they can still be downloaded."""
 
 
 def with_given(settings: Settings, parsed: Settings, given: Collection[str], prefix: str = "") -> Settings:
-    """The settings of a run or a bundle, and of the command line those whose flags are `given`."""
+    """The settings of a run or a bundle, with the command line's values for the flags in `given`."""
     changes: dict[str, Any] = {}
     for field in fields(settings):  # type: ignore[arg-type]
         value, flag = getattr(settings, field.name), prefix + field.name

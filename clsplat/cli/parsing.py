@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line's verbs, and the parsing of their arguments by tyro."""
+"""Verbs of the command line, and parsing of their arguments by tyro."""
 
 from __future__ import annotations
 
@@ -21,54 +21,60 @@ from tyro.conf import subcommand
 from clsplat.cli.flags import grouped_help, near, unknown_flags
 from clsplat.cli.options import Verb
 
-DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
+PROGRAM_DESCRIPTION = "3D Gaussian Splatting on any OpenCL device: photos in, scene out."
 VERBS = {
     "devices": "List the OpenCL devices.",
-    "doctor": "Say what is installed and what is missing: packages, OpenCL drivers, devices, GPUs without a "
-    "driver; and what to install for them on this system.",
+    "doctor": "List installed and missing packages, OpenCL drivers, devices and GPUs without a driver, with "
+    "installation advice for this system.",
     "demo": "Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable.",
     "sfm": "Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images.",
     "train": "Train a scene.",
-    "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS where the extra is installed.",
+    "eval": "Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.",
     "render": "Render a model from the cameras of a file or along a path made from them, an image for each frame.",
     "stmaps": "Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.",
-    "thumbnail": "Draw one picture of a model: of a run from among its photographs, of a file of all of it, or of "
-    "what a scene has most detail of.",
+    "thumbnail": "Draw one picture of a model: for a run, seen from among its photographs; for a file, of the whole "
+    "object or of a scene's most detailed part.",
     "view": "Look at a model in the browser: the device renders, the page shows it.",
-    "report": "Write a run's report: one HTML file with curves, pictures, figures and settings, that "
-    "loads nothing else.",
-    "compare": "Print runs side by side: scores, Gaussians, times, and the settings that differ.",
-    "convert": "Write a model in another format, by the files' endings, and say what was lost; or edit it on the way.",
-    "info": "Say what a model file holds: format, count, SH, bounds, scales, opacities, colour space, "
-    "what is not finite.",
+    "report": "Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.",
+    "compare": "Compare runs in a table: scores, Gaussians, times, and the settings that differ.",
+    "convert": "Convert a model to the format of the output file's ending, with optional edits, and report the loss.",
+    "info": "Describe a model file: format, count, SH, bounds, scales, opacities, colour space and values that are "
+    "not finite.",
     "bench": "Measure each stage of a frame and of a training step, and the device's own limits in the same run.",
-    "tune": "Find the quickest shape of the kernels for a device by a short trial, and keep it for later runs.",
+    "tune": "Find a device's quickest kernel shape by a short trial, and save it for later runs.",
     "selftest": "Test every device: build the kernels, run each stage on frozen scenes, compare with "
     "float64 and stored digests.",
 }
-"""The verbs in the order of --help, with the first sentence of each one's help. Each is a module of `clsplat.cli`, with
-a class of its name and a function `run`. A module is imported when its verb is called."""
+"""Verbs in the order of --help, with the first sentence of each one's help.
+
+Each is a module of `clsplat.cli`, with a class NAMEVerb and a function `run`.
+A module is imported when its verb is called.
+"""
+_VERB_MODULES = {"render": "render.verb"}
+"""Modules of the verbs that have a folder."""
 
 
 def verb_module(name: str) -> Any:
-    """The module of a verb: its arguments and its function."""
-    return import_module(f"clsplat.cli.{name}")
+    """The module of a verb, with its arguments and its function."""
+    return import_module(f"clsplat.cli.{_VERB_MODULES.get(name, name)}")
 
 
 def verb_class(name: str) -> type[Verb]:
-    """The arguments of a verb."""
-    kind: type[Verb] = getattr(verb_module(name), name.capitalize())
+    """The dataclass of a verb's arguments."""
+    kind: type[Verb] = getattr(verb_module(name), f"{name.capitalize()}Verb")
     return kind
 
 
 def _listed(name: str) -> type:
-    """A verb that is not called: its line in the list of verbs, without arguments."""
+    """Placeholder without arguments for a verb that is only listed."""
     return make_dataclass(name.capitalize(), (), namespace={"__doc__": VERBS[name]})
 
 
 def parse(arguments: Sequence[str]) -> Verb:
-    """The verb that the command line asks for. Raises InputError, and SystemExit with the trouble reported in one line,
-    or after the help has been printed."""
+    """Parse a command line to its verb.
+
+    Raises InputError. Raises SystemExit after reporting an error in one line, or after printing the help.
+    """
     kinds = {name: verb_class(name) if name in arguments else _listed(name) for name in VERBS}
     commands: Any = Union[tuple(Annotated[kind, subcommand(name)] for name, kind in kinds.items())]  # noqa: UP007
     boxes = io.StringIO()
@@ -79,7 +85,7 @@ def parse(arguments: Sequence[str]) -> Verb:
         raise SystemExit(0)
     try:
         with _text_rules(), contextlib.redirect_stderr(boxes), contextlib.nullcontext() if helping else _wide():
-            verb: Verb = tyro.cli(commands, args=list(arguments), prog="clsplat", description=DESCRIPTION)
+            verb: Verb = tyro.cli(commands, args=list(arguments), prog="clsplat", description=PROGRAM_DESCRIPTION)
     except SystemExit as error:
         if error.code == 2:
             report(_trouble(arguments, called, _unboxed(boxes.getvalue())), 2, arguments)
@@ -90,13 +96,15 @@ def parse(arguments: Sequence[str]) -> Verb:
     return verb.completed({*flags, *(re.sub(r"(^|\.)no_", r"\1", flag) for flag in flags)})
 
 
-_UNION = re.compile(r"no type matching \{None\}\|.* could be instantiated from .*\. Got errors: .*- <class '\w+'>: ")
-"""Begins what tyro says of a number that may be left out, before what is wrong with it."""
+_TYRO_UNION_ERROR = re.compile(
+    r"no type matching \{None\}\|.* could be instantiated from .*\. Got errors: .*- <class '\w+'>: "
+)
+"""Start of tyro's message on an optional number, before the actual error."""
 
 
 def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> str:
-    """The trouble with a call: flags and verbs that are not there, with near names, else what tyro has `said`."""
-    said = _UNION.sub("", said)
+    """Message on a wrong call: unknown flags or verbs with suggestions, else tyro's message `said`."""
+    said = _TYRO_UNION_ERROR.sub("", said)
     if called is not None:
         return unknown_flags(arguments[1:], called, f"clsplat {arguments[0]}") or said
     word = next((word for word in arguments if not word.startswith("-")), "")
@@ -107,8 +115,11 @@ def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> 
 
 
 def _text_rules() -> tyro.constructors.ConstructorRegistry:
-    """Rules for flags of one word: lists of steps are written 500,1000,2000, where tyro expects spaces. An empty path,
-    as a shell makes it of a variable that is not set, is refused: it is not the working directory."""
+    """Parsing rules for flags of one word.
+
+    Lists of steps are written 500,1000,2000, where tyro expects spaces.
+    An empty path, as from an unset shell variable, is refused: it does not mean the working directory.
+    """
     registry = tyro.constructors.ConstructorRegistry()
 
     @registry.primitive_rule
@@ -149,7 +160,7 @@ def _steps(text: str) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def _wide() -> Iterator[None]:
-    """Make the terminal look wide: a report that becomes one line must not be wrapped first."""
+    """Make the terminal look wide, so that a message that becomes one line is not wrapped first."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "10000"
     try:
@@ -161,9 +172,10 @@ def _wide() -> Iterator[None]:
 
 
 def _unboxed(report: str) -> str:
-    """The message of one of tyro's boxes as one line, without the frame and the advice below."""
+    """Message in one of tyro's boxes, on one line, without the frame and the advice below."""
     words: list[str] = []
-    titled = "╭" in report  # else, where standard output is not UTF-8, the first rule is below the title
+    # without box characters, where standard output is not UTF-8, the first rule is below the title
+    titled = "╭" in report
     for line in report.splitlines():
         text = line.strip("│ ").strip()
         if text.startswith("╭") or not text:
@@ -179,20 +191,20 @@ def _unboxed(report: str) -> str:
 
 
 def report(message: str, status: int, arguments: Sequence[str]) -> None:
-    """Tell of an error; where the command line asks for JSON, as an object on standard output too."""
+    """Print an error, also as an object on standard output if the command line asks for JSON."""
     tell(f"clsplat: error: {message}")
     if "--json" in arguments:
         print(as_json(message, status), flush=True)
 
 
 def as_json(message: str, status: int) -> str:
-    """An error, for a program that asked for JSON."""
+    """An error as JSON."""
     return json.dumps({"error": message, "status": status})
 
 
 def tell(line: str) -> None:
-    """Print on standard error if that is possible; the exit status says the same."""
+    """Print on standard error if possible. The exit status carries the same information."""
     try:
         print(line, file=sys.stderr, flush=True)
-    except OSError:  # text left in the stream would make the interpreter end with a status of its own
+    except OSError:  # text left in the stream would change the interpreter's exit status
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat report`: the page of a run."""
+"""`clsplat report`: report page of a run."""
 
 from __future__ import annotations
 
@@ -18,26 +18,25 @@ from clsplat.errors import InputError, warn
 
 
 @dataclass(frozen=True)
-class Report(Verb):
-    """Write a run's report: one HTML file with curves, pictures, figures and settings, that loads nothing else.
+class ReportVerb(Verb):
+    """Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.
 
-    docs/report.md says what is in it. A run that is not finished has a report too.
+    docs/report.md describes its content. A run that is not finished has a report too.
     """
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """A run's folder."""
     output: OutputFile = None
-    """The file; report.html in the run's folder if not given."""
+    """Output file; report.html in the run's folder if not given."""
     overwrite: Flag = False
-    """Replace the file of --output that is there."""
+    """Replace an existing file of --output."""
     views: int = 8
-    """Number of held-out views that are shown with pictures, at most: the worst, the best and some between. The table
-    has all views."""
+    """Largest number of held-out views with pictures: the worst, the best and some between. The table has all views."""
     json: Flag = False
     """Print the figures as JSON."""
 
 
-def run(verb: Report, _: Services) -> int:
+def run(verb: ReportVerb, _: Services) -> int:
     """Write the page."""
     from clsplat.report import check_page
     from clsplat.report.page import write_report

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat selftest`: its table, its sentences and its exit status."""
+"""`clsplat selftest`: table, messages and exit status."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import arg
 
-import clsplat
 from clsplat.cli.options import Flag, Verb
 from clsplat.cli.session import Services, chosen_devices
-from clsplat.files import atomic_write, check_new
+from clsplat.files.atomic import atomic_write, check_new
 from clsplat.progress import aligned
+from clsplat.version import package_version
 
 if TYPE_CHECKING:
     from clsplat.device.context import DeviceInfo
+    from clsplat.selftest.driver_check import DriverReport
     from clsplat.selftest.result import Result
-    from clsplat.selftest.trust import Report
 
-HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms", "worst in")
+SELFTEST_TABLE_HEADER = ("stage", "worst error", "ulp", "allowed", "bits", "ms", "worst in")
 
 
 @dataclass(frozen=True)
-class Selftest(Verb):
+class SelftestVerb(Verb):
     """Test every device: build the kernels, run each stage on frozen scenes, compare with float64 and stored digests.
 
-    Exit status 1 where a driver cannot be trusted. train, eval, render, view, bench, demo and, where it renders,
-    convert make a short form of this test the first time they meet a device; CLSPLAT_TRUST_DRIVER=1 leaves that out. A
-    shape of the kernels in which a driver failed is tried anew here.
+    The exit status is 1 if a driver cannot be trusted. train, eval, render, view, bench, demo and convert with
+    rendering run a short form of this test the first time they use a device; CLSPLAT_TRUST_DRIVER=1 skips it. Kernel
+    shapes in which a driver failed are tried again here.
     """
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = "all"
-    """all, or one of them: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them."""
+    """all, or one device: an index, cpu, gpu, or part of a name, as listed by `clsplat devices`."""
     json: Flag = False
     """Print the result as JSON."""
     report: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """Write the result to a file as well, with what else a report of a bug needs: system, packages, limits of each
-    device, digests, and the shapes and kernels in which drivers have failed."""
+    """Write the result to a file for a bug report. It adds system, packages, limits of each device, digests, and the
+    shapes and kernels in which drivers failed."""
     overwrite: Flag = False
-    """Replace the file if it is there."""
+    """Replace an existing file."""
 
 
-def run(verb: Selftest, _: Services) -> int:
-    """Test the devices one after the other; 1 if one of them cannot be trusted."""
-    from clsplat.selftest.trust import examine_device
+def run(verb: SelftestVerb, _: Services) -> int:
+    """Test the devices one after the other. Returns 1 if one of them cannot be trusted."""
+    from clsplat.selftest.driver_check import examine_device
 
     if verb.report is not None:
         check_new(verb.report, overwrite=verb.overwrite)
     devices = chosen_devices(None if verb.device == "all" else verb.device)
-    reports: list[Report] = []
+    reports: list[DriverReport] = []
     for info in devices:
         if not verb.json:
             print(f"{'' if not reports else chr(10)}{info.index}: {name_of(info)}, {info.shape}", flush=True)
@@ -79,11 +79,11 @@ def run(verb: Selftest, _: Services) -> int:
 
 
 def name_of(info: DeviceInfo) -> str:
-    """Device and driver."""
+    """Name of device and driver."""
     return f"{info.name}, {info.version.split('  ')[0].strip()}"
 
 
-def record(info: DeviceInfo, report: Report) -> dict[str, object]:
+def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
     """Entry of a device for --json."""
     stages = [{**asdict(result), "passed": result.passed} for result in report.results]
     return {
@@ -98,19 +98,19 @@ def record(info: DeviceInfo, report: Report) -> dict[str, object]:
 
 
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
-    """The results with what is known of the installation."""
+    """Content of a bug report: the results and facts on the installation."""
     from clsplat.cli.doctor import lines
     from clsplat.device.context import all_devices, limits
-    from clsplat.device.shapes import failures
+    from clsplat.device.drivers.shapes import failures
 
     for entry, device in zip(records, (all_devices()[int(str(entry["index"]))] for entry in records), strict=True):
         entry |= {"limits": limits(device), "refused": failures(device)}
-    return {"clsplat": clsplat.__version__, "installation": [asdict(line) for line in lines()], "devices": records}
+    return {"clsplat": package_version(), "installation": [asdict(line) for line in lines()], "devices": records}
 
 
-def table(report: Report) -> str:
-    """Every stage with its worst error, or that it was not run."""
-    rows: list[tuple[str, ...]] = [HEADER]
+def table(report: DriverReport) -> str:
+    """Table of every stage with its worst error, or a note that it was not run."""
+    rows: list[tuple[str, ...]] = [SELFTEST_TABLE_HEADER]
     if report.build_seconds is not None:
         rows.append(("build", "", "", "", "", f"{1e3 * report.build_seconds:.0f}", ""))
     rows += [_row(result) for result in report.results]

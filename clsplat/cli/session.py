@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surroundings of a verb: the services it calls, the scene, the devices."""
+"""Environment of a verb: services, scene and devices."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from clsplat.device.context import Device, DeviceInfo
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
-    from clsplat.scenes.findings import Finding
+    from clsplat.scenes.analysis.photo_findings import Finding
     from clsplat.scenes.scene import Scene
 
 
 def imported(name: str) -> Callable[..., Any]:
-    """The function of this dotted name, imported when it is called: --help must be quick."""
+    """Function that imports its target by dotted name when called, because --help must be quick."""
     module, _, member = name.rpartition(".")
 
     def call(*arguments: Any, **named: Any) -> Any:
@@ -35,14 +35,14 @@ def imported(name: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Services:
-    """The functions of the package that compute for the verbs. Tests hand in others."""
+    """Functions of the package that do the verbs' work. Tests pass replacements."""
 
     load_scene: Callable[..., Scene] = imported("clsplat.scenes.loading.load_scene")
-    findings: Callable[..., list[Finding]] = imported("clsplat.scenes.findings.findings")
+    findings: Callable[..., list[Finding]] = imported("clsplat.scenes.analysis.photo_findings.findings")
     open_device: Callable[..., Device] = imported("clsplat.device.context.open_device")
     open_devices: Callable[..., list[Device]] = imported("clsplat.device.context.open_devices")
-    require: Callable[..., Device] = imported("clsplat.selftest.trust.require")
-    reconstruct: Callable[..., Path] = imported("clsplat.scenes.sfm.reconstruct")
+    require: Callable[..., Device] = imported("clsplat.selftest.driver_check.require")
+    reconstruct: Callable[..., Path] = imported("clsplat.scenes.sfm.reconstruct.reconstruct")
     train: Callable[..., Gaussians] = imported("clsplat.api.train")
     renderer: Callable[..., Renderer] = imported("clsplat.rendering.renderer.Renderer")
     open_frame_renderer: Callable[..., Any] = imported("clsplat.sequence.frame_renderer.open_frame_renderer")
@@ -58,18 +58,25 @@ def load_scene(
     lenses: Lenses = "undistort",
     missing: Missing = "few",
 ) -> Scene:
-    """The scene, with its warnings printed."""
-    how = {"resolution": resolution, "test_every": test_every, "masks": masks, "lenses": lenses, "missing": missing}
-    scene = services.load_scene(path, **how, progress=StageProgress())
+    """Load the scene and print its warnings."""
+    scene = services.load_scene(
+        path,
+        resolution=resolution,
+        test_every=test_every,
+        masks=masks,
+        lenses=lenses,
+        missing=missing,
+        progress=StageProgress(),
+    )
     for text in scene.warnings:
         warn(text)
     return scene
 
 
 def chosen_devices(selector: str | None) -> list[DeviceInfo]:
-    """The device that `selector` names, or all devices. Raises DeviceError where there is none."""
+    """The device that `selector` names, or all devices. Raises DeviceError if there is none."""
     from clsplat.device.context import find_device, list_devices
-    from clsplat.device.quirks import no_device
+    from clsplat.device.drivers.quirks import no_device
 
     devices = list_devices() if selector is None else [find_device(selector)]
     if not devices:

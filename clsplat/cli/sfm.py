@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat sfm`: photos to a COLMAP scene."""
+"""`clsplat sfm`: reconstruction of a COLMAP scene from photos."""
 
 from __future__ import annotations
 
@@ -18,53 +18,59 @@ from clsplat.progress import StageProgress
 
 
 @dataclass(frozen=True)
-class Sfm(Verb):
+class SfmVerb(Verb):
     """Turn a folder of photos into a scene: COLMAP's cameras and points, and the undistorted images."""
 
     photos: Annotated[Positional[Path], arg(metavar="PHOTOS")]
-    """Folder with the photos; sub-folders are searched too."""
+    """Folder with the photos, searched with its sub-folders."""
     output: Output
     """Folder for the scene."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match every pair of photos, or only neighbours by name, for video frames; auto: every pair up to 100 photos."""
+    """Match every pair of photos, or only neighbours by name, for video frames. auto: every pair up to 100 photos."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
-    """Lens model to fit, by COLMAP's name; the scene's images are undistorted with it.
-    auto is OPENCV for a camera with 20 photos or more, else SIMPLE_RADIAL."""
+    """Lens model to fit, by COLMAP's name. The scene's images are undistorted with it. auto is OPENCV for a camera
+    with 20 photos or more, else SIMPLE_RADIAL."""
     threads: OptionalInt = None
-    """Number of CPU threads; if not given, one for each core."""
+    """Number of CPU threads. If not given: one for each core."""
     seed: int = 0
-    """Seed of what is random in matching and reconstruction. The same seed gives the same cameras, for up to 80
-    photos."""
+    """Random seed of matching and reconstruction. The same seed gives the same cameras, for up to 80 photos."""
     masks: Flag = False
-    """Look for no features under the masks beside the photos (masks/IMAGE.jpg.png and the like), where they are black,
-    and put the masks, undistorted, beside the scene's images."""
+    """Detect no features in the black areas of the photos' masks (masks/IMAGE.jpg.png and the like). The undistorted
+    masks are written to the scene."""
     invert_masks: Flag = False
-    """Take the masks' black parts for those that count, and their white ones for those that do not."""
+    """Invert the masks: use their black areas, and ignore the white ones."""
     alpha: Flag = False
-    """Look for no features where the photos are transparent, and put that as masks beside the scene's images."""
+    """Detect no features where the photos are transparent, and write these areas as masks to the scene."""
     overwrite: Flag = False
-    """Replace a scene in the output folder that was made of other photos or with other settings."""
+    """Replace an existing scene in the output folder that was made from other photos or with other settings."""
     json: Flag = False
-    """Print what was recovered as JSON, as in the scene's sfm.json."""
+    """Print the result as JSON, as in the scene's sfm.json."""
 
 
-def run(verb: Sfm, services: Services) -> int:
+def run(verb: SfmVerb, services: Services) -> int:
     """Recover the cameras."""
     if not verb.photos.is_dir():
         raise InputError(f"{verb.photos}: no such folder, expected one with photos")
     if verb.threads is not None and verb.threads < 1:
         raise InputError(f"--threads {verb.threads}: expected at least 1")
-    names = ("matching", "camera_model", "threads", "seed", "overwrite")
-    settings = {name: getattr(verb, name) for name in names}
     if verb.invert_masks and not verb.masks:
         raise InputError("--invert-masks: no masks are used, expected --masks too")
+    from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings
+
+    masks = None
     if verb.masks or verb.alpha:
         of_masks: MaskMeaning = "ignore" if verb.masks else "none"
-        settings["masks"] = MaskUse(of_masks, "ignore" if verb.alpha else "blend", verb.invert_masks)
-    services.reconstruct(verb.photos, verb.output, **settings, progress=StageProgress())
+        masks = MaskUse(of_masks, "ignore" if verb.alpha else "blend", verb.invert_masks)
+    services.reconstruct(
+        verb.photos,
+        verb.output,
+        SfmSettings(matching=verb.matching, camera_model=verb.camera_model, seed=verb.seed),
+        threads=verb.threads,
+        overwrite=verb.overwrite,
+        masks=masks,
+        progress=StageProgress(),
+    )
     if verb.json:
-        from clsplat.scenes.sfm import RECORD
-
-        print((verb.output / RECORD).read_text("utf-8").rstrip())
+        print((verb.output / SFM_RECORD_FILE).read_text("utf-8").rstrip())
     print(f"scene in {verb.output}; next: clsplat train {verb.output} -o RUN", file=sys.stderr)
     return 0

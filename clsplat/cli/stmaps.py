@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat stmaps`: the lenses of photographs as STMaps, for compositors."""
+"""`clsplat stmaps`: lenses of photographs as STMaps, for compositing."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ from clsplat.errors import InputError, examples, reason_of
 
 
 @dataclass(frozen=True)
-class Stmaps(Verb):
+class StmapsVerb(Verb):
     """Write the lenses of a scene's photographs as STMaps, to distort a render and to undistort a photograph.
 
-    NAME.distort.exr makes the photograph's distortion of an undistorted picture, such as `clsplat render --cameras
-    SCENE` renders; NAME.undistort.exr takes it out of the photograph.
+    NAME.distort.exr adds the photograph's distortion to an undistorted picture, such as a frame of `clsplat render
+    --cameras SCENE`. NAME.undistort.exr removes it from the photograph.
     """
 
     scene: Annotated[Positional[Path], arg(metavar="SCENE")]
-    """A COLMAP model's folder, a scene's that holds one, or a transforms.json."""
+    """Folder of a COLMAP model or of a scene that contains one, or a transforms.json."""
     output: Annotated[Path, arg(aliases=("-o",), metavar="FOLDER")]
-    """Folder of the maps; it is made. Each lens has a pair: lens-1.distort.exr, lens-1.undistort.exr and so on."""
+    """Folder for the maps, created if missing. Each lens has a pair: lens-1.distort.exr, lens-1.undistort.exr and so
+    on."""
     json: Flag = False
-    """Print the lenses as JSON: name, model, size, size undistorted, files, pictures."""
+    """Print the lenses as JSON: name, model, size, undistorted size, files, pictures."""
 
 
-def run(verb: Stmaps, _: Services) -> int:
-    """A pair of maps for each lens that bends."""
+def run(verb: StmapsVerb, _: Services) -> int:
+    """Write a pair of maps for each lens with distortion."""
     import numpy as np
 
     from clsplat.frame.lens import distorted_places, undistorted_places

@@ -5,24 +5,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from tyro.conf import arg
 
-from clsplat.cli import render
 from clsplat.cli.options import Flag, RunOrModel, Verb
+from clsplat.cli.render import verb as render
 from clsplat.cli.session import Services
 from clsplat.config.pictures import ColourConfig
 from clsplat.errors import InputError
 
-SMALLEST, LARGEST = 16, 8192
-"""Sides in pixels."""
+MIN_THUMBNAIL_SIDE_PX, MAX_THUMBNAIL_SIDE_PX = 16, 8192
+"""Limits of the side in pixels."""
 
 
 @dataclass(frozen=True)
-class Thumbnail(Verb):
-    """Draw one picture of a model: of a run from among its photographs, of a file of all of it, or of what a scene has
-    most detail of.
+class ThumbnailVerb(Verb):
+    """Draw one picture of a model: for a run, seen from among its photographs; for a file, of the whole object or of a
+    scene's most detailed part.
 
     It is the first frame of `clsplat render MODEL --path turntable`.
     """
@@ -30,37 +30,47 @@ class Thumbnail(Verb):
     model: RunOrModel
     """A run's folder or a model file."""
     output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
-    """The picture: PNG, JPEG, TIFF or EXR; the model's name with .png behind it, in this folder, if not given."""
+    """Output picture: PNG, JPEG, TIFF or EXR. If not given: the model's name plus .png, in the working directory."""
     size: int = 512
     """Width and height in pixels."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
-    """Direction that is up: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. With it a run
-    is drawn from outside too. Write --up=-z if it begins with a minus."""
+    """Up direction: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. With it a run is drawn
+    from outside too. Write --up=-z if it begins with a minus."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
-    """Colour behind the Gaussians, the numbers from 0 to 1; black if not given."""
+    """Colour behind the Gaussians: black, white or three numbers from 0 to 1; black if not given."""
     alpha: Flag = False
-    """Write alpha, and no background."""
+    """Write alpha, without a background."""
     overwrite: Flag = False
     """Replace a file that clsplat did not make."""
     device: Annotated[str | None, arg(metavar="DEVICE")] = None
-    """OpenCL device: an index, cpu, gpu, or a part of a name, as `clsplat devices` lists them. If not given:
+    """OpenCL device: an index, cpu, gpu, or part of a name, as listed by `clsplat devices`. If not given:
     CLSPLAT_DEVICE, else the first GPU, else the first device."""
 
 
-def run(verb: Thumbnail, services: Services) -> int:
-    """The first frame of a turntable around the model."""
+def run(verb: ThumbnailVerb, services: Services) -> int:
+    """Render the first frame of a turntable around the model."""
     from clsplat.images.frame_files import check_format
-    from clsplat.shots.frame_numbers import FIELD, ODD
+    from clsplat.shots.frame_numbers import FRAME_FIELD_PATTERN, UNKNOWN_FIELD_PATTERN
 
-    if not SMALLEST <= verb.size <= LARGEST:
-        raise InputError(f"--size {verb.size}: expected {SMALLEST} to {LARGEST} pixels")
+    if not MIN_THUMBNAIL_SIDE_PX <= verb.size <= MAX_THUMBNAIL_SIDE_PX:
+        raise InputError(f"--size {verb.size}: expected {MIN_THUMBNAIL_SIDE_PX} to {MAX_THUMBNAIL_SIDE_PX} pixels")
     output = verb.output or Path(f"{verb.model.resolve().name}.png")
     check_format(str(output), ("rgb",))
-    if FIELD.search(str(output)) or ODD.search(output.name):
+    if FRAME_FIELD_PATTERN.search(str(output)) or UNKNOWN_FIELD_PATTERN.search(output.name):
         raise InputError(f"{output}: has a place for frames' numbers, expected the name of one picture, given with -o")
-    same: dict[str, Any] = {name: getattr(verb, name) for name in ("up", "background", "alpha", "overwrite", "device")}
-    if output.suffix.lower() != ".exr":  # a model of linear colours has a picture too
-        same["colour"] = ColourConfig(colorspace="sRGB")
-    same |= {"width": verb.size, "height": verb.size}
-    frame = render.Render(verb.model, str(output), path="turntable", count=1, **same)
+    is_exr = output.suffix.lower() == ".exr"  # for other files, a model with linear colours is converted too
+    frame = render.RenderVerb(
+        verb.model,
+        str(output),
+        path="turntable",
+        up=verb.up,
+        count=1,
+        background=verb.background,
+        alpha=verb.alpha,
+        width=verb.size,
+        height=verb.size,
+        colour=ColourConfig() if is_exr else ColourConfig(colorspace="sRGB"),
+        overwrite=verb.overwrite,
+        device=verb.device,
+    )
     return render.run(frame.completed(frozenset()), services)

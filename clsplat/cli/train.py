@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat train`: a scene to a run."""
+"""`clsplat train`: training of a run on a scene."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection
-from contextlib import ExitStack, nullcontext
+from collections.abc import Callable, Collection, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,19 +20,22 @@ from clsplat.config.masks import NO_MASKS
 from clsplat.config.presets import Preset, Schedule, bundled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
-from clsplat.files import open_input
+from clsplat.files.documents import open_input
 from clsplat.progress import TrainProgress
 
 if TYPE_CHECKING:
+    from clsplat.device.context import Device
     from clsplat.rendering.memory_plan import Plan
+    from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene
+    from clsplat.viewer.training_view import TrainingView
 
 
 @dataclass(frozen=True)
-class Train(Verb):
-    """Train a scene. Ctrl-C, SIGTERM and SIGHUP write a checkpoint first; --resume goes on from the latest.
+class TrainVerb(Verb):
+    """Train a scene. Ctrl-C, SIGTERM and SIGHUP write a checkpoint first; --resume continues from the latest.
 
-    With --resume the settings of the run hold, and a flag that is given changes one.
+    With --resume the run keeps its settings, except for those given as flags.
     """
 
     output: Output
@@ -41,41 +44,42 @@ class Train(Verb):
     scene: Annotated[Positional[Path | None], arg(metavar="SCENE")] = None
     """Folder with the scene: COLMAP, Blender, nerfstudio, instant-ngp, or just photos. Not needed with --resume."""
     resume: Flag = False
-    """Go on with the run in the output folder."""
+    """Continue the run in the output folder."""
     accept_changes: Flag = False
-    """With --resume: go on though the scene is another than the run began with, or a photograph has changed."""
+    """With --resume: continue although the scene or a photograph has changed since the run began."""
     overwrite: Flag = False
-    """Replace the run in the output folder; files that clsplat did not write stay."""
+    """Replace the run in the output folder. Files that clsplat did not write stay."""
     device: Annotated[SeveralDevices, arg(name="")] = field(default_factory=SeveralDevices)
     view: Flag = False
-    """Show the model as it grows on a page in the browser, where training can be paused too (see clsplat view)."""
+    """Show the growing model on a page in the browser, where training can be paused too (see clsplat view)."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     auto: Flag = False
-    """Take the settings that answer what is found in the scene, such as --appearance exposure where the photographs'
-    exposures differ. Settings that are given stay. What is found is said without it too."""
+    """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
+    Settings given as flags stay. The findings are printed even without --auto."""
     json: Flag = False
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
-    """Bundle of settings. exact and default approximate nothing and are the same; fast takes less than half of the
-    time, and lost at most 0.3 dB of PSNR on the scenes it was made on. Flags that are given override it."""
+    """Bundle of settings. exact and default are the same and approximate nothing. fast takes less than half of the
+    time, and lost at most 0.3 dB of PSNR on the scenes it was tuned on. Flags override it."""
     schedule: Schedule | None = None
-    """Bundle of learning rates and of the steps at which things happen: paper, made for 30,000 steps; short, for about
-    7000; high-rates, for about 7000 too, with rates above those of short, which pay where there are fewer than about 60
-    steps a photograph. Flags that are given override it. If not given: paper, but short with --preset fast."""
+    """Bundle of learning rates and of the steps for scheduled actions. paper is made for 30,000 steps, short for
+    about 7000. high-rates is for about 7000 steps too, with higher rates than short. It pays off below about 60 steps
+    a photograph. Flags override it. If not given: paper, but short with --preset fast."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     given: Annotated[frozenset[str], Suppress] = field(default=frozenset(), compare=False)
-    """Names of the settings on the command line."""
+    """Names of the settings given on the command line."""
 
-    def completed(self, given: Collection[str]) -> Train:
-        """The settings are those of the run that is resumed, or of the preset and the schedule, for these devices."""
+    def completed(self, given: Collection[str]) -> TrainVerb:
+        """Take the settings from the resumed run, or from preset and schedule, and adapt them to the number of
+        devices."""
         verb = self._with_settings(given)
-        if "points" in given and verb.config.points:  # a run goes on from any folder
+        if "points" in given and verb.config.points:  # absolute: a run can be resumed from any folder
             verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))
         explicit = self.resume or "batch" in given
         config = verb.config.on_devices(self.device.count, explicit=explicit)
         return replace(verb, config=config, given=frozenset(given))
 
-    def _with_settings(self, given: Collection[str]) -> Train:
+    def _with_settings(self, given: Collection[str]) -> TrainVerb:
         if not self.resume and (self.preset, self.schedule) == ("default", None):
             return self
         if not self.resume:
@@ -91,7 +95,7 @@ class Train(Verb):
 
 
 def _check_used(config: TrainConfig, given: Collection[str]) -> None:
-    """Raise InputError for a flag of something that is not asked for."""
+    """Raise InputError for a flag whose feature is off."""
     for name, used, why, wanted in (
         ("depth_unit", config.depth == "maps", "no depth maps are used", "depth maps"),
         ("depth_weight", config.depth != "none", "no depths are used", "depth"),
@@ -104,8 +108,8 @@ def _check_used(config: TrainConfig, given: Collection[str]) -> None:
             raise InputError(f"--{flag} {getattr(config, name)}: {why}, expected --{wanted} too")
 
 
-def run(verb: Train, services: Services) -> int:
-    """Train. Everything that can be wrong with the call is found before the run's folder is touched."""
+def run(verb: TrainVerb, services: Services) -> int:
+    """Train. Errors in the call are found before the run's folder is changed."""
     from clsplat.runs.locks import locked
     from clsplat.runs.run import check_output, is_run
 
@@ -120,13 +124,15 @@ def run(verb: Train, services: Services) -> int:
         return _train(verb, services, locks)
 
 
-def _train(verb: Train, services: Services, locks: ExitStack) -> int:
-    """Do the work of `run`. locks: takes the lock of a folder that is new."""
+def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
+    """Do the work of `run`.
+
+    locks: receives the lock of a new folder.
+    """
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
-    from clsplat.selftest.result import APPEARANCE, DEPTH, LENSES, MASKS, POSES, TRAINING
-    from clsplat.training.forecast import Forecast
+    from clsplat.training.preparation import check_steps_left
 
     verb.device.check()
     verb.config.check()
@@ -136,7 +142,7 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         from clsplat.cli.view import training_view
 
         page = training_view(verb.page)
-    source = verb.scene
+    source, earlier = verb.scene, None
     if verb.resume:
         earlier = Run.open(verb.output)
         check_resumed(earlier, verb.config)
@@ -147,55 +153,22 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
         raise InputError("--auto and --resume exclude each other: the run has its settings")
     devices = verb.device.open_all(services)
     scene, config = _looked_at(verb, services, source)
-    verb = replace(verb, config=config)
-    if verb.resume and (done := max((step for step, _ in earlier.checkpoints()), default=0)) > verb.config.iterations:
-        raise InputError(
-            f"--iterations {verb.config.iterations}: {verb.output} is at step {done} already, expected more"
-        )
-    if len(scene.points) == 1:  # a Gaussian's size follows from its neighbours, and it has none
+    if earlier is not None:
+        check_steps_left(earlier, config, "--iterations")
+    if len(scene.points) == 1:  # a Gaussian's size follows from its neighbours, and a single one has none
         warn(f"{source}: has a single point, training starts from one Gaussian of next to no size")
-    changed = verb.resume and scene_record.check(
-        earlier, scene, source, verb.config.resolution, accept=verb.accept_changes
+    changed = earlier is not None and scene_record.check(
+        earlier, scene, source, config.resolution, accept=verb.accept_changes
     )
-    stages = (
-        *TRAINING,
-        *(() if config.mask_use == NO_MASKS else MASKS),
-        *APPEARANCE[config.appearance],
-        *(DEPTH if config.depth_use else ()),
-        *(POSES if config.refine_poses else ()),
-        *(LENSES if config.refine_lenses else ()),
-    )
+    stages = _stages(config)
     devices = [services.require(device, stages) for device in devices]
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
-    run = Run.create(verb.output, verb.config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
+    run = Run.create(verb.output, config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     if changed:
         scene_record.write(run, scene)
-    on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
-    print(
-        f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
-        f"{len(scene.points):,} points; on {on} (the first steps may wait for kernels to be built)",
-        file=sys.stderr,
-    )
-    if scene.test_views:
-        tell_of_lpips()
-
-    def print_plan(plan: Plan) -> None:
-        if devices[0].memory.limit is not None or any(plan.pieces):
-            print(f"{plan.need.gaussians:,} Gaussians: {plan}", file=sys.stderr)
-
-    how = {"device": devices, "run": run, "resume": run.resuming, "on_plan": print_plan}
-    try:
-        with (
-            page(scene, run.config) if page else nullcontext() as between,
-            TrainProgress(run.config.iterations, Forecast(run.config)) as progress,
-        ):
-            services.train(scene, run.config, **how, on_step=progress, between=between)
-    except KeyboardInterrupt as error:
-        steps = run.checkpoints()
-        at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
-        error.args = (f"{at}; go on with: clsplat train -o {run.path} --resume",)
-        raise
+    _tell_of(scene, devices)
+    _train_run(services, scene, run, devices, page)
     result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
         print(json.dumps(result, indent=2))
@@ -205,9 +178,81 @@ def _train(verb: Train, services: Services, locks: ExitStack) -> int:
     return 0
 
 
-def _looked_at(verb: Train, services: Services, source: Path) -> tuple[Scene, TrainConfig]:
-    """The scene, checked, and the settings, with --auto those that answer what is found in it. Prints that."""
-    from clsplat.scenes.answers import answered, paragraph
+def _stages(config: TrainConfig) -> tuple[str, ...]:
+    """Stages of the self-test that a training with these settings needs."""
+    from clsplat.selftest.result import (
+        APPEARANCE_STAGES,
+        DEPTH_STAGES,
+        LENS_STAGES,
+        MASK_STAGES,
+        POSE_STAGES,
+        TRAINING_STAGES,
+    )
+
+    return (
+        *TRAINING_STAGES,
+        *(() if config.mask_use == NO_MASKS else MASK_STAGES),
+        *APPEARANCE_STAGES[config.appearance],
+        *(DEPTH_STAGES if config.depth_use else ()),
+        *(POSE_STAGES if config.refine_poses else ()),
+        *(LENS_STAGES if config.refine_lenses else ()),
+    )
+
+
+def _tell_of(scene: Scene, devices: Sequence[Device]) -> None:
+    """Print the sizes of the scene, the devices, and the reason if LPIPS will be missing."""
+    on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
+    print(
+        f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
+        f"{len(scene.points):,} points; on {on} (the first steps may wait for kernels to be built)",
+        file=sys.stderr,
+    )
+    if scene.test_views:
+        tell_of_lpips()
+
+
+def _train_run(
+    services: Services,
+    scene: Scene,
+    run: Run,
+    devices: Sequence[Device],
+    page: Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]] | None,
+) -> None:
+    """Train the run with a progress bar, and with a page if there is one. An interruption says how to go on."""
+    from clsplat.training.forecast import Forecast
+
+    def print_plan(plan: Plan) -> None:
+        if devices[0].memory.limit is not None or any(plan.pieces):
+            print(f"{plan.need.gaussians:,} Gaussians: {plan}", file=sys.stderr)
+
+    try:
+        with (
+            page(scene, run.config) if page else nullcontext() as between,
+            TrainProgress(run.config.iterations, Forecast(run.config)) as progress,
+        ):
+            services.train(
+                scene,
+                run.config,
+                device=devices,
+                run=run,
+                resume=run.resuming,
+                on_plan=print_plan,
+                on_step=progress,
+                between=between,
+            )
+    except KeyboardInterrupt as error:
+        steps = run.checkpoints()
+        at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
+        error.args = (f"{at}; go on with: clsplat train -o {run.path} --resume",)
+        raise
+
+
+def _looked_at(verb: TrainVerb, services: Services, source: Path) -> tuple[Scene, TrainConfig]:
+    """Load and check the scene, and print the findings on it. Returns the scene and its settings.
+
+    With --auto the settings are adapted to the findings.
+    """
+    from clsplat.scenes.analysis.recommendations import answered, paragraph
 
     config = verb.config
     scene = _scene(services, source, config)
@@ -224,39 +269,31 @@ def _looked_at(verb: Train, services: Services, source: Path) -> tuple[Scene, Tr
 
 
 def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
-    """The scene to train on, with the points to start from. Raises InputError for one that would end a training."""
-    if config.points:  # structure from motion may come first, which takes its time
+    """Load the scene to train on, with its start points. Raises InputError if training would fail on it."""
+    from clsplat.training.preparation import prepared
+
+    if config.points:  # check now: structure from motion may run first and take long
         with open_input(Path(config.points), "a cloud of points"):
             pass
     scene = load_scene(
         services, source, config.resolution, config.test_every, config.mask_use, config.lenses, config.missing
     )
-    if config.start_points:
-        from clsplat.scenes.cloud import with_points
-
-        scene = with_points(scene, config.start_points)
-    if config.depth_use:
-        from clsplat.scenes.depth import with_depths
-
-        scene = with_depths(scene, config.depth_use)
+    scene = prepared(scene, config)
     _check_scene(scene)
-    if config.refines:
-        from clsplat.training.cameras import Cameras
-
-        Cameras(config, scene.train_views, scene.extent)
     return scene
 
 
 def _check_scene(scene: Scene) -> None:
-    """Raise InputError for a scene that would end a training later on: no views to train on, a view too small to
-    measure, a picture that is cut."""
-    from clsplat.evaluation.metrics import SSIM_WINDOW
+    """Raise InputError for a scene on which training would fail later.
 
-    scene.require_training_views()
+    These have a view too small to measure, or a truncated picture.
+    """
+    from clsplat.evaluation.metrics import SSIM_WINDOW_PX
+
     for view in scene.test_views:
-        if min(view.camera.width, view.camera.height) < SSIM_WINDOW:
+        if min(view.camera.width, view.camera.height) < SSIM_WINDOW_PX:
             raise InputError(
                 f"{view.path}: is {view.camera.width} x {view.camera.height} at this --resolution, expected at least "
-                f"{SSIM_WINDOW} pixels a side to measure SSIM"
+                f"{SSIM_WINDOW_PX} pixels a side to measure SSIM"
             )
     scene.check_pictures()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat tune`: the quickest shape of the kernels for a device."""
+"""`clsplat tune`: the quickest kernel shape for a device."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from clsplat.cli.session import Services
 
 
 @dataclass(frozen=True)
-class Tune(Verb):
-    """Find the quickest shape of the kernels for a device by a short trial, and keep it for later runs.
+class TuneVerb(Verb):
+    """Find a device's quickest kernel shape by a short trial, and save it for later runs.
 
-    A shape is how many pixels a kernel works on at once, how many work-items share a tile, and whether they share
-    its pixels or its Gaussians for the gradient. A run that is resumed, or repeated for the same bytes, wants the
-    shape that it had. CLSPLAT_SHAPE=LANESxITEMS overrides what is kept.
+    A shape sets how many pixels a kernel works on at once and how many work-items share a tile. It also sets whether
+    they share the tile's pixels or its Gaussians for the gradient. A run that is resumed, or repeated for the same
+    bytes, needs its original shape. CLSPLAT_SHAPE=LANESxITEMS overrides the saved one.
     """
 
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
     forget: Flag = False
-    """Go back to the default shape, without a trial."""
+    """Return to the default shape, without a trial."""
     json: Flag = False
     """Print the result as JSON."""
 
 
-def run(verb: Tune, _: Services) -> int:
-    """Print what each shape of the kernels takes, and keep the quickest."""
+def run(verb: TuneVerb, _: Services) -> int:
+    """Print the time of each kernel shape, and save the quickest."""
     from clsplat.bench.shapes import tune
     from clsplat.device.context import all_devices, find_device
-    from clsplat.device.shapes import default_shape, save_shape, saved_path
+    from clsplat.device.drivers.shapes import default_shape, save_shape, saved_path
 
     info = find_device(verb.device.selector)
     device = all_devices()[info.index]

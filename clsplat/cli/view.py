@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat view`, and the page of `clsplat train --view`: from the command line to a viewer (`clsplat.viewer`)."""
+"""`clsplat view` and the page of `clsplat train --view`: from the command line to a viewer (`clsplat.viewer`)."""
 
 from __future__ import annotations
 
@@ -18,47 +18,47 @@ from clsplat.cli.options import DeviceOptions, PageOptions, RunOrModel, ScenePat
 from clsplat.cli.session import Services
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
-from clsplat.process import endings, handled
+from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, endings, handled
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
     from clsplat.viewer.server import Server
     from clsplat.viewer.training_view import TrainingView
 
-FIRST = (640, 360)
-"""Pixels of the pictures that are made before there is a page, so that kernels are built and the model is in place."""
+WARM_UP_PICTURE_SIZE_PX = (640, 360)
+"""Size in pixels of the pictures rendered before the page opens, to build kernels and load the model."""
 
 
 @dataclass(frozen=True)
-class View(Verb):
+class ViewVerb(Verb):
     """Look at a model in the browser: the device renders, the page shows it. Ctrl-C ends it.
 
-    docs/viewer.md has what the page can do.
+    docs/viewer.md describes the page.
     """
 
     model: RunOrModel
-    """A run's folder or a model file; for a file in a run's folder that run's settings hold."""
+    """A run's folder or a model file. A file in a run's folder has that run's settings."""
     scene: ScenePath = None
-    """Folder with the scene, for its cameras and photos; the one the run was trained on if not given."""
+    """Folder with the scene, for its cameras and photos. If not given: the one that the run was trained on."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians. If not given: the run's setting, else black."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
-    """Give the model exposure and colours of this photograph of its scene, by the run's appearance.json, not its lens's
-    vignette; if not given, those that all have on average."""
+    """Give the model the exposure and colours of this photograph of its scene, from the run's appearance.json, but not
+    its lens's vignette. If not given: the photographs' average."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
 
 
-def run(verb: View, services: Services) -> int:
+def run(verb: ViewVerb, services: Services) -> int:
     """Show a model in the browser until Ctrl-C."""
-    from clsplat.device.child import TrialInterrupted
+    from clsplat.device.drivers.worker_process import TrialInterrupted
     from clsplat.gaussians import Gaussians
     from clsplat.images.alpha import background_colour
     from clsplat.models.edit import exposed
     from clsplat.models.formats import colour_space
     from clsplat.runs.appearance import gains_of
     from clsplat.runs.run import model_file, run_of
-    from clsplat.selftest.result import FORWARD
+    from clsplat.selftest.result import FORWARD_STAGES
     from clsplat.shots.viewpoints import extent_of
     from clsplat.viewer.appearance import Look
     from clsplat.viewer.models import HeldModel
@@ -66,7 +66,6 @@ def run(verb: View, services: Services) -> int:
     from clsplat.viewer.pose import looking, start_of
     from clsplat.viewer.scheduler import Viewing
     from clsplat.viewer.server import Address, Server
-    from clsplat.viewer.training_view import LONGEST_WAIT
 
     address = Address(verb.page.host, verb.page.port, verb.page.paths)
     verb.device.check()
@@ -79,7 +78,7 @@ def run(verb: View, services: Services) -> int:
         raise InputError(f"{file}: has no Gaussians, expected some to look at")
     config = run.config if run else TrainConfig()
     scene = _scene(services, verb.scene or (run.scene if run else None), config, given=verb.scene is not None)
-    device = verb.device.trusted(services, FORWARD)
+    device = verb.device.trusted(services, FORWARD_STAGES)
     background = background_colour(verb.background or config.background)
     model = HeldModel(gaussians, device, config.rasterizer, background, colour_space(file))
     views = scene.views if scene else []
@@ -87,23 +86,25 @@ def run(verb: View, services: Services) -> int:
     box = (low + gaussians.origin, high + gaussians.origin)
     start = start_of([view.camera for view in views], gaussians.means + gaussians.origin)
     world = World(file.name, start, gaussians.origin, box, gaussians.sh_degree, views)
-    for exact in (False, True):  # the first pictures wait for kernels to be built
-        model.picture(looking(start, FIRST).camera(), Look(), exact=exact)
+    for exact in (False, True):  # kernels are built for the first pictures
+        model.picture(looking(start, WARM_UP_PICTURE_SIZE_PX).camera(), Look(), exact=exact)
     viewing = Viewing(model)
     stopped = threading.Event()
     signals = handled((signal.SIGINT, *endings()), lambda *_: stopped.set())
     with signals, closing(Server(viewing, world, address)) as server:
         _print_address(server)
-        with suppress(TrialInterrupted):  # asked to end while a driver hung
+        with suppress(TrialInterrupted):  # interrupted while a driver hung
             while not stopped.is_set():
                 if not viewing.work():
-                    viewing.wait(LONGEST_WAIT)
+                    viewing.wait(MAX_SIGNAL_WAIT_SECONDS)
     return 0
 
 
 def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]]:
-    """The page of a training, which is open as long as the context is. Raises InputError where it cannot be served, at
-    once, before anything is trained or written."""
+    """Function that opens the page of a training as a context manager.
+
+    Raises InputError at once if the page cannot be served, before anything is trained or written.
+    """
     from clsplat.images.alpha import background_colour
     from clsplat.shots.viewpoints import extent_of
     from clsplat.viewer.page import World
@@ -129,12 +130,18 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
 
 
 def _scene(services: Services, path: Path | None, config: TrainConfig, *, given: bool) -> Scene | None:
-    """The scene, for its cameras and photos. Where only the run names it and it is gone: None, with a warning."""
+    """Load the scene, for its cameras and photos. If only the run names it and it is gone: None, with a warning."""
     if path is None:
         return None
     try:
-        how = {"resolution": config.resolution, "test_every": config.test_every, "lenses": config.lenses}
-        return services.load_scene(path, masks=config.mask_use, missing=config.missing, **how)
+        return services.load_scene(
+            path,
+            resolution=config.resolution,
+            test_every=config.test_every,
+            masks=config.mask_use,
+            lenses=config.lenses,
+            missing=config.missing,
+        )
     except (InputError, OSError) as error:
         if given:
             raise

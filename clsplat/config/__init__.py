@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings, each default once, and nothing else."""
+"""Settings, with each default defined once, and the table of channels."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rules for settings, and the message where one is broken; sizes of memory."""
+"""Rules for settings, the error message for a broken rule, and parsing of memory sizes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from clsplat.errors import InputError
 
-MOST = 1 << 62
-"""Below which whole numbers are, so that TOML has room for them."""
-_SIZE = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
+WHOLE_NUMBER_LIMIT = 1 << 62
+"""Exclusive limit of whole numbers, which TOML can hold."""
+_BYTE_SIZE_PATTERN = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([kmgt]?)(i?b)?\s*", re.IGNORECASE)
 Rule = tuple[tuple[str, ...], Callable[[float], bool], str]
-"""Names of settings, whether a value makes sense (which NaN must not), and what is expected."""
+"""Names of settings, a predicate that is True for valid values and False for NaN, and the expectation in words."""
 
 
 def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
@@ -29,8 +29,8 @@ def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
 
 
 def check_kinds(config: object, prefix: str) -> None:
-    """Raise InputError naming the flag of the first setting that is of another kind than its field, which Python lets
-    through, or larger than config.toml can hold."""
+    """Raise InputError naming the flag of the first setting with a wrong type, or too large for config.toml. Python
+    does not check types."""
     for name, kind in get_type_hints(type(config)).items():
         value = getattr(config, name)
         if expected := misfit(kind, value):
@@ -39,14 +39,14 @@ def check_kinds(config: object, prefix: str) -> None:
 
 
 def misfit(kind: Any, value: object) -> str | None:
-    """The values that a field of type `kind` takes, in words; None if `value` is one of them."""
+    """Describe the values that a field of type `kind` takes; None if `value` is valid."""
     if get_origin(kind) is Literal:
         fits, expected = isinstance(value, str) and value in get_args(kind), f"one of {', '.join(get_args(kind))}"
     elif get_origin(kind) is tuple:
         fits = isinstance(value, tuple | list) and all(_is_whole(step) for step in value)
-        expected = f"whole numbers below {MOST}"
+        expected = f"whole numbers below {WHOLE_NUMBER_LIMIT}"
     elif kind is int:
-        fits, expected = _is_whole(value), f"a whole number below {MOST}"
+        fits, expected = _is_whole(value), f"a whole number below {WHOLE_NUMBER_LIMIT}"
     elif kind is float:
         fits = isinstance(value, Real) and not _is_truth(value) and not 1e300 <= abs(value) < inf  # type: ignore[operator]
         expected = "a number below 1e300"
@@ -59,15 +59,15 @@ def misfit(kind: Any, value: object) -> str | None:
 
 
 def _is_truth(value: object) -> bool:
-    return type(value).__name__ in ("bool", "bool_")  # NumPy's has had both names
+    return type(value).__name__ in ("bool", "bool_")  # NumPy's type has had both names
 
 
 def _is_whole(value: object) -> bool:
-    return isinstance(value, Integral) and not _is_truth(value) and abs(int(value)) < MOST
+    return isinstance(value, Integral) and not _is_truth(value) and abs(int(value)) < WHOLE_NUMBER_LIMIT
 
 
 def check_steps(flag: str, steps: tuple[int, ...]) -> None:
-    """Raise InputError unless the steps are from 1 up and in order."""
+    """Raise InputError unless the steps are at least 1 and increase."""
     if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
         raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps from 1 up, in order")
 
@@ -76,7 +76,7 @@ def parse_bytes(text: str | int | None) -> int | None:
     """Bytes of "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number. Raises InputError."""
     if text is None:
         return None
-    match = _SIZE.fullmatch(str(text))
+    match = _BYTE_SIZE_PATTERN.fullmatch(str(text))
     size = 0
     if match is not None:
         number, prefix, ending = match.groups()
@@ -88,7 +88,7 @@ def parse_bytes(text: str | int | None) -> int | None:
 
 
 def device_names(selector: str | None) -> list[str]:
-    """The names of devices in `selector`, or without one in CLSPLAT_DEVICE, which have commas between; an empty one
-    where there is neither."""
+    """Device names in `selector`, or else in CLSPLAT_DEVICE, separated by commas. One empty name if neither is
+    given."""
     text = selector or os.environ.get("CLSPLAT_DEVICE") or ""
     return [name.strip() for name in text.split(",") if name.strip()] or [text]

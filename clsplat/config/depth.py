@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The known depths that training compares the render's with."""
+"""Known depths that training compares with the render."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ from typing import Literal
 
 DepthSource = Literal["none", "points", "maps"]
 MapKind = Literal["metric", "relative"]
-DECAY = 0.01
-"""Part of the depth loss's weight that is left at the last step; until then it falls by the same factor every step."""
+DEPTH_WEIGHT_END_FRACTION = 0.01
+"""Fraction of the depth loss's weight that is left at the last step. It falls exponentially."""
 
 
 @dataclass(frozen=True)
 class DepthUse:
-    """Where depths are known from. source: the scene's points, or maps beside the photographs; maps: what these hold;
-    unit: world units of one step of a map of whole numbers."""
+    """Source of the known depths.
+
+    source: the scene's points, or depth maps next to the photographs.
+    maps: the values that the maps hold.
+    unit: world units per step of an integer map.
+    """
 
     source: DepthSource = "none"
     maps: MapKind = "metric"
@@ -26,4 +30,4 @@ class DepthUse:
 
 
 NO_DEPTH = DepthUse()
-"""The use where none is asked for."""
+"""The default: no depths."""

@@ -8,9 +8,12 @@ from typing import Literal
 
 Depths = Literal["z", "inverse", "ray"]
 
-HELD = ("Z", "BACK", "KEEP", "RATE")
-"""A surface: depths at which it begins and ends, the share of the light that it lets through, and the binary logarithm
-of that over its length, 0 for one without length."""
+HOLDOUT_SURFACE_FIELDS = ("Z", "BACK", "KEEP", "RATE")
+"""Values of a surface.
+
+Front and back depth, the fraction of light that it transmits, and the binary logarithm of that fraction per length. The
+last is 0 for a surface without length.
+"""
 
 
 @dataclass(frozen=True)
@@ -18,8 +21,7 @@ class HoldoutConfig:
     """Reading of hold-outs."""
 
     channel: str = ""
-    """Channel of --holdout's files that has the depths, such as depth.Z; Z if not given. Their alpha is A of the same
-    layer."""
+    """Depth channel in --holdout's files, such as depth.Z; Z if not given. Their alpha is A of the same layer."""
     depths: Depths = "z"
-    """Kind of the depths: z, along the camera's axis; inverse, 1 / z, which Nuke writes; ray, distances from the
+    """Kind of the depths. z: along the camera's axis. inverse: 1 / z, as Nuke writes it. ray: distances from the
     camera."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The meanings of masks and of alpha channels."""
+"""Meanings of masks and of alpha channels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ AlphaMeaning = Literal["blend", "ignore", "transparent"]
 
 @dataclass(frozen=True)
 class MaskUse:
-    """The use of a scene's masks: their meaning, that of alpha channels, and whether masks are inverted."""
+    """Meanings of a scene's masks and alpha channels, and True if masks are inverted."""
 
     masks: MaskMeaning = "none"
     alpha: AlphaMeaning = "blend"
@@ -20,4 +20,4 @@ class MaskUse:
 
 
 NO_MASKS = MaskUse()
-"""The use where none is asked for."""
+"""The default: no masks, alpha blended over the background."""

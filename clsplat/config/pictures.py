@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of pictures (docs/pictures.md), each default once, as in `training`. Nothing slow is imported here, as the
-command line is made from them."""
+"""Settings of pictures (docs/pictures.md), each default defined once, as in `training`.
+
+The command line is built from them, so this module imports nothing slow.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +17,17 @@ from clsplat.errors import InputError
 Filter = Literal["box", "blackman-harris"]
 
 STRIP_PIXELS = 1 << 24
-"""Pixels that are on the host at once, before filtering: about a gigabyte with every layer."""
+"""Maximum number of pixels on the host at once, before filtering: about a gigabyte with every layer."""
 DEEP_STRIP_FLOATS = 1 << 24
-"""Floats for the slices of a deep picture's strip: 64 MiB."""
-SENSOR_WIDTH = 36.0
-"""Millimetres of a picture's width, where nothing says otherwise."""
-_MOST_SUPERSAMPLES = 64
-_MOST_SAMPLES = 4096
-_MOST_BINS = 256
-_PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
+"""Maximum number of floats for the slices of a strip of a deep picture: 64 MiB."""
+DEEP_MERGE_FLOATS = 1 << 26
+"""Maximum number of floats for all deep pictures that are merged, at once: 256 MiB."""
+SENSOR_WIDTH_MM = 36.0
+"""Default width of the picture on the sensor, in millimetres."""
+_MAX_SUPERSAMPLES = 64
+_MAX_SAMPLES_PER_FRAME = 4096
+_MAX_DEEP_BINS = 256
+_ENCODER_PRESETS = ("ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow")
 
 
 @dataclass(frozen=True)
@@ -33,9 +37,9 @@ class ColourConfig:
     colorspace: str = ""
     """Colour space of the pictures, a name of the OpenColorIO configuration such as ACEScg; '' is the model's own."""
     model_colorspace: str = ""
-    """Colour space that the model was trained in; '' goes by the model file, and by sRGB where that says nothing."""
+    """Colour space that the model was trained in; '' uses the model file's, or sRGB if the file names none."""
     ocio_config: str = ""
-    """OpenColorIO configuration, a file or ocio://NAME; '' is $OCIO, or the studio configuration that is built in."""
+    """OpenColorIO configuration, a file or ocio://NAME; '' is $OCIO, or the built-in studio configuration."""
 
 
 @dataclass(frozen=True)
@@ -44,30 +48,30 @@ class FramingConfig:
 
     overscan: str = "0"
     """Pixels beyond each edge of the frame, or a share of its width and height such as 5%. EXR files keep the frame as
-    their display window, others have a larger picture."""
+    their display window. Other files contain the larger picture."""
     region: str = ""
     """Part of the frame to render alone, X,Y,WIDTH,HEIGHT in pixels from its top left corner; '' renders all of it. In
     EXR files it is the data window."""
     supersample: int = 1
-    """Samples of a pixel across and down: the frame is rendered this many times larger, and made smaller in linear
-    light. 1 does without."""
+    """Samples of a pixel across and down. The frame is rendered this many times larger, and filtered down in linear
+    light. 1 turns it off."""
     filter: Filter = "box"
-    """Filter that makes a pixel of --supersample's samples. box: the mean over it; blackman-harris: a window three
+    """Filter from --supersample's samples to a pixel. box: the mean over the pixel. blackman-harris: a window three
     pixels wide, which is smoother."""
 
     def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+        """Raise InputError naming the first setting whose value is invalid."""
         parse_overscan(self.overscan)
         if self.region:
             parse_region(self.region)
         if self.region and parse_overscan(self.overscan) != (0, 0.0):
             raise InputError("--overscan and --region exclude each other: a region lies within the frame")
-        if not 1 <= self.supersample <= _MOST_SUPERSAMPLES:
-            raise InputError(f"--supersample {self.supersample}: expected 1 to {_MOST_SUPERSAMPLES}")
+        if not 1 <= self.supersample <= _MAX_SUPERSAMPLES:
+            raise InputError(f"--supersample {self.supersample}: expected 1 to {_MAX_SUPERSAMPLES}")
 
 
 def parse_overscan(text: str) -> tuple[int, float]:
-    """(pixels, 0) or (0, share) of "32" or "5%". Raises InputError."""
+    """(pixels, 0) or (0, share) from "32" or "5%". Raises InputError."""
     word = text.strip()
     try:
         pixels, share = (0, float(word[:-1]) / 100) if word.endswith("%") else (int(word), 0.0)
@@ -79,7 +83,7 @@ def parse_overscan(text: str) -> tuple[int, float]:
 
 
 def parse_region(text: str) -> tuple[int, int, int, int]:
-    """x, y, width, height of "100,50,640,480". Raises InputError."""
+    """x, y, width, height from "100,50,640,480". Raises InputError."""
     words = [word.strip() for word in text.split(",")]
     if len(words) != 4 or not all(word.isdecimal() for word in words) or "0" in words[2:]:
         raise InputError(f"--region {text}: expected X,Y,WIDTH,HEIGHT in pixels such as 100,50,640,480")
@@ -89,22 +93,21 @@ def parse_region(text: str) -> tuple[int, int, int, int]:
 
 @dataclass(frozen=True)
 class WarpConfig:
-    """Lenses that bend."""
+    """Distortion of the rendered picture."""
 
     stmap: str = ""
-    """STMap, an EXR file, that the picture is bent by: R and G say where each pixel comes from, in parts of the frame
-    from its lower left corner. The frame is rendered as far as they reach; '' bends nothing."""
+    """STMap, an EXR file, to warp the picture with. R and G give the source of each pixel, as fractions of the frame
+    from its lower left corner. Rendering extends as far as the map reaches. '' warps nothing."""
     distort: bool = False
-    """Bend pictures as the photographs' lenses do, so that they lie on the photographs as they were taken. For cameras
-    of a COLMAP model or a transforms.json."""
+    """Distort pictures like the photographs' lenses, so that they match the original photographs. For cameras of a
+    COLMAP model or a transforms.json."""
 
-    def check(self, channels: Collection[str] = (), *, deep: bool = False) -> None:
-        """Raise InputError for settings that exclude each other, and for what a bent picture has not."""
+    def check(self, channels: Collection[str] = ()) -> None:
+        """Raise InputError for settings that exclude each other, and for channels that a distorted picture cannot
+        have."""
         if self.stmap and self.distort:
             raise InputError("--stmap and --distort exclude each other: both bend the picture")
         flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
-        if flag and deep:
-            raise InputError(f"{flag}: deep EXR has no bent pictures, expected a flat one")
         if flag and (moving := [name for name in channels if name in ("motion", "backward")]):
             raise InputError(f"{flag}: {', '.join(moving)} of a bent picture is not defined, expected other --channels")
 
@@ -114,36 +117,38 @@ class SamplingConfig:
     """Shutter and lens."""
 
     samples: int = 16
-    """Pictures that are rendered and averaged for each frame with motion blur or depth of field; more are smoother and
-    take as much longer."""
+    """Pictures that are rendered and averaged for each frame with motion blur or depth of field. More are smoother, and
+    take proportionally longer."""
     shutter_angle: float | None = None
-    """Motion blur: how long the shutter is open, half before the frame and half after it, in degrees of which 360 are
-    from frame to frame; 0 is none. If not given: the shutter of a USD stage, else none."""
+    """Motion blur: shutter angle in degrees, centred on the frame; 360 is the time between frames, 0 is no blur. If not
+    given: the shutter of a USD stage, else none."""
     shutter_open: float | None = None
-    """Opening of the shutter, in frames from the frame, such as -0.25; in place of --shutter-angle, with
+    """Opening of the shutter, in frames from the frame, such as -0.25. Replaces --shutter-angle, together with
     --shutter-close."""
     shutter_close: float | None = None
     """Closing of the shutter, in frames from the frame, such as 0.25."""
     f_stop: float | None = None
-    """Depth of field: the f-number of a lens, such as 2.8, its focal length that of the camera on a sensor of
+    """Depth of field: f-number of the lens, such as 2.8. Its focal length is the camera's, on a sensor of
     --sensor-width. If neither this nor --aperture is given: the lens of a USD stage, else everything is in focus.
-    Wants --focus."""
+    Requires --focus."""
     aperture: float | None = None
-    """Depth of field: the radius of the lens in the scene's units, in place of --f-stop; 0 is none. Wants --focus."""
+    """Depth of field: radius of the lens in the scene's units, instead of --f-stop; 0 is none. Requires --focus."""
     focus: float | None = None
-    """Depth that is in focus, along the camera's axis in the scene's units, for --f-stop and --aperture; if not given
-    that of a USD stage."""
+    """Depth that is in focus, along the camera's axis in the scene's units, for --f-stop and --aperture. If not given:
+    the focus of a USD stage."""
     sensor_width: float | None = None
-    """Millimetres that the picture's width is on the sensor, for --f-stop; if not given that of a USD stage, else
+    """Width of the picture on the sensor in millimetres, for --f-stop. If not given: the width of a USD stage, else
     36."""
     metres: float | None = None
-    """Metres that a unit of the scene is, for --f-stop; if not given that of a USD stage, else 1."""
+    """Metres per unit of the scene, for --f-stop. If not given: the unit of a USD stage, else 1."""
 
     def check(self, *, whole: bool = True) -> None:
-        """Raise InputError naming the first setting whose value makes no sense. whole: False for flags that a stage
-        may add the focus to."""
+        """Raise InputError naming the first setting whose value is invalid.
+
+        whole: False if a USD stage may still add the focus.
+        """
         rules: tuple[Rule, ...] = (
-            (("samples",), lambda value: 1 <= value <= _MOST_SAMPLES, f"1 to {_MOST_SAMPLES}"),
+            (("samples",), lambda value: 1 <= value <= _MAX_SAMPLES_PER_FRAME, f"1 to {_MAX_SAMPLES_PER_FRAME}"),
             (("shutter_angle",), lambda value: value is None or 0 <= value <= 3600, "0 to 3600 degrees"),
             (("f_stop", "sensor_width", "metres"), lambda value: value is None or 0 < value < inf, "a number above 0"),
             (("aperture",), lambda value: value is None or 0 <= value < inf, "a radius of at least 0"),
@@ -175,13 +180,13 @@ class SamplingConfig:
 
     @property
     def middle(self) -> float:
-        """The time half way between opening and closing, in frames from the frame."""
+        """Time half way between opening and closing, in frames from the frame."""
         begin, end = self.shutter
         return 0.5 * (begin + end)
 
     @property
     def moves(self) -> bool:
-        """True if the shutter stays open for a time, so that the camera is looked at more than once."""
+        """True if the shutter stays open for a time, so that the camera is sampled more than once."""
         return self.shutter[1] > self.shutter[0]
 
     @property
@@ -194,10 +199,15 @@ class SamplingConfig:
         """True if a frame is more than one sample."""
         return self.moves or self.has_lens
 
+    @property
+    def pictures(self) -> int:
+        """Number of pictures that are averaged for a frame."""
+        return self.samples if self.on else 1
+
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Settings of a picture beside its channels: colour, framing, sampling, a lens that bends."""
+    """Settings of a picture without its channels: colour, framing, sampling, distortion."""
 
     colour: ColourConfig = field(default_factory=ColourConfig)
     framing: FramingConfig = field(default_factory=FramingConfig)
@@ -205,15 +215,17 @@ class PictureConfig:
     warp: WarpConfig = field(default_factory=WarpConfig)
 
     def check(self, *, whole: bool = True) -> None:
-        """Raise InputError naming the first setting whose value makes no sense. whole: as of `SamplingConfig.check`."""
+        """Raise InputError naming the first setting whose value is invalid.
+
+        whole: see `SamplingConfig.check`.
+        """
         self.framing.check()
         self.sampling.check(whole=whole)
 
     def check_deep(self) -> None:
-        """Raise InputError for what deep pictures have not."""
-        if self.sampling.on or self.framing.supersample > 1:
-            flag = "a shutter or a lens" if self.sampling.on else "--supersample"
-            raise InputError(f"deep EXR: {flag} has no deep samples, expected a frame without")
+        """Raise InputError for settings that deep pictures do not support."""
+        if self.framing.supersample > 1:
+            raise InputError("deep EXR: --supersample has no deep samples, expected a frame without")
 
 
 @dataclass(frozen=True)
@@ -221,16 +233,19 @@ class DeepConfig:
     """Slices of a deep EXR."""
 
     bins: int = 16
-    """Slices by depth, the most samples that a pixel has. Each pixel has them where its light is taken."""
+    """Slices by depth, which is the maximum number of samples of a pixel. Each pixel places its slices at the
+    depths that contribute its light."""
 
     def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
-        check_rules(self, "--deep.", ((("bins",), lambda value: 1 <= value <= _MOST_BINS, f"1 to {_MOST_BINS}"),))
+        """Raise InputError naming the first setting whose value is invalid."""
+        check_rules(
+            self, "--deep.", ((("bins",), lambda value: 1 <= value <= _MAX_DEEP_BINS, f"1 to {_MAX_DEEP_BINS}"),)
+        )
 
 
 ProRes = Literal["422", "hq", "4444"]
-FPS = 24.0
-"""Frames a second of a video where neither a flag nor the cameras' file says another rate."""
+DEFAULT_VIDEO_FPS = 24.0
+"""Frames per second of a video if neither a flag nor the cameras' file gives a rate."""
 
 
 @dataclass(frozen=True)
@@ -238,36 +253,41 @@ class VideoConfig:
     """Encoding of a video."""
 
     fps: float | None = None
-    """Frames a second; if not given the rate of the cameras' file, or 24 where that has none. 23.976, 29.97 and
-    their like are 24000/1001, 30000/1001 and so on."""
+    """Frames per second. If not given: the rate of the cameras' file, or 24 if it has none. 23.976, 29.97 and the like
+    are 24000/1001, 30000/1001 and so on."""
     crf: int = 18
-    """Quality of an .mp4: 0 is the best, 51 the worst, 18 about the least that shows no loss."""
+    """Quality of an .mp4: 0 is the best, 51 the worst. 18 is about the lowest quality that shows no loss."""
     preset: str = "medium"
     """Effort of the encoder for a smaller file, from ultrafast to veryslow."""
     prores: ProRes = "hq"
     """ProRes of a .mov: 422, hq (422 HQ), or 4444, which may have alpha."""
 
     def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+        """Raise InputError naming the first setting whose value is invalid."""
         if self.fps is not None and not 0.01 <= self.fps <= 1000:
             raise InputError(f"--video.fps {self.fps}: expected 0.01 to 1000 frames a second")
         if not 0 <= self.crf <= 51:
             raise InputError(f"--video.crf {self.crf}: expected 0 to 51")
-        if self.preset not in _PRESETS:
-            raise InputError(f"--video.preset {self.preset}: expected one of {', '.join(_PRESETS)}")
+        if self.preset not in _ENCODER_PRESETS:
+            raise InputError(f"--video.preset {self.preset}: expected one of {', '.join(_ENCODER_PRESETS)}")
 
 
 Parts = Literal["one", "several"]
 ExrDepth = Literal["half", "float"]
-EXR_DEPTH: ExrDepth = "float"
+DEFAULT_EXR_DEPTH: ExrDepth = "float"
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "dwaa", "dwab"]
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """Encoding of pictures. bits: 8 or 16, of PNG and TIFF, 10 or 16 of DPX; quality: of JPEG; prores: of MOV."""
+    """Encoding of pictures.
 
-    depth: ExrDepth = EXR_DEPTH
+    bits: 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
+    quality: of JPEG.
+    prores: of MOV.
+    """
+
+    depth: ExrDepth = DEFAULT_EXR_DEPTH
     parts: Parts = "one"
     compression: Compression = "zip"
     bits: int = 8

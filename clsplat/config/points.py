@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The points that training starts from, where they are not the scene's alone."""
+"""Points that training starts from, in addition to or instead of the scene's own."""
 
 from __future__ import annotations
 
@@ -7,18 +7,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 PointsUse = Literal["replace", "join"]
-POINTS_OF_FILE = 200_000
-"""Points that are kept of a file where no limit is given: scanners write tens of millions."""
-SKY_RADIUS = 10.0
-"""Radius of the sky's sphere, in distances of what is farthest of the scene. Density control prunes by sizes that many
-times as large where there is a sky."""
+DEFAULT_MAX_FILE_POINTS = 200_000
+"""Default limit on a file's points: scanners write tens of millions."""
+SKY_RADIUS_RATIO = 10.0
+"""Radius of the sky's sphere, relative to the distance of the scene's farthest points from its middle.
+
+With a sky, density control's size limit for pruning is this many times as large.
+"""
 
 
 @dataclass(frozen=True)
 class StartPoints:
-    """Points beside or in place of the scene's own. file: a cloud, empty for none; use: its relation to the scene's
-    points; limit: the most points that are kept, of the file or without one of the scene's, 0 for all; sky: points of a
-    sphere around the scene, 0 for none."""
+    """Points in addition to or instead of the scene's own.
+
+    file: a point cloud, empty for none.
+    use: "replace" or "join" the scene's points.
+    limit: maximum number of points to keep, of the file or else of the scene; 0 for all.
+    sky: number of points on a sphere around the scene, 0 for none.
+    """
 
     file: str = ""
     use: PointsUse = "replace"
@@ -29,5 +35,5 @@ class StartPoints:
         return bool(self.file or self.sky or self.limit)
 
 
-OWN_POINTS = StartPoints()
-"""The scene's points as they are."""
+SCENE_POINTS_ONLY = StartPoints()
+"""The scene's points unchanged."""

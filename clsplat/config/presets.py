@@ -12,24 +12,28 @@ from clsplat.errors import InputError
 
 Preset = Literal["exact", "default", "fast"]
 Schedule = Literal["paper", "short", "high-rates"]
-PRESETS: dict[Preset, RasterizerConfig] = {
+RASTERIZER_PRESETS: dict[Preset, RasterizerConfig] = {
     "exact": RasterizerConfig(),
     "default": RasterizerConfig(),
     "fast": RasterizerConfig(alpha_min=2 / 255, transmittance_min=1e-3),
 }
-"""exact: nothing approximate; default: what is on unless asked for, equal to exact as long as every default has an
-error of zero; fast: approximations that are worth their error (docs/performance.md)."""
+"""Rasterizer settings by preset.
+
+exact: no approximations.
+default: the default settings, equal to exact as long as every default has an error of zero.
+fast: approximations that are worth their error (docs/performance.md).
+"""
 
 
 def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
     """Settings that `clsplat train --schedule` starts from.
 
-    paper: the defaults, made for 30,000 steps, whatever `iterations` is. short: for runs of about 7000 steps, in which
-    the paper's rates leave a model unfinished. Colours, opacities and rotations learn faster, SH degrees come twice as
-    fast, the means' rate has fallen at the end, density control ends at five sevenths, and the last seventh cools down
-    (docs/decisions/0013-a-short-schedule.md). high-rates: the same, but means, sizes, rotations and colours by
-    direction learn faster still and cool down further, SH degrees come every 300 steps, and mcmc has less noise for its
-    rate (docs/decisions/0031-high-rates.md).
+    paper: the defaults, made for 30,000 steps, for any `iterations`.
+    short: for runs of about 7000 steps, which the paper's rates leave unfinished. Colours, opacities and rotations
+    learn faster, and SH degrees rise twice as fast. The means' rate reaches its minimum at the last step. Density
+    control ends at five sevenths, and the last seventh is a cooldown (docs/decisions/0013-a-short-schedule.md).
+    high-rates: like short, but means, sizes, rotations and higher SH bands learn even faster and cool down further. SH
+    degrees rise every 300 steps, and mcmc has less noise relative to its rate (docs/decisions/0031-high-rates.md).
     """
     if schedule == "paper":
         return TrainConfig(iterations=iterations)
@@ -69,17 +73,17 @@ def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> Train
     """Settings that `clsplat train --preset --schedule --iterations` start from.
 
     fast trains less. Pictures are a quarter of the size for a fourteenth of the steps and half the size until two
-    sevenths. There are fewer Gaussians, as splits are along the longest axis, and those that add less than a tenth of
-    a pixel to every view are dropped. The rates are those of the short schedule, those of means, scales and rotations
-    up to four times higher. The higher SH bands are updated in every second step
-    (docs/decisions/0015-the-fast-preset.md). Raises InputError for fast with high-rates.
+    sevenths. There are fewer Gaussians: splits are along the longest axis, and Gaussians that add less than a tenth of
+    a pixel to every view are pruned. The rates come from the short schedule, with means, scales and rotations up to
+    four times higher. The higher SH bands are updated in every second step (docs/decisions/0015-the-fast-preset.md).
+    Raises InputError for fast with high-rates.
     """
     if preset == "fast" and schedule == "high-rates":
         raise InputError(
             "--preset fast and --schedule high-rates exclude each other: fast raises the short schedule's rates"
         )
     config = scheduled(schedule or ("short" if preset == "fast" else "paper"), iterations)
-    config = replace(config, rasterizer=PRESETS[preset])
+    config = replace(config, rasterizer=RASTERIZER_PRESETS[preset])
     if preset != "fast":
         return config
     optimiser = config.optimiser

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the rasterizer, each default once."""
+"""Settings of the rasterizer, with each default defined once."""
 
 from __future__ import annotations
 
@@ -11,32 +11,33 @@ from clsplat.config.checks import Rule, check_kinds, check_rules
 
 @dataclass(frozen=True)
 class RasterizerConfig:
-    """Approximations of the rasterizer: each saves work and changes pictures, but for the defaults.
+    """Approximations of the rasterizer. Each saves work and changes pictures, except for the defaults.
 
-    sh-tolerance and sh-storage are of frames of a model that is held on the device (render, eval), not of training.
-    docs/performance.md has the error of each setting, and the time that it buys.
+    sh-tolerance and sh-storage apply to frames of a model that stays on the device (render, eval), not to training.
+    docs/performance.md has the error of each setting, and the time that it saves.
     """
 
     extent: Literal["opacity", "3sigma"] = "opacity"
-    """Reach of a Gaussian. opacity: to where its alpha is alpha-min; 3sigma: three standard deviations, which cuts what
-    is visible of opaque ones (approximate)."""
+    """Reach of a Gaussian. opacity: until its alpha falls to alpha-min. 3sigma: three standard deviations, which cuts
+    off visible parts of opaque Gaussians (approximate)."""
     sh_degree_limit: int = 3
     """Leave out the bands of spherical harmonics (SH, colour by direction) above this degree, 0 to 3 (approximate)."""
     sh_tolerance: float = 0.0
-    """Leave out a Gaussian's highest SH bands as long as that changes no channel of its colour, 0 to 1, by more than
-    this, from any direction: 0 leaves out those that are zero (approximate above 0). Bands that none needs are always
-    left out, those that some need only where that is half of all coefficients: from there on it pays."""
+    """Leave out a Gaussian's highest SH bands if no channel of its colour, 0 to 1, changes by more than this from any
+    direction. 0 leaves out only bands that are zero (approximate above 0). Bands that no Gaussian needs are always left
+    out. Bands that only some need are left out if that removes at least half of all coefficients, as only then is it
+    faster."""
     sh_storage: Literal["float", "half"] = "float"
-    """Keep the SH bands above 0 in 32 or in 16 bits (half is approximate, of half the memory)."""
+    """Store the SH bands above 0 in 32 or in 16 bits. half takes half of the memory, and is approximate."""
     alpha_min: float = 1 / 255
-    """Skip a Gaussian at a pixel where its alpha is less than this (approximate above the default, 1/255: one step of 8
-    bits)."""
+    """Skip a Gaussian at a pixel where its alpha is less than this. Values above the default, 1/255 or one step of 8
+    bits, are approximate."""
     transmittance_min: float = 1e-4
-    """A Gaussian that would take a pixel's transmittance to this or less is left out and ends the pixel (approximate
+    """Leave out a Gaussian that would reduce a pixel's transmittance to this or less, and end the pixel (approximate
     above 1e-4)."""
 
     def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+        """Raise InputError naming the first setting whose value is invalid."""
         rules: tuple[Rule, ...] = (
             (("sh_degree_limit",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("sh_tolerance",), lambda value: 0 <= value <= 1, "0 to 1"),
@@ -47,49 +48,39 @@ class RasterizerConfig:
         check_rules(self, "--rasterizer.", rules)
 
     def switches(self) -> BenchSwitches:
-        """Every setting that the rasterizer reads. Switches that this configuration does not have are on."""
+        """All settings that the rasterizer reads. Switches that this configuration lacks are on."""
         return BenchSwitches(**vars(self))
 
 
 @dataclass(frozen=True)
 class BenchSwitches(RasterizerConfig):
-    """Settings of the rasterizer, with the switches that change no bit of a frame and are there to be measured.
+    """Settings of the rasterizer, and switches that change no bit of a frame and exist for measurements.
 
-    docs/performance.md has the error of each setting, and the time that it buys.
+    docs/performance.md has the error of each setting, and the time that it saves.
     """
 
     extent: Literal["opacity", "constant", "3sigma"] = "opacity"  # type: ignore[assignment]  # one value more
-    """Reach of a Gaussian. opacity: to where its alpha is alpha-min; constant: as far as an opaque one would, whatever
-    its opacity; 3sigma: three standard deviations, which cuts what is visible of opaque ones (approximate)."""
+    """Reach of a Gaussian. opacity: until its alpha falls to alpha-min. constant: the reach of an opaque one, whatever
+    its opacity. 3sigma: three standard deviations, which cuts off visible parts of opaque Gaussians (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
-    """Tiles of 16 x 16 pixels that a Gaussian is listed in. ellipse: those that its ellipse reaches, or all of its
-    bounding box where that has at most 16; box: all of its bounding box; square: those that the square of its longest
-    half axis reaches, as in the code of Kerbl et al."""
+    """Tiles of 16 x 16 pixels that list a Gaussian. ellipse: the tiles that its ellipse reaches, or its whole bounding
+    box if that has at most 16 tiles. box: its whole bounding box. square: the tiles within the square of its longest
+    half axis, as in the code of Kerbl et al."""
     depth_sort: Literal["visible", "pairs"] = "visible"
-    """Order of the sorts. visible: the visible Gaussians by depth, then their pairs with tiles, stably, by tile; pairs:
+    """Order of the sorts. visible: the visible Gaussians by depth, then their pairs with tiles, stably, by tile. pairs:
     all pairs by tile and depth, as in the code of Kerbl et al."""
     key_bits: Literal["needed", "all"] = "needed"
-    """Bits that are sorted by. needed: those in which the depths of the frame and its tiles differ; all: 32 of each."""
+    """Bits of the sort keys. needed: only the bits in which the frame's depths and tiles differ. all: 32 of each."""
     row_skip: bool = True
     """Visit only the rows of a tile that a Gaussian's bounding box reaches."""
     column_skip: bool = True
-    """Visit only the vectors (pixels that are worked on at once) of a row that a Gaussian's bounding box reaches."""
-    vector_skip: bool = True
-    """Leave a vector of pixels when the Gaussian contributes to none of them. Frames on a CPU have no use for it: their
-    vectors are found by the ellipse, so that few are visited in vain."""
+    """Visit only the vectors (pixels that are processed at once) of a row that a Gaussian's bounding box reaches."""
     early_stop: bool = True
-    """Leave a tile when all its pixels are opaque; else go on to its last Gaussian, to no effect."""
-    last_contributor: bool = True
-    """A tile's gradient begins at the last Gaussian that one of its pixels takes, or at its last, to no effect."""
+    """Leave a tile when all its pixels are opaque. Otherwise continue to its last Gaussian, without effect."""
     record_cells: bool = True
-    """A tile's gradient visits the cells of pixels in which a Gaussian contributes, as blending has recorded them; else
-    it finds those that the ellipse reaches once more."""
-    gradient_skip: bool = True
-    """A tile's gradient leaves out the recorded cells in which no pixel has one."""
+    """Visit in a tile's gradient the cells of pixels in which a Gaussian contributes, as recorded by blending.
+    Otherwise find the cells that the ellipse reaches once more."""
     frustum_cull: bool = True
-    """Leave out a Gaussian that reaches no tile of the image before its colour is worked out; else it has a colour and
-    a place in the order of depth, to no effect. What is not in front of the near plane has no projection, and is always
-    left out."""
-    opacity_cull: bool = True
-    """Leave out a Gaussian whose opacity is not over alpha-min before its colour is worked out; else as with
-    frustum-cull off, wherever it lies: it has no extent."""
+    """Leave out a Gaussian that reaches no tile of the image before computing its colour. Otherwise it gets a colour
+    and a place in the depth order, without effect. Gaussians that are not in front of the near plane have no
+    projection, and are always left out."""

@@ -11,8 +11,8 @@ from clsplat.errors import InputError
 
 Eye = Literal["left", "right"]
 EYES: tuple[Eye, Eye] = ("left", "right")
-STAGE = "stage"
-"""Word for the pair of cameras that a USD stage has."""
+STEREO_STAGE_WORD = "stage"
+"""Value of --stereo that selects the pair of cameras of a USD stage."""
 
 
 @dataclass(frozen=True)
@@ -20,18 +20,20 @@ class StereoConfig:
     """Pairs of pictures, for the left and the right eye."""
 
     stereo: str = ""
-    """Render a frame for each eye, this far apart in the scene's units; or stage: from the two cameras of a USD stage
-    that have stereoRole left and right. Two files with {eye}, %V (left, right) or %v (l, r) in -o, else one EXR file
+    """Render a frame for each eye, this far apart in the scene's units; or stage, for the two cameras of a USD stage
+    with stereoRole left and right. Writes two files if -o has {eye}, %V (left, right) or %v (l, r), else one EXR file
     with a part for each eye. '' renders no pairs."""
     convergence: float | None = None
-    """Depth at which both eyes see the same, along the camera's axis: their principal points are shifted, they are not
-    turned. If not given they look parallel."""
+    """Depth at which both eyes see the same, along the camera's axis. Their principal points are shifted, and the
+    cameras are not turned. If not given, the eyes look parallel."""
     eye: Literal["both", "left", "right"] = "both"
-    """Render one eye of --stereo alone, such as for a video."""
+    """Render only one eye of --stereo, such as for a video."""
 
     def check(self, *, distort: bool = False) -> None:
-        """Raise InputError naming the first setting whose value makes no sense. distort: pictures are bent as
-        photographs are."""
+        """Raise InputError naming the first setting whose value is invalid.
+
+        distort: True if pictures are distorted like photographs.
+        """
         if not self.stereo:
             for flag, given in (("--convergence", self.convergence is not None), ("--eye", self.eye != "both")):
                 if given:
@@ -44,18 +46,20 @@ class StereoConfig:
                 raise InputError("--convergence: the cameras of --stereo stage have their own, expected it without")
             return
         if not 0 < self.distance < inf:
-            raise InputError(f"--stereo {self.stereo}: expected the distance of the eyes above 0, or {STAGE}")
+            raise InputError(
+                f"--stereo {self.stereo}: expected the distance of the eyes above 0, or {STEREO_STAGE_WORD}"
+            )
         if self.convergence is not None and not 0 < self.convergence < inf:
             raise InputError(f"--convergence {self.convergence}: expected a depth above 0")
 
     @property
     def of_stage(self) -> bool:
         """True if the eyes are cameras of a USD stage."""
-        return self.stereo == STAGE
+        return self.stereo == STEREO_STAGE_WORD
 
     @property
     def distance(self) -> float:
-        """Distance of the eyes in the scene's units; NaN for what is no number."""
+        """Distance of the eyes in the scene's units; NaN if --stereo is not a number."""
         try:
             return float(self.stereo)
         except ValueError:
@@ -63,7 +67,7 @@ class StereoConfig:
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
-        """The eyes that are rendered, none where the frames are no pairs."""
+        """Eyes to render; empty if frames are not stereo pairs."""
         if not self.stereo:
             return ()
         return EYES if self.eye == "both" else (self.eye,)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of training, each default once: these dataclasses are the command line, the `config.toml` and the help.
+"""Settings of training, with each default defined once: command line, `config.toml` and help come from these
+dataclasses.
 
-The training defaults are those of the paper's authors' 2024 code, with the paper's resolution warm-up.
+The training defaults follow the paper authors' 2024 code, with the paper's resolution warm-up.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ from math import inf
 from typing import Literal
 
 from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
+from clsplat.config.cli_defaults import TEST_EVERY
 from clsplat.config.depth import DepthSource, DepthUse, MapKind
 from clsplat.config.masks import AlphaMeaning, MaskMeaning, MaskUse
-from clsplat.config.points import POINTS_OF_FILE, PointsUse, StartPoints
+from clsplat.config.points import DEFAULT_MAX_FILE_POINTS, PointsUse, StartPoints
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError
 
 Background = Literal["black", "white", "random"]
@@ -28,43 +29,43 @@ AppearanceKind = Literal["none", "exposure", "ppisp", "grid"]
 
 @dataclass(frozen=True)
 class OptimiserConfig:
-    """Learning rates and Adam's constants, a rate per parameter group."""
+    """Learning rates and Adam's constants, with a rate per parameter group."""
 
     means_rate: float = 1.6e-4
-    """Learning rate of the Gaussians' middles (means) at the first step, in parts of the scene's extent."""
+    """Learning rate of the Gaussians' centres (means) at the first step, relative to the scene's extent."""
     means_rate_end: float = 1.6e-6
-    """Learning rate of the means from means-rate-steps on, in parts of the extent; until then it falls to this by the
-    same factor every step."""
+    """Learning rate of the means after means-rate-steps, relative to the extent. Until then the rate falls
+    exponentially."""
     means_rate_steps: int = 30_000
     """Steps over which the learning rate of the means falls."""
     sh_dc_rate: float = 2.5e-3
-    """Learning rate of colours: the constant band of the spherical harmonics."""
+    """Learning rate of the colours: the constant band of the spherical harmonics."""
     sh_rest_rate: float = 2.5e-3 / 20
-    """Learning rate of what colours have by direction: the higher bands of the spherical harmonics."""
+    """Learning rate of the colours' dependence on direction: the higher bands of the spherical harmonics."""
     opacities_rate: float = 0.025
     """Learning rate of the opacities, as logits."""
     scales_rate: float = 5e-3
-    """Learning rate of the sizes, as logarithms."""
+    """Learning rate of the scales, as logarithms."""
     quaternions_rate: float = 1e-3
     """Learning rate of the rotations, as quaternions."""
     sparse: bool = False
-    """Leave Gaussians that a step's view does not show as they are, Adam's moments too (approximate)."""
+    """Do not update Gaussians that a step's view does not show, nor their Adam moments (approximate)."""
     sh_rest_every: int = 1
-    """Steps from one update of the higher SH bands to the next (approximate above 1)."""
+    """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
-    """Number of last steps over which every learning rate falls, by the same factor every step, to the part cooldown-to
-    of itself; 0: none falls."""
+    """Number of final steps over which every learning rate falls exponentially, to the fraction cooldown-to of itself.
+    0: none falls."""
     cooldown_to: float = 0.1
-    """Part of every learning rate that is left after the cooldown's last step, more than 0, at most 1."""
+    """Fraction of every learning rate that is left after the cooldown, more than 0, at most 1."""
     beta1: float = 0.9
-    """Part of Adam's first moment, the mean gradient, that is kept from step to step."""
+    """Decay of Adam's first moment, the mean gradient: the fraction that is kept at each step."""
     beta2: float = 0.999
-    """Part of Adam's second moment, the mean squared gradient, that is kept from step to step."""
+    """Decay of Adam's second moment, the mean squared gradient: the fraction that is kept at each step."""
     epsilon: float = 1e-15
     """Adam's epsilon, which is added to the root of the second moment before dividing by it."""
 
     def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+        """Raise InputError naming the first setting whose value is invalid."""
         rates = tuple(setting.name for setting in fields(self) if setting.name.endswith(("_rate", "_rate_end")))
         rules: tuple[Rule, ...] = (
             (rates, lambda value: 0 <= value < inf, "a finite number, at least 0"),
@@ -76,88 +77,78 @@ class OptimiserConfig:
         )
         check_kinds(self, "--optimiser.")
         check_rules(self, "--optimiser.", rules)
-        if self.means_rate > 0 and self.means_rate_end == 0:  # in between it would be 0 as well, from the first step on
+        if self.means_rate > 0 and self.means_rate_end == 0:  # then the rate would be 0 from the first step
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0, the rate falls log-linearly to it")
 
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Adaptive density control: where Gaussians are added and taken away (Kerbl et al. 2023, section 5)."""
+    """Adaptive density control: when Gaussians are added and removed (Kerbl et al. 2023, section 5)."""
 
     every: int = 100
-    """Steps between densifications, in which Gaussians are cloned, split and pruned; 0 turns density control off."""
+    """Steps between densifications, which clone, split and prune Gaussians; 0 turns density control off."""
     start: int = 500
-    """Last step without densification: Gaussians are cloned, split and pruned after later steps only."""
+    """Last step without densification: Gaussians are cloned, split and pruned only after later steps."""
     stop: int = 15_000
-    """Step from which on Gaussians are no longer cloned, split and pruned, nor opacities reset."""
+    """First step without further density control: Gaussians are no longer cloned, split and pruned, nor opacities
+    reset."""
     gradient_threshold: float = 2e-4
-    """Mean gradient of a Gaussian's place on the screen, in units of half the image, from which on it is densified
-    (cloned or split); less makes more Gaussians."""
+    """Mean screen-space gradient from which a Gaussian is densified (cloned or split), in units of half the image.
+    Lower values make more Gaussians."""
     absolute_gradients: bool = False
-    """Add up the gradients' absolute values pixel by pixel for that (AbsGS); gradient-threshold wants about 8e-4
-    then."""
+    """Sum the absolute values of the per-pixel gradients instead (AbsGS). gradient-threshold should then be about
+    8e-4."""
     dense_fraction: float = 0.01
-    """Largest size of a Gaussian that is cloned, in parts of the scene's extent; larger ones are split."""
+    """Largest scale of a Gaussian that is cloned, relative to the scene's extent; larger ones are split."""
     split_factor: float = 1.6
     """Factor by which each half of a split Gaussian is smaller."""
     min_opacity: float = 0.005
     """Prune Gaussians whose opacity is less than this, 0 to 1."""
     max_world_fraction: float = 0.1
-    """Prune Gaussians that are larger than this part of the scene's extent, after the first opacity reset."""
+    """Prune Gaussians larger than this fraction of the scene's extent, after the first opacity reset."""
     max_screen_radius: float = 0.0
     """Prune Gaussians that covered a larger radius than this on the screen, in pixels, after the first opacity reset; 0
     prunes none."""
     opacity_reset_every: int = 3000
-    """Steps between opacity resets, 0 for none; one more at density.start where the background is white."""
+    """Steps between opacity resets, 0 for none. A white background adds one at density.start."""
     opacity_reset_to: float = 0.01
-    """Opacity is lowered to at most this at a reset."""
+    """Maximum opacity after a reset."""
     max_gaussians: int = 10_000_000
-    """Clones and splits stop at this number of Gaussians; where room is short, the largest gradients go first."""
-    views_agree: int = 1
-    """Densify only where the gradient was over the threshold in this many views since the last densification, and its
-    mean too; 1 asks for the mean alone, as the paper. A view that came again counts again."""
+    """Maximum number of Gaussians, at which cloning and splitting stop. Near the limit the Gaussians with the largest
+    gradients go first."""
     growth: Growth = "paper"
-    """paper: densify what is over the threshold; budget: the number of Gaussians rises along a parabola to
-    max-gaussians at density.stop, the largest gradients first, whatever the threshold (Taming 3DGS); mcmc: Gaussians
-    under min-opacity move to where gradients are largest, and noise moves what is nearly transparent (3DGS-MCMC); the
-    number rises by the same part each time to max-gaussians at density.stop. Both are by splits along the longest
-    axis, there are no clones and resets; max-screen-radius moves Gaussians, from the start."""
+    """paper: densify Gaussians over the threshold. budget: the number of Gaussians rises along a parabola to
+    max-gaussians at density.stop, largest gradients first, whatever the threshold (Taming 3DGS). mcmc: Gaussians under
+    min-opacity move to the largest gradients, and noise moves nearly transparent ones (3DGS-MCMC). The number rises by
+    the same factor each time, to max-gaussians at density.stop. mcmc splits Gaussians along the longest axis, also when
+    it moves them, and has no clones and resets. It applies max-screen-radius from the start, and moves those
+    Gaussians."""
     long_axis: bool = False
-    """Split what is densified along its longest axis, small or large, into two that lie on it (Improved-GS); there are
-    no clones then. Growth mcmc always does."""
-    edge_views: int = 0
-    """With growth budget: training views that are looked at before each densification. What is over gradient-threshold
-    is then drawn at random, each as likely as what it adds to the photographs' edges there (Improved-GS); 0: the
-    largest gradients go first, whatever the threshold."""
+    """Split Gaussians, small or large, along their longest axis, into two halves on that axis (Improved-GS). Nothing is
+    cloned then. Growth mcmc always splits like this."""
     spread: float = 1.0
-    """With growth mcmc, where more Gaussians have to move than there are with a gradient: distance of what moves from
-    the mean of the Gaussian that it comes to, in standard deviations, drawn at random; 0 puts it there, as
-    published."""
+    """With growth mcmc, if more Gaussians have to move than there are Gaussians with a gradient: random distance of a
+    moved one from its target's mean. In standard deviations; 0 puts it at the mean, as published."""
     noise_rate: float = 5e5
-    """With growth mcmc: noise added to the means each step, in learning rates of the means, for Gaussians of size 1 in
-    a scene of extent 1; 0 adds none. None is added in the cooldown."""
+    """With growth mcmc: noise added to the means each step, in learning rates of the means, for Gaussians of scale 1 in
+    a scene of extent 1. 0 adds none. The cooldown has no noise."""
     opacity_weight: float = 0.01
-    """With growth mcmc: weight of the mean opacity in the loss, by the Gaussians that the step's view shows."""
+    """With growth mcmc: weight of the mean opacity in the loss, summed over the Gaussians that the step's view
+    shows."""
     scale_weight: float = 0.01
-    """With growth mcmc: weight of the mean size in the loss, in parts of the scene's extent, by the Gaussians that the
-    step's view shows."""
+    """With growth mcmc: weight of the mean scale in the loss, relative to the scene's extent, summed over the Gaussians
+    that the step's view shows."""
     min_contribution: float = 0.0
-    """Prune Gaussians that add less than this to every training view of an epoch (a pass through all of them): alpha
-    times transmittance, summed over the picture, in pixels. 0 prunes none."""
+    """Prune Gaussians that contribute less than this to every training view of an epoch (a pass through all of them). A
+    contribution is alpha times transmittance, summed over the picture, in pixels. 0 prunes none."""
     prune_every: int = 0
-    """Steps between prunings by opacity and contribution alone, which go on after density.stop; 0 for none."""
-    prune_at: tuple[int, ...] = ()
-    """Steps after which the Gaussians that contribute least are pruned, as many as prune-fraction says."""
-    prune_fraction: float = 0.0
-    """Share of the Gaussians, 0 to 1, that is pruned at each step of prune-at: those that contribute least over an
-    epoch (Speedy-Splat). Gaussians whose contribution is not known are not counted; after an opacity reset that is all
-    of them, for two epochs."""
+    """Steps between prunings by opacity and contribution alone, which continue after density.stop; 0 for none."""
 
     def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+        """Raise InputError naming the first setting whose value is invalid."""
         rules: tuple[Rule, ...] = (
             (
-                ("every", "start", "stop", "opacity_reset_every", "prune_every", "edge_views"),
+                ("every", "start", "stop", "opacity_reset_every", "prune_every"),
                 lambda value: value >= 0,
                 "at least 0",
             ),
@@ -174,33 +165,19 @@ class DensityConfig:
                 lambda value: 0 <= value < inf,
                 "a finite number, at least 0",
             ),
-            (("max_gaussians", "views_agree"), lambda value: value >= 1, "at least 1"),
-            (("prune_fraction",), lambda value: 0 <= value < 1, "at least 0, less than 1"),
+            (("max_gaussians",), lambda value: value >= 1, "at least 1"),
         )
         check_kinds(self, "--density.")
         check_rules(self, "--density.", rules)
-        check_steps("--density.prune-at", self.prune_at)
-        if self.prune_fraction > 0 and not self.prune_at:
-            raise InputError(
-                f"--density.prune-fraction {self.prune_fraction}: never used, expected steps in --density.prune-at too"
-            )
-        if self.prune_at and self.prune_fraction == 0:
-            steps = ",".join(map(str, self.prune_at))
-            raise InputError(f"--density.prune-at {steps}: prunes nothing, expected --density.prune-fraction too")
         if self.growth != "paper" and self.max_gaussians == DensityConfig.max_gaussians:
             raise InputError(
                 f"--density.growth {self.growth}: expected --density.max-gaussians too, the number of Gaussians to "
                 "grow to"
             )
-        if self.edge_views and self.growth != "budget":
+        if self.growth == "mcmc" and self.prune_every:
             raise InputError(
-                f"--density.edge-views {self.edge_views}: chooses what a budget is spent on, expected --density.growth "
-                "budget too"
-            )
-        if self.growth == "mcmc" and (self.prune_at or self.prune_every):
-            found = "prune-at" if self.prune_at else "prune-every"
-            raise InputError(
-                f"--density.growth mcmc: moves Gaussians and prunes none before the end, expected no --density.{found}"
+                "--density.growth mcmc: moves Gaussians and prunes none before the end, expected no "
+                "--density.prune-every"
             )
 
 
@@ -209,136 +186,135 @@ class TrainConfig:
     """One training run."""
 
     iterations: int = 30_000
-    """Number of training steps, each of which is one view. Learning rates and density control do not depend on it, but
-    for --optimiser.cooldown, --schedule short and high-rates, and --preset fast."""
+    """Number of training steps, each of one view. Learning rates and density control do not depend on it, except for
+    --optimiser.cooldown, --schedule short and high-rates, and --preset fast."""
     batch: int = 1
-    """Views whose gradients are added up before the model changes. Each still counts as a step; with more of them
-    learning rates and Adam's constants are scaled for it (Zhao et al. 2024). With several devices, if not given: one
-    for each."""
+    """Views whose gradients are summed before the model changes. Each still counts as a step. Learning rates and Adam's
+    constants are scaled for the batch (Zhao et al. 2024). With several devices, if not given: one for each."""
     seed: int = 0
-    """Seed of everything random; the same seed on the same device gives the same model."""
+    """Seed of everything random. The same seed on the same device gives the same model."""
     sh_degree: int = 3
-    """Highest degree of the spherical harmonics (SH): how finely colours depend on the direction they are seen from, 0
-    (not at all) to 3."""
+    """Highest degree of the spherical harmonics (SH): how finely colours depend on the viewing direction, 0 (not at
+    all) to 3."""
     sh_degree_every: int = 1000
     """Steps after which the SH degree in use rises by one, from 0 to sh-degree."""
     dssim_weight: float = 0.2
-    """Weight of D-SSIM (how unlike structures are) in the loss, 0 to 1; L1 (mean absolute difference) has the rest."""
+    """Weight of D-SSIM (structural dissimilarity) in the loss, 0 to 1. L1 (mean absolute difference) has the rest."""
     background: Background = "black"
-    """Background behind the Gaussians and behind images with alpha; random: a new colour each step, and black in
+    """Background behind the Gaussians and behind images with alpha. random: a new colour each step, and black in
     evaluations."""
     thinning: float = 0.0
-    """For few photographs (DropGaussian): share of the Gaussians, drawn at random, that is left out of the last step, 0
-    to 0.9; it rises from 0 at the first. The others are more opaque in that step. 0.2 is as published; 0 leaves none
-    out."""
+    """For few photographs (DropGaussian): fraction of the Gaussians, drawn at random, that the last step leaves out, 0
+    to 0.9. It rises from 0 at the first step. The other Gaussians are more opaque in that step. 0.2 is as published; 0
+    leaves none out."""
     penalty: float = 0.0
-    """Weight in the loss of the mean opacity and of the mean size, in parts of the scene's extent, by the Gaussians
-    that the step's view shows; 0.02 is of use against fog where there are few photographs. With --density.growth mcmc
-    its own weights say that."""
+    """Weight in the loss of the mean opacity and of the mean scale relative to the scene's extent. Summed over the
+    Gaussians that the step's view shows. 0.02 helps against fog if there are few photographs. --density.growth mcmc has
+    weights of its own instead."""
     antialiased: bool = False
-    """Train for pictures of any size (Mip-Splatting): a narrower low-pass that leaves a Gaussian its light, and no
-    Gaussian smaller than the photographs show. The model is drawn so too, and its file says it."""
+    """Train for pictures of any size (Mip-Splatting). A narrower low-pass filter preserves a Gaussian's light, and no
+    Gaussian is smaller than the photographs can show. The model is rendered the same way, and its file says it."""
     perspective: Perspective = "auto"
-    """How pinholes' pictures show a Gaussian. plane: as an ellipse on the image's plane (Kerbl et al.); rays: along the
-    rays of the pixels, as fisheyes and panoramas do, which takes longer; auto: rays where the scene has photographs of
-    these, so that all show the same. The model is drawn so too, and its file says it."""
+    """Projection of a Gaussian in pinhole pictures. plane: as an ellipse on the image plane (Kerbl et al.). rays: along
+    the rays of the pixels, as for fisheyes and panoramas, which takes longer. auto: rays if the scene has fisheyes or
+    panoramas, so that all photographs show the same. The model is rendered the same way, and its file says it."""
     masks: MaskMeaning = "none"
-    """Meaning of the masks beside the photographs, white where a pixel counts. ignore: what is black is not looked at,
-    such as people; transparent: there is nothing there, such as around a thing on a turntable; none: no masks are
+    """Meaning of the photographs' masks, which are white where a pixel counts. ignore: the loss ignores black pixels,
+    such as people. transparent: black pixels are empty, such as around an object on a turntable. none: masks are not
     used."""
     invert_masks: bool = False
-    """Take the masks' black parts for those that count, and their white ones for those that do not."""
+    """Invert masks: black pixels count, and white ones do not."""
     alpha: AlphaMeaning = "blend"
-    """Meaning of the photographs' alpha channels. blend: their colours are laid over the background; ignore and
-    transparent: as of masks."""
+    """Meaning of the photographs' alpha channels. blend: colours are blended over the background. ignore and
+    transparent: as for masks."""
     alpha_weight: float = 0.1
-    """Weight of the alpha loss, the mean absolute difference between the render's alpha and the photograph's, where
-    masks or alpha mean transparent. Training's background is random then, and --background that of evaluations."""
+    """Weight of the alpha loss, the mean absolute difference between the alphas of the render and of the photograph.
+    Used if masks or alpha mean transparent. Training's background is then random, and --background applies only to
+    evaluations."""
     warmup: tuple[int, ...] = (250, 500)
-    """Steps after which the training resolution doubles: with two of them training starts at a quarter of the size,
+    """Steps after which the training resolution doubles. With two of them training starts at a quarter of the size,
     with '' at the full size."""
-    frequency_steps: int = 0
-    """Steps within which the training resolution rises from an eighth of the size, as fast as the detail in the
-    photographs asks (by their spectra), in place of --warmup; 0 goes by --warmup."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
     test_every: int = TEST_EVERY
-    """Every n-th view by name is held out, the first too; 0 holds out none. A data set's own split goes first."""
+    """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
+    precedence."""
     missing: Missing = "few"
-    """Pictures that the scene lists and that are not there. few: up to a tenth of them are left out, with a warning,
-    and more are an error; skip: any number is left out; error: none may be missing. What is held out stays the same."""
+    """Handling of pictures that the scene lists but that are missing. few: up to a tenth of them are left out, with a
+    warning, and more are an error. skip: any number is left out. error: none may be missing. The held-out views stay
+    the same."""
     lenses: Lenses = "undistort"
-    """Photographs of fisheyes: undistort, to the pinhole pictures that they hold; native: trained through their own
-    lens, which sees all of them, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) always are."""
+    """Photographs of fisheyes. undistort: convert to the pinhole pictures that they contain. native: train through
+    their own lens, which sees all of them, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) are always trained
+    natively."""
     random_points: int = 100_000
-    """Number of Gaussians to start from, at random places, where a scene has no points."""
+    """Number of Gaussians to start from, at random places, if a scene has no points."""
     points: str = ""
-    """File of points to start from, in the scene's frame: PLY (COLMAP's fused.ply too), or with the extra las LAS and
-    LAZ. Points without colours take those of the photographs that show them. Of a scene without points a cloud beside
-    it is taken, such as points3d.ply."""
+    """File of points to start from, in the scene's frame: PLY (also COLMAP's fused.ply), or with the extra las LAS and
+    LAZ. Points without colours are coloured by the photographs that show them. A scene without points uses a cloud next
+    to it, such as points3d.ply."""
     points_use: PointsUse = "replace"
-    """replace: the file's points stand in for the scene's own; join: they come in addition."""
+    """replace: the file's points replace the scene's own. join: they are added."""
     points_limit: int = 0
-    """Most points to keep, of the file or else of the scene's own: one for each voxel that has some, the mean of their
-    places and colours, with voxels as small as that leaves. 0 keeps 200,000 of a file, and all of the scene's own."""
+    """Maximum number of points to keep, of the file or else of the scene's own. One point is kept per occupied voxel,
+    the mean of its places and colours, with the smallest sufficient voxels. 0 keeps 200,000 of a file, and all of the
+    scene's own."""
     sky: int = 0
-    """Points of a sky to start from, at most, on a sphere around the scene, where photographs show nothing above the
-    scene's points; 0 for none."""
+    """Maximum number of sky points to start from, on a sphere around the scene, where photographs show nothing above
+    the scene's points; 0 for none."""
     depth: DepthSource = "none"
-    """Known depths to compare the render's with. points: of the points of a COLMAP model, in the photographs that show
-    them; maps: depth maps in depths/ beside images/, or depth_file_path of transforms.json; none: none are used."""
+    """Known depths to compare with the render. points: the points of a COLMAP model, in the photographs that show them.
+    maps: depth maps in depths/ next to images/, or depth_file_path of transforms.json. none: no depths."""
     depth_weight: float = 0.01
-    """Weight of the depth loss at the first step, the mean difference of one over the depth, which counts in parts of
-    one over the scene's extent; it falls to a hundredth at the last step."""
+    """Weight of the depth loss at the first step. The loss is the mean difference of inverse depths, in units of one
+    over the scene's extent. The weight falls to a hundredth at the last step."""
     depth_maps: MapKind = "metric"
-    """metric: depth maps hold distances along the camera's axis, of fisheyes and panoramas from the camera, 0 where
-    nothing is known; relative: numbers that grow with nearness, brought to scale by the scene's points."""
+    """metric: depth maps hold distances along the camera's axis, for fisheyes and panoramas distances from the camera,
+    0 if unknown. relative: numbers that grow with nearness, scaled to the scene's points."""
     depth_unit: float = 1e-3
-    """World units of one step of a depth map of whole numbers (PNG); the default is of millimetres in a scene in
-    metres."""
+    """World units per step of an integer depth map (PNG). The default is for millimetres in a scene in metres."""
     checkpoint_every: int = 1000
-    """Steps between checkpoints; 0 writes one at the end only, or at an interruption."""
+    """Steps between checkpoints; 0 writes only one, at the end or at an interruption."""
     eval_at: tuple[int, ...] = ()
     """Steps at which the held-out views are evaluated, besides the last."""
     stages_every: int = 100
-    """Steps between those in which the time of each stage is measured for the report; such a step is slower, as the
-    device is waited for after every stage. Only steps that metrics.jsonl has count; the last one is measured too. 0
-    measures none."""
+    """Steps between measurements of the time of each stage for the report. Such a step is slower, as it waits for the
+    device after every stage. Only steps that metrics.jsonl records are measured, and always the last. 0 measures
+    none."""
     report: bool = True
     """Write report.html at the end."""
     appearance: AppearanceKind = "none"
-    """exposure: learn a gain for each colour channel of each photograph, whose exposure and white balance then do not
-    go into the model; it has their mean. ppisp: also how its channels mix, where cameras make colours in other ways,
-    and a vignette for each lens, where corners are darker. grid: a bilateral grid of colour maps for each photograph,
-    which also takes what changes by place and brightness, as where photographs were edited. none: photographs are taken
-    as they are."""
+    """exposure: learn a gain for each colour channel of each photograph, so that exposure and white balance stay out of
+    the model, which has their mean. ppisp: also learn how channels mix, for cameras with different colour processing,
+    and a vignette for each lens, for darker corners. grid: a bilateral grid of colour maps for each photograph. It also
+    covers changes by place and brightness, such as in edited photographs. none: photographs are used unchanged."""
     appearance_rate: float = 2e-3
-    """Learning rate of appearance, as logarithms to base 2 of the gains, or as coefficients of a grid; times the
-    root of the photographs' number, and for gains in trainings of fewer than 10,000 steps by as much more as they are
-    shorter."""
+    """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
+    the root of the number of photographs. For gains, trainings of fewer than 10,000 steps raise it in proportion."""
     refine_poses: bool = False
-    """Refine the poses of the training views with the model; two are held. The run's refined/ gets the cameras, a
-    COLMAP model, and eval.json the PSNR of held-out views that were aligned with the model. Not with batches."""
+    """Refine the poses of the training views with the model; two are fixed. The run's refined/ gets the cameras, a
+    COLMAP model, and eval.json the PSNR of held-out views after aligning them with the model. Not with batches."""
     pose_reach: float = 5.0
-    """Degrees by which a refined pose can turn in a training, about; it can move by as many 57ths of the scene's
-    extent."""
+    """Approximate limit of a refined pose's rotation over a training, in degrees. The limit of its movement is as many
+    57ths of the scene's extent."""
     refine_lenses: bool = False
-    """Refine focal lengths and principal points with the model, those of photographs that share a lens together. The
-    run's refined/ gets them. For photographs without distortion; not with batches."""
+    """Refine focal lengths and principal points with the model. Photographs with the same lens share them. The run's
+    refined/ gets them. For photographs without distortion; not with batches."""
     lens_reach: float = 2.0
-    """Hundredths of the focal length by which it, or the principal point, can change in a training, about."""
+    """Approximate limit of the change of the focal length, or the principal point, over a training, in hundredths of
+    the focal length."""
     refine_gate: float = 1.0
-    """Decibels by which the mean PSNR of held-out views can be under its best in two measurements in a row; then
-    refined cameras return to those of the best and stay. At most 8 views are measured, where refinement begins and
-    every tenth of the training, with poses as given or moved as the refined ones are on average, whichever fits. A
-    warning tells at the end if views that fit the model best are ahead of those as given by more. 0: neither; nor is
-    there a gate where no view is held out."""
+    """Tolerance in decibels of the held-out views' mean PSNR. If it is further below its best in two measurements in a
+    row, the refined cameras return to the best and stay. At most 8 views are measured, when refinement begins and at
+    every tenth of the training. Their poses are as given, or moved by the mean motion of the refined ones, whichever
+    fits better. A warning at the end reports if aligned views are ahead of the given ones by more than this. 0 turns
+    both off. There is no gate if no view is held out."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
     def check(self) -> None:
-        """Raise InputError naming the first setting whose value makes no sense."""
+        """Raise InputError naming the first setting whose value is invalid."""
         rules: tuple[Rule, ...] = (
             (("sh_degree",), lambda value: 0 <= value <= 3, "0 to 3"),
             (("appearance_rate",), lambda value: 0 <= value < inf, "a finite number, at least 0"),
@@ -356,7 +332,6 @@ class TrainConfig:
             (
                 (
                     "seed",
-                    "frequency_steps",
                     "resolution",
                     "test_every",
                     "checkpoint_every",
@@ -413,33 +388,36 @@ class TrainConfig:
 
     @property
     def mask_use(self) -> MaskUse:
-        """The use of the scene's masks."""
+        """Use of the scene's masks and alpha channels."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
 
     @property
     def depth_use(self) -> DepthUse:
-        """The known depths that are compared."""
+        """Known depths to compare with the render."""
         return DepthUse(self.depth, self.depth_maps, self.depth_unit) if self.depth != "none" else DepthUse()
 
     @property
     def start_points(self) -> StartPoints:
-        """The points to start from beside or in place of the scene's own."""
-        limit = self.points_limit or (POINTS_OF_FILE if self.points else 0)
+        """Points to start from, in addition to or instead of the scene's own."""
+        limit = self.points_limit or (DEFAULT_MAX_FILE_POINTS if self.points else 0)
         return StartPoints(self.points, self.points_use, limit, self.sky)
 
     @property
     def random_background(self) -> bool:
-        """True if each step has a background of its own."""
+        """True if each step has its own background."""
         return self.background == "random" or "transparent" in (self.masks, self.alpha)
 
     @property
     def alpha_loss(self) -> float:
-        """Weight of the alpha loss, 0 where there is none."""
+        """Weight of the alpha loss; 0 without one."""
         return self.alpha_weight if "transparent" in (self.masks, self.alpha) else 0.0
 
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
-        """The settings for `count` devices: a batch of a view for each, unless it is told. Raises InputError for a
-        batch that they cannot share evenly."""
+        """Settings for `count` devices. A batch of 1 becomes one view per device, unless `explicit`.
+
+        explicit: the batch was given on the command line.
+        Raises InputError for a batch that the devices cannot share evenly.
+        """
         if self.refines and count > 1:
             raise InputError(f"{self._refining}: not with {count} devices, expected one")
         if self.batch == 1 and not explicit:

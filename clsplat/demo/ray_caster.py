@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs of a small textured still life, made by a plain NumPy ray caster with no splats in it.
+"""Photographs of a small textured still life, rendered by a plain NumPy ray caster without splats.
 
-The demo and the tests of structure from motion need photos that carry no licence and no known poses, and that
-no splat renderer has touched. Everything in the scene is diffuse but for a mild highlight on the two balls, so its
-light (sun with soft shadows, sky) is baked into one texture per object, and a photo is a nearest hit and a texture
-look-up per ray. The world is z up, in metres: a paved floor inside a round wall so high that no photo shows the sky, of
-which there would be no points to start from: what training puts there may hang in front of another camera.
+The demo and the tests of structure from motion need photos without licence and without known poses.
+No splat renderer may have been involved.
+
+The scene is diffuse, apart from a mild highlight on the two balls.
+Its light (sun with soft shadows, sky) is therefore baked into one texture per object.
+A photo is a nearest hit and a texture look-up per ray.
+
+The world is z up, in metres: a paved floor inside a round wall that hides the sky from every photo.
+Sky would have no points to start from, and training might put Gaussians for it in front of another camera.
 """
 
 from __future__ import annotations
@@ -29,27 +33,28 @@ from clsplat.shots.viewpoints import look_at
 
 Palette = tuple[tuple[float, float, float], ...]
 
-SUN = np.array([0.45, -0.35, 0.82], np.float32) / np.float32(np.sqrt(0.45**2 + 0.35**2 + 0.82**2))
-SUN_LIGHT = np.array([0.80, 0.74, 0.64], np.float32)
-SKY_LIGHT = np.array([0.36, 0.40, 0.47], np.float32)
-SHADOW_RAYS = 24
-GLOSS = 0.25
+SUN_DIRECTION = np.array([0.45, -0.35, 0.82], np.float32) / np.float32(np.sqrt(0.45**2 + 0.35**2 + 0.82**2))
+SUN_COLOUR = np.array([0.80, 0.74, 0.64], np.float32)
+SKY_COLOUR = np.array([0.36, 0.40, 0.47], np.float32)
+SHADOW_RAYS_PER_TEXEL = 24
+HIGHLIGHT_STRENGTH = 0.25
 """Strength of the highlight on the balls."""
-WALL_RADIUS, WALL_HEIGHT = 3.4, 2.8
-CENTRE = np.array([0.0, 0.0, 0.35], np.float32)
-FIELD_OF_VIEW = np.deg2rad(62.0)
+WALL_RADIUS_METRES, WALL_HEIGHT_METRES = 3.4, 2.8
+SCENE_CENTRE = np.array([0.0, 0.0, 0.35], np.float32)
+FIELD_OF_VIEW_RADIANS = np.deg2rad(62.0)
 
 
 class Noise:
-    """Smooth periodic noise in three dimensions: cubic B-splines over random lattices, a lattice per octave."""
+    """Smooth periodic 3D noise: cubic B-splines over random lattices, one per octave."""
 
     def __init__(self, seed: int) -> None:
         self._lattices = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, 24, 24, 24)).astype(np.float32)
 
     def __call__(self, points: Float32, wavelength: float, octaves: int, gain: float = 0.65) -> Float32:
-        """Sum of octaves, about [-1, 1], (n,), at points (n, 3); the first octave has this wavelength in metres.
+        """Sum of octaves at points (n, 3): (n,), about [-1, 1].
 
-        A B-spline without its prefilter removes what the lattice cannot carry, so each octave is band limited.
+        wavelength: of the first octave, in metres.
+        A B-spline without prefilter removes frequencies that the lattice cannot represent: octaves are band limited.
         """
         total, weight = np.zeros(len(points), np.float32), 1.0
         for octave in range(octaves):
@@ -59,39 +64,39 @@ class Noise:
             )
             total += np.float32(weight) * sample
             weight *= gain
-        # B-spline smoothing leaves about a third of the lattice's range
+        # the B-spline's smoothing leaves about a third of the lattice's range
         return np.asarray(np.tanh(2.2 * total).astype(np.float32))
 
 
 def smooth_square(phase: Float32, softness: float) -> Float32:
-    """A square wave of period 1 with soft edges, [0, 1]: hard edges would alias in the texture."""
+    """Square wave of period 1 in [0, 1] with soft edges. Hard edges would alias in the texture."""
     return np.asarray(0.5 + 0.5 * np.tanh(np.sin(2 * np.pi * phase) / softness))
 
 
 def palette_colour(value: Float32, colours: Palette) -> Float32:
-    """Linear interpolation through equally spaced colours; value (n,) in [0, 1], result (n, 3)."""
+    """Linear interpolation between equally spaced colours: value (n,) in [0, 1] to colour (n, 3)."""
     stops = np.linspace(0.0, 1.0, len(colours))
     channels = [np.interp(value, stops, levels) for levels in zip(*colours, strict=True)]
     return np.stack(channels, axis=-1).astype(np.float32)
 
 
 def speckled(colour: Float32, points: Float32, noise: Noise, wavelength: float) -> Float32:
-    """Soft dark and light specks over colour (n, 3): blobs of a few pixels are what SIFT finds and matches."""
+    """Add soft dark and light specks to a colour (n, 3). SIFT finds and matches blobs of a few pixels."""
     fine = noise(points + 11, wavelength, 2, gain=0.8)[:, None]
     dark, light = np.clip(-1.7 * fine - 0.5, 0, 1), np.clip(1.7 * fine - 0.5, 0, 1)
     return np.asarray(colour * (1 - 0.55 * dark) + (0.97 - colour) * (0.45 * light))
 
 
 def dot(a: Float32, b: Float32) -> Float32:
-    """Row-wise scalar product of (n, 3) and (n, 3) or (3,)."""
+    """Row-wise dot product of (n, 3) with (n, 3) or (3,)."""
     return np.asarray(a[:, 0] * b[..., 0] + a[:, 1] * b[..., 1] + a[:, 2] * b[..., 2])
 
 
 @dataclass
 class Surface(ABC):
-    """One object: how a ray meets it, how its texture wraps around it, and its baked colours.
+    """One object: its intersection with rays, its texture mapping and its baked colours.
 
-    rows, columns: texels of the texture; a texel is about a pixel wide in the photos.
+    rows, columns: texels of the texture. A texel is about a pixel wide in the photos.
     """
 
     rows: int
@@ -100,22 +105,26 @@ class Surface(ABC):
 
     @abstractmethod
     def distance(self, origin: Float32, direction: Float32) -> Float32:
-        """Distance to the nearest hit in front, infinity for none, (n,); origin (n, 3) or (3,), direction (n, 3)."""
+        """Distance (n,) to the nearest hit in front, infinity for a miss.
+
+        origin: (n, 3) or (3,).
+        direction: (n, 3).
+        """
 
     @abstractmethod
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
-        """Row and column in [0, 1] for points (n, 3) of the surface."""
+        """Row and column in [0, 1] of points (n, 3) on the surface."""
 
     @abstractmethod
     def point(self, row: Float32, column: Float32) -> tuple[Float32, Float32]:
-        """Position and normal, (n, 3) each, for texture coordinates (n,): the inverse of `texture_coordinates`."""
+        """Position and normal, (n, 3) each, at texture coordinates (n,): the inverse of `texture_coordinates`."""
 
     @abstractmethod
     def albedo(self, points: Float32, noise: Noise) -> Float32:
         """Diffuse colour in [0, 1], (n, 3), at points (n, 3)."""
 
     def colour(self, points: Float32) -> Float32:
-        """Bilinear look-up of the baked texture, (n, 3)."""
+        """Bilinear look-up in the baked texture at points (n, 3), as (n, 3)."""
         row, column = self.texture_coordinates(points)
         y = np.clip(row * np.float32(self.rows) - 0.5, 0, self.rows - 1.001)
         x = np.clip(column * np.float32(self.columns) - 0.5, 0, self.columns - 1.001)
@@ -128,13 +137,13 @@ class Surface(ABC):
         return np.asarray(top * (1 - fy) + bottom * fy)
 
     def grid(self, rows: int, columns: int) -> tuple[Float32, Float32]:
-        """Position and normal at the centres of a rows x columns grid over the texture, (rows * columns, 3)."""
+        """Position and normal at the centres of a rows x columns grid over the texture, (rows * columns, 3) each."""
         row, column = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
         return self.point(row.ravel().astype(np.float32), column.ravel().astype(np.float32))
 
 
 class Floor(Surface):
-    """A disc at z = 0 out to the wall, paved with a warm soft-edged checker of stone."""
+    """Disc at z = 0 that reaches to the wall, paved with a warm, soft-edged checker of stone."""
 
     def distance(self, origin: Float32, direction: Float32) -> Float32:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -142,11 +151,11 @@ class Floor(Surface):
         return np.where(t > 1e-4, t, np.inf).astype(np.float32)
 
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
-        scale = np.float32(0.5 / WALL_RADIUS)
+        scale = np.float32(0.5 / WALL_RADIUS_METRES)
         return points[:, 1] * scale + np.float32(0.5), points[:, 0] * scale + np.float32(0.5)
 
     def point(self, row: Float32, column: Float32) -> tuple[Float32, Float32]:
-        side = 2 * WALL_RADIUS
+        side = 2 * WALL_RADIUS_METRES
         points = np.stack([(column - 0.5) * side, (row - 0.5) * side, np.zeros_like(row)], axis=-1)
         return points.astype(np.float32), np.broadcast_to(np.array([0, 0, 1], np.float32), points.shape)
 
@@ -162,26 +171,26 @@ class Floor(Surface):
 
 
 class Wall(Surface):
-    """The inside of an upright cylinder around the floor, painted in broad bands."""
+    """Inside of an upright cylinder around the floor, painted in broad bands."""
 
     def distance(self, origin: Float32, direction: Float32) -> Float32:
         a = direction[:, 0] ** 2 + direction[:, 1] ** 2
         b = origin[..., 0] * direction[:, 0] + origin[..., 1] * direction[:, 1]
-        c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - np.float32(WALL_RADIUS**2)
+        c = origin[..., 0] ** 2 + origin[..., 1] ** 2 - np.float32(WALL_RADIUS_METRES**2)
         with np.errstate(divide="ignore", invalid="ignore"):
-            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # from inside, the far root is the one ahead
+            t = (-b + np.sqrt(np.maximum(b * b - a * c, 0))) / a  # from inside, the far root is the hit in front
             z = origin[..., 2] + t * direction[:, 2]
-        return np.where((t > 1e-3) & (z < WALL_HEIGHT) & (z > 0), t, np.inf).astype(np.float32)
+        return np.where((t > 1e-3) & (z < WALL_HEIGHT_METRES) & (z > 0), t, np.inf).astype(np.float32)
 
     def texture_coordinates(self, points: Float32) -> tuple[Float32, Float32]:
         angle = np.arctan2(points[:, 1], points[:, 0]) / np.float32(2 * np.pi)
-        return points[:, 2] / np.float32(WALL_HEIGHT), (angle + 0.5).astype(np.float32)
+        return points[:, 2] / np.float32(WALL_HEIGHT_METRES), (angle + 0.5).astype(np.float32)
 
     def point(self, row: Float32, column: Float32) -> tuple[Float32, Float32]:
         angle = (column - 0.5) * 2 * np.pi
         normals = np.stack([-np.cos(angle), -np.sin(angle), np.zeros_like(angle)], axis=-1).astype(np.float32)
-        points = -WALL_RADIUS * normals
-        points[:, 2] = row * WALL_HEIGHT
+        points = -WALL_RADIUS_METRES * normals
+        points[:, 2] = row * WALL_HEIGHT_METRES
         return points.astype(np.float32), normals
 
     def albedo(self, points: Float32, noise: Noise) -> Float32:
@@ -195,7 +204,7 @@ class Wall(Surface):
 
 @dataclass
 class Ball(Surface):
-    """A sphere, textured by longitude and height angle, marbled in the palette."""
+    """Sphere, textured by longitude and polar angle, marbled in the palette."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     radius: float = 1.0
@@ -229,7 +238,7 @@ class Ball(Surface):
 
 @dataclass
 class Box(Surface):
-    """An upright box turned about z, its six faces side by side in the texture."""
+    """Upright box, turned about z. Its six faces lie next to each other in the texture."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     half: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -248,7 +257,7 @@ class Box(Surface):
         enter = np.full(len(direction), -np.inf, np.float32)
         leave = np.full(len(direction), np.inf, np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
-            for axis in range(3):  # a loop of three is much quicker than NumPy's reductions over an axis of three
+            for axis in range(3):  # a loop over three axes is much quicker than NumPy reductions over an axis of three
                 one = (-half[axis] - start[..., axis]) / step[:, axis]
                 other = (half[axis] - start[..., axis]) / step[:, axis]
                 np.maximum(enter, np.minimum(one, other), out=enter)
@@ -287,7 +296,7 @@ class Box(Surface):
 
 
 def still_life() -> list[Surface]:
-    """The objects of the scene, without their textures."""
+    """Objects of the scene, without textures."""
     marble = ((0.10, 0.16, 0.34), (0.30, 0.46, 0.70), (0.80, 0.86, 0.90), (0.95, 0.94, 0.88))
     amber = ((0.45, 0.16, 0.05), (0.86, 0.46, 0.12), (0.98, 0.84, 0.48))
     red = ((0.26, 0.06, 0.07), (0.64, 0.18, 0.14), (0.90, 0.50, 0.34))
@@ -303,9 +312,9 @@ def still_life() -> list[Surface]:
 
 
 def bake(surfaces: list[Surface], seed: int) -> None:
-    """Fill in every texture: albedo times sky and sun, with soft sun shadows and darkening near the floor."""
+    """Compute every texture: albedo times sky and sun, with soft sun shadows and darkening near the floor."""
     noise = Noise(seed)
-    suns = SUN + np.random.default_rng(seed).normal(0.0, 0.05, (SHADOW_RAYS, 3)).astype(np.float32)
+    suns = SUN_DIRECTION + np.random.default_rng(seed).normal(0.0, 0.05, (SHADOW_RAYS_PER_TEXEL, 3)).astype(np.float32)
     suns /= np.linalg.norm(suns, axis=1, keepdims=True)
     blockers = [surface for surface in surfaces if isinstance(surface, (Ball, Box))]
     with ThreadPoolExecutor(2) as pool:
@@ -313,7 +322,10 @@ def bake(surfaces: list[Surface], seed: int) -> None:
 
 
 def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], noise: Noise) -> None:
-    """Fill in one texture; suns (n, 3) are directions to points of the sun's disc."""
+    """Compute one texture.
+
+    suns: (n, 3), directions to points of the sun's disc.
+    """
     points, normals = surface.grid(surface.rows, surface.columns)
     # soft shadows vary slowly: cast them on a grid four times coarser, then interpolate
     rows, columns = surface.rows // 4, surface.columns // 4
@@ -323,20 +335,22 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
     for sun in suns:
         direction = np.broadcast_to(sun, start.shape)
         lit += ~np.any([np.isfinite(blocker.distance(start, direction)) for blocker in blockers], axis=0)
-    sunlit = ndimage.zoom((lit / SHADOW_RAYS).reshape(rows, columns), 4, order=1, grid_mode=True, mode="nearest")
-    sun_term = np.maximum(dot(normals, SUN), 0) * sunlit.ravel()
+    sunlit = ndimage.zoom(
+        (lit / SHADOW_RAYS_PER_TEXEL).reshape(rows, columns), 4, order=1, grid_mode=True, mode="nearest"
+    )
+    sun_term = np.maximum(dot(normals, SUN_DIRECTION), 0) * sunlit.ravel()
     sky_term = 0.55 + 0.45 * normals[:, 2]
     if isinstance(surface, (Ball, Box)):
         sky_term = sky_term * (1 - 0.4 * np.exp(-points[:, 2] / 0.12))
-    light = SKY_LIGHT * (0.35 + 0.65 * sky_term)[:, None] + SUN_LIGHT * sun_term[:, None]
+    light = SKY_COLOUR * (0.35 + 0.65 * sky_term)[:, None] + SUN_COLOUR * sun_term[:, None]
     texture = surface.albedo(points, noise) * light
     surface.texture = texture.reshape(surface.rows, surface.columns, 3).astype(np.float32)
 
 
 def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
-    """Hand-held views: three in five on a low ring, the others on a high one, all towards the middle, with jitter."""
+    """Hand-held cameras: three in five on a low ring, the others on a high one. All look at the middle, with jitter."""
     generator = np.random.default_rng(seed + 1)
-    focal = 0.5 * max(width, height) / np.tan(0.5 * FIELD_OF_VIEW)
+    focal = 0.5 * max(width, height) / np.tan(0.5 * FIELD_OF_VIEW_RADIANS)
     low = max(1, round(count * 0.6)) if count > 1 else count
     views = []
     for ring, ring_count, radius, elevation in ((0, low, 2.55, 0.85), (1, count - low, 2.15, 1.75)):
@@ -344,7 +358,7 @@ def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
             angle = 2 * np.pi * (index + 0.5 * ring) / ring_count + generator.normal(0, 0.02)
             position = np.array([radius * np.cos(angle), radius * np.sin(angle), elevation])
             position += generator.normal(0, 0.04, 3)
-            target = CENTRE + generator.normal(0, 0.06, 3)
+            target = SCENE_CENTRE + generator.normal(0, 0.06, 3)
             up = np.array([0.0, 0.0, 1.0]) + generator.normal(0, 0.02, 3)
             rotation, translation = look_at(position, target, up)
             views.append(Camera(width, height, focal, focal, width / 2, height / 2, rotation, translation))
@@ -352,7 +366,10 @@ def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
 
 
 def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32:
-    """One photo, (height, width, 3) in [0, 1]; samples x samples rays a pixel, averaged."""
+    """Render one photo, (height, width, 3) in [0, 1].
+
+    samples: samples x samples rays a pixel are averaged.
+    """
     columns = (np.arange(camera.width * samples, dtype=np.float32) + 0.5) / samples
     rows = (np.arange(camera.height * samples, dtype=np.float32) + 0.5) / samples
     x, y = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
@@ -364,7 +381,7 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
     distances = np.stack([surface.distance(origin, direction) for surface in surfaces])
     nearest = distances.min(axis=0)
     hit_index = np.where(np.isfinite(nearest), distances.argmin(axis=0), -1)
-    colour = np.zeros_like(direction)  # no ray misses the wall
+    colour = np.zeros_like(direction)  # every ray hits the floor, the wall or an object
     for index, surface in enumerate(surfaces):
         rays = np.flatnonzero(hit_index == index)
         if not len(rays):
@@ -373,18 +390,18 @@ def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32
         colour[rays] = surface.colour(points)
         if isinstance(surface, Ball):
             normals = ((points - np.asarray(surface.centre)) / surface.radius).astype(np.float32)
-            halfway = (SUN - direction[rays]).astype(np.float32)
+            halfway = (SUN_DIRECTION - direction[rays]).astype(np.float32)
             halfway /= np.sqrt(dot(halfway, halfway))[:, None]
             highlight = np.maximum(dot(normals, halfway), 0) ** 24
-            colour[rays] += GLOSS * highlight[:, None]
+            colour[rays] += HIGHLIGHT_STRENGTH * highlight[:, None]
     fine = colour.reshape(camera.height, samples, camera.width, samples, 3)
     linear = np.clip(fine.mean(axis=(1, 3)), 0, 1)
-    # a gentle tone curve: the photos should not look gloomy
+    # a gentle tone curve keeps the photos from looking gloomy
     return np.asarray(linear ** np.float32(1 / 1.6))
 
 
 def write_jpeg(path: Path, image: Float32) -> None:
-    """Write (height, width, 3) in [0, 1] as an 8 bit JPEG of high quality, with nothing in it but the pixels."""
+    """Write an image (height, width, 3) in [0, 1] as an 8-bit JPEG of high quality, without metadata."""
     pixels = np.ascontiguousarray(np.rint(image * 255).astype(np.uint8))
     spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
     spec.attribute("Compression", "jpeg:97")
@@ -401,17 +418,20 @@ def write_photos(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> None:
-    """Write `count` photos `photo_000.jpg` ... into folder (made if missing). The same seed gives the same photos.
+    """Write `count` photos `photo_000.jpg` ... into the folder, which is made if missing.
 
-    width, height: pixels. progress(text, fraction) is called as the work goes on. Raises ClsplatError where a
-    photo cannot be written. Poses are neither returned nor written: recovering them is the point of the demo.
+    Equal seeds give equal photos.
+    width, height: in pixels.
+    progress: called with a text and a fraction as the work goes on.
+    Raises ClsplatError if a photo cannot be written.
+    Poses are neither returned nor written: the demo shows that they can be recovered.
     """
     folder.mkdir(parents=True, exist_ok=True)
     progress("painting the scene", 0.0)
     surfaces = still_life()
     bake(surfaces, seed)
     views = cameras(count, width, height, seed)
-    # NumPy lets go of the interpreter in its loops: two threads nearly halve the time
+    # NumPy releases the interpreter lock in its loops: two threads nearly halve the time
     with ThreadPoolExecutor(2) as pool:
         for index, image in enumerate(pool.map(partial(render, surfaces), views)):
             write_jpeg(folder / f"photo_{index:03d}.jpg", image)

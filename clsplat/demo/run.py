@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: photos of a scene of our own, their poses thrown away and recovered, trained, measured and shown."""
+"""The demo: make photos of a synthetic scene, recover their poses, train, evaluate and render a turntable."""
 
 from __future__ import annotations
 
@@ -10,40 +10,43 @@ from pathlib import Path
 from typing import Any
 
 from clsplat.api import train
+from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
-from clsplat.config.verbs import DEMO_ITERATIONS
 from clsplat.demo.ray_caster import write_photos
 from clsplat.device.context import open_device
 from clsplat.errors import InputError, examples
-from clsplat.files import atomic_write, is_file
+from clsplat.files.atomic import atomic_write
+from clsplat.files.documents import is_file
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
 from clsplat.progress import Progress, StageProgress, TrainProgress, no_progress
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
-from clsplat.scenes import sfm
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.sfm import reconstruct as sfm
 from clsplat.shots.generated import turntable
 
-PHOTOS = 40
-TURNTABLE_FRAMES = 60
-MARK = ".clsplat-demo"
-"""The file that says of a folder that a demo has made what is in it."""
-MADE = ("photos", "scene", "run", "turntable")
+DEMO_PHOTO_COUNT = 40
+TURNTABLE_FRAME_COUNT = 60
+DEMO_MARKER_FILE_NAME = ".clsplat-demo"
+"""Marker file of a folder whose content was made by a demo."""
+DEMO_FOLDERS = ("photos", "scene", "run", "turntable")
 
 
 def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS) -> dict[str, Any]:
-    """Make everything below output: photos/, scene/, run/ and turntable/; returns the evaluation, as in eval.json.
+    """Make photos/, scene/, run/ and turntable/ below `output`, and return the evaluation, as in eval.json.
 
-    What an earlier, interrupted demo has finished is used again. device: as `clsplat devices` names it; iterations: of
-    training. Raises InputError for a folder that holds something else, and what the steps raise.
+    Finished steps of an interrupted demo are reused.
+    device: as named by `clsplat devices`.
+    iterations: of training.
+    Raises InputError if the folder holds other files, and the errors of the steps.
     """
     output.mkdir(parents=True, exist_ok=True)
     with locked(output, "demo"):
         claim(output)
         start = time.monotonic()
-        # before minutes of work: is there a device of that name?
+        # fail on a wrong device name before minutes of work
         opened = open_device(device)
         report = StageProgress()
         scene_folder = make_scene(output, report)
@@ -55,10 +58,10 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
         gaussians, renderer = Gaussians.load(run.model_path), Renderer(opened)
         turntable_folder = output / "turntable"
         turntable_folder.mkdir(exist_ok=True)
-        for index, camera in enumerate(turntable([view.camera for view in scene.views], TURNTABLE_FRAMES)):
+        for index, camera in enumerate(turntable([view.camera for view in scene.views], TURNTABLE_FRAME_COUNT)):
             picture = renderer.render(gaussians, camera, (0.0, 0.0, 0.0)).image
             write_image(turntable_folder / f"frame_{index:03d}.png", picture)
-            report("rendering the turntable", (index + 1) / TURNTABLE_FRAMES)
+            report("rendering the turntable", (index + 1) / TURNTABLE_FRAME_COUNT)
     minutes, seconds = divmod(round(time.monotonic() - start), 60)
     print(
         f"done in {minutes} min {seconds} s: PSNR {result['mean']['psnr']:.2f} dB, SSIM {result['mean']['ssim']:.3f} "
@@ -73,29 +76,33 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as a demo's. Raises InputError where it has what a demo would replace, and is not marked."""
-    if is_file(output / MARK):
+    """Mark a folder as a demo's. Raises InputError if it is not marked and holds folders that a demo would replace."""
+    if is_file(output / DEMO_MARKER_FILE_NAME):
         return
-    existing = [name for name in MADE if (output / name).exists() or (output / name).is_symlink()]
+    existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]
     if existing:
         raise InputError(
-            f"{output}: holds {examples(existing, len(MADE))}, which no demo has made and a demo would replace; choose "
+            f"{output}: holds {examples(existing, len(DEMO_FOLDERS))}, which no demo has made and a demo would "
+            "replace; choose "
             "another folder, or remove them"
         )
-    atomic_write(output / MARK, b"What is beside this file was made by clsplat demo, which may replace it.\n")
+    atomic_write(
+        output / DEMO_MARKER_FILE_NAME, b"This folder was made by clsplat demo, which may replace its content.\n"
+    )
 
 
 def make_scene(output: Path, progress: Progress = no_progress) -> Path:
-    """Photos in output/photos and the scene recovered from them in output/scene, whose path is returned.
+    """Make photos in output/photos and recover their scene in output/scene. Returns the scene's path.
 
-    Both are used again where they are complete. Raises InputError where output/photos holds other files.
+    Complete results are reused. Raises InputError if output/photos holds other files.
     """
     photos, scene = output / "photos", output / "scene"
     existing = sorted(path.name for path in photos.glob("[!.]*"))
-    expected = [f"photo_{index:03d}.jpg" for index in range(PHOTOS)]
+    expected = [f"photo_{index:03d}.jpg" for index in range(DEMO_PHOTO_COUNT)]
     if not set(existing).issubset(expected):
         raise InputError(f"{photos}: holds files that are not the demo's, expected a new folder")
     if existing != expected:
-        write_photos(photos, count=PHOTOS, progress=progress)
-    # the ray caster's lens has no distortion, as ours is known to have none: photos need no resampling
-    return sfm.reconstruct(photos, scene, camera_model="SIMPLE_PINHOLE", overwrite=True, progress=progress)
+        write_photos(photos, count=DEMO_PHOTO_COUNT, progress=progress)
+    # the ray caster's lens has no distortion: photos need no resampling
+    settings = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE")
+    return sfm.reconstruct(photos, scene, settings, overwrite=True, progress=progress)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays in device memory: a shape and a dtype over a buffer, and a workspace of named ones that grow.
+"""Arrays in device memory (a shape and a dtype over a buffer), and a workspace of named scratch arrays that grow.
 
-Debug mode: with CLSPLAT_POISON=1 every array is full of NaN (as integers 2143289344) when it is handed out; with
-CLSPLAT_POISON=0xff800000 or another number of 32 bits it is full of that. Reads of memory that was never written then
-show.
+Debug mode: with CLSPLAT_POISON=1 every array is filled with NaN (2143289344 as an integer) when it is handed out.
+CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number. Reads of memory that was never written
+then show up in the results.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike, NDArray
 
+from clsplat.device.command_buffer import CHECK_TAPES, CommandBuffer, asked
 from clsplat.device.context import Device
-from clsplat.device.host_memory import host_bytes
-from clsplat.device.tape import CHECK, Tape, asked
+from clsplat.device.host_allocator import host_bytes
 from clsplat.errors import CapacityError, InputError, amount
 
 R = TypeVar("R")
@@ -54,19 +54,21 @@ class DeviceArray:
         return host
 
     def set(self, values: NDArray[Any]) -> None:
-        """Copy from the host; waits for the device. Raises ValueError where shape or dtype differ."""
+        """Copy from the host; waits for the device. Raises ValueError if the shape or dtype differs."""
         self._check(values)
         self._write(values, 0)
 
     def send(self, values: NDArray[Any]) -> None:
-        """Copy from the host, without waiting: `values` must not change before the device is waited for. Raises
-        ValueError where shape or dtype differ, or the array is not C-contiguous."""
+        """Copy from the host without waiting: `values` must not change until the host has waited for the device.
+
+        Raises ValueError if the shape or dtype differs, or the array is not C-contiguous.
+        """
         self._check(values)
         if values.size:
             self.device.calls.writes += 1
             event = cl.enqueue_copy(self.device.queue, self.buffer, values, is_blocking=False)
             self._note("write", event)
-            self.device.under_way.append(event)  # without a reference it waits for itself
+            self.device.under_way.append(event)  # without a reference, pyopencl's event waits when it is deleted
 
     def _check(self, values: NDArray[Any]) -> None:
         if values.shape != self.shape or values.dtype != self.dtype:
@@ -91,8 +93,11 @@ class DeviceArray:
         self._read(host, 0)
 
     def begin_get(self, into: NDArray[Any] | None = None) -> Callable[[], NDArray[Any]]:
-        """Start a copy to the host behind what is on the queue now. The result waits for no more than that, and returns
-        the copy. into: memory of that shape for it, such as `pinned`."""
+        """Start a copy to the host, queued behind all work that is on the queue now.
+
+        into: host memory of that shape for the copy, such as `pinned`.
+        Returns a function that waits for this copy only, and returns it.
+        """
         host = np.empty(self.shape, self.dtype) if into is None else into
         copying = partial(cl.enqueue_copy, self.device.queue, host, self.buffer, is_blocking=False)
         self.device.calls.reads += 1
@@ -112,25 +117,25 @@ class DeviceArray:
         return finish
 
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
-        """A copy of the rows from start to before stop on the host, from any start; waits for the device."""
+        """Return a host copy of the rows [start, stop); `start` needs no alignment. Waits for the device."""
         host = np.empty((stop - start, *self.shape[1:]), self.dtype)
         self._read(host, start)
         return host
 
     def set_rows(self, start: int, values: NDArray[Any]) -> None:
-        """Copy from the host to the rows from any start on; waits for the device."""
+        """Copy from the host to the rows that begin at `start`, which needs no alignment; waits for the device."""
         self._write(values, start)
 
     def _read(self, host: NDArray[Any], start: int) -> None:
-        """Fill an array on the host with the rows from start on, and wait."""
+        """Fill a host array with the rows that begin at `start`, and wait."""
         if host.size:
             self.device.calls.blocking_reads += 1
             event = cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=self._at(start), is_blocking=True)
             self._note("read", event, host.nbytes)
-            self.device.under_way.clear()  # the queue is in order: all that came before is done
+            self.device.under_way.clear()  # the queue is in order: all earlier work is done
 
     def _write(self, values: NDArray[Any], start: int) -> None:
-        """Fill the rows from start on with an array on the host, and wait."""
+        """Fill the rows that begin at `start` from a host array, and wait."""
         if values.size:
             self.device.calls.blocking_writes += 1
             host = np.ascontiguousarray(values, self.dtype)
@@ -139,11 +144,11 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _at(self, row: int) -> int:
-        """The byte at which a row begins; an array without a first axis has row 0 alone."""
+        """The byte at which a row begins; an array without a first axis has only row 0."""
         return row * (self.nbytes // self.shape[0]) if row else 0
 
     def rows(self, start: int, stop: int) -> DeviceArray:
-        """The rows [start, stop) in place. `start` has to be a multiple of `Device.row_alignment`."""
+        """The rows [start, stop) in place. `start` must be a multiple of `Device.row_alignment`."""
         if (start, stop) == (0, self.shape[0]):
             return self
         width = self.nbytes // max(self.shape[0], 1)
@@ -151,12 +156,12 @@ class DeviceArray:
         return DeviceArray(self.device, buffer, (stop - start, *self.shape[1:]), self.dtype)
 
     def reshaped(self, *shape: int) -> DeviceArray:
-        """The same memory in another shape, not larger."""
+        """The same memory in another shape, which must not be larger."""
         return DeviceArray(self.device, self.buffer, shape, self.dtype)
 
 
 def _poison() -> NDArray[np.uint32] | None:
-    """Word that new memory is filled with, or None to leave it as it is. Raises InputError."""
+    """The word that new memory is filled with, or None to leave memory as it is. Raises InputError."""
     value = os.environ.get("CLSPLAT_POISON", "")
     if value in ("", "0"):
         return None
@@ -167,7 +172,7 @@ def _poison() -> NDArray[np.uint32] | None:
 
 
 def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nbytes: int) -> None:
-    """Fill the buffer's first `nbytes`: whole words, and the rest by the word's last byte."""
+    """Fill the buffer's first `nbytes`: whole words, and the remaining bytes with the word's last byte."""
     whole = nbytes // 4 * 4
     if whole:
         cl.enqueue_fill_buffer(device.queue, buffer, word, 0, whole)
@@ -176,13 +181,14 @@ def _fill_bytes(device: Device, buffer: cl.Buffer, word: NDArray[np.uint32], nby
 
 
 class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
-    """A buffer that can be referred to weakly, as the account of the device's memory wants."""
+    """A buffer that supports weak references, which the memory account needs."""
 
 
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
-    """A new array, its buffer of at least `capacity` elements.
+    """Allocate a new array with a buffer of at least `capacity` elements.
 
-    Raises CapacityError over the device's limit of one buffer, the limit of all (`Device.memory`), or what it has.
+    Raises CapacityError beyond the device's limit for one buffer, the limit for all (`Device.memory`), or its free
+    memory.
     """
     kind = np.dtype(dtype)
     elements = max(prod(shape), capacity, 1)
@@ -208,22 +214,27 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
 
 
 def upload(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """A new array with these values."""
+    """Upload these values to a new array."""
     array = allocate(device, values.shape, values.dtype)
     array.set(values)
     return array
 
 
 def shared(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """A C-contiguous array on the host, to be read in place by a device that shares the host's memory: it takes none of
-    the device's. It must not change for as long as the result lives."""
+    """Let a device that shares the host's memory read a C-contiguous host array in place; it takes no device memory.
+
+    The array must not change while the result lives.
+    """
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_ONLY | cl.mem_flags.USE_HOST_PTR, hostbuf=values)
     return DeviceArray(device, buffer, values.shape, values.dtype)
 
 
 def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
-    """An array on the host for kernels that read it: in place where it is C-contiguous and the device shares the host's
-    memory, else a copy, for which it is not waited. It must not change for as long as the result lives."""
+    """Make a host array available to kernels that read it.
+
+    It is used in place if it is C-contiguous and the device shares the host's memory, otherwise copied without waiting.
+    The array must not change while the result lives.
+    """
     host = np.ascontiguousarray(values).reshape(values.shape)
     if device.shares_memory and host.size:
         return shared(device, host)
@@ -234,13 +245,14 @@ def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 @dataclass(frozen=True, eq=False)
 class Hosted:
-    """An array that kernels write, and the host's memory that it comes to: the same, where the device shares it."""
+    """An array that kernels write, and the host memory that receives it: the same memory if the device shares the
+    host's."""
 
     array: DeviceArray
     _host: NDArray[Any]
 
     def get(self) -> NDArray[Any]:
-        """The array on the host, no copy; waits for the device. It is read before a kernel writes there again."""
+        """The array on the host, not a copy; waits for the device. Read it before a kernel writes there again."""
         if not self._host.size:
             return self._host
         if not self.array.device.shares_memory:
@@ -258,7 +270,7 @@ class Hosted:
 
 
 def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> Hosted:
-    """A new array that comes to the host. Raises CapacityError as `allocate`."""
+    """Allocate an array that is read back to the host. Raises CapacityError like `allocate`."""
     kind = np.dtype(dtype)
     nbytes = prod(shape) * kind.itemsize
     if not device.shares_memory or not nbytes:
@@ -272,24 +284,27 @@ def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32
 
 
 def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """An array on the host that a device copies to by itself. A driver may make the host wait for copies to other
-    memory, asked to or not."""
+    """Allocate pinned host memory, to which a device copies by itself.
+
+    For copies to other memory a driver may make the host wait, even if asked not to.
+    """
     nbytes = prod(shape) * np.dtype(dtype).itemsize
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, nbytes)
     flags = cl.map_flags.READ | cl.map_flags.WRITE
     host, _ = cl.enqueue_map_buffer(device.queue, buffer, flags, 0, shape, dtype, is_blocking=True)
-    return host  # type: ignore[no-any-return]  # it keeps the mapping, and that the buffer
+    return host  # type: ignore[no-any-return]  # the array keeps the mapping alive, and the mapping keeps the buffer
 
 
-MOST_TAPES = 256
-"""Tapes of an object: those of photographs of a few sizes. With one more it begins again."""
+MAX_TAPES_PER_OBJECT = 256
+"""The most tapes of one object, enough for photographs of a few sizes. Beyond it all of its tapes are dropped."""
 
 
 class Workspace:
-    """Scratch arrays by name. A name's buffer is kept from call to call, and grows by half when it is too small, or
-    where memory is `tight` to just what is needed.
+    """Scratch arrays by name.
 
-    It has the tapes of what is done to its arrays, which are good until one of these gets another buffer.
+    A name's buffer is kept from call to call. A buffer that is too small grows by half, or, if memory is `tight`, to
+    the required size only. The workspace also keeps tapes (recorded command buffers) of work on its arrays; they are
+    valid until one of these arrays gets another buffer.
     """
 
     def __init__(self, device: Device) -> None:
@@ -299,37 +314,41 @@ class Workspace:
         self._use = asked()
         self._arrays: dict[str, DeviceArray] = {}
         self._latest: dict[str, tuple[DeviceArray, DTypeLike]] = {}
-        self._tapes: WeakKeyDictionary[object, dict[tuple[object, ...], tuple[Any, Tape]]] = WeakKeyDictionary()
+        self._tapes: WeakKeyDictionary[object, dict[tuple[object, ...], tuple[Any, CommandBuffer]]] = (
+            WeakKeyDictionary()
+        )
         self._renewed = 0
 
     def replayed(
         self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
     ) -> R:
-        """The result of `make`, which is the same whenever it is called with this key, and so is what it puts on the
-        queue: from the second time on that comes from a tape.
+        """Return the result of `make`; its queue commands come from a tape from the second call with this key.
 
-        of: the object with the arrays that are not the workspace's; with it its tapes go. The key has all else that
-        `make` depends on, but for `numbers`, which are those that it launches as `Anew`, in order.
+        For one key, `make` must always return the same result and put the same commands on the queue.
+
+        of: the object whose arrays are not the workspace's; its tapes are dropped with it.
+        key: everything else that `make` depends on, except `numbers`.
+        numbers: the numbers that `make` launches as `Anew`, in order.
         """
         if self._poison is not None or self._use == "0" or not self._device.replays:
             return make()
         tapes = self._tapes.get(of)
         known = None if tapes is None else tapes.get(key)
-        if known is not None and self._use != CHECK:
+        if known is not None and self._use != CHECK_TAPES:
             known[1].set(numbers)
             self._device.replay(known[1])
-            return known[0]  # type: ignore[no-any-return]  # what this key's `make` returned
+            return known[0]  # type: ignore[no-any-return]  # the result of this key's `make`
         renewed = self._renewed
         result, tape = self._device.record(make)
         if tape is None or self._renewed != renewed:
             return result
         if known is not None:
             known[1].check(tape, numbers)
-            for read in known[1].reads:  # to where the result that is known has it
+            for read in known[1].reads:  # copy into the memory of the known result
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
         tapes = self._tapes.setdefault(of, {})
-        if len(tapes) >= MOST_TAPES:
+        if len(tapes) >= MAX_TAPES_PER_OBJECT:
             tapes.clear()
         tapes[key] = result, tape
         return result
@@ -337,8 +356,10 @@ class Workspace:
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """An array of which the contents are not to be read before they are written; kept: it was handed out before in
-        this shape, and has what was left there."""
+        """An array whose contents are undefined until they are written.
+
+        kept: the array was handed out before in this shape, and its contents are kept.
+        """
         latest = self._latest.get(name)
         if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:
             return latest[0]  # as in nearly every step
@@ -352,7 +373,7 @@ class Workspace:
                 self._forget_tapes()
             held = self._arrays.pop(name, None)
             latest = self._latest.pop(name, None)
-            del held, latest  # before their successor is made: there need not be room for both
+            del held, latest  # freed before the new buffer is allocated: there may not be room for both
             held = self._arrays[name] = allocate(self._device, (elements,), kind, max(elements, spare))
         if self._poison is not None and not kept:
             _fill_bytes(self._device, held.buffer, self._poison, elements * kind.itemsize)
@@ -361,12 +382,12 @@ class Workspace:
         return array
 
     def clear(self) -> None:
-        """Let go of every buffer."""
+        """Release every buffer."""
         self._arrays.clear()
         self._latest.clear()
         self._forget_tapes()
 
     def _forget_tapes(self) -> None:
-        """Let go of all tapes, and of those that are recorded just now."""
+        """Drop all tapes, and those being recorded."""
         self._tapes.clear()
         self._renewed += 1

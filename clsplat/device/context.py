@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chooses a device, its queue and the shape of its kernels."""
+"""Device selection, and the open device: its queue, kernel shape and kernels."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from numpy.typing import NDArray
 
 from clsplat.config.checks import device_names
 from clsplat.device import forks
-from clsplat.device.account import Memory
-from clsplat.device.child import TIMEOUT, patience
-from clsplat.device.known import tell_once
-from clsplat.device.processor import name_processor
+from clsplat.device.command_buffer import CommandBuffer
+from clsplat.device.drivers.capabilities import pretended, traits_of
+from clsplat.device.drivers.cpu_name import name_processor
+from clsplat.device.drivers.driver_records import tell_once
+from clsplat.device.drivers.quirks import compiles_by_size, no_device, subgroup_ways, title
+from clsplat.device.drivers.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
+from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, patience
+from clsplat.device.memory_account import Memory
 from clsplat.device.profile import Calls, Recorder
 from clsplat.device.program import Kernel, Kernels, build, text_of, variant_of
-from clsplat.device.quirks import compiles_by_size, no_device, subgroup_ways, title
-from clsplat.device.rehearsal import Rehearsal
-from clsplat.device.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
+from clsplat.device.sandbox import Rehearsal
 from clsplat.device.source import kernel_source
-from clsplat.device.tape import Tape
-from clsplat.device.traits import pretended, traits_of
 from clsplat.errors import DeviceError, DriverError, KernelBuildError, switched_on
 from clsplat.process import undisturbed
 
 T = TypeVar("T")
 
-SYNC = "CLSPLAT_SYNC"
-"""Variable that makes each launch wait for its kernel: the one that hangs or fails is named."""
+SYNC_VARIABLE = "CLSPLAT_SYNC"
+"""Environment variable that makes each launch wait for its kernel, so that a kernel that hangs or fails is named."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class DeviceInfo:
 
 
 def all_devices() -> list[cl.Device]:
-    """Every OpenCL device that is visible, in the order of its index. Raises DeviceError in a fork (`forks`)."""
+    """Every visible OpenCL device, in the order of its index. Raises DeviceError in a forked process (`forks`)."""
     forks.claim()
-    with undisturbed():  # a driver's threads start compilers and linkers, which a Ctrl-C on this terminal would end
+    with undisturbed():  # a driver's threads start compilers and linkers, which Ctrl-C in this terminal would end
         devices = _visible()
     for device in devices:
         name_processor(device)
@@ -77,8 +77,10 @@ def _visible() -> list[cl.Device]:
 
 
 def list_devices() -> list[DeviceInfo]:
-    """Every OpenCL device that is visible, GPUs and CPUs, in the order of their index. Raises DeviceError for a
-    CLSPLAT_SHAPE or CLSPLAT_PRETEND that makes no sense for any."""
+    """Every visible OpenCL device, GPUs and CPUs, in the order of their index.
+
+    Raises DeviceError if CLSPLAT_SHAPE or CLSPLAT_PRETEND is invalid for every device.
+    """
     asked_shape()
     return [
         DeviceInfo(
@@ -96,7 +98,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def limits(device: cl.Device) -> dict[str, object]:
-    """The limits of a device that decide how kernels are launched, for a report of a bug."""
+    """The device limits that decide how kernels are launched, for a bug report."""
     names = (
         *("driver_version", "opencl_c_version", "extensions", "max_clock_frequency", "max_compute_units"),
         *("max_work_group_size", "local_mem_size", "max_constant_buffer_size", "max_mem_alloc_size", "global_mem_size"),
@@ -115,11 +117,15 @@ def limits(device: cl.Device) -> dict[str, object]:
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
-    why: the warning that this is not the wanted shape, given when the device is used; only_tries: a launch is
-    rehearsed, if it has to be, and not made (`launch.only_tried`); waits: for each kernel, as SYNC asks; shares_memory:
-    its memory is the host's; calls: what its queue was given; tapes: those that are recorded just now; under_way:
-    events and buffers that keep arrays on the host alive, which the device may still have to read; part: if it is a
-    part of a listed device, that and its number; index: in the list, of the whole.
+    why: the warning that this is not the wanted shape, given when the device is used.
+    only_tries: launches are rehearsed if necessary, and not made (`launch.only_tried`).
+    waits: wait for each kernel, as SYNC_VARIABLE requests.
+    shares_memory: the device uses the host's memory.
+    calls: the number of calls on its queue.
+    tapes: the tapes that are being recorded.
+    under_way: events and buffers that keep host arrays alive which the device may still have to read.
+    part: for a part of a listed device, that device and the part's number.
+    index: position in the list of devices; for a part, the position of the whole device.
     """
 
     def __init__(
@@ -139,7 +145,7 @@ class Device:
         self.kind = traits.kind
         self.shape, self._why_another = (shape, why) if shape else shape_of(device)
         self.only_tries = False
-        self.waits = switched_on(SYNC)
+        self.waits = switched_on(SYNC_VARIABLE)
         self.shares_memory = self.kind == "cpu"
         self.compiles_by_size = compiles_by_size(device)
         self.max_allocation, self.max_group = traits.allocation, traits.group
@@ -149,7 +155,7 @@ class Device:
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         self._queue = cl.CommandQueue(self.context, device, properties)
         self.calls = Calls()
-        self.tapes: list[Tape] = []
+        self.tapes: list[CommandBuffer] = []
         self.under_way: list[object] = []
         self._options = "-cl-std=CL1.2"
         if traits.exact_division:
@@ -163,13 +169,13 @@ class Device:
 
     @property
     def queue(self) -> cl.CommandQueue:
-        """The in-order queue. Raises DeviceError in a fork (`forks`)."""
+        """The in-order queue. Raises DeviceError in a forked process (`forks`)."""
         forks.check()
         return self._queue
 
     def kernels(self, stem: str, **defines: object) -> Kernels:
         """The kernels of `stem`.cl in this device's shape, built at the first call."""
-        if self._why_another:  # told by what is used, and not before the self-test may have chosen yet another
+        if self._why_another:  # warned about when used, not before, as the self-test may still choose another shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -186,31 +192,34 @@ class Device:
 
     def _built(self, stem: str, defines: Mapping[str, object]) -> Kernels:
         given, text = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **defines}, text_of(stem)
-        # a driver's cache goes by the options: shapes share a file that does not name what they differ in
+        # a driver's cache is keyed by the options: shapes share a file that names none of the options in which they
+        # differ
         named = {name: value for name, value in given.items() if name.partition("(")[0] in text}
         variant = variant_of(stem, named, self._options)
         program, salt = build(self.context, self.cl_device, self.rehearsal.build(variant))
         self.rehearsal.built(variant, salt)
         return Kernels(variant, program)
 
-    def with_shape(self, label: str = "", **changes: Any) -> Device:
-        """A device like this with another shape, by its label or by lanes, items and chunks."""
+    def with_shape(
+        self, label: str = "", *, lanes: int | None = None, items: int | None = None, chunks: int | None = None
+    ) -> Device:
+        """A device like this with another shape, given by its label or by lanes, items and chunks."""
         shape = self.shape.relabelled(label) if label else self.shape
-        if changes:
-            shape = replace(shape, by_gaussian=False, subgroups=False)
-        device = Device(self.cl_device, replace(shape, **changes), profile=self.profile, part=self._part)
+        if lanes or items or chunks:
+            shape = Shape(lanes or shape.lanes, items or shape.items, chunks or shape.chunks)
+        device = Device(self.cl_device, shape, profile=self.profile, part=self._part)
         device.memory.limit = self.memory.limit
         return device
 
     def with_switches(self, switches: Mapping[str, object]) -> Device:
-        """The same device, queue and cache of kernels, adding these defines for kernels whose text names them."""
+        """The same device, queue and kernel cache, with these defines added for kernels whose text names them."""
         device = copy(self)
         device._switches = {**self._switches, **switches}  # noqa: SLF001  # a copy of our own class
         return device
 
     @property
     def is_another(self) -> bool:
-        """True if this shape was taken because the driver had failed in the one that is wanted."""
+        """True if this shape was taken because the driver had failed in the wanted one."""
         return bool(self._why_another)
 
     def switched(self, *names: str) -> bool:
@@ -218,20 +227,22 @@ class Device:
         return any(name in self._switches for name in names)
 
     def with_memory_limit(self, limit: int | None) -> Device:
-        """The same device, queue and kernels, with an account of its own of at most `limit` bytes of buffers."""
+        """The same device, queue and kernels, with its own memory account of at most `limit` bytes of buffers."""
         device = copy(self)
         device.memory = Memory(limit)
         return device
 
     @property
     def budget(self) -> int:
-        """Bytes that may be in use: the limit, else all that the device has."""
+        """Bytes that may be in use: the limit if there is one, otherwise all of the device's memory."""
         return self.memory.limit or int(self.cl_device.global_mem_size)
 
     @property
     def row_alignment(self) -> int:
-        """Alignment, in rows of four bytes or more, of a part that is cut off an array in place: OpenCL has sub-buffers
-        begin at multiples of it; and whole vectors of lanes."""
+        """Alignment, in rows of at least four bytes, of a part of an array that is used in place.
+
+        OpenCL requires sub-buffers to begin at multiples of it, and kernels read whole vectors of lanes.
+        """
         return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
     def enqueue(
@@ -243,13 +254,13 @@ class Device:
         *,
         wait: bool = False,
     ) -> cl.Event:
-        """Put a kernel on the queue, and wait for it if asked to, or with CLSPLAT_SYNC=1. Raises DriverError."""
+        """Put a kernel on the queue; wait for it if asked to, or if CLSPLAT_SYNC=1. Raises DriverError."""
         try:
             event = kernel.cl_kernel(self.queue, size, local, *values)
             self.calls.launches += 1
             if self.waits:
                 self._wait_for(event, kernel)
-            elif wait:  # so that the last kernel that was named is the one that fails
+            elif wait:  # so that a failing kernel is the last one named
                 self.finish()
         except cl.Error as error:
             raise self._not_launched(kernel, error) from None
@@ -260,10 +271,9 @@ class Device:
     def _not_launched(self, kernel: Kernel, error: cl.Error) -> DriverError:
         return DriverError(self._trouble(kernel, f"cannot be launched: {' '.join(str(error).split())}"))
 
-    def record(self, work: Callable[[], T]) -> tuple[T, Tape | None]:
-        """The result of `work`, and a tape of what it has put on the queue; None where that cannot be put there again
-        as it was."""
-        tape, before = Tape(), copy(self.calls)
+    def record(self, work: Callable[[], T]) -> tuple[T, CommandBuffer | None]:
+        """The result of `work`, and a tape of its queue commands; None if they cannot be replayed as they were."""
+        tape, before = CommandBuffer(), copy(self.calls)
         self.tapes.append(tape)
         try:
             result = work()
@@ -271,11 +281,11 @@ class Device:
             self.tapes.remove(tape)
         return result, tape if tape.is_all_of(self.calls.since(before)) else None
 
-    def replay(self, tape: Tape) -> None:
-        """Put on the queue what the tape has. Raises DriverError, as `enqueue` does."""
+    def replay(self, tape: CommandBuffer) -> None:
+        """Put the commands of a tape on the queue. Raises DriverError, like `enqueue`."""
         kernel = None
         try:
-            for kernel, call in tape.entries:  # noqa: B007  # the kernel is that of an error
+            for kernel, call in tape.entries:  # noqa: B007  # the loop variable names the kernel in an error
                 call()
         except cl.Error as error:
             if kernel is None:
@@ -285,16 +295,18 @@ class Device:
 
     @property
     def replays(self) -> bool:
-        """True if what a tape has may be put on the queue: nothing wants to see each launch."""
+        """True if tapes may be replayed: nothing needs to observe each launch."""
         return not (self.waits or self.recorder.on or self.only_tries)
 
     def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
-        """Wait for a kernel that has been put on the queue. Raises DriverError for one that does not come back."""
+        """Wait for a kernel that is on the queue. Raises DriverError if it does not finish in time, or fails."""
         self.queue.flush()
         start, seconds, pause = time.monotonic(), patience(), 1e-5
         while (status := event.command_execution_status) > cl.command_execution_status.COMPLETE:
             if time.monotonic() - start > seconds:
-                raise DriverError(self._trouble(kernel, f"does not come back within {seconds:g} s ({TIMEOUT})"))
+                raise DriverError(
+                    self._trouble(kernel, f"does not come back within {seconds:g} s ({DRIVER_TIMEOUT_VARIABLE})")
+                )
             time.sleep(pause)
             pause = min(2 * pause, 1e-2)
         if status < 0:
@@ -305,7 +317,7 @@ class Device:
         return f"{title(self.cl_device)}, kernels in the shape {self.shape.label}: {where}, {text}"
 
     def finish(self) -> None:
-        """Wait until the device has nothing to do."""
+        """Wait until the device is idle."""
         self.queue.finish()
         self.under_way.clear()
 
@@ -321,7 +333,7 @@ class Device:
         """The define FMA_BY_CONTRACTION if the compiler fuses a lone a*b + c in vectors: then that is the fast way to
         fma's bits.
 
-        Not without vectors: Intel's runtime, which vectorises loops by itself, then fuses here and not there.
+        Never without vectors: Intel's runtime vectorises loops by itself, and then fuses some of these operations only.
         """
         if self.shape.lanes == 1:
             return {}
@@ -331,7 +343,7 @@ class Device:
         return fused if np.all(results == np.float32(2.0**-24)) else {}
 
     def _with_subgroups(self) -> dict[str, object]:
-        """The defines of the first of `subgroup_ways` in which items exchange what they should. Raises DeviceError."""
+        """The defines of the first of `subgroup_ways` in which items exchange values correctly. Raises DeviceError."""
         if self._subgroups:
             return self._subgroups[0]
         for defines in subgroup_ways(self.cl_device):
@@ -354,7 +366,10 @@ class Device:
     def _probed(
         self, kernel: Kernel, items: int, shape: int | tuple[int, ...], *numbers: object
     ) -> NDArray[np.float32]:
-        """An array of this shape, as a group of so many items writes it; numbers: the kernel's other arguments."""
+        """An array of this shape, written by one group of `items` work-items.
+
+        numbers: the kernel's other arguments.
+        """
         results = np.empty(shape, np.float32)
         buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)
         values = (buffer, *numbers)
@@ -368,11 +383,11 @@ class Device:
 
 
 def select(selector: str | None) -> cl.Device:
-    """The device that `selector` names: an index, `cpu`, `gpu`, or a part of its name, platform or version.
+    """The device that `selector` names: an index, `cpu`, `gpu`, or part of its name, platform or version.
 
-    Without one: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
+    Without a selector: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
-    patience()  # what the environment says of drivers is looked at before it is needed
+    patience()  # check the environment variable before it is needed
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
@@ -380,7 +395,7 @@ def select(selector: str | None) -> cl.Device:
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
         return next((device for device, info in devices if info.kind == "gpu"), devices[0][0])
-    wanted = selector.lower() if selector.strip() else None  # blanks are in every name
+    wanted = selector.lower() if selector.strip() else None  # a blank occurs in every name
     for device, info in devices:
         words = f"{info.name} {info.platform} {info.version}".lower()
         by_name = wanted is not None and (wanted == info.kind or wanted in words)
@@ -397,21 +412,21 @@ def find_device(selector: str | None) -> DeviceInfo:
 
 
 def _names(selector: str | None) -> list[str]:
-    """The names of devices in `selector`. Raises DeviceError for what is no text."""
+    """The names of devices in `selector`. Raises DeviceError if it is not text."""
     if not isinstance(selector, str | None):
         raise DeviceError(f"device is {selector!r}, expected text, such as '0', 'gpu' or a part of a name")
     return device_names(selector)
 
 
 def _part_of(name: str) -> tuple[str, int | None]:
-    """The name of a device and the number of its part, of NAME/NUMBER; None for the whole."""
+    """The device name and part number in NAME/NUMBER; the number is None for a whole device."""
     whole, slash, number = name.rpartition("/")
     return (whole, int(number)) if slash and whole and number.isdigit() else (name, None)
 
 
 @lru_cache(maxsize=8)
 def _divided(index: int, parts: int) -> list[cl.Device]:
-    """Equal parts of the `index`-th device, by OpenCL's device fission; none where it cannot be divided so."""
+    """Equal parts of the `index`-th device, by OpenCL's device fission; empty if it cannot be divided so."""
     device = all_devices()[index]
     try:
         units = device.max_compute_units // parts
@@ -442,12 +457,14 @@ def _open(
 def open_devices(
     selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False
 ) -> list[Device]:
-    """Open each of the devices that `selector` names, with commas between (see `select`); the same object for the same
-    device without a limit.
+    """Open each device that `selector` names, separated by commas (see `select`).
 
-    NAME/K is the K-th part, from 0, of a device that OpenCL divides equally: into as many parts as the largest K asks
-    for, at least two. memory_limit: bytes that the buffers of each object's users may take together; profile: the
-    queues measure. Raises DeviceError where a device is named twice.
+    Without a limit, the same device gives the same object. NAME/K is the K-th part, from 0, of a device that OpenCL
+    divides equally. The number of parts is the smallest, at least two, that has part K for every K given.
+
+    memory_limit: bytes that the buffers of each object's users may take together.
+    profile: make queues that record timings.
+    Raises DeviceError if a device is named twice.
     """
     chosen: list[tuple[int, int | None]] = []
     for name in _names(selector):

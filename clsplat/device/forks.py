@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forks of a process that has used OpenCL: the threads of its drivers are not in them, so that a call would wait for
-ever."""
+"""Forks of a process that has used OpenCL: the driver's threads are missing there, so a call would wait forever."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ _owner: list[int] = []
 
 
 def claim() -> None:
-    """Note that OpenCL is used in this process. Raises DeviceError in a fork of one that has."""
+    """Record that this process uses OpenCL. Raises DeviceError in a fork of a process that has used it."""
     if not _owner:
         _owner.append(os.getpid())
     check()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Puts kernels on a device's queue."""
+"""Kernel launches: argument conversion, group sizes, and the rehearsal of first launches."""
 
 from __future__ import annotations
 
@@ -12,20 +12,23 @@ import numpy as np
 
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
+from clsplat.device.drivers.quirks import tells_group_sizes
+from clsplat.device.profile import UPDATED_ARRAYS_BY_KERNEL
 from clsplat.device.program import Kernel
-from clsplat.device.quirks import tells_group_sizes
 
-LOCAL = 64
-"""Work-items a group where they do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
-_WORD = 0xFFFFFFFF
-_MANY = 1 << 16
-"""Items along an axis from which on PoCL compiles a kernel anew."""
+DEFAULT_GROUP_ITEMS = 64
+"""Work-items per group in kernels that do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
+_LOW_32_BITS = 0xFFFFFFFF
+_RECOMPILED_SIZE_ITEMS = 1 << 16
+"""Items along an axis from which PoCL compiles a kernel again."""
 
 
 @contextmanager
 def only_tried(device: Device) -> Iterator[None]:
-    """Inside, the launches of this device are rehearsed where they have to be, and not made. So a driver's failure
-    leaves nothing half done."""
+    """In the block, rehearse this device's launches if necessary, and do not make them.
+
+    A driver's failure then leaves nothing half done.
+    """
     device.only_tries = True
     try:
         yield
@@ -34,17 +37,17 @@ def only_tried(device: Device) -> Iterator[None]:
 
 
 def _values(arguments: tuple[Any, ...]) -> list[Any]:
-    """The arguments that the kernel gets: whole numbers as their 32 bits, with or without a sign."""
+    """The arguments that the kernel gets: whole numbers as 32 bits, signed or unsigned."""
     return [
         argument.buffer
         if (kind := type(argument)) is DeviceArray
-        else (argument & _WORD if kind is int or kind is bool else argument)
+        else (argument & _LOW_32_BITS if kind is int or kind is bool else argument)
         for argument in arguments
     ]
 
 
 def _type(value: Any) -> Any:
-    """The type of an argument for OpenCL's wrapper; None for one that is no scalar."""
+    """The type of an argument for pyopencl; None if it is not a scalar."""
     if isinstance(value, int):
         return np.uint32
     if isinstance(value, float):
@@ -53,14 +56,14 @@ def _type(value: Any) -> Any:
 
 
 def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
-    """A name for the form of a launch, where the driver compiles a kernel anew for each form; empty for the usual one.
+    """The form of a launch, for a driver that compiles a kernel again for each form; empty for the usual form.
 
-    The sizes of groups are not in it: an image's width is one, and each would be a trial.
+    Group sizes are not part of it: an image's width is one, and each would need a trial.
     """
     if not device.compiles_by_size:
         return ""
     groups = "" if local else " of any groups"
-    return groups if max(size) < _MANY else groups + " of many items"
+    return groups if max(size) < _RECOMPILED_SIZE_ITEMS else groups + " of many items"
 
 
 def _first(
@@ -88,23 +91,6 @@ def _first(
     kernel.tried.add(form)
 
 
-_UPDATED = {
-    "adam": 4,
-    "limit_scales": 1,
-    "project_step": 18,
-    "density_statistics": 3,
-    "view_agreement": 1,
-    "contribution_statistics": 2,
-    "add_slots": 1,
-    "add_view": 1,
-    "join_view": 1,
-    "add_noise": 1,
-    "remove_gains": 1,
-    "develop": 1,
-}
-"""Kernels that read and write some arrays in place: how many of their last ones."""
-
-
 def _enqueue(
     device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
 ) -> None:
@@ -119,29 +105,30 @@ def _enqueue(
     if device.recorder.on:
         name = kernel.name
         arrays = [argument for argument in arguments if isinstance(argument, DeviceArray)]
-        updated = arrays[len(arrays) - _UPDATED.get(name, 0) :]
+        updated = arrays[len(arrays) - UPDATED_ARRAYS_BY_KERNEL.get(name, 0) :]
         once = {id(array.buffer): array.nbytes for array in arrays}
         device.recorder.add(name, event, sum(once.values()) + sum(array.nbytes for array in updated))
 
 
 def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) -> None:
-    """One work-item for each of `items`; the kernel guards the rounding up. Nothing for 0 items."""
+    """Launch one work-item for each of `items`; the kernel guards the rounding up. Nothing for 0 items."""
     if items > 0:
-        size = -(-items // LOCAL) * LOCAL
-        local = (LOCAL,) if device.max_group >= LOCAL else None
+        size = -(-items // DEFAULT_GROUP_ITEMS) * DEFAULT_GROUP_ITEMS
+        local = (DEFAULT_GROUP_ITEMS,) if device.max_group >= DEFAULT_GROUP_ITEMS else None
         _enqueue(device, kernel, (size,), local, arguments)
 
 
 def launch_groups(device: Device, kernel: Kernel, groups: int, items: int, *arguments: Any) -> None:
-    """`groups` work-groups of `items`. Nothing for 0 groups."""
+    """Launch `groups` work-groups of `items`. Nothing for 0 groups."""
     if groups > 0:
         _enqueue(device, kernel, (groups * items,), (items,), arguments)
 
 
 def launch_grid(device: Device, kernel: Kernel, size: tuple[int, ...], *arguments: Any) -> None:
-    """A grid of work-items: a row of it is a group's loop on a CPU, which the driver would else make one group of all.
+    """Launch a grid of work-items. On a CPU a row is one group's loop; the driver would otherwise make one group of
+    all.
 
-    Nothing where a side is 0.
+    Nothing if a side is 0.
     """
     if all(size):
         fits = size[0] <= min(device.max_group, 1024)

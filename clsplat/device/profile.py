@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Costs of the stages: kernels, milliseconds, launches and bytes, recorded while `clsplat bench` asks for them."""
+"""Costs of the stages: kernels, milliseconds, launches and bytes, recorded while `clsplat bench` requests them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ import pyopencl as cl
 P = ParamSpec("P")
 R = TypeVar("R")
 
-OUTSIDE = "transfers"
-"""The stage of what is put on the queue outside every stage: camera, background."""
+TRANSFERS_STAGE = "transfers"
+"""The stage of work put on the queue outside every stage: camera, background."""
 
 
 @dataclass
 class StageRecord:
-    """kernels: device milliseconds by kernel, copies and fills among them; ms: their sum; wall_ms: from an idle device
-    to an idle device, so launches and the host's part are in it; bytes: of the arrays that the launches were given."""
+    """The costs of one stage.
+
+    kernels: device milliseconds by kernel, including copies and fills.
+    ms: their sum.
+    wall_ms: from idle device to idle device, including launches and the host's work.
+    bytes: of the arrays passed to the launches.
+    """
 
     kernels: dict[str, float] = field(default_factory=dict)
     ms: float = 0.0
@@ -33,10 +38,11 @@ class StageRecord:
 
 @dataclass
 class Calls:
-    """Counts of what a device's queue was given, from its opening on.
+    """Numbers of calls on a device's queue since it was opened.
 
-    launches: kernels; fills, writes, reads: of buffers, where the host does not wait; blocking_writes, blocking_reads:
-    those that it waits for.
+    launches: kernels.
+    fills, writes, reads: buffer operations for which the host does not wait.
+    blocking_writes, blocking_reads: buffer operations for which it waits.
     """
 
     launches: int = 0
@@ -47,23 +53,24 @@ class Calls:
     blocking_reads: int = 0
 
     def since(self, earlier: Calls) -> Calls:
-        """The counts less those of a copy that was made earlier."""
+        """The difference from an earlier copy of the counts."""
         return Calls(*(now - then for now, then in zip(astuple(self), astuple(earlier), strict=True)))
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """The sum of all counts."""
         return sum(astuple(self))
 
     def add(self, more: Calls) -> None:
-        """Count what a tape has, which never waits."""
+        """Add the counts of a tape, which never waits."""
         self.launches += more.launches
         self.fills += more.fills
         self.reads += more.reads
 
 
 class Recorder:
-    """A device has one. Off unless inside `recording`; then every launch and transfer is noted under its stage."""
+    """The recorder of a device. It is off except inside `recording`; there it notes every launch and transfer by
+    stage."""
 
     def __init__(self, queue: cl.CommandQueue) -> None:
         self._queue = queue
@@ -75,10 +82,11 @@ class Recorder:
 
     @contextmanager
     def recording(self, *, wait: bool) -> Iterator[dict[str, StageRecord]]:
-        """The stages of what is done inside, filled in at the end.
+        """Yield the stages of the work in the block, filled in at its end.
 
-        wait: finish the queue around each stage for `wall_ms`; without it the device runs ahead as it always does, and
-        the kernels' times are the events'. They are 0 where the queue was made without profiling, or the driver lies.
+        wait: finish the queue around each stage for `wall_ms`. Otherwise the device runs ahead as usual, and the
+        kernels' times come from the events. They are 0 if the queue was made without profiling, or the driver reports
+        wrong times.
         """
         stages: dict[str, StageRecord] = {}
         self.on, self._wait, self._stages, self._events = True, wait, stages, []
@@ -94,7 +102,7 @@ class Recorder:
 
     def add(self, name: str, event: Any, nbytes: int) -> None:
         """Note a launch or transfer; only while `on`."""
-        stage = self._stack[0] if self._stack else OUTSIDE
+        stage = self._stack[0] if self._stack else TRANSFERS_STAGE
         record = self._stages.setdefault(stage, StageRecord())
         record.launches += 1
         record.bytes += nbytes
@@ -102,7 +110,7 @@ class Recorder:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Inside, work is that of stage `name`, unless a stage is already going on."""
+        """Assign the work in the block to stage `name`, unless it is already inside a stage."""
         outermost = not self._stack
         self._stack.append(name)
         timed = outermost and self._wait
@@ -128,10 +136,19 @@ class Recorded(Protocol):
 D = TypeVar("D", bound=Recorded)
 
 
-def stage(name: str) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:
-    """Marks a function whose first argument is the device as a stage of the pipeline."""
+UPDATED_ARRAYS_BY_KERNEL: dict[str, int] = {}
+"""For each kernel by name, the number of trailing array arguments that it both reads and writes."""
+
+
+def stage(name: str, **updated: int) -> Callable[[Callable[Concatenate[D, P], R]], Callable[Concatenate[D, P], R]]:
+    """Mark a function as a stage of the pipeline; its first argument is the device.
+
+    updated: entries of `UPDATED_ARRAYS_BY_KERNEL` for the kernels that the function launches.
+    """
 
     def decorate(function: Callable[Concatenate[D, P], R]) -> Callable[Concatenate[D, P], R]:
+        UPDATED_ARRAYS_BY_KERNEL.update(updated)
+
         @wraps(function)
         def call(device: D, /, *args: P.args, **kwargs: P.kwargs) -> R:
             if not device.recorder.on:

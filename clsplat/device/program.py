@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builds kernels, once per source and set of defines."""
+"""Kernel builds, once per source and set of defines."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from typing import Any
 
 import pyopencl as cl
 
-from clsplat.device import binaries
-from clsplat.device.known import BREAK
-from clsplat.device.quirks import build_advice
+from clsplat.device.drivers import binary_cache
+from clsplat.device.drivers.driver_records import BREAK_KERNEL_VARIABLE
+from clsplat.device.drivers.quirks import build_advice
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import DriverError, InputError, KernelBuildError, examples
 
 
 @dataclass(frozen=True)
 class Variant:
-    """The text of a kernel file and the options that it is built with."""
+    """The text of a kernel file and its build options."""
 
     stem: str
     source: str
@@ -31,50 +31,56 @@ class Variant:
 
     @cached_property
     def digest(self) -> str:
-        """A name that no other text or options have."""
+        """A name that is unique to the text and options."""
         text = "\0".join((self.stem, self.source, *self.options))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def anew(self, salt: str) -> Variant:
-        """The same kernels, in a text that no driver's cache has: what it has may be of an aborted build. A comment
-        would not do, as PoCL looks for what the preprocessor leaves."""
+        """The same kernels, in a text that is in no driver's cache, as the cached entry may come from an aborted build.
+
+        A comment would not do, as PoCL's cache is keyed by the preprocessor's output.
+        """
         return replace(self, source=f"{self.source}typedef int anew_{salt};\n") if salt else self
 
 
 def variant_of(stem: str, defines: Mapping[str, object], options: str) -> Variant:
-    """`stem`.cl with these defines. Raises InputError for a CLSPLAT_BREAK_KERNEL that makes no sense."""
+    """`stem`.cl with these defines. Raises InputError if CLSPLAT_BREAK_KERNEL is invalid."""
     flags = [f"-D{name}" if value is True else f"-D{name}={value}" for name, value in sorted(defines.items())]
     return Variant(stem, text_of(stem), (*flags, *options.split()))
 
 
 def text_of(stem: str) -> str:
-    """The source of a kernel file, or what BREAK makes of it. Raises InputError where that makes no sense."""
+    """The source of a kernel file, modified by BREAK_KERNEL_VARIABLE if set. Raises InputError if that is invalid."""
     source = kernel_source(stem)
-    wanted = os.environ.get(BREAK)
+    wanted = os.environ.get(BREAK_KERNEL_VARIABLE)
     if not wanted:
         return source
     where, _, change = wanted.partition(":")
     old, arrow, new = (part.strip() for part in change.partition("=>"))
     if not (where and old and arrow):
-        raise InputError(f"{BREAK}={wanted}: expected STEM: WORDS => WORDS")
+        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: expected STEM: WORDS => WORDS")
     stems = sorted(path.stem for path in kernel_root().glob("*.cl"))
     if where.strip() not in stems:
-        raise InputError(f"{BREAK}={wanted}: {where.strip()} is no kernel, expected one of {examples(stems)}")
+        raise InputError(
+            f"{BREAK_KERNEL_VARIABLE}={wanted}: {where.strip()} is no kernel, expected one of {examples(stems)}"
+        )
     if where.strip() != stem:
         return source
     if old not in source:
-        raise InputError(f"{BREAK}={wanted}: {stem}.cl has no such words")
+        raise InputError(f"{BREAK_KERNEL_VARIABLE}={wanted}: {stem}.cl has no such words")
     return source.replace(old, new)
 
 
 def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.Program, str]:
-    """Compile a kernel file; the program, and the salt of `Variant.anew` that it took, or nothing. Raises
-    KernelBuildError with the device, the options, the log and the source, and DriverError for a program without
-    kernels.
+    """Compile a kernel file. Returns the program, and the salt of `Variant.anew` that it needed, or an empty string.
 
-    What fails is built once more in a text that is this process's own: an aborted build leaves a program without
-    kernels in PoCL's cache, and another process that builds the same text may take its files away."""
-    if (saved := binaries.load(context, device, variant.digest, variant.options)) is not None:
+    A failed build is repeated once with a text that is unique to this process. An aborted build leaves a program
+    without kernels in PoCL's cache, and another process that builds the same text may remove its files.
+
+    Raises KernelBuildError with the device, the options, the log and the source, and DriverError for a program without
+    kernels.
+    """
+    if (saved := binary_cache.load(context, device, variant.digest, variant.options)) is not None:
         return saved, ""
     salt = ""
     try:
@@ -86,7 +92,7 @@ def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.
         program = _compiled(context, device, variant.anew(salt))
     if program.num_kernels == 0:
         raise DriverError(f"{device.name.strip()}: {variant.stem}.cl has no kernels when the driver has built it")
-    binaries.save(device, variant.digest, program)
+    binary_cache.save(device, variant.digest, program)
     return program, salt
 
 
@@ -109,12 +115,11 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
 
 
 class Kernel:
-    """A kernel that has been built.
+    """A built kernel.
 
-    tried: the forms of launch (`launch.form_of`) of which it is known that the driver can do them. With the first of
-    them the types of the kernel's scalars have been told to OpenCL's wrapper, as each would else cost 10 microseconds
-    a launch.
-    spare: kernel objects of tapes that are gone, for others (`tape.Tape`).
+    tried: the forms of launch (`launch.form_of`) that the driver is known to manage. With the first of them the types
+    of the kernel's scalars are set in pyopencl, as each would otherwise cost 10 microseconds a launch.
+    spare: kernel objects of dropped tapes, for other tapes (`command_buffer.Tape`).
     """
 
     def __init__(self, variant: Variant, program: cl.Program, kernel: Any) -> None:
@@ -125,7 +130,7 @@ class Kernel:
         self.tried: set[str] = set()
 
     def most_items(self, device: cl.Device) -> int:
-        """Work-items that the driver allows a group of this kernel."""
+        """Work-items that the driver allows in a group of this kernel."""
         return int(self.cl_kernel.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, device))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the kernels and makes one text of a file and what it includes."""
+"""The kernel sources: their folder, and one text of a file with its includes."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ import re
 from functools import cache, lru_cache
 from pathlib import Path
 
-from clsplat.device.layout import header
-
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
 @lru_cache(maxsize=1)
 def kernel_root() -> Path:
-    """The folder of the OpenCL sources: `clsplat/kernels` in a wheel, `kernels/` beside the package in a checkout."""
+    """The folder of the OpenCL sources: `clsplat/kernels` in a wheel, `kernels/` next to the package in a checkout."""
     package = Path(__file__).resolve().parents[1]
     for root in (package / "kernels", package.parent / "kernels"):
         if (root / "project.cl").is_file():
@@ -24,9 +22,9 @@ def kernel_root() -> Path:
 
 @cache
 def kernel_source(stem: str) -> str:
-    """The layouts and the text of `stem`.cl, each `#include "..."` (relative to the kernel root) put in once.
+    """The text of `stem`.cl, with each `#include "..."` (relative to the kernel root) inserted once.
 
-    The text is whole, rather than relying on `-I`, so that drivers' caches see a changed header.
+    The text is complete, instead of relying on `-I`, so that drivers' caches notice a changed header.
     """
     seen: set[str] = set()
     lines: list[str] = []
@@ -43,4 +41,4 @@ def kernel_source(stem: str) -> str:
                 lines.append(line)
 
     append(f"{stem}.cl")
-    return header() + "\n".join(lines) + "\n"
+    return "\n".join(lines) + "\n"

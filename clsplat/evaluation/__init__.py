@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders against photographs."""
+"""Comparison of renders with photographs."""

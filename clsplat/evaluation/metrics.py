@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closeness of a render to its photograph: PSNR, SSIM, and LPIPS where the optional extra is installed.
+"""Similarity of a render to its photograph: PSNR, SSIM, and LPIPS if the optional extra is installed.
 
-Images are (H, W, 3), clamped to [0, 1] and compared in float64; corrected ones up to the photograph's brightest value.
+Images are (H, W, 3), clamped to [0, 1] and compared in float64. Colour-corrected images are clamped at the photograph's
+brightest value.
 """
 
 from __future__ import annotations
@@ -21,23 +22,29 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import lpips_weights
 
 MIN_SQUARED_ERROR = 1e-12
-"""Equal images would have an infinite PSNR, which JSON cannot hold; this floor makes it 120 dB."""
-SSIM_WINDOW = 11
+"""Equal images would have an infinite PSNR, which JSON cannot hold. This floor makes it 120 dB."""
+SSIM_WINDOW_PX = 11
 
 Image = NDArray[Any]
 
 
 def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, at most 120. counts (H, W): the pixels that count. Raises ValueError for images
-    of different shapes."""
+    """Peak signal-to-noise ratio in dB, at most 120.
+
+    counts: (H, W), the pixels that count.
+    Raises ValueError for images of different shapes.
+    """
     a, b = _pair(image, truth)
     squares = np.square(a - b) if counts is None else np.square(a - b)[counts]
     return float(-10 * np.log10(max(float(np.mean(squares)), MIN_SQUARED_ERROR)))
 
 
 def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """PSNR of the image after its correction. The peak is 1; values over 1 are compared as they are where the truth has
-    such, and clamped to 1 elsewhere, those under 0 to 0. counts (H, W): the pixels that count."""
+    """PSNR of the image after `corrected`, with a peak of 1.
+
+    Values are clamped to 0 and to the photograph's largest value, or to 1 if that is smaller.
+    counts: (H, W), the pixels that count.
+    """
     most = max(1.0, float(truth.max() if counts is None else truth[counts].max(initial=1.0)))
     fitted = corrected(image, truth, counts)
     squares = np.square(np.clip(fitted, 0, most) - np.clip(truth.astype(np.float64), 0, most))
@@ -46,8 +53,10 @@ def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None 
 
 
 def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> Image:
-    """The image (H, W, 3) after the affine map of its colours that brings it nearest to the truth, by least squares.
-    counts (H, W): the pixels that count."""
+    """The image (H, W, 3) after the affine colour transform that fits it best to the truth, by least squares.
+
+    counts: (H, W), the pixels that count.
+    """
     colours, wanted = (np.asarray(each, np.float64).reshape(-1, 3) for each in (image, truth))
     known = np.hstack([colours, np.ones((len(colours), 1))])
     rows = slice(None) if counts is None else counts.ravel()
@@ -59,40 +68,49 @@ def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = Non
 def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
     """Mean structural similarity: the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5, mean of the channels.
 
-    counts (H, W): the pixels that count. Others are black in both pictures, and the mean is over windows around pixels
-    that count.
+    counts: (H, W), the pixels that count. Other pixels are black in both images, and the mean is over windows around
+    pixels that count.
 
     Raises InputError for images smaller than the window, ValueError for images of different shapes.
     """
     structural_similarity: Any = import_module("skimage.metrics").structural_similarity  # slow to import, untyped
     a, b = _pair(image, truth)
     height, width = a.shape[:2]
-    if min(height, width) < SSIM_WINDOW:
+    if min(height, width) < SSIM_WINDOW_PX:
         raise InputError(f"an image of {width}x{height} pixels is too small for SSIM, expected at least 11x11")
-    settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
+    similarity = functools.partial(
+        structural_similarity,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+    )
     if counts is None:
-        return float(structural_similarity(a, b, channel_axis=2, **settings))
+        return float(similarity(a, b))
     a, b = (np.where(counts[:, :, None], picture, 0.0) for picture in (a, b))
-    _, values = structural_similarity(a, b, channel_axis=2, full=True, **settings)
+    _, values = similarity(a, b, full=True)
     return float(values[counts].mean())
 
 
 def lpips(image: Image, truth: Image) -> float | None:
-    """LPIPS (VGG, as the paper reports), or None where it is not installed: `lpips_missing` says why."""
+    """LPIPS (VGG, as in the 3DGS paper), or None if it is not available; `lpips_missing` has the reason."""
     model = _lpips_model()
     return None if isinstance(model, str) else model(*_pair(image, truth))
 
 
 def lpips_missing() -> str | None:
-    """The reason that there is no LPIPS, in a few words; None where there is."""
+    """The reason that LPIPS is not available, in a few words, or None."""
     model = _lpips_model()
     return model if isinstance(model, str) else None
 
 
 @functools.cache
 def prepare_lpips() -> str | None:
-    """Prepare LPIPS: fetch the network's weights if they are missing. Loads nothing. Returns None, or the reason that
-    LPIPS cannot be used and what to do about it."""
+    """Prepare LPIPS without loading it: download the network's weights if they are missing.
+
+    Returns None, or the reason that LPIPS cannot be used, with advice.
+    """
     for name in ("lpips", "torch"):
         if find_spec(name) is None:
             return f"the optional extra is not installed (no {name}): pip install 'clsplat[lpips]'"
@@ -105,7 +123,7 @@ def prepare_lpips() -> str | None:
 
 @functools.cache
 def _lpips_model() -> Callable[[Image, Image], float] | str:
-    """The metric as a function of two images, or the reason why there is none."""
+    """The metric as a function of two images, or the reason that it is not available."""
     if reason := prepare_lpips():
         return reason
     try:
@@ -113,7 +131,7 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
             package: Any = import_module("lpips")
             torch: Any = import_module("torch")
             network = package.LPIPS(net="vgg", verbose=False).eval()
-    except Exception as error:  # noqa: BLE001  # whatever fails there must not fail an evaluation
+    except Exception as error:  # noqa: BLE001  # no failure there may fail an evaluation
         return f"its network could not be loaded ({' '.join(str(error).split())[:100]})"
 
     def measure(a: Image, b: Image) -> float:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps between a rendered frame and its file: windows, samples, strips, deep slices."""
+"""Steps between a rendered frame and its file: windows, filters, samples, warps, strips, deep slices."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deep EXR: the samples of a pixel are slices of the scene by depth, each with its alpha and associated colour.
+"""Deep EXR: a pixel's samples are slices of the scene by depth, each with its alpha and premultiplied colour.
 
-Over each other, front to back, they are the flat picture: the Gaussians of a slice are those that the pixel takes. Each
-pixel has its slices where its light is taken (docs/pictures.md).
+Composited front to back, they give the flat picture, since the slices hold the Gaussians that the pixel blends. Each
+pixel has its slices at the depths where its light is absorbed (docs/pictures.md).
 """
 
 from __future__ import annotations
@@ -16,91 +16,76 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
-from clsplat.config.channels import DEEP
-from clsplat.config.pictures import DEEP_STRIP_FLOATS, DeepConfig, Encoding
-from clsplat.device.context import Device
-from clsplat.device.layout import TILE
+from clsplat.config.channels import DEEP_CHANNELS
+from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError
-from clsplat.files import scratch_folder
-from clsplat.frame.draw import on_tiles
+from clsplat.files.atomic import scratch_folder
+from clsplat.frame.deep import Convert, DrawDeep
 from clsplat.frame.strips import strips
-from clsplat.gaussians import Gaussians
-from clsplat.images.colour import Colours
 from clsplat.images.deep_samples import deep_data, samples_bytes
-from clsplat.images.frame_files import HALF_MAX, Header, deep_spec
+from clsplat.images.frame_files import MAX_HALF_FLOAT, FrameFileHeader, deep_spec
 from clsplat.images.writing import write_rows
-from clsplat.rendering.memory_needs import frame_pixels
-from clsplat.rendering.renderer import Renderer
-from clsplat.stages.deep import DEEP_FLOATS
 
-_MOST_PIXELS = 1 << 16
-"""Pixels that are encoded at once: bounds the host's memory, and leaves the encoder rows for its threads."""
-
-
-def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-    """(bins, H, W, 5): red, green, blue, associated with alpha; alpha; depth. All 0 behind a pixel's last slice."""
-    larger, rows, columns = on_tiles(camera)
-    return renderer.render_deep(gaussians, larger, bins)[:, rows, columns]
-
-
-def deep_rows(device: Device, camera: Camera, bins: int) -> int:
-    """Rows of the strips, in whole tiles, that a deep picture of `bins` slices is rendered in."""
-    floats = DEEP_FLOATS * bins
-    pixels = min(DEEP_STRIP_FLOATS // floats, frame_pixels(device, planes=4 * floats))
-    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with what fills the first and last tile
+_ENCODE_BATCH_PIXELS = 1 << 16
+"""Pixels that are encoded at once: bounds the host's memory, and leaves the encoder enough rows for its threads."""
 
 
 def write_deep(
     path: Path,
-    renderer: Renderer,
-    gaussians: Gaussians,
+    draw: DrawDeep,
     camera: Camera,
-    config: DeepConfig | None = None,
+    rows: int,
+    bins: int,
     encoding: Encoding | None = None,
-    header: Header | None = None,
-    colours: Colours | None = None,
+    header: FrameFileHeader | None = None,
+    convert: Convert | None = None,
 ) -> bool:
-    """Render and write a deep scanline EXR, atomically, in strips that bound the memory; True if nothing is in it.
+    """Draw and write a deep scanline EXR, atomically, in strips of `rows` that bound the memory. Returns True if it is
+    empty.
 
-    Channels R G B A Z ZBack; a pixel has a sample for each of its slices, all of it at one depth. Colours are half or
-    float as the encoding says, depths are float. Raises InputError and ClsplatError as
-    `images.frame_files.write_channels`.
+    Channels are R, G, B, A, Z and ZBack. A pixel has a sample for each of its at most `bins` slices, each at a single
+    depth. Colours are half or float, by `encoding`, in the space that `convert` makes; depths are float. Raises
+    InputError and ClsplatError in the cases of `images.frame_files.write_channels`.
     """
-    config = config or DeepConfig()
-    encoding, header, colours = encoding or Encoding(), header or Header(), colours or Colours()
+    encoding, header = encoding or Encoding(), header or FrameFileHeader()
     if path.suffix.lower() != ".exr":
-        raise InputError(f"{path}: deep samples want an .exr file")
+        raise InputError(f"{path}: deep samples need an .exr file")
     spec = deep_spec(camera.width, camera.height, encoding, header)
-    rows = deep_rows(renderer.device, camera, config.bins)
     seen: list[bool] = []
 
-    with scratch_folder(samples_bytes(_MOST_PIXELS + camera.width, config.bins)) as folder:
+    with scratch_folder(samples_bytes(_ENCODE_BATCH_PIXELS + camera.width, bins)) as folder:
 
         def pieces() -> Iterator[tuple[Any, int]]:
             for strip in strips(camera, rows):
-                slices = render_deep(renderer, gaussians, strip, config.bins)
-                for top in range(0, strip.height, step := max(_MOST_PIXELS // camera.width, 1)):
-                    counts, columns = _samples(slices[:, top : top + step], colours, half=encoding.depth == "half")
+                planes = draw(strip)
+                for top in range(0, strip.height, step := max(_ENCODE_BATCH_PIXELS // camera.width, 1)):
+                    some = planes[:, :, top : top + step]
+                    counts, columns = _samples(some, convert, half=encoding.depth == "half")
                     seen.append(bool(counts.any()))
                     yield deep_data(folder / "rows.exr", counts, columns), len(counts)
-                del slices  # its memory is free before the next strip takes some
+                del planes, some  # frees their memory before the next strip allocates
 
         write_rows(path, spec, "exr", pieces())
     return not any(seen)
 
 
-def _samples(slices: Float32, colours: Colours, *, half: bool) -> tuple[NDArray[np.int32], dict[str, NDArray[Any]]]:
-    """The number of samples of each pixel, and their values as `deep_data` takes them. slices: of a few rows."""
-    _, height, width, floats = slices.shape
-    planes = np.ascontiguousarray(slices.transpose(3, 0, 1, 2)).reshape(floats, -1)
-    counts = (slices[:, :, :, 3] > 0).sum(axis=0, dtype=np.int32)
-    # the slices of a pixel are its first ones: sample k of pixel p is at k H W + p
+def _samples(
+    slices: Float32, convert: Convert | None, *, half: bool
+) -> tuple[NDArray[np.int32], dict[str, NDArray[Any]]]:
+    """The number of samples of each pixel, and their values in the form that `deep_data` takes.
+
+    slices: planes of a few rows.
+    """
+    _, floats, height, width = slices.shape
+    planes = np.ascontiguousarray(slices.swapaxes(0, 1)).reshape(floats, -1)
+    counts = (slices[:, 3] > 0).sum(axis=0, dtype=np.int32)
+    # a pixel fills its first slices: sample k of pixel p is at k H W + p
     first = np.cumsum(counts.ravel(), dtype=np.int64) - counts.ravel()
     pixels = np.repeat(np.arange(height * width), counts.ravel())
     at = (np.arange(len(pixels)) - first[pixels]) * (height * width) + pixels
     alpha, depth = planes[3].take(at), planes[4].take(at)
     rgb = np.stack([planes[channel].take(at) for channel in range(3)]).T
-    light = [*colours.convert(rgb[None], alpha[None], colours.model, colours.output)[0].T, alpha]
+    light = [*(rgb if convert is None else convert(rgb[None], alpha[None])[0]).T, alpha]
     if half:
-        light = [np.clip(values, -HALF_MAX, HALF_MAX).astype(np.float16) for values in light]
-    return counts, dict(zip(DEEP, [*light, depth, depth], strict=True))  # a slice begins and ends at one depth
+        light = [np.clip(values, -MAX_HALF_FLOAT, MAX_HALF_FLOAT).astype(np.float16) for values in light]
+    return counts, dict(zip(DEEP_CHANNELS, [*light, depth, depth], strict=True))  # a slice has a single depth

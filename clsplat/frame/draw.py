@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `Draw` makes the named channels of a camera's picture; here, the one by the kernels."""
+"""A `Draw` renders the named channels of a camera's picture. Contains the one by the kernels."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.channels import CHANNELS, MATTES, feature_names, light_and_rest
-from clsplat.device.layout import TILE
+from clsplat.config.channels import CRYPTOMATTE_CHANNELS, FRAME_CHANNELS, feature_names, light_and_rest
 from clsplat.frame.holdout import Cut
-from clsplat.frame.objects import Matte
+from clsplat.frame.mattes import Matte
 from clsplat.frame.window import crop, reframed
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.renderer import SHARES, Renderer
+from clsplat.layouts.columns import TILE
+from clsplat.rendering.renderer import OBJECTS_PER_COVERAGE_PASS, Renderer
 from clsplat.stages.channels import Features
 
 Planes = dict[str, NDArray[Any]]
-"""Channels by name, (height, width) or (height, width, floats); rgb over the background, so over black it is associated
-with alpha."""
+"""Channels by name, (height, width) or (height, width, floats). rgb is over the background; over black it is
+premultiplied by alpha."""
 Draw = Callable[[Camera, Collection[str]], Planes]
-"""From a camera and the names of channels to their planes."""
+"""Function from a camera and the names of channels to their planes."""
 
 
 def drawn_by(
@@ -37,11 +37,13 @@ def drawn_by(
     earlier: Gaussians | None = None,
     mattes: Mapping[str, Matte] | None = None,
 ) -> Draw:
-    """A Draw by the kernels; after, before: the cameras of a whole frame that motion and backward motion go to; cut: of
-    the frame's hold-out; moved, earlier: the Gaussians that these motions go to, where they do not stand still; mattes:
-    by the names of their channels.
+    """A Draw by the kernels.
 
-    Planes need not be contiguous: the encoder, which may be another thread, puts them in order.
+    after, before: cameras of a whole frame that motion and backward motion lead to.
+    cut: of the frame's holdout.
+    moved, earlier: Gaussians that motion and backward motion lead to, None if they stand still.
+    mattes: by the names of their channels.
+    Planes need not be contiguous: the encoder, which may run in another thread, makes them so.
     """
 
     def draw(camera: Camera, names: Collection[str]) -> Planes:
@@ -49,7 +51,7 @@ def drawn_by(
         _, rest = light_and_rest(names)
         made: Planes = {}
         holdout = cut(camera) if cut else None
-        of_objects = {name: (mattes or {})[name] for name in names if name in MATTES}
+        of_objects = {name: (mattes or {})[name] for name in names if name in CRYPTOMATTE_CHANNELS}
         if not rest:
             picture = renderer.render(gaussians, camera, background, contiguous=False, holdout=holdout)
         else:
@@ -59,14 +61,15 @@ def drawn_by(
                 feature_names(rest),
                 after=after and reframed(after, camera),
                 before=before and reframed(before, camera),
-                **{name: then for name, then in (("moved", moved), ("earlier", earlier)) if then is not None},
+                moved=moved,
+                earlier=earlier,
                 background=background,
                 contiguous=False,
                 holdout=holdout,
             )
         planes: Planes = {"rgb": picture.image, "alpha": picture.alpha}
         for name in rest:
-            plane, signs = made[CHANNELS[name].kernel], CHANNELS[name].signs
+            plane, signs = made[FRAME_CHANNELS[name].kernel], FRAME_CHANNELS[name].signs
             planes[name] = plane * np.array(signs, np.float32) if signs else plane
         for name, matte in of_objects.items():
             planes[name] = renderer.render_shares(gaussians, camera, matte.owners, len(matte.names), holdout)
@@ -76,7 +79,7 @@ def drawn_by(
 
 
 def in_two(light: Draw, rest: Draw) -> Draw:
-    """A Draw that takes the channels that light is added up in from one, and the others from another."""
+    """A Draw that takes the channels of light from one Draw, and the other channels from another."""
 
     def draw(camera: Camera, names: Collection[str]) -> Planes:
         of_light, others = light_and_rest(names)
@@ -87,14 +90,15 @@ def in_two(light: Draw, rest: Draw) -> Draw:
 
 
 def feature_floats(names: Collection[str]) -> int:
-    """Floats of each Gaussian's that these channels are blended from, 0 where they are colour alone."""
+    """Floats per Gaussian that these channels are blended from, 0 for colour alone."""
     _, rest = light_and_rest(names)
     floats = Features.of(feature_names(rest)).floats if rest else 0
-    return max(floats, SHARES) if any(name in MATTES for name in names) else floats
+    return max(floats, OBJECTS_PER_COVERAGE_PASS) if any(name in CRYPTOMATTE_CHANNELS for name in names) else floats
 
 
 def on_tiles(camera: Camera) -> tuple[Camera, slice, slice]:
-    """A camera whose picture begins with a whole tile of its frame, and where the wanted one is in that."""
+    """A camera whose picture begins at a tile border of its frame, and the rows and columns of the wanted picture in
+    it."""
     if camera.window is None:
         return camera, slice(None), slice(None)
     left, top = camera.window.x % TILE, camera.window.y % TILE

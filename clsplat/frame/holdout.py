@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame's hold-out as the pictures that are drawn of it need it: windows, strips and finer ones."""
+"""A frame's holdout, resampled for the pictures that are rendered: windows, strips and supersampled ones."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from clsplat.images.holdouts import Holdout, Surfaces
 
 
 class Cut:
-    """Takes the surfaces of a camera's picture out of its frame's hold-out. The last ones are kept, as the samples of
-    a shutter or a lens are of one picture."""
+    """Cuts the surfaces of a camera's picture out of its frame's holdout.
+
+    The last result is kept, as all samples of a shutter or a lens are of one picture.
+    """
 
     def __init__(self, holdout: Holdout) -> None:
         self._holdout = holdout
@@ -19,8 +21,10 @@ class Cut:
         self._last: Surfaces | None = None
 
     def __call__(self, camera: Camera) -> Surfaces | None:
-        """The surfaces in the pixels of the picture, each those of the pixel of the hold-out that it is in, as depths
-        that the kernels have; None where there are none."""
+        """Surfaces in the pixels of the picture, as depths in the kernels' terms; None if there are none.
+
+        Each pixel takes the surfaces of the holdout's pixel that contains it.
+        """
         window, holdout = camera.window, self._holdout
         x, y, across, down = (
             (window.x, window.y, window.width, window.height) if window else (0, 0, camera.width, camera.height)

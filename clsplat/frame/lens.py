@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lenses that bend a picture: where each pixel is in a straight one, by an STMap or by a photograph's lens.
+"""Warps of a picture: where each of its pixels lies in a straight picture, by an STMap or by a photograph's lens.
 
-A straight picture is looked at as far as the places reach, also beyond the frame. `warp` makes the bent one.
+The straight picture is rendered as far as these places reach, also beyond the frame. `warp` samples the warped picture
+from it.
 """
 
 from __future__ import annotations
@@ -13,65 +14,70 @@ from typing import Protocol
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.camera import FRAME_CLAMP, Camera, Window
+from clsplat.camera import JACOBIAN_CLAMP_HALF_FRAMES, Camera, Window
 from clsplat.frame.window import crop
 from clsplat.images.stmap import StMap
-from clsplat.scenes.data_set import Lens
+from clsplat.scenes.dataset import Lens
 
-BEYOND = 1.0
-"""Frames beyond each edge of the straight frame from which on there is nothing: a map may say anything there."""
-STEP = 2.0**-20
-"""Pixels that places are whole multiples of, so that counting them from a window's corner rounds nothing."""
-MARGIN = 2
-"""Pixels around a place that its interpolation looks at."""
-GRID = 33
-"""Places across and down at which a lens is looked at for what holds of the whole frame."""
-ONE_SAMPLE = 1.25
-"""Straight pixels a bent one up to which one sample of it is enough."""
-MOST_SAMPLES = 16
-_STEPS = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
+MAX_BEYOND_EDGE_FRAMES = 1.0
+"""Limit of places beyond each edge of the straight frame, in frames. Farther out nothing is seen, as a map may have any
+value there."""
+PLACE_STEP_PX = 2.0**-20
+"""Places are rounded to multiples of this, in pixels, so that subtracting a window's corner causes no rounding
+error."""
+INTERPOLATION_MARGIN_PX = 2
+"""Pixels around a place that its interpolation reads."""
+PROBE_GRID_SIDE = 33
+"""Places across and down at which a lens is sampled for properties of the whole frame."""
+MAX_SINGLE_SAMPLE_PX = 1.25
+"""Size of a warped pixel, in straight pixels, up to which one sample is enough."""
+MAX_WARP_SAMPLES = 16
+"""Limit of a pixel's samples across and down."""
+_HALF_PIXEL_STEPS = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
 
 
 class Places(Protocol):
-    """A source of places."""
+    """A source of places: positions of warped pixels in a straight picture."""
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """Width and height of the bent frame, of a straight one."""
+        """Width and height of the warped frame that belongs to a straight one."""
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """(h, w, 2) pixels of the straight frame that are seen at x (w,), y (h,) of the bent one; NaN where nothing
+        """Pixels (h, w, 2) of the straight frame that are seen at x (w,), y (h,) of the warped one; NaN where nothing
         is."""
 
 
 @dataclass(frozen=True, eq=False)
 class ByMap:
-    """Places by an STMap."""
+    """Places from an STMap."""
 
     stmap: StMap
 
     def size(self, frame: Camera) -> tuple[int, int]:  # noqa: ARG002
-        """The map's."""
+        """Width and height of the map."""
         return self.stmap.width, self.stmap.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Pixels of the straight frame, as of `Places`."""
+        """Pixels of the straight frame, as in `Places`."""
         u, v = np.moveaxis(self.stmap.at(x, y), 2, 0)
         return np.stack([u * frame.width, (1 - v) * frame.height], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
 class ByLens:
-    """Places by the lens of a photograph, whose pixels the bent picture has. The frame is that of `Lens.bare`, in any
-    size."""
+    """Places from a photograph's lens. The warped picture has the photograph's pixels.
+
+    The straight frame is shown by the camera of `Lens.bare`, in any size.
+    """
 
     lens: Lens
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """The frame's."""
+        """Width and height of the straight frame."""
         return frame.width, frame.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Pixels of the straight frame, as of `Places`."""
+        """Pixels of the straight frame, as in `Places`."""
         bare = self.lens.bare(frame.rotation, frame.translation)
         across, down = np.meshgrid((x - frame.cx) / frame.fx * bare.fx, (y - frame.cy) / frame.fy * bare.fy)
         pixels = np.stack([(across + bare.cx).ravel(), (down + bare.cy).ravel()], axis=1)
@@ -81,58 +87,71 @@ class ByLens:
 
 @dataclass(frozen=True, eq=False)
 class Warp:
-    """A straight frame, and where a bent one's pixels are in it. frame: a camera of the whole of it."""
+    """A straight frame, and the places of a warped frame's pixels in it.
+
+    frame: camera of the whole straight frame.
+    """
 
     source: Places
     frame: Camera
 
     def at(self, x: Float64, y: Float64) -> Float64:
-        """Places (h, w, 2), NaN also where they are too far out."""
-        places = np.round(self.source.places(self.frame, x, y) / STEP) * STEP
+        """Places (h, w, 2), NaN also where they are too far outside the frame."""
+        places = np.round(self.source.places(self.frame, x, y) / PLACE_STEP_PX) * PLACE_STEP_PX
         size = np.array([self.frame.width, self.frame.height])
         with np.errstate(invalid="ignore"):
-            inside = np.logical_and(places >= -BEYOND * size, places <= (1 + BEYOND) * size).all(axis=2)
+            inside = np.logical_and(
+                places >= -MAX_BEYOND_EDGE_FRAMES * size, places <= (1 + MAX_BEYOND_EDGE_FRAMES) * size
+            ).all(axis=2)
         return np.where(np.expand_dims(inside, 2), places, np.nan)
 
     @property
     def shown(self) -> Camera:
-        """A camera of the bent frame's size; of its pixels alone, not of what they see."""
+        """A camera of the warped frame's size. Only its pixels are valid, not its rays."""
         width, height = self.source.size(self.frame)
         return replace(self.frame, width=width, height=height)
 
     @cached_property
     def _grid(self) -> tuple[Float64, Float64]:
-        """Places (GRID, GRID, 2) over the frame, and by how much they move a pixel on, across and down, the larger."""
+        """Places (33, 33, 2) spread over the frame, and the distance (33, 33) between adjacent pixels' places.
+
+        The distance is the larger of those across and down.
+        """
         width, height = self.source.size(self.frame)
-        x, y = ((np.arange(GRID) / (GRID - 1)) * (side - 1) + 0.5 for side in (width, height))
-        ends = [self.at(*(places + shift for places, shift in zip((x, y), by, strict=True))) for by in _STEPS]
+        x, y = ((np.arange(PROBE_GRID_SIDE) / (PROBE_GRID_SIDE - 1)) * (side - 1) + 0.5 for side in (width, height))
+        ends = [
+            self.at(*(places + shift for places, shift in zip((x, y), by, strict=True))) for by in _HALF_PIXEL_STEPS
+        ]
         steps = np.stack([np.linalg.norm(ends[0] - ends[1], axis=2), np.linalg.norm(ends[2] - ends[3], axis=2)])
         return self.at(x, y), np.fmax(*steps)
 
     @property
     def empty(self) -> float:
-        """The part of the frame that nothing is seen in."""
+        """Fraction of the frame in which nothing is seen."""
         return float(np.isnan(self._grid[0][:, :, 0]).mean())
 
     @cached_property
     def samples(self) -> int:
-        """Samples of a pixel across and down."""
+        """Samples across and down a pixel."""
         most = np.nanmax(self._grid[1], initial=0.0)
-        return 1 if most <= ONE_SAMPLE else min(int(np.ceil(most - 1e-3)), MOST_SAMPLES)
+        return 1 if most <= MAX_SINGLE_SAMPLE_PX else min(int(np.ceil(most - 1e-3)), MAX_WARP_SAMPLES)
 
     @cached_property
     def clamp(self) -> float:
-        """`Window.clamp` of the straight frame, the same for each of its windows."""
+        """`Window.clamp` of the straight frame, the same for all of its windows."""
         places = self._grid[0].reshape(-1, 2)
         if np.isnan(places).all():
-            return FRAME_CLAMP
+            return JACOBIAN_CLAMP_HALF_FRAMES
         size = np.array([self.frame.width, self.frame.height])
-        beyond = np.maximum(-np.nanmin(places, axis=0), np.nanmax(places, axis=0) - size) + MARGIN
-        return max(FRAME_CLAMP, float((2 * beyond / size).max()))
+        beyond = np.maximum(-np.nanmin(places, axis=0), np.nanmax(places, axis=0) - size) + INTERPOLATION_MARGIN_PX
+        return max(JACOBIAN_CLAMP_HALF_FRAMES, float((2 * beyond / size).max()))
 
     def of_window(self, camera: Camera) -> tuple[Float64, Camera | None]:
-        """Places (k height, k width, 2) of the samples of a picture or a window of it; and the straight window that
-        they are in, None where they are nowhere."""
+        """Places (k height, k width, 2) of the samples of a picture or of its window, and the straight window that
+        holds them.
+
+        The window is None if nothing is seen.
+        """
         x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
         samples = self.samples
         across = x + (np.arange(camera.width * samples) + 0.5) / samples
@@ -140,15 +159,15 @@ class Warp:
         places = self.at(across, down)
         if np.isnan(places).all():
             return places, None
-        first = np.floor(np.nanmin(places, axis=(0, 1))).astype(int) - MARGIN
-        last = np.ceil(np.nanmax(places, axis=(0, 1))).astype(int) + MARGIN
+        first = np.floor(np.nanmin(places, axis=(0, 1))).astype(int) - INTERPOLATION_MARGIN_PX
+        last = np.ceil(np.nanmax(places, axis=(0, 1))).astype(int) + INTERPOLATION_MARGIN_PX
         (left, top), (width, height) = first.tolist(), (last - first).tolist()
         whole = replace(self.frame, window=Window(0, 0, self.frame.width, self.frame.height, self.clamp))
         return places, crop(whole, left, top, width, height)
 
 
 def distorted_places(lens: Lens, straight: Camera) -> Float64:
-    """(height, width, 2): pixels of the straight picture that are seen in the lens's own; NaN where none is."""
+    """Pixels (height, width, 2) of the straight picture that are seen in the lens's own picture; NaN where none is."""
     grid = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.cam_from_img(np.stack([axis.ravel() for axis in grid], axis=1))
     places = rays * (straight.fx, straight.fy) + (straight.cx, straight.cy)
@@ -156,7 +175,7 @@ def distorted_places(lens: Lens, straight: Camera) -> Float64:
 
 
 def undistorted_places(lens: Lens, straight: Camera) -> Float64:
-    """(height, width, 2): pixels of the lens's own picture that are seen in the straight one; NaN where none is."""
+    """Pixels (height, width, 2) of the lens's own picture that are seen in the straight one; NaN where none is."""
     x = (np.arange(straight.width) + 0.5 - straight.cx) / straight.fx
     y = (np.arange(straight.height) + 0.5 - straight.cy) / straight.fy
     across, down = np.meshgrid(x, y)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame with everything that is asked of it: framing, samples, colour, and strips where it is large.
+"""All steps that make a frame: framing, samples, colour, and strips if it is large.
 
-One order for all of them: the kernels draw in the model's space; that becomes light, which is filtered and averaged;
-what comes out is converted. A strip is a window of the picture, so that it goes through all of this alone.
+The order is always the same. The kernels render in the model's colour space. The result is converted to linear light,
+filtered and averaged, and then converted to the output's space. A strip is a window of the picture, and passes all
+steps on its own.
 """
 
 from __future__ import annotations
@@ -13,13 +14,24 @@ import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig, SamplingConfig, WarpConfig
+from clsplat.frame.deep import (
+    Convert,
+    DrawDeep,
+    Merge,
+    deep_converted,
+    deep_in_strips,
+    deep_rows,
+    deep_sampled,
+    deep_warped,
+    drawn_in_slices,
+)
 from clsplat.frame.draw import Draw, Planes, drawn_by
 from clsplat.frame.holdout import Cut
 from clsplat.frame.lens import Places, Warp
-from clsplat.frame.objects import Matte
+from clsplat.frame.mattes import Matte
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
+from clsplat.frame.shutter_times import sample_moments
 from clsplat.frame.strips import in_strips, strip_rows
-from clsplat.frame.times import sample_moments
 from clsplat.frame.warp import warped
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
@@ -27,12 +39,13 @@ from clsplat.images.cryptomatte import ranked
 from clsplat.rendering.renderer import Renderer
 from clsplat.stages.holdout import held_bytes
 
-UNSEEN = 1e-6
-"""Most that a colour differs from the background's where nothing is seen: averages of equal samples are rounded."""
+BLANK_COLOUR_TOLERANCE = 1e-6
+"""Largest difference from the background's colour where nothing is seen, since averages of equal samples are
+rounded."""
 
 
 class FramePipeline:
-    """Makes the frames of one job."""
+    """Renders the frames of one job."""
 
     def __init__(
         self,
@@ -44,9 +57,13 @@ class FramePipeline:
         recorded: str = SRGB,
         mattes: Mapping[str, Matte] | None = None,
     ) -> None:
-        """recorded: the model's colour space (`colour.recorded_space`); background: in that space, black where alpha is
-        written; mattes: by the names of their channels. Raises InputError for settings and spaces that make no
-        sense."""
+        """Prepare colours, and check the settings of a job.
+
+        recorded: the model's colour space (`colour.recorded_space`).
+        background: in that space, black if alpha is written.
+        mattes: by the names of their channels.
+        Raises InputError for settings and colour spaces that do not fit together.
+        """
         self.config = config or PictureConfig()
         self.config.check()
         self.colours = Colours(self.config.colour, recorded)
@@ -64,14 +81,17 @@ class FramePipeline:
         models: Callable[[float], Gaussians] | None = None,
         moved: tuple[Gaussians | None, Gaussians | None] = (None, None),
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
-        """The Draw of a camera that says size and window, of the picture or a strip of it; and the conversion that
-        makes its planes the file's, which needs no device.
+        """The Draw of a frame, and the conversion of its planes to the file's colours, which needs no device.
 
-        at: the camera of the whole frame, in its final size, at a time in frames from the frame: 0 if nothing moves;
-        after, before: those of the next frame and of the frame before, for motion; lens: it bends the picture;
-        sampling: of this frame, else that of all; cut: of the frame's hold-out, for every sample of the frame. models:
-        the Gaussians at these times, where they are not the pipeline's own; moved: those that motion and backward
-        motion go to, where they do not stand still.
+        The camera that is drawn gives only size and window, of the picture or of a strip.
+        at: camera of the whole frame, in its final size, at a time in frames from the frame; the time is 0 if nothing
+          moves.
+        after, before: cameras of the next and the previous frame, for motion.
+        lens: warps the picture.
+        sampling: of this frame, None for the job's.
+        cut: of the frame's holdout, for every sample of the frame.
+        models: the Gaussians at a time, None for the pipeline's own.
+        moved: Gaussians that motion and backward motion lead to, None if these stand still.
         """
         sampling = sampling or self.config.sampling
         config, colours, space = self.config, self.colours, self.colours.model
@@ -102,8 +122,42 @@ class FramePipeline:
             draw = warped(rows, Warp(lens, at(sampling.middle)))
         return draw, lambda planes: self._with_ranks(converted(planes, colours, space, colours.output))
 
+    def draw_deep(
+        self,
+        bins: int,
+        at: Callable[[float], Camera],
+        lens: Places | None = None,
+        sampling: SamplingConfig | None = None,
+        models: Callable[[float], Gaussians] | None = None,
+    ) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
+        """Deep counterpart of `draw`: the DrawDeep, and the conversion of its colours to the file's.
+
+        Also returns a function from a camera to the rows of its strips.
+        """
+        sampling = sampling or self.config.sampling
+        colours, device = self.colours, self._renderer.device
+        space = colours.light if self._made_in_light(sampling) or lens is not None else colours.model
+
+        def drawn_at(time: float) -> DrawDeep:
+            draw = drawn_in_slices(self._renderer, lambda: models(time) if models else self._gaussians, bins)
+            return draw if space == colours.model else deep_converted(draw, between(colours.model, space))
+
+        def between(source: str, target: str) -> Convert:
+            return lambda rgb, alpha: colours.convert(rgb, alpha, source, target)
+
+        def rows(camera: Camera) -> int:
+            return deep_rows(device, camera, bins, len(cameras))
+
+        draw, (middle, cameras) = drawn_at(sampling.middle), sample_cameras(at, sampling)
+        if len(cameras) > 1:
+            draws = [drawn_at(time) for time in sample_moments(sampling)]
+            draw = deep_sampled(draws, cameras, Merge(device, bins))
+        if lens is not None:
+            draw = deep_warped(deep_in_strips(draw, rows), Warp(lens, middle), Merge(device, bins))
+        return draw, between(space, colours.output), rows
+
     def _with_ranks(self, planes: Planes) -> Planes:
-        """The same planes, those of mattes as they are written."""
+        """The same planes, with mattes in the form in which they are written."""
         return {
             name: ranked(plane, self._mattes[name].names) if name in self._mattes else plane
             for name, plane in planes.items()
@@ -115,11 +169,11 @@ class FramePipeline:
         return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def _made_in_light(self, sampling: SamplingConfig) -> bool:
-        """True if frames are made of several, in linear light."""
+        """True if frames are averages of several, in linear light."""
         return sampling.on or self.config.framing.supersample > 1
 
     def is_blank(self, planes: Planes, sampling: SamplingConfig | None = None) -> bool | None:
-        """True if planes of `draw`, not converted, show nothing but the background, None where none of them tells."""
+        """True if planes of `draw`, before conversion, show only the background; None if no channel can tell."""
         sampling = sampling or self.config.sampling
         for name in ("alpha", "count", "depth"):
             if name in planes:
@@ -129,12 +183,14 @@ class FramePipeline:
         behind = np.array(self._background, np.float32).reshape(1, 1, 3)
         if self._made_in_light(sampling) or self.config.warp != WarpConfig():
             behind = self.colours.convert(behind, None, self.colours.model, self.colours.light)
-        return bool(np.abs(planes["rgb"] - behind).max() <= UNSEEN)
+        return bool(np.abs(planes["rgb"] - behind).max() <= BLANK_COLOUR_TOLERANCE)
 
 
 def converted(planes: Planes, colours: Colours, source: str, target: str) -> Planes:
-    """The same planes, rgb in another colour space: divided by alpha around the conversion if that is among them, else
-    opaque."""
+    """The same planes with rgb in another colour space.
+
+    rgb is divided by alpha for the conversion and multiplied again if alpha is present, else it is treated as opaque.
+    """
     if source == target or "rgb" not in planes:
         return planes
     return {**planes, "rgb": colours.convert(planes["rgb"], planes.get("alpha"), source, target)}

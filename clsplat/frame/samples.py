@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples that a frame is the mean of: over a pixel (supersampling), the shutter's time and the lens's area.
 
-Samples have fixed places, and those of shutter and lens equal weights: the same frame again has the same bits, wherever
-a single frame has. Light is added up in linear values alone. Channels that have no mean come from one sample.
+Samples have fixed places, and samples of shutter and lens have equal weights. So a repeated frame is bit-identical
+wherever a frame without samples is. Light is averaged in linear values only. Channels that have no mean come from one
+sample.
 """
 
 from __future__ import annotations
@@ -16,19 +17,21 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
-from clsplat.config.pictures import SENSOR_WIDTH, Filter, FramingConfig, SamplingConfig
+from clsplat.config.pictures import SENSOR_WIDTH_MM, Filter, FramingConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, in_two
-from clsplat.frame.times import sample_moments
+from clsplat.frame.shutter_times import sample_moments
 from clsplat.frame.window import crop, reframed
 
-_RADII: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
+_FILTER_RADII_PX: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
+"""Radius of each pixel filter, in pixels."""
 GOLDEN_ANGLE = np.pi * (3 - 5**0.5)
+"""Angle between successive points of Vogel's spiral, in radians."""
 
 
 def filter_taps(config: FramingConfig) -> NDArray[np.float32]:
-    """Weights of the samples across a pixel and its margins, symmetric; they add up to 1."""
-    samples, radius = config.supersample, _RADII[config.filter]
+    """Weights of the samples across a pixel and its margins; symmetric, with a sum of 1."""
+    samples, radius = config.supersample, _FILTER_RADII_PX[config.filter]
     margin = samples * _margin(config)
     at = (np.arange(-margin, samples + margin) + 0.5) / samples - 0.5
     if config.filter == "box":
@@ -40,29 +43,29 @@ def filter_taps(config: FramingConfig) -> NDArray[np.float32]:
 
 
 def _margin(config: FramingConfig) -> int:
-    """Pixels beyond the picture that its filter looks at."""
-    return int(np.ceil(_RADII[config.filter] - 0.5))
+    """Pixels beyond the picture that its filter reads."""
+    return int(np.ceil(_FILTER_RADII_PX[config.filter] - 0.5))
 
 
 def finer(camera: Camera, config: FramingConfig) -> Camera:
-    """The camera that a supersampled picture is drawn with: larger, with the margin that its filter looks at.
+    """The camera for rendering a supersampled picture: larger, with the margin that its filter reads.
 
-    Raises InputError for a panorama, which has nothing around it, where the filter looks beyond a pixel.
+    Raises InputError for a panorama with a filter wider than a pixel, since nothing lies beyond its edges.
     """
     margin, samples = _margin(config), config.supersample
     if margin == 0:
         return camera.resized(camera.width * samples, camera.height * samples)
-    if camera.projection == "equirectangular":
+    if camera.model.wraps:
         raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges, expected box")
     padded = crop(camera, -margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
     return padded.resized(padded.width * samples, padded.height * samples)
 
 
 def supersampled(draw: Draw, config: FramingConfig) -> Draw:
-    """rgb and alpha from a frame `supersample` times larger, filtered; other channels as without.
+    """rgb and alpha filtered from a frame `supersample` times larger; other channels at the original size.
 
-    `draw` has to give rgb in linear light: what falls on a pixel adds up in that alone. The sums are in the same order
-    wherever the picture is in its frame.
+    `draw` must give rgb in linear light, the only space in which light adds up. The order of summation does not depend
+    on the picture's place in its frame.
     """
     samples = config.supersample
     if samples == 1:
@@ -82,24 +85,30 @@ def supersampled(draw: Draw, config: FramingConfig) -> Draw:
 
 
 def lens_points(count: int) -> Float64:
-    """(count, 2) on the unit disc, each for as much of its area (Vogel's spiral)."""
+    """Points (count, 2) on the unit disc, each for an equal share of its area (Vogel's spiral)."""
     index = np.arange(count)
     radius, angle = np.sqrt((index + 0.5) / count), GOLDEN_ANGLE * index
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def lens_radius(camera: Camera, config: SamplingConfig) -> float:
-    """Radius of the lens in the scene's units; camera: of a whole frame."""
+    """Radius of the lens in scene units.
+
+    camera: of a whole frame.
+    """
     if config.f_stop is None:
         return config.aperture or 0.0
-    focal_length = camera.fx * (config.sensor_width or SENSOR_WIDTH) / camera.width / 1000 / (config.metres or 1.0)
+    focal_length = camera.fx * (config.sensor_width or SENSOR_WIDTH_MM) / camera.width / 1000 / (config.metres or 1.0)
     return focal_length / (2 * config.f_stop)
 
 
 def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
-    """The camera from the point (x, y) of its lens, in the scene's units, sheared so that what is at the depth `focus`
-    stays where it is in the picture. Raises InputError for a camera without an image plane."""
-    if camera.projection != "perspective":
+    """The camera from the point (x, y) of its lens, in scene units.
+
+    It is sheared so that points at the depth `focus` stay in place in the picture. Raises InputError for a camera
+    without an image plane.
+    """
+    if not camera.is_pinhole:
         raise InputError(f"depth of field is not defined for {camera.projection} cameras, expected a perspective one")
     return replace(
         camera,
@@ -110,9 +119,10 @@ def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
 
 
 def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tuple[Camera, list[Camera]]:
-    """(the camera in the middle of shutter and lens, one for each sample), of whole frames.
+    """The camera in the middle of shutter and lens, and one camera per sample, all of whole frames.
 
-    at: the camera at a time in frames from the frame, such as `Shot.at` gives; one sample is the middle itself.
+    at: the camera at a time in frames from the frame, such as `Shot.at`.
+    A single sample is the middle itself.
     """
     middle = at(config.middle)
     if not config.on or config.samples == 1:
@@ -128,11 +138,12 @@ def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tup
 
 
 def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callable[[int], Draw] | None = None) -> Draw:
-    """rgb and alpha as the mean over the cameras, of whole frames; other channels, of which there is no mean, from the
-    middle one. The camera that is drawn says the size and the window alone. light: the Draw of each sample, where that
-    is another than `draw`.
+    """A Draw of rgb and alpha as the mean over the cameras. Other channels have no mean and come from the middle
+    camera.
 
-    `draw` has to give rgb in linear light. Sums are of float64, in the cameras' order.
+    middle, cameras: of whole frames. The camera that is drawn gives only size and window.
+    light: the Draw of each sample, if it differs from `draw`.
+    `draw` must give rgb in linear light. Sums are float64, in the cameras' order.
     """
 
     def blurred(camera: Camera, names: Collection[str]) -> Planes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames that are too large for the device's memory or the host's: rendered in strips, and written as they come."""
+"""Frames too large for the memory of the device or the host: rendered in strips, and written strip by strip."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.config.pictures import STRIP_PIXELS, Encoding, FramingConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import TILE
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, feature_floats
 from clsplat.frame.window import crop
-from clsplat.images.frame_files import Header, check_target, encoded
+from clsplat.images.frame_files import FrameFileHeader, check_target, encoded
 from clsplat.images.writing import write_rows
+from clsplat.layouts.columns import TILE
 from clsplat.rendering.memory_needs import frame_pixels
 
 
@@ -28,22 +28,23 @@ def strip_rows(
     config: FramingConfig | None = None,
     planes: int = 0,
 ) -> int:
-    """Rows of a strip that leaves room for the rest, whole tiles of them; the picture's height where it needs none.
+    """Rows of a strip that leaves memory for the rest, in whole tiles; the picture's height if it needs no strips.
 
-    names: of the channels that are wanted; config: supersampling makes strips larger than they are written; planes:
-    bytes of each pixel in further planes.
+    names: of the wanted channels.
+    config: its supersampling makes rendered strips larger than written ones.
+    planes: bytes per pixel in further planes.
     """
     samples = config.supersample if config else 1
     most = min(frame_pixels(device, feature_floats(names), planes), STRIP_PIXELS)
     across = -(-camera.width * samples // TILE) * TILE * samples
-    rows = most // across - 2 * TILE  # what a window that begins within a tile, and a filter's margins, add
+    rows = most // across - 2 * TILE  # room for a window that begins within a tile, and for a filter's margins
     if rows >= camera.height:
         return camera.height
     return max(rows // TILE, 1) * TILE
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:
-    """The picture from the top, `rows` at a time; where there are several they end with the frame's tiles."""
+    """The picture in strips of at most `rows`, from the top. Several strips end at the frame's tile borders."""
     if rows >= camera.height:
         yield camera
         return
@@ -56,7 +57,7 @@ def strips(camera: Camera, rows: int) -> Iterator[Camera]:
 
 
 def in_strips(draw: Draw, rows: int) -> Draw:
-    """The same channels, drawn in strips: bounds the device's memory, not the host's."""
+    """A Draw of the same channels in strips. Bounds the device's memory, not the host's."""
 
     def drawn(camera: Camera, names: Collection[str]) -> Planes:
         parts = [draw(strip, names) for strip in strips(camera, rows)]
@@ -66,7 +67,10 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 
 
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
-    """Raise InputError for several parts, which a file has one after the other. views: of a stereo pair in the file."""
+    """Raise InputError for a file in several parts or views, which it stores one after the other.
+
+    views: of a stereo pair in the file.
+    """
     if views > 1:
         raise InputError(
             f"--stereo: a picture of {camera.width}x{camera.height} is written in strips here, expected a file for "
@@ -85,15 +89,15 @@ def write_in_strips(
     names: Collection[str],
     rows: int,
     encoding: Encoding | None = None,
-    header: Header | None = None,
+    header: FrameFileHeader | None = None,
 ) -> None:
-    """Draw and write a picture strip by strip, atomically. The bytes are those that `write_channels` writes of all of
-    it, except in formats whose layout depends on how the rows come.
+    """Draw and write a picture strip by strip, atomically.
 
-    Raises InputError for what the format cannot hold and for several parts, which a file has one after the other;
-    ClsplatError if writing fails.
+    The bytes are the same as `write_channels` writes for the whole picture, except in formats whose layout depends on
+    how rows arrive. Raises InputError for channels that the format cannot hold, and for several parts, which a file
+    stores one after the other. Raises ClsplatError if writing fails.
     """
-    encoding, header, extension = encoding or Encoding(), header or Header(), path.suffix.lower()
+    encoding, header, extension = encoding or Encoding(), header or FrameFileHeader(), path.suffix.lower()
     check_target(path, names)
     if extension == ".exr":
         check_parts(camera, encoding)
@@ -103,5 +107,5 @@ def write_in_strips(
     if header.window is None:
         spec.full_height = camera.height
     pieces = chain(iter([first]), (pixels for pixels, _ in parts))
-    del first  # its memory is free before the third is drawn
+    del first  # frees its memory before the third strip is drawn
     write_rows(path, spec, extension[1:], ((pixels, len(pixels)) for pixels in pieces))

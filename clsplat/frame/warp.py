@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bent pictures, of straight ones and the places of their pixels (docs/pictures.md). A window of a bent picture has the
-pixels that the whole has there."""
+"""Warped pictures, sampled from straight ones at the places of their pixels (docs/pictures.md).
+
+A window of a warped picture has the same pixels as the whole picture there.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +15,20 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera, Window
-from clsplat.config.channels import CHANNELS
+from clsplat.config.channels import FRAME_CHANNELS
 from clsplat.frame.draw import Draw, Planes
 from clsplat.frame.lens import Warp
 
-_ROWS = 128
-"""Rows of samples that are taken at once: bounds the host's memory."""
+_SAMPLE_ROWS_PER_BATCH = 128
+"""Rows of samples that are taken at once, to bound the host's memory."""
 
 
 def warped(draw: Draw, warp: Warp) -> Draw:
-    """A Draw of bent pictures; the camera that is drawn says the size and the window alone.
+    """A Draw of warped pictures. The camera that is drawn gives only size and window.
 
-    `draw` makes straight windows, with rgb in linear light. rgb and alpha are means of
-    `Warp.samples` samples of a pixel, of Catmull and Rom's cubic between pixels; other channels those of the nearest
-    pixel. Where nothing is seen all is 0, and the index -1.
+    `draw` renders straight windows, with rgb in linear light. rgb and alpha are means over `Warp.samples` by
+    `Warp.samples` samples of a pixel, interpolated by Catmull and Rom's cubic. Other channels come from the nearest
+    pixel. Where nothing is seen, all values are 0, and ids -1.
     """
 
     def bent(camera: Camera, names: Collection[str]) -> Planes:
@@ -42,11 +44,11 @@ def warped(draw: Draw, warp: Warp) -> Draw:
 
 
 def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDArray[Any]:
-    """A plane (h, w) or (h, w, floats) at places (k rows, k columns, 2)."""
+    """Sample a plane (h, w) or (h, w, floats) at places (k rows, k columns, 2)."""
     height, width = places.shape[0] // samples, places.shape[1] // samples
-    channel = CHANNELS.get(name)
+    channel = FRAME_CHANNELS.get(name)
     result = np.empty((height, width, *plane.shape[2:]), plane.dtype)
-    step = max(_ROWS // samples, 1)
+    step = max(_SAMPLE_ROWS_PER_BATCH // samples, 1)
     for top in range(0, height, step):
         some = places[top * samples : (top + step) * samples]
         if channel is None or channel.is_light:
@@ -61,7 +63,7 @@ def _taken(plane: NDArray[Any], places: Float64, samples: int, name: str) -> NDA
 
 
 def nearest(plane: NDArray[Any], places: Float64, nothing: float = 0) -> NDArray[Any]:
-    """The pixels of a plane that places (h, w, 2) are in; `nothing` where these are NaN."""
+    """Values of the pixels that contain places (h, w, 2); `nothing` where a place is NaN."""
     there = ~np.isnan(places[:, :, 0])
     at = np.where(there[:, :, None], np.floor(places), 0).astype(np.int64)
     x, y = (np.clip(at[:, :, axis], 0, plane.shape[1 - axis] - 1) for axis in (0, 1))
@@ -71,13 +73,15 @@ def nearest(plane: NDArray[Any], places: Float64, nothing: float = 0) -> NDArray
 
 
 def cubic(plane: NDArray[Any], places: Float64) -> NDArray[Any]:
-    """A plane between its pixels, by Catmull and Rom's cubic, held within the sixteen pixels around, so that nothing is
-    darker or brighter than these. 0 where places are NaN."""
+    """Interpolate a plane at places by Catmull and Rom's cubic; 0 where a place is NaN.
+
+    The result is clamped to the range of the sixteen pixels around, so that it is never darker or brighter than these.
+    """
     there = ~np.isnan(places[:, :, 0])
     at = np.where(there[:, :, None], places, 0.5) - 0.5
     first = np.floor(at).astype(np.int64)
     weights = [_catmull_rom((at - first)[:, :, axis].astype(np.float32)) for axis in (0, 1)]
-    # the border is repeated, so that the sixteen are at one distance from each other everywhere
+    # a repeated border keeps the offsets between the sixteen pixels the same everywhere
     edges = [(2, 2), (2, 2)] + [(0, 0)] * (plane.ndim - 2)
     padded = np.pad(np.asarray(plane, np.float32), edges, mode="edge")
     height, width = padded.shape[:2]
@@ -99,7 +103,7 @@ def cubic(plane: NDArray[Any], places: Float64) -> NDArray[Any]:
 
 
 def _catmull_rom(t: Float32) -> tuple[Float32, Float32, Float32, Float32]:
-    """Weights of the four pixels around a place, t behind the second."""
+    """Weights of the four pixels around a place, at the distance t after the second one."""
     return (
         0.5 * t * (t * (2 - t) - 1),
         0.5 * (t * t * (3 * t - 5) + 2),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windows of a frame, the pixels that are rendered of it: overscan and region of interest.
+"""Windows of a frame, the pixels that are rendered: overscan and region of interest.
 
-A picture is a window of its frame (`Camera.window`). Its pixels have the bits that the frame's have there
+A picture is a window of its frame (`Camera.window`). Its pixels are bit-identical to the frame's pixels there
 (docs/pictures.md).
 """
 
@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from clsplat.camera import FRAME_CLAMP, Camera, Window
+from clsplat.camera import JACOBIAN_CLAMP_HALF_FRAMES, Camera, Window
 from clsplat.config.pictures import FramingConfig, parse_overscan, parse_region
 from clsplat.errors import InputError
 
 
 def framed(camera: Camera, config: FramingConfig) -> Camera:
-    """The camera of the picture that is written, of one whose size is the frame's.
+    """The camera of the written picture, from a camera of the frame's size.
 
-    Its window is None where it is the frame. Raises InputError for a region that is not in the frame.
+    Its window is None if the picture is the whole frame. Raises InputError for a region outside the frame.
     """
     pixels, share = parse_overscan(config.overscan)
     if config.region:
@@ -34,18 +34,18 @@ def framed(camera: Camera, config: FramingConfig) -> Camera:
         return camera
     larger = crop(camera, -across, -down, camera.width + 2 * across, camera.height + 2 * down)
     assert larger.window is not None
-    clamp = max(FRAME_CLAMP, 2 * across / camera.width, 2 * down / camera.height)
+    clamp = max(JACOBIAN_CLAMP_HALF_FRAMES, 2 * across / camera.width, 2 * down / camera.height)
     return replace(larger, window=replace(larger.window, clamp=clamp))
 
 
 def crop(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
-    """The part of a picture from its pixel (x, y) on, which may lie beyond it."""
+    """The part of a picture that begins at its pixel (x, y). It may extend beyond the picture."""
     window = camera.window or Window(0, 0, camera.width, camera.height)
     return replace(camera, width=width, height=height, window=replace(window, x=window.x + x, y=window.y + y))
 
 
 def reframed(camera: Camera, like: Camera) -> Camera:
-    """A camera of a whole frame with the size and window of another, whose frame may be larger or smaller."""
+    """A camera of a whole frame, with the size and window of another camera, whose frame may be larger or smaller."""
     frame = like.window or like
     sized = camera if (camera.width, camera.height) == (frame.width, frame.height) else None
     sized = sized or camera.resized(frame.width, frame.height)

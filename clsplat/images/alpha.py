@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Alpha: colours with and without it multiplied in, and over a background."""
+"""Alpha: straight and premultiplied colours, and compositing over a background."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Image = NDArray[Any]
 
 
 def background_colour(name: str) -> tuple[float, float, float]:
-    """The colour behind held-out views: white, or black also for "random"."""
+    """Background colour of held-out views: white, or black, which also stands for "random"."""
     return (1.0, 1.0, 1.0) if name == "white" else (0.0, 0.0, 0.0)
 
 
 def composite(image: Image, background: ArrayLike) -> Image:
-    """(H, W, 3) floats: the image, with straight alpha if it has four channels, over the colour `background` (3,)."""
+    """Image (H, W, 3) in floats over the colour `background` (3,). A fourth channel of the input is straight alpha."""
     pixels: Image = image
     if np.issubdtype(image.dtype, np.integer):
         pixels = image.astype(np.float32) / np.iinfo(image.dtype).max
@@ -31,11 +31,11 @@ def composite(image: Image, background: ArrayLike) -> Image:
 
 
 def associate(image: Float32) -> Float32:
-    """(H, W, 4) with straight alpha to premultiplied."""
+    """Premultiply (H, W, 4) that has straight alpha."""
     return np.concatenate([image[:, :, :3] * image[:, :, 3:], image[:, :, 3:]], axis=2)
 
 
 def unassociate(image: Float32) -> Float32:
-    """(H, W, 4) with premultiplied alpha to straight. Colour without any alpha is kept as it is."""
+    """Convert (H, W, 4) with premultiplied alpha to straight alpha. Colour with an alpha of 0 is kept."""
     alpha = image[:, :, 3:]
     return np.concatenate([image[:, :, :3] / np.where(alpha > 0, alpha, np.float32(1)), alpha], axis=2)

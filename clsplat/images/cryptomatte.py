@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cryptomatte (Friedman and Jones 2015; specification 1.2.0, https://github.com/Psyop/Cryptomatte): for each pixel the
-objects that cover most of it, an id and its coverage each, and in the header which name an id is of."""
+"""Cryptomatte (Friedman and Jones 2015; specification 1.2.0, https://github.com/Psyop/Cryptomatte).
+
+Each pixel stores ids and coverages of the objects that cover most of it. The header maps names to ids.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from clsplat.arrays import Float32
-from clsplat.config.channels import LAYERS
+from clsplat.config.channels import CRYPTOMATTE_LAYERS
 
-_MASK = 0xFFFFFFFF
+_UINT32_MASK = 0xFFFFFFFF
 
 
 def murmur3(data: bytes, seed: int = 0) -> int:
@@ -20,30 +22,30 @@ def murmur3(data: bytes, seed: int = 0) -> int:
     value, whole = seed, len(data) // 4 * 4
 
     def mixed(word: int) -> int:
-        word = word * 0xCC9E2D51 & _MASK
-        word = (word << 15 | word >> 17) & _MASK
-        return word * 0x1B873593 & _MASK
+        word = word * 0xCC9E2D51 & _UINT32_MASK
+        word = (word << 15 | word >> 17) & _UINT32_MASK
+        return word * 0x1B873593 & _UINT32_MASK
 
     for at in range(0, whole, 4):
         value ^= mixed(int.from_bytes(data[at : at + 4], "little"))
-        value = (value << 13 | value >> 19) & _MASK
-        value = (value * 5 + 0xE6546B64) & _MASK
+        value = (value << 13 | value >> 19) & _UINT32_MASK
+        value = (value * 5 + 0xE6546B64) & _UINT32_MASK
     if tail := data[whole:]:
         value ^= mixed(int.from_bytes(tail, "little"))
     value ^= len(data)
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
-        value = (value ^ value >> shift) * factor & _MASK
+        value = (value ^ value >> shift) * factor & _UINT32_MASK
     return value ^ value >> 16
 
 
 def id_bits(name: str) -> int:
-    """The 32 bits of a name's id, which as a float is neither denormal nor infinite nor NaN."""
+    """32 bits of a name's id; as a float it is neither denormal, infinite nor NaN."""
     bits = murmur3(name.encode())
     return bits ^ (1 << 23) if bits >> 23 & 255 in (0, 255) else bits
 
 
 def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
-    """Attributes of a file's header: the layer's name, how ids are made, the manifest."""
+    """Header attributes: the layer's name, hash and conversion of the ids, and the manifest."""
     key = f"cryptomatte/{murmur3(layer.encode()):08x}"[: len("cryptomatte/") + 7]
     manifest = json.dumps({name: f"{id_bits(name):08x}" for name in names}, separators=(",", ":"))
     return {
@@ -55,13 +57,16 @@ def header_of(layer: str, names: Sequence[str]) -> dict[str, str]:
 
 
 def ranked(coverage: Float32, names: Sequence[str]) -> Float32:
-    """(H, W, 4 LAYERS): ids and coverages of the objects that cover most of each pixel, largest first, of the coverage
-    (H, W, objects); ties in the order of the names, 0 where there is none."""
-    kept = min(2 * LAYERS, len(names))
+    """Rank coverage (H, W, objects) into (H, W, 4 CRYPTOMATTE_LAYERS): ids and coverages of each pixel's largest
+    objects, largest first.
+
+    Ties go by the order of the names; unused ranks are 0.
+    """
+    kept = min(2 * CRYPTOMATTE_LAYERS, len(names))
     ids = np.array([id_bits(name) for name in names], np.uint32).view(np.float32)
     order = np.argsort(-coverage, axis=2, kind="stable")[:, :, :kept]
     share = np.take_along_axis(coverage, order, axis=2)
-    planes = np.zeros((*coverage.shape[:2], 2 * LAYERS, 2), np.float32)
+    planes = np.zeros((*coverage.shape[:2], 2 * CRYPTOMATTE_LAYERS, 2), np.float32)
     planes[:, :, :kept, 0] = np.where(share > 0, ids[order], 0)
     planes[:, :, :kept, 1] = np.where(share > 0, share, 0)
-    return planes.reshape(*coverage.shape[:2], 4 * LAYERS)
+    return planes.reshape(*coverage.shape[:2], 4 * CRYPTOMATTE_LAYERS)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of deep pixels, whole rows of them, as OpenImageIO writes them.
+"""Samples of deep pixels, in whole rows, for OpenImageIO to write.
 
-OpenImageIO takes deep values from Python one by one, which costs twenty times what a frame does. What it reads itself
-it takes as a whole: so the rows go to it as a deep EXR without compression, whose layout is plain
-(https://openexr.com/en/latest/OpenEXRFileLayout.html), and from it to the file, with its header and compression.
+From Python, OpenImageIO takes deep values one by one, which costs twenty times as much as a frame. Deep data that it
+reads itself comes as a whole. So the rows are written to an uncompressed deep EXR, whose layout is simple
+(https://openexr.com/en/latest/OpenEXRFileLayout.html). OpenImageIO reads it and writes the final file with its header
+and compression.
 """
 
 from __future__ import annotations
@@ -18,23 +19,25 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError
-from clsplat.files import native_name
+from clsplat.files.names import native_name
 
-_MAGIC, _VERSION, _DEEP = 20000630, 2, 0x800
-_PIXEL_TYPES = {2: 1, 4: 2}
-"""HALF and FLOAT, by their bytes."""
+_EXR_MAGIC, _EXR_VERSION, _EXR_DEEP_FLAG = 20000630, 2, 0x800
+_EXR_PIXEL_TYPES = {2: 1, 4: 2}
+"""EXR's codes of HALF and FLOAT, by size in bytes."""
 
 
 def samples_bytes(pixels: int, most: int) -> int:
-    """More bytes than the file of `deep_data` has for pixels of `most` samples in their rows."""
+    """Upper bound in bytes of `deep_data`'s scratch file, for pixels with `most` samples each."""
     return pixels * (4 + 24 * most) + 40 * pixels + (1 << 12)
 
 
 def deep_data(scratch: Path, counts: NDArray[np.int32], columns: dict[str, NDArray[Any]]) -> Any:
     """OpenImageIO's deep data of rows of pixels.
 
-    scratch: a file to go through; counts (H, W): samples of each pixel; columns: by channel, (samples,) halves or
-    floats, in rows, in pixels, front to back. Raises ClsplatError.
+    scratch: a file to go through.
+    counts (H, W): samples of each pixel.
+    columns: halves or floats (samples,) by channel, in order of rows and pixels, front to back.
+    Raises ClsplatError.
     """
     _write(scratch, counts, columns)
     source = oiio.ImageInput.open(native_name(scratch))
@@ -51,7 +54,7 @@ def deep_data(scratch: Path, counts: NDArray[np.int32], columns: dict[str, NDArr
 
 def _write(path: Path, counts: NDArray[np.int32], columns: dict[str, NDArray[Any]]) -> None:
     height, width = counts.shape
-    names = sorted(columns)  # as EXR has channels
+    names = sorted(columns)  # EXR sorts channels by name
     table = np.cumsum(counts, axis=1, dtype="<i4")
     ends = [0, *np.cumsum(table[:, -1], dtype=np.int64).tolist()]
     each = sum(columns[name].itemsize for name in names)
@@ -71,7 +74,7 @@ def _write(path: Path, counts: NDArray[np.int32], columns: dict[str, NDArray[Any
 
 def _header(width: int, height: int, channels: Sequence[tuple[str, int]]) -> bytes:
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    listed = (name.encode() + b"\0" + struct.pack("<4i", _PIXEL_TYPES[size], 0, 1, 1) for name, size in channels)
+    listed = (name.encode() + b"\0" + struct.pack("<4i", _EXR_PIXEL_TYPES[size], 0, 1, 1) for name, size in channels)
     attributes = (
         ("channels", "chlist", b"".join(listed) + b"\0"),
         ("chunkCount", "int", struct.pack("<i", height)),
@@ -86,4 +89,4 @@ def _header(width: int, height: int, channels: Sequence[tuple[str, int]]) -> byt
         ("version", "int", struct.pack("<i", 1)),
     )
     texts = (f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value for name, kind, value in attributes)
-    return struct.pack("<2i", _MAGIC, _VERSION | _DEEP) + b"".join(texts) + b"\0"
+    return struct.pack("<2i", _EXR_MAGIC, _EXR_VERSION | _EXR_DEEP_FLAG) + b"".join(texts) + b"\0"

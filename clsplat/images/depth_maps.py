@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading depth maps: PNG and TIFF of whole numbers, EXR, NPY."""
+"""Reading depth maps: integer PNG and TIFF, EXR, NPY."""
 
 from __future__ import annotations
 
@@ -11,35 +11,37 @@ import OpenImageIO as oiio
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError
-from clsplat.files import open_input
-from clsplat.images.reading import MAX_PIXELS, error_of, image_size, one_line, open_image
+from clsplat.files.documents import open_input
+from clsplat.images.reading import MAX_IMAGE_PIXELS, error_of, image_size, one_line, open_image
 
-EXTENSIONS = (".png", ".exr", ".tif", ".tiff", ".npy")
-"""Extensions of depth maps when a folder is searched, in lower case."""
-KINDS = "a depth map: PNG or TIFF of whole numbers, EXR, or NPY"
+DEPTH_MAP_SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".npy")
+"""Depth map extensions when a folder is searched, in lower case."""
+DEPTH_MAP_KINDS = "a depth map: PNG or TIFF of whole numbers, EXR, or NPY"
 
 
-LEVELS = {"uint8": 255, "uint16": 65535}
-"""Largest values of the whole numbers that pictures hold."""
+INTEGER_MAXIMA = {"uint8": 255, "uint16": 65535}
+"""Maxima of the integers that images store."""
 
 
 def map_header(path: Path) -> tuple[int, int, bool]:
-    """Width and height of a depth map, and whether it is of whole numbers. Raises InputError as `read_map`, but for
-    what is behind the header."""
+    """Width and height of a depth map, and whether it stores integers.
+
+    Raises InputError like `read_map`, except for errors after the header.
+    """
     if path.suffix.lower() == ".npy":
         array = _numpy(path)
         return array.shape[1], array.shape[0], array.dtype.kind in "iu"
     source = open_image(path)
     kind = str(source.spec().format)
     source.close()
-    return *image_size(path, orient=False), kind in LEVELS
+    return *image_size(path, orient=False), kind in INTEGER_MAXIMA
 
 
 def read_map(path: Path) -> Float32:
-    """The values (H, W) of a depth map as they are stored: whole numbers of 8 and 16 bits are not scaled. Of a file
-    with several channels the one called Z or depth, else the first. NaN where a value is not finite.
+    """Values (H, W) of a depth map as stored; 8- and 16-bit integers are not scaled. Non-finite values become NaN.
 
-    Raises InputError, naming the file, for one that is missing, damaged, or no depth map.
+    If there are several channels, the one called Z or depth counts, else the first. Raises InputError with the file's
+    name if it is missing, damaged, or not a depth map.
     """
     if path.suffix.lower() == ".npy":
         values = np.array(_numpy(path), np.float32)
@@ -53,7 +55,7 @@ def read_map(path: Path) -> Float32:
             raise InputError(f"{path}: does not decode: {one_line(reason)}; copy the depth map again")
         pixels = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)
         values = np.ascontiguousarray(pixels[:, :, _channel(spec)])
-        levels = LEVELS.get(str(spec.format))
+        levels = INTEGER_MAXIMA.get(str(spec.format))
         if levels:
             values = np.rint(values * np.float32(levels))
     return np.where(np.isfinite(values), values, np.float32(np.nan))
@@ -65,13 +67,13 @@ def _channel(spec: Any) -> int:
 
 
 def _numpy(path: Path) -> Any:
-    with open_input(path, KINDS):
+    with open_input(path, DEPTH_MAP_KINDS):
         pass
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path}: does not read as NPY: {one_line(str(error))}; expected {KINDS}") from None
+        raise InputError(f"{path}: does not read as NPY: {one_line(str(error))}; expected {DEPTH_MAP_KINDS}") from None
     array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
-    if array.ndim != 2 or array.dtype.kind not in "fiu" or not 0 < array.size <= MAX_PIXELS:
+    if array.ndim != 2 or array.dtype.kind not in "fiu" or not 0 < array.size <= MAX_IMAGE_PIXELS:
         raise InputError(f"{path}: is {array.dtype} of shape {array.shape}, expected numbers (height, width)")
     return array

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposure as a photograph's EXIF tells it."""
+"""Exposure from a photograph's EXIF data."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from pathlib import Path
 from clsplat.errors import InputError
 from clsplat.images.reading import open_image
 
-_SPEEDS = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings", "Exif:ISOSpeed")
+_EXIF_ISO_TAGS = ("Exif:PhotographicSensitivity", "Exif:ISOSpeedRatings", "Exif:ISOSpeed")
 
 
 def exposure_of(path: Path) -> float | None:
-    """Log to base 2 of the light that a photograph got, but for the scene's: of time times sensitivity by the square of
-    the f-number. None where the file does not tell all three, or cannot be read."""
+    """Log to base 2 of a photograph's exposure: time times sensitivity over the square of the f-number.
+
+    None if the file lacks one of the three or cannot be read.
+    """
     try:
         source = open_image(path)
     except InputError:
@@ -22,6 +24,6 @@ def exposure_of(path: Path) -> float | None:
     spec = source.spec()
     source.close()
     time, stop = spec.get_float_attribute("ExposureTime", 0.0), spec.get_float_attribute("FNumber", 0.0)
-    speed = next((value for name in _SPEEDS if (value := spec.get_int_attribute(name, 0)) > 0), 0)
+    speed = next((value for name in _EXIF_ISO_TAGS if (value := spec.get_int_attribute(name, 0)) > 0), 0)
     known = all(0 < value < math.inf for value in (time, stop, speed))
     return math.log2(time * speed / stop**2) if known else None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of rendered frames: channels in EXR, one part or several, or a plain picture.
+"""Files of rendered frames: channels in EXR, in one part or several, or a plain image.
 
-Alpha is associated in EXR, TIFF and DPX, unassociated in PNG. Matrices in the header are those of row
-vectors, p_camera = p_world M, in the spaces that OpenEXR defines for its standard attributes (ImfStandardAttributes.h).
+Alpha is premultiplied in EXR, TIFF and DPX, straight in PNG. Matrices in the header are for row vectors, p_camera =
+p_world M, in the spaces of OpenEXR's standard attributes (ImfStandardAttributes.h).
 """
 
 from __future__ import annotations
@@ -19,33 +19,41 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera, Window
-from clsplat.config.channels import DEEP, WRITTEN
+from clsplat.config.channels import DEEP_CHANNELS, WRITABLE_CHANNELS
 from clsplat.config.pictures import Encoding
 from clsplat.errors import InputError, examples
 from clsplat.images.alpha import unassociate
+from clsplat.images.provenance import RECORD_TAGS, attribute_of, record_text
 from clsplat.images.reading import decodes, image_size, opened
-from clsplat.images.records import PLACES, attribute_of, record_text
 from clsplat.images.writing import steps_of, write_spec
 
-HALF_MAX = np.float32(65504)
+MAX_HALF_FLOAT = np.float32(65504)
 _PNG_LEVEL, _PNG_FILTER = 1, 0x40
-"""Each pixel from the mean of the two beside it, rather than the best of five filters for each row. A fifth of the time
-of level 6, which can be more than a CPU device takes for the frame, for a file that is a tenth larger at most."""
-_EXR_LEVEL = 1
-"""Level of zip and zips: two thirds of the time of the usual 4, for 2 to 7 % more bytes."""
-_LARGEST_FLOAT_INDEX = 2**24
-_BLOCK = 1 << 12
-"""Bytes of a disk's block."""
+"""PNG compression level, and the filter that predicts each pixel from the mean of left and upper neighbours.
 
-EXTENSIONS = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".dpx")
-VIDEOS = (".mp4", ".mov")
+Together they take a fifth of the time of level 6 with the best of five filters for each row, for files at most a tenth
+larger. On a CPU device, level 6 can take longer than the frame.
+"""
+_EXR_ZIP_LEVEL = 1
+"""Level of zip and zips: two thirds of the time of the default 4, for 2 to 7 % more bytes."""
+_MAX_EXACT_FLOAT_INDEX = 2**24
+_DISK_BLOCK_BYTES = 1 << 12
+"""Bytes in a disk block."""
+
+FRAME_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".dpx")
+VIDEO_SUFFIXES = (".mp4", ".mov")
 
 
 @dataclass(frozen=True, eq=False)
-class Header:
-    """Contents of a file beside pixels; window: None where the picture is the display window; chromaticities: x and y
-    of red, green, blue and white, none where they are not known; is_srgb: True if the colours are sRGB's; typed:
-    attributes of EXR, with OpenImageIO's names of their types; view: left or right of a stereo pair."""
+class FrameFileHeader:
+    """Contents of a frame file other than pixels.
+
+    window: None if the image is the display window.
+    chromaticities: x and y of red, green, blue and white; empty if unknown.
+    is_srgb: True if the colours are in sRGB.
+    typed: EXR attributes with OpenImageIO's names of their types.
+    view: left or right, for a stereo pair.
+    """
 
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
     matrices: Mapping[str, Float64] = field(default_factory=dict)
@@ -57,55 +65,41 @@ class Header:
 
 
 def camera_matrices(camera: Camera) -> dict[str, Float64]:
-    """worldToCamera and worldToNDC of row vectors, as OpenEXR defines them, for a camera that has an image plane; none
-    for others.
+    """OpenEXR's worldToCamera and worldToNDC for row vectors; empty for a camera without an image plane.
 
-    In the camera's space x is right, y up and z along the view, a left-handed frame. In NDC (0, 0) is the upper left
-    corner of the display window, and (1, 1) the lower right one. OpenEXR says nothing of z: here it is 0 at the near
-    plane and 1 at infinity. Of an orthographic camera it is 1 at the far plane, or without one grows by 1 a world unit.
+    Camera space has x right, y up and z along the view, a left-handed frame. In NDC, (0, 0) is the upper left corner of
+    the display window and (1, 1) the lower right one. OpenEXR does not define z; here it is 0 at the near plane and 1
+    at infinity. For an orthographic camera it is 1 at the far plane, or grows by 1 a world unit if there is none.
     """
-    if not camera.kind.flat:
+    display = camera.window or camera
+    projection = camera.model.ndc_from_cam(camera, display.width, display.height)
+    if projection is None:
         return {}
     to_camera = np.eye(4)
     flip = np.diag([1.0, -1.0, 1.0])
     to_camera[:3, :3] = (flip @ camera.rotation).T
     to_camera[3, :3] = flip @ camera.translation
-    display = camera.window or camera
-    centre = camera.cx / display.width, camera.cy / display.height
-    projection = np.zeros((4, 4))
-    projection[0, 0] = camera.fx / display.width
-    projection[1, 1] = -camera.fy / display.height
-    if camera.projection == "perspective":  # w = z
-        projection[2] = [*centre, 1.0, 1.0]
-        projection[3, 2] = -camera.near
-    else:
-        along = 1 / (camera.far - camera.near) if np.isfinite(camera.far) else 1.0
-        projection[2, 2] = along
-        projection[3] = [*centre, -along * camera.near, 1.0]
     return {"worldToCamera": to_camera, "worldToNDC": to_camera @ projection}
 
 
 def is_whole_panorama(camera: Camera) -> bool:
-    """True if the picture shows all directions once, the middle of it straight ahead, as EXR's envmap wants it."""
-    if camera.projection != "equirectangular" or camera.window is not None:
-        return False
-    whole = (camera.fx * 2 * np.pi, camera.fy * np.pi, 2 * camera.cx, 2 * camera.cy)
-    return bool(np.allclose(whole, (camera.width, camera.height) * 2, rtol=1e-9))
+    """True if the image shows all directions once, with straight ahead in the middle, as EXR's envmap requires."""
+    return camera.window is None and camera.model.is_whole(camera)
 
 
 def parse_channels(text: str) -> tuple[str, ...]:
-    """The names in `text`, comma-separated, in the order of WRITTEN. Raises InputError."""
+    """Channel names from a comma-separated text, in the order of WRITABLE_CHANNELS. Raises InputError."""
     asked = [word.strip() for word in text.split(",") if word.strip()]
-    unknown = [word for word in asked if word not in WRITTEN]
+    unknown = [word for word in asked if word not in WRITABLE_CHANNELS]
     if unknown or not asked:
         problem = f"has {examples(map(repr, unknown))}" if unknown else "is empty"
-        raise InputError(f"--channels {text}: {problem}, expected some of {', '.join(WRITTEN)}")
-    return tuple(name for name in WRITTEN if name in asked)
+        raise InputError(f"--channels {text}: {problem}, expected some of {', '.join(WRITABLE_CHANNELS)}")
+    return tuple(name for name in WRITABLE_CHANNELS if name in asked)
 
 
 def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> None:
-    """Raise InputError where a file of that name cannot hold the channels. video: it may be one, too."""
-    extension, known = Path(path).suffix.lower(), (*EXTENSIONS, *VIDEOS) if video else EXTENSIONS
+    """Raise InputError if a file of that name cannot hold the channels. video: videos are allowed too."""
+    extension, known = Path(path).suffix.lower(), (*FRAME_SUFFIXES, *VIDEO_SUFFIXES) if video else FRAME_SUFFIXES
     if extension not in known:
         raise InputError(f"{path}: has the extension {extension or 'none'!r}, expected one of {', '.join(known)}")
     if extension == ".exr":
@@ -119,27 +113,31 @@ def check_format(path: str, channels: Iterable[str], *, video: bool = False) -> 
 
 
 def check_target(path: Path, channels: Iterable[str]) -> None:
-    """Raise InputError as `check_format`, and for a folder that does not exist."""
+    """Raise InputError like `check_format`, and for a folder that does not exist."""
     check_format(str(path), channels)
     if not path.parent.is_dir():
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
 
 
 def write_channels(
-    path: Path, channels: Mapping[str, NDArray[Any]], encoding: Encoding | None = None, header: Header | None = None
+    path: Path,
+    channels: Mapping[str, NDArray[Any]],
+    encoding: Encoding | None = None,
+    header: FrameFileHeader | None = None,
 ) -> None:
     """Write a frame, atomically.
 
-    channels: by name, (H, W) or (H, W, channels); rgb as it is over black, so associated with alpha. In a part of whole
-    numbers the id -1, where no Gaussian is, is 4294967295. Raises InputError and ClsplatError as `writing.write_image`.
+    channels: by name, (H, W) or (H, W, channels); rgb is over black, so premultiplied by alpha. In an integer part the
+      id -1, for no Gaussian, becomes 4294967295.
+    Raises InputError and ClsplatError like `writing.write_image`.
     """
-    write_views(path, [(channels, header or Header())], encoding)
+    write_views(path, [(channels, header or FrameFileHeader())], encoding)
 
 
 def write_views(
-    path: Path, views: Sequence[tuple[Mapping[str, NDArray[Any]], Header]], encoding: Encoding | None = None
+    path: Path, views: Sequence[tuple[Mapping[str, NDArray[Any]], FrameFileHeader]], encoding: Encoding | None = None
 ) -> None:
-    """`write_channels` of several views in one file: EXR, of which each has parts of its own, named after it."""
+    """`write_channels` for several views in one EXR file. Each view has its own parts, named after it."""
     encoding = encoding or Encoding()
     check_target(path, views[0][0])
     extension = path.suffix.lower()
@@ -149,16 +147,23 @@ def write_views(
 
 
 def encoded(
-    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, *, several: bool = False
+    extension: str,
+    channels: Mapping[str, NDArray[Any]],
+    encoding: Encoding,
+    header: FrameFileHeader,
+    *,
+    several: bool = False,
 ) -> list[tuple[NDArray[Any], Any]]:
-    """(pixels, OpenImageIO's specification) of each part of a file. several: the file has other views too, so that
-    parts are named after theirs."""
-    channels = {name: channels[name] for name in WRITTEN if name in channels}
+    """Pixels and OpenImageIO specification of each part of a file.
+
+    several: True if the file has other views too, so that parts are named after their view.
+    """
+    channels = {name: channels[name] for name in WRITABLE_CHANNELS if name in channels}
     if extension != ".exr":
         return [_picture(extension, channels, encoding, header)]
     groups = _parts(tuple(channels)) if encoding.parts == "several" else [tuple(channels)]
     view = header.view if several else ""
-    names = [WRITTEN[group[0]].part if len(groups) > 1 else "" for group in groups]
+    names = [WRITABLE_CHANNELS[group[0]].part if len(groups) > 1 else "" for group in groups]
     named = [".".join(filter(None, (name, view))) for name in names]
     return [_exr_part(group, channels, encoding, header, name) for group, name in zip(groups, named, strict=True)]
 
@@ -174,19 +179,21 @@ def is_whole(
     deep: bool = False,
     views: int = 1,
 ) -> bool:
-    """True if the file holds these channels as `write_channels` writes them, and is whole.
+    """True if the file is complete and holds these channels as `write_channels` writes them.
 
-    It has to have that size and no other values of these attributes, and to decode to its last row; with a block of
-    zeros in it every row is decoded. A file that was cut short fails. deep: expect a deep picture, whose channels are
-    DEEP; views: of a stereo pair, each with these channels.
+    It must have that size and no other values of these attributes, and its last row must decode. If the file contains a
+    block of zeros, every row is decoded. A truncated file fails.
+
+    deep: expect a deep image, whose channels are DEEP_CHANNELS.
+    views: number of views, each with these channels.
     """
-    channels = [name for name in WRITTEN if name in set(channels)]
+    channels = [name for name in WRITABLE_CHANNELS if name in set(channels)]
     exr = path.suffix.lower() == ".exr"
     groups = _parts(channels) if exr and encoding.parts == "several" else [tuple(channels)]
     if not path.is_file():
         return False
     try:
-        image_size(path)  # finds a PNG that is cut short, of which libpng would print
+        image_size(path)  # rejects a truncated PNG, about which libpng would print
     except InputError:
         return False
     holed = _has_hole(path)
@@ -198,10 +205,12 @@ def is_whole(
             if not source.seek_subimage(part, 0):
                 return False
             spec = source.spec()
-            names = DEEP if deep else tuple(channel for name in group for channel in WRITTEN[name].names)
+            names = (
+                DEEP_CHANNELS if deep else tuple(channel for name in group for channel in WRITABLE_CHANNELS[name].names)
+            )
             if (spec.width, spec.height, spec.deep) != (width, height, deep):
                 return False
-            if sorted(spec.channelnames) != sorted(names):  # OpenImageIO has its own order of an EXR's
+            if sorted(spec.channelnames) != sorted(names):  # OpenImageIO reorders the channels of an EXR
                 return False
             if any(attribute_of(spec, key) not in (None, value) for key, value in (attributes or {}).items()):
                 return False
@@ -211,36 +220,36 @@ def is_whole(
 
 
 def _has_hole(path: Path) -> bool:
-    """True if a block of the disk in the file is all zeros, as where a machine stopped before it was written."""
-    empty = bytes(_BLOCK)
+    """True if a disk block of the file is all zeros, as after a crash before it was written."""
+    empty = bytes(_DISK_BLOCK_BYTES)
     with open(path, "rb") as file:
-        return any(empty in block for block in iter(lambda: file.read(_BLOCK << 8), b""))
+        return any(empty in block for block in iter(lambda: file.read(_DISK_BLOCK_BYTES << 8), b""))
 
 
 def is_foreign(path: Path) -> bool:
-    """True if a file is a picture that clsplat has not made."""
+    """True if a file is an image that clsplat did not write."""
     with opened(path) as source:
         return source is not None and "clsplat" not in str(source.spec().getattribute("Software"))
 
 
 def attribute(path: Path, name: str) -> Any:
-    """The value of an attribute of a file's first part, None where it has none or is no picture."""
+    """Attribute of a file's first part; None if it has none or is not an image."""
     with opened(path) as source:
         return None if source is None else attribute_of(source.spec(), name)
 
 
 def _parts(names: Sequence[str]) -> list[tuple[str, ...]]:
-    """The channels of each part. Those of one part stand together in the table."""
-    return [tuple(group) for _, group in groupby(names, lambda name: WRITTEN[name].part)]
+    """Channels of each part; channels of one part are adjacent in WRITABLE_CHANNELS."""
+    return [tuple(group) for _, group in groupby(names, lambda name: WRITABLE_CHANNELS[name].part)]
 
 
 def _exr_part(
-    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header, part: str
+    names: Sequence[str], channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: FrameFileHeader, part: str
 ) -> tuple[NDArray[Any], Any]:
-    kinds = [WRITTEN[name].kind for name in names for _ in WRITTEN[name].names]
+    kinds = [WRITABLE_CHANNELS[name].kind for name in names for _ in WRITABLE_CHANNELS[name].names]
     planes = [np.atleast_3d(channels[name]) for name in names]
     if set(kinds) == {"whole"}:
-        pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes the largest
+        pixels = np.concatenate(planes, axis=2).astype(np.int64).astype(np.uint32)  # -1 becomes 2^32 - 1
         formats = [oiio.UINT32]
     else:
         formats = [oiio.HALF if kind == "colour" and encoding.depth == "half" else oiio.FLOAT for kind in kinds]
@@ -249,21 +258,23 @@ def _exr_part(
         for name, plane in zip(names, planes, strict=True):
             _check_floats(name, plane)
             for channel in range(plane.shape[2]):
-                if formats[at] == oiio.HALF:  # else what is over its largest would become infinite
-                    np.clip(plane[:, :, channel], -HALF_MAX, HALF_MAX, out=pixels[:, :, at])
+                if formats[at] == oiio.HALF:  # values beyond its range would become infinite
+                    np.clip(plane[:, :, channel], -MAX_HALF_FLOAT, MAX_HALF_FLOAT, out=pixels[:, :, at])
                 else:
                     pixels[:, :, at] = plane[:, :, channel]
                 at += 1
-    spec = _exr_spec(pixels.shape, [channel for name in names for channel in WRITTEN[name].names], formats, header)
+    spec = _exr_spec(
+        pixels.shape, [channel for name in names for channel in WRITABLE_CHANNELS[name].names], formats, header
+    )
     deflated = encoding.compression.startswith("zip")
-    spec.attribute("compression", f"{encoding.compression}:{_EXR_LEVEL}" if deflated else encoding.compression)
+    spec.attribute("compression", f"{encoding.compression}:{_EXR_ZIP_LEVEL}" if deflated else encoding.compression)
     if part:
         spec.attribute("oiio:subimagename", part)
     return np.ascontiguousarray(pixels), spec
 
 
 def _check_floats(name: str, plane: NDArray[Any]) -> None:
-    if WRITTEN[name].kind == "whole" and plane.max(initial=0) > _LARGEST_FLOAT_INDEX:
+    if WRITABLE_CHANNELS[name].kind == "whole" and plane.max(initial=0) > _MAX_EXACT_FLOAT_INDEX:
         raise InputError(
             f"--channels {name}: the largest is {plane.max():,}, more than a float holds exactly; use --parts several, "
             "where it is a whole number"
@@ -271,23 +282,23 @@ def _check_floats(name: str, plane: NDArray[Any]) -> None:
 
 
 def _picture(
-    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: Header
+    extension: str, channels: Mapping[str, NDArray[Any]], encoding: Encoding, header: FrameFileHeader
 ) -> tuple[NDArray[Any], Any]:
     planes = [np.atleast_3d(plane) for plane in channels.values()]
     if extension == ".png" and "alpha" in channels:
         planes = [unassociate(np.concatenate(planes, axis=2))]
     bits = 8 if extension in (".jpg", ".jpeg") else encoding.bits
     whole = steps_of(planes, bits)
-    if bits == 10:  # OpenImageIO cuts off what 16 bits have more, so that these have to be those of the ten
+    if bits == 10:  # OpenImageIO truncates 16 bits to 10, so expand the 10 bits exactly
         whole = (whole << 6) | (whole >> 4)
     spec = _spec(whole.shape, "RGBA", oiio.UINT8 if bits == 8 else oiio.UINT16, header)
-    if extension in PLACES and (text := record_text(header.attributes)):
-        spec.attribute(PLACES[extension], text)
+    if extension in RECORD_TAGS and (text := record_text(header.attributes)):
+        spec.attribute(RECORD_TAGS[extension], text)
     if extension == ".dpx":
         spec.attribute("oiio:BitsPerSample", bits)
         spec.attribute("oiio:Endian", "big")
     if extension == ".png":
-        if not header.is_srgb:  # else OpenImageIO says so in the chunks sRGB, gAMA and cHRM
+        if not header.is_srgb:  # otherwise OpenImageIO writes the chunks sRGB, gAMA and cHRM
             spec.attribute("oiio:ColorSpace", "unknown")
         spec.attribute("oiio:UnassociatedAlpha", 1)
         spec.attribute("png:compressionLevel", _PNG_LEVEL)
@@ -297,18 +308,18 @@ def _picture(
     return whole, spec
 
 
-def deep_spec(width: int, height: int, encoding: Encoding, header: Header) -> Any:
-    """OpenImageIO's specification of a deep EXR: colours are half or float as the encoding says, depths are float."""
-    spec = _exr_spec((height, width, len(DEEP)), DEEP, [oiio.FLOAT], header)
+def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHeader) -> Any:
+    """OpenImageIO's specification of a deep EXR: colours are half or float by the encoding, depths are float."""
+    spec = _exr_spec((height, width, len(DEEP_CHANNELS)), DEEP_CHANNELS, [oiio.FLOAT], header)
     spec.deep = True
     spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
-    spec.z_channel = DEEP.index("Z")
+    spec.z_channel = DEEP_CHANNELS.index("Z")
     spec.attribute("compression", encoding.compression if encoding.compression in ("none", "rle", "zips") else "zips")
     return spec
 
 
-def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[Any], header: Header) -> Any:
-    """formats: of the channels, or the one of all."""
+def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[Any], header: FrameFileHeader) -> Any:
+    """OpenImageIO's specification of an EXR part; formats: one for each channel, or one for all."""
     several = len(set(formats)) > 1
     spec = _spec(shape, names, oiio.FLOAT if several else formats[0], header)
     if several:
@@ -324,7 +335,7 @@ def _exr_spec(shape: tuple[int, ...], names: Sequence[str], formats: Sequence[An
     return spec
 
 
-def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Header) -> Any:
+def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: FrameFileHeader) -> Any:
     height, width, channels = shape
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.channelnames = tuple(names[:channels])
@@ -334,7 +345,7 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Heade
         spec.full_width, spec.full_height = header.window.width, header.window.height
     if header.chromaticities:
         spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(header.chromaticities))
-    spec.attribute("DateTime", "")  # OpenImageIO's default is now, and the same frame is to have the same bytes
+    spec.attribute("DateTime", "")  # OpenImageIO's default is now, but equal frames need equal bytes
     for name, value in header.attributes.items():
         spec.attribute(name, value)
     return spec

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hold-outs: the surfaces of other elements in a frame, from a depth EXR or a deep EXR (docs/pictures.md)."""
+"""Holdouts: the surfaces of other elements in a frame, from a depth EXR or a deep EXR (docs/pictures.md)."""
 
 from __future__ import annotations
 
@@ -15,28 +15,33 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.holdout import HELD
+from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
 from clsplat.errors import InputError, examples
-from clsplat.files import is_file
+from clsplat.files.documents import is_file
 from clsplat.images.reading import error_of, one_line, open_image
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Surfaces in the pixels of a picture. counts (H, W) int64: how many each pixel has; rows (S, 4) float32: HELD of
-    all of them, pixel by pixel, in each from the nearest beginning on."""
+    """Surfaces in the pixels of an image.
+
+    counts (H, W): int64, number of surfaces of each pixel. rows (S, 4): float32, HOLDOUT_SURFACE_FIELDS of all
+    surfaces, pixel by pixel; within a pixel the nearest front comes first.
+    """
 
     counts: NDArray[np.int64]
     rows: Float32
 
     @property
     def dense(self) -> int:
-        """Surfaces of a pixel on average, in the fullest row of pixels, rounded up."""
+        """Average number of surfaces a pixel in the fullest row, rounded up."""
         return int(np.ceil(self.counts.mean(axis=1).max(initial=0)))
 
     def taken(self, across: NDArray[np.int64], down: NDArray[np.int64]) -> Surfaces:
-        """The surfaces of a picture whose column x is column across[x] of this one, and row y row down[y]. Beyond this
-        one's edges there are none."""
+        """Resample the surfaces: column x is column across[x] of this image, row y is row down[y].
+
+        Pixels outside this image have no surfaces.
+        """
         height, width = self.counts.shape
         if np.array_equal(across, np.arange(width)) and np.array_equal(down, np.arange(height)):
             return self
@@ -48,15 +53,19 @@ class Surfaces:
         return Surfaces(counts, self.rows[np.repeat(first, flat) + np.arange(flat.sum())])
 
     def scaled(self, factors: Float32) -> Surfaces:
-        """The same with the depths of each pixel times its factor (H, W)."""
+        """Multiply the depths of each pixel by its factor (H, W)."""
         by = np.repeat(factors.ravel(), self.counts.ravel())[:, None]
         return Surfaces(self.counts, (self.rows * np.concatenate([by, by, by**0, 1 / by], axis=1)).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
 class Holdout:
-    """The hold-out of a frame. surfaces: of the file's data window, which begins at the frame's pixel (x, y); size: of
-    the frame."""
+    """Holdout of a frame.
+
+    surfaces: of the file's data window.
+    x, y: pixel of the frame where that window begins.
+    size: width and height of the frame.
+    """
 
     surfaces: Surfaces
     x: int
@@ -65,8 +74,10 @@ class Holdout:
 
 
 def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
-    """True if its depths are half floats. Raises InputError for a file that cannot be the hold-out of a frame of that
-    size (width, height), as its header says."""
+    """True if the depths are half floats.
+
+    Raises InputError if the header shows that the file cannot be the holdout of a frame of that size (width, height).
+    """
     with _part(path, size, channel) as (source, _, places):
         spec = source.spec()
         kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
@@ -74,11 +85,12 @@ def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
 
 
 def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, inverse: bool = False) -> Holdout:
-    """The hold-out of a frame of that size (width, height).
+    """Read the holdout of a frame of that size (width, height).
 
-    channel: the name of the depths, Z if empty; a deep file's samples have A and may have ZBack, a flat file may have
-    A. Depths of 0 and infinity are no surface. inverse: the file has 1 / depth. Raises InputError as `check_holdout`,
-    and for values that are not numbers, negative depths, and files that do not decode.
+    channel: name of the depths, Z if empty. Samples of a deep file have A and may have ZBack; a flat file may have A.
+    inverse: the file stores 1 / depth.
+    Depths of 0 and infinity are no surface. Raises InputError like `check_holdout`, and for NaN, negative depths, and
+    files that do not decode.
     """
     with _part(path, size, channel) as (source, part, places):
         spec = source.spec()
@@ -105,8 +117,8 @@ def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, invers
 
 
 def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Surfaces:
-    """Surfaces (H, W, count) of each pixel: the depths at which they begin and end, and their alpha. One at no depth,
-    0 or infinity, is none."""
+    """Surfaces from front depths, back depths and alpha, (H, W, count) each. A front depth of 0 or infinity is no
+    surface."""
     counts = np.full(begin.shape[0] * begin.shape[1], begin.shape[2])
     return _surfaces(begin.ravel(), end.ravel(), alpha.ravel(), counts, begin.shape[:2])
 
@@ -114,7 +126,7 @@ def surfaces_of(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> 
 def _surfaces(
     begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any], counts: NDArray[np.int64], shape: tuple[int, ...]
 ) -> Surfaces:
-    """Of values that are pixel by pixel, of which each has so many."""
+    """Surfaces from values stored pixel by pixel; counts: number of values of each pixel."""
     alpha = np.clip(alpha, 0, 1)
     shown = (begin > 0) & (begin < np.inf) & (alpha > 0)
     pixels = np.repeat(np.arange(len(counts)), counts)[shown]
@@ -127,8 +139,8 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """HELD. Of an opaque surface nothing behind its beginning is seen."""
-    rows = np.zeros((len(begin), len(HELD)), np.float32)
+    """HELD of each surface. An opaque surface hides everything behind its front, so it gets no length."""
+    rows = np.zeros((len(begin), len(HOLDOUT_SURFACE_FIELDS)), np.float32)
     rows[:, 0], rows[:, 2] = begin, 1 - alpha
     rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)
     long = rows[:, 1] > rows[:, 0]
@@ -139,7 +151,7 @@ def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float3
 
 @contextmanager
 def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any, int, list[int | None]]]:
-    """The file's input, the part that has the depths, and where in it depths, alpha and back depths are."""
+    """The file's input, the part with the depths, and channel indices of depths, alpha and back depths in it."""
     if not is_file(path):
         raise InputError(f"{path}: no such hold-out, expected a depth or deep EXR for each frame that is rendered")
     source = open_image(path)

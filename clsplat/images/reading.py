@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading and scaling pictures, through OpenImageIO.
+"""Reading and scaling images, through OpenImageIO.
 
-In memory a picture is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), with *straight* (unassociated) alpha whatever the
-file has, in the file's own colour space: nothing is linearised. In files alpha is what OpenImageIO writes:
-unassociated in PNG, associated (premultiplied) in EXR.
+In memory an image is float32 (H, W, C), C = 3 (RGB) or 4 (RGBA), in the file's own colour space; nothing is linearised.
+Alpha is *straight* (unassociated) whatever the file stores. Files follow OpenImageIO: straight in PNG, premultiplied
+(associated) in EXR.
 """
 
 from __future__ import annotations
@@ -23,50 +23,59 @@ from scipy import sparse
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError, examples, reason_of
-from clsplat.files import is_file, native_name, open_input
+from clsplat.files.documents import is_file, open_input
+from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
 
-EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
-"""Extensions of pictures when a folder is searched, in lower case. Named files may be anything OpenImageIO reads."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
+"""Image extensions when a folder is searched, in lower case. A file given by name may be anything OpenImageIO reads."""
 
 T = TypeVar("T", bound=np.generic)
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MAX_PIXELS = 1 << 28
-FREE_FLOATS, FLOATS_A_BYTE = 48 << 20, 4096
-"""Channel values that a picture may have whatever its file's length is, and for each byte of it. Both are more than any
-real picture has, compressed, as deflate makes at most 1032 bytes of one."""
-_ROWS = 64
-MAX_FILE_BYTES, FREE_FILE_BYTES = 1 << 30, 1 << 26
-SIGNATURES = (
+MAX_IMAGE_PIXELS = 1 << 28
+MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE = 48 << 20, 4096
+"""Channel values allowed for a file of any length, or for each byte of it, whichever is more.
+
+Both exceed any real image; deflate expands a byte to at most 1032 bytes.
+"""
+_DECODE_CHECK_ROWS = 64
+MAX_IMAGE_FILE_BYTES, MAX_UNSIGNED_IMAGE_BYTES = 1 << 30, 1 << 26
+IMAGE_SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
     *(b"SDPX", b"XPDS", b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
 )
-"""First bytes of pictures larger than FREE_FILE_BYTES: some decoders read the whole of a file that is not theirs."""
-# libjpeg's notes about data that it can do without; every other message means that pixels are lost
-HARMLESS = ("extraneous bytes",)
+"""First bytes of images larger than MAX_UNSIGNED_IMAGE_BYTES; some decoders read the whole of a file that is not
+theirs."""
+# libjpeg's notes about data that it does not need; every other message means lost pixels
+HARMLESS_DECODER_NOTES = ("extraneous bytes",)
 
 
-COMPANION = (
+COMPANION_PATTERN = (
     r"(?:depths?|disp|disparity|normals?|alpha|albedo|masks?|mattes?|seg|segmentations?|semantics?|confidence|conf|flow"
     r"|edges?|silhouettes?|labels?)"
 )
-GROUND = r"(?:fg|foreground)"
-"""Words in names of masks that count only where a mark parts them from the photograph's."""
-_COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION}(?:[_-]\w+)?", re.IGNORECASE)
+FOREGROUND_PATTERN = r"(?:fg|foreground)"
+"""Words in mask names that count only if a separator parts them from the photograph's name."""
+_COMPANION_FOLDER = re.compile(rf"(?:\w+[_-])?{COMPANION_PATTERN}(?:[_-]\w+)?", re.IGNORECASE)
 _COMPANION_AFTER = re.compile(
-    rf"(?:[._-]?{COMPANION}|[._-]{GROUND})(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE
+    rf"(?:[._-]?{COMPANION_PATTERN}|[._-]{FOREGROUND_PATTERN})(?:[._-]?(?:\d+|vis|map|raw|image))*", re.IGNORECASE
 )
-_COMPANION_BEFORE = re.compile(rf"(?:dynamic[._-])?(?:{COMPANION}|{GROUND})(?:[._-]map)?[._-]", re.IGNORECASE)
-_COLOUR = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
+_COMPANION_BEFORE = re.compile(
+    rf"(?:dynamic[._-])?(?:{COMPANION_PATTERN}|{FOREGROUND_PATTERN})(?:[._-]map)?[._-]", re.IGNORECASE
+)
+_COLOUR_SUFFIX = re.compile(r"[._-](?:colou?r|rgba?|image|img)\Z", re.IGNORECASE)
 
 
 def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) -> set[Path]:
-    """Those of `paths` that go with one of the pictures and are none: masks, depths, normals and the like.
+    """Files among `paths` that accompany one of the pictures: masks, depths, normals and the like.
 
-    Their names tell, in any case. Such a word stands behind a picture's name (r_0_depth_0001.png), before it
-    (mask_r_0.png) or in place of "color" (frame-1.color.jpg, frame-1.depth.png). COLMAP's masks have .png behind the
-    picture's extension. Whatever is in a sub-folder of `folder` that is called by such a word counts too.
+    Words such as mask or depth in their names decide, in any case:
+
+    - The word follows a picture's name (r_0_depth_0001.png) or precedes it (mask_r_0.png).
+    - The word replaces "color" (frame-1.color.jpg, frame-1.depth.png).
+    - COLMAP's masks append .png to the picture's full name.
+    - The file is in a sub-folder of `folder` that is named by such a word.
     """
     pictures = list(pictures)
 
@@ -79,7 +88,7 @@ def companions(paths: Iterable[Path], pictures: Iterable[Path], folder: Path) ->
     pictures, alone = others or pictures, not others
     names = {picture.name.casefold() for picture in pictures}
     stems = {picture.stem.casefold() for picture in pictures} | names
-    stems |= {_COLOUR.sub("", stem) for stem in stems}
+    stems |= {_COLOUR_SUFFIX.sub("", stem) for stem in stems}
     return {
         path
         for path in paths
@@ -99,9 +108,11 @@ def _goes_with(path: Path, names: set[str], stems: set[str]) -> bool:
 
 
 def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
-    """All pictures (by extension) under `folder`, if `deep` with its sub-folders, sorted; hidden files and folders are
-    left out, and links that lead nowhere. Links to folders are followed, to each folder once. Raises InputError for a
-    folder that cannot be read."""
+    """All images (by extension) under `folder`, sorted; sub-folders are searched if `deep`.
+
+    Hidden files and folders and broken links are left out. Linked folders are followed, each folder once. Raises
+    InputError for a folder that cannot be read.
+    """
     paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
@@ -114,21 +125,21 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
         paths += [
             path
             for path in (Path(root, name) for name in files)
-            if not path.name.startswith(".") and path.suffix.lower() in EXTENSIONS and is_file(path)
+            if not path.name.startswith(".") and path.suffix.lower() in IMAGE_SUFFIXES and is_file(path)
         ]
     return sorted(paths)
 
 
 def cannot_be_searched(error: OSError) -> None:
-    """Raise InputError: handed to `os.walk`, which else passes over a folder that it cannot read."""
+    """Raise InputError; handler for `os.walk`, which would skip a folder that it cannot read."""
     why = reason_of(error)
     raise InputError(f"{error.filename}: cannot be searched for pictures: {why}; make it readable or move it away")
 
 
 def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
-    """Width and height from the header, without decoding the pixels, as `read_image` would give them.
+    """Width and height from the header, as `read_image` would return them, without decoding pixels.
 
-    Raises InputError for a file that is missing, no picture, or a PNG that is cut short.
+    Raises InputError for a missing file, one that is not an image, or a truncated PNG.
     """
     source = open_image(path)
     spec = source.spec()
@@ -142,8 +153,10 @@ def image_size(path: Path, *, orient: bool = True) -> tuple[int, int]:
 
 
 def stored_range(path: Path) -> tuple[int, bool]:
-    """Largest whole number that a file's pixels can hold, 0 for floats, and whether these numbers are what was written:
-    JPEG's are about that. Raises InputError."""
+    """Largest integer that the file's pixels can hold, 0 for floats, and whether its compression is lossless.
+
+    JPEG and the like keep the numbers only approximately. Raises InputError.
+    """
     source = open_image(path)
     dtype, kind = np.dtype(str(source.spec().format)), source.format_name()
     source.close()
@@ -151,15 +164,16 @@ def stored_range(path: Path) -> tuple[int, bool]:
 
 
 def read_image(path: Path, *, orient: bool = True) -> Float32:
-    """Read a picture as float32 (H, W, 3), or (H, W, 4) if it has alpha, straight.
+    """Read an image as float32 (H, W, 3), or (H, W, 4) with straight alpha.
 
-    Integers of 8 or 16 bits are scaled to [0, 1], floats kept as they are, beyond 1 too. Grey becomes RGB. Of an EXR
-    with more channels R, G, B and A are taken, and its whole display window. orient: turn the picture as its EXIF
-    orientation says, right for photos as such; pictures of a COLMAP model are read without, as COLMAP itself
-    (pycolmap 4.2.1) keeps the pixels as stored: keypoints and camera sizes refer to those.
+    Integers of 8 or 16 bits are scaled to [0, 1]; floats are kept, also beyond 1. Grey becomes RGB. An EXR gives R, G,
+    B and A of its whole display window; other channels are ignored.
 
-    Raises InputError, naming the file and the decoder's reason, for a file that is missing, no picture, damaged, cut
-    short, of another kind of channels, or with values that are not finite.
+    orient: apply the EXIF orientation, right for plain photographs. COLMAP (pycolmap 4.2.1) ignores it, and its
+      keypoints and camera sizes refer to the pixels as stored, so a COLMAP model's photographs are read without.
+
+    Raises InputError with the file and the decoder's reason if it is missing, not an image, damaged or truncated.
+    Raises it also for unsupported channels and non-finite values.
     """
     source = open_image(path)
     spec = source.spec()
@@ -168,7 +182,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     pixels = source.read_image(oiio.FLOAT)
     reason = error_of(source)
     source.close()
-    if pixels is None or (reason and not any(harmless in reason for harmless in HARMLESS)):
+    if pixels is None or (reason and not any(harmless in reason for harmless in HARMLESS_DECODER_NOTES)):
         raise InputError(f"{path}: does not decode: {one_line(reason)}; copy the picture again or leave it out")
     pixels = np.asarray(pixels, np.float32)
     if pixels.size != spec.height * spec.width * spec.nchannels:
@@ -188,9 +202,9 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
 def downscale(image: Float32, width: int, height: int) -> Float32:
     """Resample (H, W, C) to (height, width, C): each new pixel is the mean of the area it covers.
 
-    The exact area, so that a whole factor is a box filter, and pixel corners stay where they are, as
-    `Camera.resized` has it. An axis that grows is interpolated linearly. With four channels the mean is taken of
-    premultiplied colour, so that what is transparent does not bleed in. Straight alpha in and out.
+    Areas are exact: a whole factor is a box filter, and pixel corners stay in place as in `Camera.resized`. An axis
+    that grows is interpolated linearly. Colour is premultiplied for the mean, so that transparent pixels do not bleed
+    in. Alpha is straight in input and output.
     """
     if image.shape[:2] == (height, width):
         return image
@@ -205,8 +219,7 @@ def downscale(image: Float32, width: int, height: int) -> Float32:
 
 
 def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
-    """The image turned by EXIF orientations 1 to 8: from 5 on rows and columns change places, then the axes are
-    flipped."""
+    """Apply an EXIF orientation from 1 to 8: for 5 to 8 rows and columns are transposed, then axes are flipped."""
     if orientation >= 5:
         image = image.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
@@ -217,15 +230,17 @@ def turned(image: NDArray[T], orientation: int) -> NDArray[T]:
 
 
 def channels_of(spec: Any) -> list[str]:
-    """Names of the channels in upper case, one each; a decoder's list may be shorter or longer than its pixels are
-    deep."""
+    """Names of the channels in upper case, one for each; a decoder's own list may be too short or too long."""
     names = [name.upper() for name in spec.channelnames][: spec.nchannels]
     return names + [""] * (spec.nchannels - len(names))
 
 
 def alpha_of(spec: Any) -> int:
-    """Index of the alpha channel, -1 for none. That of a decoder may be no channel (OpenImageIO's of GIF is 4 of 4),
-    or one of colour; then names tell."""
+    """Index of the alpha channel, -1 for none.
+
+    A decoder's index may be outside the channels (OpenImageIO gives 4 of 4 for GIF) or a colour channel; then names
+    decide.
+    """
     names, index = channels_of(spec), int(spec.alpha_channel)
     if 0 <= index < len(names) and names[index] not in ("R", "G", "B", "Y", "I"):
         return index
@@ -233,17 +248,21 @@ def alpha_of(spec: Any) -> int:
 
 
 def open_image(path: Path) -> Any:
-    """OpenImageIO's input of a file, whose header makes sense. Alpha is straight where the format has it so. Raises
-    InputError."""
+    """OpenImageIO's input of a file with a plausible header. Straight alpha stays straight if the format stores it so.
+
+    Raises InputError.
+    """
     if not is_file(path):
         raise InputError(f"{path}: no such image file")
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     size = path.stat().st_size
     with open_input(path, "a picture") as file:
-        known = file.read(8).startswith(SIGNATURES)
-    if size > MAX_FILE_BYTES or (size > FREE_FILE_BYTES and not known):
-        raise InputError(f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_FILE_BYTES}")
+        known = file.read(8).startswith(IMAGE_SIGNATURES)
+    if size > MAX_IMAGE_FILE_BYTES or (size > MAX_UNSIGNED_IMAGE_BYTES and not known):
+        raise InputError(
+            f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_IMAGE_FILE_BYTES}"
+        )
     source = oiio.ImageInput.open(native_name(path), hints)
     if source is None:
         raise InputError(f"{path}: does not decode: {one_line(error_of(oiio))}; expected an image")
@@ -252,7 +271,7 @@ def open_image(path: Path) -> Any:
     floats = max(shown) * spec.nchannels
     if spec.depth > 1 or min(spec.width, spec.height, spec.full_width, spec.full_height) < 1:
         raise InputError(f"{path}: is {spec.width} x {spec.height} x {spec.depth} pixels, expected a flat picture")
-    if max(shown) > MAX_PIXELS or floats > max(FREE_FLOATS, FLOATS_A_BYTE * size):
+    if max(shown) > MAX_IMAGE_PIXELS or floats > max(MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE * size):
         raise InputError(
             f"{path}: says that it is {spec.width} x {spec.height} pixels of {spec.nchannels} channels, shown as "
             f"{spec.full_width} x {spec.full_height}, in {size} bytes; is it damaged?"
@@ -262,7 +281,7 @@ def open_image(path: Path) -> Any:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """OpenImageIO's input of a file, None where that is none. Its messages are not looked at."""
+    """Context with OpenImageIO's input of a file, or None if it is not an image. Error messages are discarded."""
     source = oiio.ImageInput.open(native_name(path))
     try:
         yield source
@@ -273,10 +292,11 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def decodes(source: Any, part: int, first: int) -> bool:
-    """True if the rows of an input's part decode, from the picture's row `first` on. They are read a few at a time."""
+    """True if the rows of an input's part decode, starting at the image's row `first`. A few rows are read at a
+    time."""
     spec = source.spec()
-    for top in range(spec.y + first, spec.y + spec.height, _ROWS):
-        place = (part, 0, top, min(top + _ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
+    for top in range(spec.y + first, spec.y + spec.height, _DECODE_CHECK_ROWS):
+        place = (part, 0, top, min(top + _DECODE_CHECK_ROWS, spec.y + spec.height), 0, 0, spec.nchannels)
         rows = source.read_native_deep_scanlines(*place) if spec.deep else source.read_scanlines(*place, oiio.FLOAT)
         if rows is None or source.geterror():
             return False
@@ -284,11 +304,11 @@ def decodes(source: Any, part: int, first: int) -> bool:
 
 
 def error_of(source: Any) -> str:
-    """OpenImageIO's message about what went wrong."""
+    """OpenImageIO's message about the last error."""
     try:
         return str(source.geterror())
     except UnicodeDecodeError:
-        return "in words that are no text"
+        return "in a message that is not text"
 
 
 def one_line(reason: str) -> str:
@@ -315,7 +335,7 @@ def _as_rgb(path: Path, pixels: Float32, spec: Any) -> Float32:
 
 
 def _display_window(image: Float32, spec: Any) -> Float32:
-    """The whole picture of an EXR whose data window is only a part of it; outside is 0."""
+    """The whole display window of an EXR whose data window differs; 0 outside the data window."""
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     width, height = spec.full_width, spec.full_height
     if (x, y, spec.width, spec.height) == (0, 0, width, height):
@@ -329,7 +349,7 @@ def _display_window(image: Float32, spec: Any) -> Float32:
 
 
 def _check_png_is_whole(path: Path) -> None:
-    """Raise InputError for a file that is cut short, before training, and before libpng prints."""
+    """Raise InputError for a truncated file, before training, and before libpng prints."""
     if not png_is_whole(path):
         size = path.stat().st_size
         raise InputError(
@@ -354,7 +374,7 @@ def png_is_whole(path: Path) -> bool:
 
 
 def _resampling(source: int, target: int) -> Any:
-    """The sparse matrix (target, source) whose rows are the weights of an axis, each summing to 1."""
+    """Sparse matrix (target, source) that resamples an axis; each row's weights sum to 1."""
     if target >= source:
         centres = (np.arange(target) + 0.5) * (source / target) - 0.5
         first = np.clip(np.floor(centres).astype(int), 0, source - 1)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""STMaps: pictures whose red and green say of each pixel where it comes from in another picture.
+"""STMaps: images whose red and green give the source position of each pixel in another image.
 
-The numbers are parts of that picture's width and height, from its lower left corner, as in Nuke: the identity has
-(x + 1/2) / width and 1 - (y + 1/2) / height in the pixel (x, y) from the top left.
+Positions are fractions of that image's width and height from its lower left corner, as in Nuke. At pixel (x, y) from
+the top left, the identity is (x + 1/2) / width and 1 - (y + 1/2) / height.
 """
 
 from __future__ import annotations
@@ -16,26 +16,32 @@ import OpenImageIO as oiio
 
 from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError, warn
-from clsplat.files import digest
+from clsplat.files.documents import digest
 from clsplat.images.reading import error_of, one_line, open_image
 from clsplat.images.writing import write_spec
 
-HALF_PLACES = 2048
-"""Pixels a side from which on a half float is more than half a pixel off."""
+HALF_FLOAT_SIDE_LIMIT_PX = 2048
+"""Image side in pixels from which a half float is more than half a pixel off."""
 
 
-_PARTS = 32
-"""Parts of a map's sides, of each of which it is asked which way around it lies."""
-_SINE = 0.05
-"""Least of the angle between a part's sides: those of a grey picture are one."""
-_ALIKE = 0.7
-"""Share of these that lie the same way in any map; in pictures it is a half, or they lie no way as they are grey."""
+_ORIENTATION_CELLS_PER_SIDE = 32
+"""Cells along each side of a map; each cell's orientation is tested."""
+_MIN_CELL_SINE = 0.05
+"""Smallest sine of the angle between a cell's mapped sides; for a grey image the two sides coincide."""
+_MIN_ORIENTED_SHARE = 0.7
+"""Least fraction of the cells that have the same orientation in a map. In ordinary images it is a half, or they have
+none because they are grey."""
 
 
 @dataclass(frozen=True, eq=False)
 class StMap:
-    """A map that was read. values (H, W, 2) float32: across and up; x, y: of its first pixel in the frame, which may be
-    negative; width, height: of the frame; digest: SHA-256 of its file."""
+    """STMap read from a file.
+
+    values (H, W, 2): float32, across and up.
+    x, y: position of its first pixel in the frame; may be negative.
+    width, height: size of the frame.
+    digest: SHA-256 of its file.
+    """
 
     values: Float32
     x: int
@@ -51,8 +57,10 @@ class StMap:
         return across and self.y <= y and y + height <= self.y + rows
 
     def at(self, x: Float64, y: Float64) -> Float64:
-        """(h, w, 2): its values at places x (w,), y (h,) of the frame, in pixels, interpolated linearly between pixels'
-        centres; beyond the outer centres as the last two go on."""
+        """Values (h, w, 2) at positions x (w,), y (h,) of the frame, in pixels.
+
+        They are interpolated linearly between pixel centres, and extrapolated linearly beyond the outer ones.
+        """
         rows, columns, _ = self.values.shape
 
         def ends(place: Float64, count: int) -> tuple[np.ndarray, np.ndarray, Float64]:
@@ -68,21 +76,24 @@ class StMap:
         def line(row: np.ndarray) -> Float64:
             begin, end = (values[row[:, None], column[None, :]].astype(np.float64) for column in (left, right))
             mixed = begin + across * (end - begin)
-            return np.asarray(np.where(across == 0, begin, mixed))  # what is not finite stays where it is
+            return np.asarray(np.where(across == 0, begin, mixed))  # keeps non-finite values from spreading
 
         upper, lower = line(above), line(below)
         return np.asarray(np.where(down == 0, upper, upper + down * (lower - upper)))
 
 
 def read_stmap(path: Path) -> StMap:
-    """The map in a file; one that was read before is kept. Raises InputError for a file that is missing, no picture, of
-    whole numbers or without two channels. Warns of half floats, which are too coarse for places in large pictures."""
+    """Read an STMap; recent ones are cached.
+
+    Raises InputError for a file that is missing, not an image, of integers, or without two channels. Warns of half
+    floats, which are too coarse for positions in large images.
+    """
     open_image(path).close()
     return _read(path, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=2)
-def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # asked anew where the file has changed
+def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # read again if the file has changed
     source = open_image(path)
     spec = source.spec()
     names = [name.upper() for name in spec.channelnames]
@@ -97,23 +108,25 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # asked anew wher
     if pixels is None:
         raise InputError(f"{path}: does not decode: {one_line(reason)}; expected an STMap")
     values = np.asarray(pixels, np.float32).reshape(spec.height, spec.width, spec.nchannels)[:, :, channels]
-    if (share := _one_way(values)) < _ALIKE:
+    if (share := _one_way(values)) < _MIN_ORIENTED_SHARE:
         raise InputError(
-            f"{path}: looks like a picture, as its R and G lead to and fro ({100 * share:.0f} % of its parts one way), "
-            "expected an STMap, whose R and G are places that follow each other"
+            f"{path}: looks like a picture: R and G have one orientation in {100 * share:.0f} % of its cells, "
+            "expected an STMap, whose R and G are neighbouring positions"
         )
-    if "half" in kinds and max(spec.full_width, spec.full_height) >= HALF_PLACES:
+    if "half" in kinds and max(spec.full_width, spec.full_height) >= HALF_FLOAT_SIDE_LIMIT_PX:
         warn(f"{path}: is of half floats, which are pixels off at {spec.full_width}x{spec.full_height}; write floats")
     place = (spec.x - spec.full_x, spec.y - spec.full_y, spec.full_width, spec.full_height)
     return StMap(np.ascontiguousarray(values), *place, digest(path))
 
 
 def _one_way(values: Float32) -> float:
-    """The share of the parts of a map that show what they show the same way around, mirrored or not, of those that have
-    numbers and are no part of one value; 1 of maps without numbers or too small to tell, 0 of those that show a line or
-    a place."""
-    rows, columns = (np.arange(0, side, max(side // _PARTS, 1)) for side in values.shape[:2])
-    if len(rows) < _PARTS // 2 or len(columns) < _PARTS // 2:
+    """Fraction of a map's cells with the most common orientation, mirrored or not.
+
+    Only cells with finite and varying values count. The result is 1 for a map without numbers or too small to judge,
+    and 0 for a map that shows only a line or a point.
+    """
+    rows, columns = (np.arange(0, side, max(side // _ORIENTATION_CELLS_PER_SIDE, 1)) for side in values.shape[:2])
+    if len(rows) < _ORIENTATION_CELLS_PER_SIDE // 2 or len(columns) < _ORIENTATION_CELLS_PER_SIDE // 2:
         return 1.0
     corners = values[rows[:, None], columns].astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -123,15 +136,15 @@ def _one_way(values: Float32) -> float:
         told = np.isfinite(areas) & (sides > 0)
     if not told.any():
         return 0.0 if np.isfinite(corners).any() else 1.0
-    turned = areas[told] / sides[told]  # the sine of the angle between them
-    return float(max((turned > _SINE).mean(), (turned < -_SINE).mean()))
+    turned = areas[told] / sides[told]  # sine of the angle between the sides
+    return float(max((turned > _MIN_CELL_SINE).mean(), (turned < -_MIN_CELL_SINE).mean()))
 
 
 def write_stmap(path: Path, places: Float64, width: int, height: int) -> None:
-    """Write a map as an EXR of 32-bit floats, atomically: R, G, and B of zeros, which compositors expect.
+    """Write a map as a 32-bit float EXR, atomically: R, G, and a B of zeros, which compositors expect.
 
-    places (H, W, 2): x and y in pixels from the top left corner of a picture of that width and height, NaN where there
-    is none. Raises ClsplatError if writing fails.
+    places (H, W, 2): x and y in pixels from the top left corner of an image of that width and height; NaN for none.
+    Raises ClsplatError if writing fails.
     """
     pixels = np.zeros((*places.shape[:2], 3), np.float32)
     pixels[:, :, 0], pixels[:, :, 1] = places[:, :, 0] / width, 1 - places[:, :, 1] / height

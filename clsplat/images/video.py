@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Video: frames to an .mp4, H.264, or a .mov, ProRes, as they come, by PyAV (`pip install 'clsplat[video]'`)."""
+"""Video writing, frame by frame: .mp4 (H.264) or .mov (ProRes), by PyAV (`pip install 'clsplat[video]'`)."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config.pictures import FPS, ProRes, VideoConfig
+from clsplat.config.pictures import DEFAULT_VIDEO_FPS, ProRes, VideoConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import FULL, atomic_name, native_name
+from clsplat.files.atomic import DISK_FULL_ERRNOS, atomic_name
+from clsplat.files.names import native_name
 from clsplat.images.alpha import unassociate
-from clsplat.images.frame_files import VIDEOS
-from clsplat.images.records import parse_record
+from clsplat.images.colour import REC709_LUMA_WEIGHTS
+from clsplat.images.frame_files import VIDEO_SUFFIXES
+from clsplat.images.provenance import parse_record
 
-_LUMA = (0.2126, 0.7152, 0.0722)
-_BLUE, _RED = np.float32(2 * (1 - 0.0722)), np.float32(2 * (1 - 0.2126))
-"""Ranges of B - Y and R - Y, from end to end."""
+_BLUE_CHROMA_RANGE, _RED_CHROMA_RANGE = (np.float32(2 * (1 - REC709_LUMA_WEIGHTS[index])) for index in (2, 0))
+"""Full ranges of B - Y and R - Y."""
 
 
 VideoPlanes = NDArray[np.uint8] | tuple[NDArray[np.uint16], ...]
-"""A frame as its encoder takes it: of `frame_planes`, or of `prores_planes`."""
-_PROFILES: dict[ProRes, str] = {"422": "standard", "hq": "hq", "4444": "4444"}
-"""FFmpeg's names of ProRes."""
+"""Frame in the encoder's form: of `frame_planes` or `prores_planes`."""
+_PRORES_PROFILES: dict[ProRes, str] = {"422": "standard", "hq": "hq", "4444": "4444"}
+"""FFmpeg's names of the ProRes profiles."""
 
 
 def video_missing() -> str:
-    """The reason that no video can be written, in one line; '' if it can."""
+    """One-line reason why no video can be written; '' if it can."""
     try:
         import av  # noqa: F401
     except ImportError:
@@ -41,20 +42,24 @@ def video_missing() -> str:
     return ""
 
 
-SMALL = 128
-"""Pixels of the shorter side under which x264 does without its tree of macroblocks: with it up to 102 of 250 videos of
-48x40 had other bytes on a busy machine, none of 225 of 320x240. It saves a quarter of a larger video's bytes."""
+MBTREE_MIN_SIDE_PX = 128
+"""Shorter side in pixels below which x264's macroblock tree is off. The tree saves a quarter of a larger video's bytes.
+
+With the tree, up to 102 of 250 videos of 48x40 differed in their bytes on a busy machine, and none of 225 of 320x240.
+"""
 
 
-LARGEST_SIDE = 16384
-"""Pixels: x264's MAX_RESOLUTION."""
-LARGEST_AREA = 260
-"""Megapixels, about: FFmpeg's av_image_check_size wants 8 (width + 128) (height + 128) under 2^31."""
+MAX_VIDEO_SIDE_PX = 16384
+"""Largest side in pixels: x264's MAX_RESOLUTION."""
+MAX_VIDEO_MEGAPIXELS = 260
+"""Largest frame in megapixels, about: FFmpeg's av_image_check_size wants 8 (width + 128) (height + 128) under 2^31."""
 
 
 def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
-    """The record (`records`) of a video; nothing where the file is no video or has none, or, with `frames`, where it is
-    not whole or has another number of them."""
+    """Record (`provenance`) of a video; empty if the file is not a video or has none.
+
+    frames: if given, the result is empty also for an incomplete video or another number of frames.
+    """
     import av
 
     try:
@@ -69,9 +74,9 @@ def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
 
 
 def check_video(path: Path) -> None:
-    """Raise InputError where this installation cannot write a video there."""
-    if path.suffix.lower() not in VIDEOS:
-        raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {' or '.join(VIDEOS)}")
+    """Raise InputError if this installation cannot write a video there."""
+    if path.suffix.lower() not in VIDEO_SUFFIXES:
+        raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {' or '.join(VIDEO_SUFFIXES)}")
     if reason := video_missing():
         raise InputError(f"{path}: {reason}")
     if not path.parent.is_dir():
@@ -79,35 +84,39 @@ def check_video(path: Path) -> None:
 
 
 def check_codec(path: str, config: VideoConfig, channels: Collection[str]) -> None:
-    """Raise InputError for settings of the other codec, and for alpha that the codec has none of."""
+    """Raise InputError for settings of the other codec, and for alpha if the codec has none."""
     usual = VideoConfig()
     if Path(path).suffix.lower() == ".mp4":
         if config.prores != usual.prores:
-            raise InputError(f"--video.prores {config.prores}: is of ProRes, expected the name of a .mov, not {path}")
+            raise InputError(f"--video.prores {config.prores}: is for ProRes, expected the name of a .mov, not {path}")
         return
     for name in ("crf", "preset"):
         if getattr(config, name) != getattr(usual, name):
             value = getattr(config, name)
-            raise InputError(f"--video.{name} {value}: is of H.264, expected the name of an .mp4, not {path}")
+            raise InputError(f"--video.{name} {value}: is for H.264, expected the name of an .mp4, not {path}")
     if "alpha" in channels and config.prores != "4444":
         raise InputError(f"{path}: ProRes {config.prores} cannot hold alpha, expected --video.prores 4444 with it")
 
 
 def check_size(path: Path, width: int, height: int) -> None:
-    """Raise InputError where frames are larger than the encoder takes."""
-    if max(width, height) > LARGEST_SIDE or 8 * (width + 128) * (height + 128) >= 1 << 31:
+    """Raise InputError if frames are larger than the encoder accepts."""
+    if max(width, height) > MAX_VIDEO_SIDE_PX or 8 * (width + 128) * (height + 128) >= 1 << 31:
         raise InputError(
-            f"{path}: frames of {width}x{height}, expected at most {LARGEST_SIDE:,} pixels a side and {LARGEST_AREA} "
-            "megapixels, which is what a video is encoded of here; give a smaller --width, or write pictures"
+            f"{path}: frames of {width}x{height}, expected at most {MAX_VIDEO_SIDE_PX:,} pixels a side and "
+            f"{MAX_VIDEO_MEGAPIXELS} "
+            "megapixels in a video; give a smaller --width, or write pictures"
         )
 
 
 def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """(3 H / 2, W): luma, below it chroma at half the size, as PyAV takes them; sizes rounded up to even ones. Rec.709,
-    limited range, chroma sited at the left as in H.264. FFmpeg's own is darker by a level.
+    """Planes (3 H / 2, W) for H.264: luma, and below it chroma at half the size, as PyAV takes them.
 
-    image: (H, W, 3), floats as they are to be displayed, clipped to [0, 1], NaN as 0, or uint8. Raises ValueError for
-    another shape."""
+    Sizes are rounded up to even numbers. Rec.709, limited range, chroma sited at the left as in H.264. FFmpeg's own
+    conversion is darker by one level.
+
+    image (H, W, 3): floats as displayed, clipped to [0, 1], NaN as 0, or uint8.
+    Raises ValueError for another shape.
+    """
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
         raise ValueError(f"frame {pixels.shape}: expected (H, W, 3)")
@@ -115,8 +124,8 @@ def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
     rgb = values.astype(np.float32, copy=False)
     height, width, _ = rgb.shape
     rgb = np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-    luma = rgb @ np.array(_LUMA, np.float32)
-    chroma = np.stack([(rgb[:, :, 2] - luma) / _BLUE, (rgb[:, :, 0] - luma) / _RED])
+    luma = rgb @ np.array(REC709_LUMA_WEIGHTS, np.float32)
+    chroma = np.stack([(rgb[:, :, 2] - luma) / _BLUE_CHROMA_RANGE, (rgb[:, :, 0] - luma) / _RED_CHROMA_RANGE])
     chroma = 0.5 * (chroma[:, 0::2] + chroma[:, 1::2])
     chroma = _left_sited(chroma)
     flat = np.concatenate([(16 + 219 * luma).ravel(), (128 + 224 * chroma).ravel()])
@@ -124,12 +133,13 @@ def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def prores_planes(image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> tuple[NDArray[np.uint16], ...]:
-    """Luma, chroma and, where there is alpha, that, (H, W) each, as ProRes takes them: 10 bits, Rec.709 in limited
-    range, alpha in full range. Of 422 and hq chroma is half as wide, sited at the left, and the width rounded up to an
-    even one.
+    """Planes (H, W) for ProRes: luma, two of chroma, and alpha if given, in 10 bits.
 
-    image: (H, W, 3), floats as they are to be displayed, clipped to [0, 1], NaN as 0; alpha: (H, W), which image is
-    associated with; in the file it is straight.
+    Colours are Rec.709 in limited range, alpha is in full range. For 422 and hq, chroma has half the width and is sited
+    at the left, and the width is rounded up to an even number.
+
+    image (H, W, 3): floats as displayed, clipped to [0, 1], NaN as 0.
+    alpha (H, W): image is premultiplied by it; the file stores straight alpha.
     """
     rgb = np.nan_to_num(np.asarray(image, np.float32))
     if alpha is not None:
@@ -138,8 +148,8 @@ def prores_planes(image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRe
     rgb = np.clip(rgb, 0, 1)
     if prores != "4444":
         rgb = np.pad(rgb, ((0, 0), (0, rgb.shape[1] % 2), (0, 0)), mode="edge")
-    luma = rgb @ np.array(_LUMA, np.float32)
-    chroma = np.stack([(rgb[:, :, 2] - luma) / _BLUE, (rgb[:, :, 0] - luma) / _RED])
+    luma = rgb @ np.array(REC709_LUMA_WEIGHTS, np.float32)
+    chroma = np.stack([(rgb[:, :, 2] - luma) / _BLUE_CHROMA_RANGE, (rgb[:, :, 0] - luma) / _RED_CHROMA_RANGE])
     if prores != "4444":
         chroma = _left_sited(chroma)
     planes = [64 + 876 * luma, *(512 + 896 * chroma)]
@@ -148,18 +158,18 @@ def prores_planes(image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRe
 
 
 def _left_sited(chroma: NDArray[Any]) -> NDArray[Any]:
-    """(2, H, W / 2): a quarter of each neighbour, half of the sample that it is at."""
+    """Chroma (2, H, W / 2): half of the sample at the same position and a quarter of each neighbour."""
     left = np.concatenate([chroma[:, :, :1], chroma[:, :, 1:-1:2]], axis=2)
     return np.asarray(0.25 * (left + chroma[:, :, 1::2]) + 0.5 * chroma[:, :, 0::2])
 
 
 def planes_of(path: Path, image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> VideoPlanes:
-    """The frame as the encoder of a video of that name takes it."""
+    """The frame in the form that the encoder of a video of that name takes."""
     return prores_planes(image, alpha, prores) if path.suffix.lower() == ".mov" else frame_planes(image)
 
 
 def rate_of(fps: float) -> Fraction:
-    """Frames a second for a file: those of television, which are said in two or three decimals, in 1001ths."""
+    """Frame rate for a file; television rates given with two or three decimals become multiples of 1/1001."""
     whole = round(fps * 1.001)
     ntsc = Fraction(1000 * whole, 1001)
     near = 5e-3 if whole % 24 == 0 or whole % 30 == 0 else 1e-4
@@ -170,10 +180,11 @@ def rate_of(fps: float) -> Fraction:
 
 @contextmanager
 def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "") -> Iterator[VideoWriter]:
-    """A video that takes the place of `path` when the block ends well; on any exception nothing is left there. comment:
-    of what it was made.
+    """Context with a writer of a video, which replaces `path` if the block succeeds; after an exception nothing is left
+    there.
 
-    Raises InputError for another extension, a folder that does not exist, no frames, and where PyAV is not installed.
+    comment: provenance record for the header.
+    Raises InputError for another extension, a missing folder, no frames, or if PyAV is not installed.
     """
     config = config or VideoConfig()
     config.check()
@@ -188,7 +199,7 @@ def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "
 
 
 def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
-    """PyAV's frame of planes of whole numbers."""
+    """PyAV frame of 16-bit planes."""
     import av
 
     height, width = planes[0].shape
@@ -197,7 +208,7 @@ def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
         lines = np.zeros((values.shape[0], plane.line_size // 2), np.uint16)
         lines[:, : values.shape[1]] = values
         plane.update(lines)
-    # ProRes has them in each frame's header too, where an encoder takes them from the frame
+    # ProRes stores these in each frame's header too; the encoder takes them from the frame
     frame.colorspace = frame.color_primaries = frame.color_trc = frame.color_range = 1
     return frame
 
@@ -205,12 +216,16 @@ def _frame_of(planes: tuple[NDArray[np.uint16], ...], form: str) -> Any:
 class VideoWriter:
     """A video that is written frame by frame, in order.
 
-    H.264 has 8-bit 4:2:0 in Rec.709's limited range, which halves the colour's resolution; where a size is odd the
-    last column or row is repeated, as the format has none. ProRes has 10 bits, 4:2:2 or 4:4:4.
+    H.264 has 8-bit 4:2:0 in Rec.709's limited range, which halves the colour's resolution. It has no odd sizes, so the
+    last column or row is repeated. ProRes has 10 bits, 4:2:2 or 4:4:4.
     """
 
     def __init__(self, path: Path, temporary: Path, config: VideoConfig, comment: str = "") -> None:
-        """temporary: the file's name as long as it is written; comment: in its header."""
+        """Prepare the writer; the first frame opens the file.
+
+        temporary: name of the file while it is written.
+        comment: text for its header.
+        """
         self._path, self._temporary, self._config, self._comment = path, temporary, config, comment
         self._container: Any = None
         self._stream: Any = None
@@ -218,7 +233,7 @@ class VideoWriter:
         self.frames = 0
 
     def add(self, planes: VideoPlanes) -> None:
-        """Append a frame as `planes_of` gives it; all of one size and kind.
+        """Append a frame from `planes_of`; all frames have one size and kind.
 
         Raises ClsplatError if writing fails, ValueError for a frame of another size.
         """
@@ -247,54 +262,58 @@ class VideoWriter:
 
         check_size(self._path, width, height)
         config = self._config
-        rate = rate_of(FPS if config.fps is None else config.fps)
+        rate = rate_of(DEFAULT_VIDEO_FPS if config.fps is None else config.fps)
         kind = self._path.suffix.lower()[1:]
         self._container = av.open(native_name(self._temporary), "w", format=kind, options={"movflags": "+faststart"})
         if self._comment:
             self._container.metadata["comment"] = self._comment
         if kind == "mov":
-            # Apple's readers want its mark; alpha of 16 bits loses nothing
-            options = {"profile": _PROFILES[config.prores], "vendor": "apl0", "alpha_bits": "16" if alpha else "0"}
+            # Apple's readers expect its vendor code; 16-bit alpha loses nothing
+            options = {
+                "profile": _PRORES_PROFILES[config.prores],
+                "vendor": "apl0",
+                "alpha_bits": "16" if alpha else "0",
+            }
             codec, form = "prores_ks", "yuv422p10le" if config.prores != "4444" else "yuv444p10le"
             form = "yuva444p10le" if alpha else form
         else:
-            # one thread a core, but the same bytes whatever their number
-            parameters = "threads=4:sliced-threads=0" + (":mbtree=0" if min(width, height) < SMALL else "")
+            # a fixed number of threads: the same bytes on every machine
+            parameters = "threads=4:sliced-threads=0" + (":mbtree=0" if min(width, height) < MBTREE_MIN_SIDE_PX else "")
             options = {"crf": str(config.crf), "preset": config.preset, "x264-params": parameters}
             codec, form = "libx264", "yuv420p"
         self._stream = self._container.add_stream(codec, rate=rate, options=options)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, form
         context = self._stream.codec_context
         context.time_base = 1 / rate
-        # Rec.709's matrix, limited range, sRGB's transfer as near as the list has it
+        # Rec.709's matrix, limited range, and the listed transfer that is closest to sRGB's
         context.colorspace = context.color_primaries = context.color_trc = 1
         context.color_range = 1
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
-        """Turn what FFmpeg raises into errors of the system, or of ours."""
+        """Turn FFmpeg's errors into OSError or ClsplatError."""
         import av
 
         try:
             yield
         except (av.error.FFmpegError, OSError) as error:
-            if error.errno in FULL or error.errno == errno.EFBIG:
+            if error.errno in DISK_FULL_ERRNOS or error.errno == errno.EFBIG:
                 raise OSError(error.errno, os.strerror(error.errno)) from None
             reason = error.strerror or str(error)
             raise ClsplatError(f"{self._path}: cannot be written: {reason}") from None
 
     def finish(self) -> None:
-        """Write what the encoder still holds, to the disk. Raises InputError for a video of no frames."""
+        """Flush the encoder and the file to the disk. Raises InputError for a video of no frames."""
         if self.frames == 0:
             raise InputError(f"{self._path}: a video of no frames, expected at least one")
         with self._refusals():
             self._container.mux(self._stream.encode(None))
             self._container.close()
-            with open(self._temporary, "r+b") as file:  # Windows flushes only what may be written to
+            with open(self._temporary, "r+b") as file:  # Windows flushes only files opened for writing
                 os.fsync(file.fileno())
 
     def close(self) -> None:
-        """Close the file, whatever is in it."""
+        """Close the file, complete or not."""
         if self._container is not None:
-            with suppress(Exception):  # it is closed if all went well; else what it says is not the reason
+            with suppress(Exception):  # after success it is closed already; after a failure its error is not the cause
                 self._container.close()

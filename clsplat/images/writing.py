@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures to files: whole or not at all."""
+"""Writing image files, completely or not at all."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from clsplat.errors import ClsplatError, InputError, plain
-from clsplat.files import atomic_name, native_name, require_room, room_error
+from clsplat.files.atomic import atomic_name, require_room, room_error
+from clsplat.files.names import native_name
 from clsplat.images.alpha import associate
 from clsplat.images.reading import decodes, one_line, opened, png_is_whole
 
-CHANNEL_NAMES = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+CHANNEL_NAMES_BY_COUNT = {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 
 
 def write_image(path: Path, image: NDArray[Any]) -> None:
-    """Write a picture, atomically: 8-bit PNG or float EXR, by the extension.
+    """Write an image, atomically: 8-bit PNG or float EXR, by the extension.
 
-    image (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; floats, in a PNG clipped to [0, 1] and rounded, or
-    uint8. Raises InputError for another extension or a folder that does not exist, ClsplatError if writing fails (disk
-    full). The previous file is whole then, and no temporary file is left.
+    image: (H, W) or (H, W, C), C = 1, 3 or 4, with straight alpha; uint8, or floats, which a PNG clips to [0, 1] and
+      rounds.
+    Raises InputError for another extension or a missing folder, ClsplatError if writing fails (disk full). After a
+    failure the previous file is intact, and no temporary file is left.
     """
     path = Path(path)
     extension = path.suffix.lower()
@@ -36,7 +38,7 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
         raise InputError(f"{path.parent}: no such folder to write {path.name} to")
     pixels = np.asarray(image)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
-    if pixels.ndim != 3 or pixels.shape[2] not in CHANNEL_NAMES or 0 in pixels.shape:
+    if pixels.ndim != 3 or pixels.shape[2] not in CHANNEL_NAMES_BY_COUNT or 0 in pixels.shape:
         raise ValueError(f"image {np.shape(image)}: expected (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)")
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.float32) / np.float32(255)
@@ -49,18 +51,21 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
         pixels = associate(pixels)
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8 if is_png else oiio.FLOAT)
-    spec.channelnames = CHANNEL_NAMES[channels]
+    spec.channelnames = CHANNEL_NAMES_BY_COUNT[channels]
     if is_png:
         spec.attribute("oiio:UnassociatedAlpha", 1)
     write_spec(path, [np.ascontiguousarray(pixels)], [spec], extension[1:])
 
 
 def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
-    """Channels side by side as whole numbers, 0 to 1 as 0 to the largest; NaN as 0. A channel at a time, as they come
-    from the device as planes, and a pass over interleaved ones takes several times as long."""
+    """Channels side by side as integers: 0 to 1 become 0 to the maximum, NaN becomes 0.
+
+    Works on one channel at a time: the device returns planes, and a pass over interleaved channels takes several times
+    as long.
+    """
     height, width = planes[0].shape[:2]
     whole = np.empty((height, width, sum(plane.shape[2] for plane in planes)), np.uint8 if bits == 8 else np.uint16)
-    scratch = np.empty((height, width), np.float32 if bits == 8 else np.float64)  # a float32 rounds 16 bits twice
+    scratch = np.empty((height, width), np.float32 if bits == 8 else np.float64)  # float32 would round 16 bits twice
     most = scratch.dtype.type(2**bits - 1)
     channels = (plane[:, :, channel] for plane in planes for channel in range(plane.shape[2]))
     for at, channel in enumerate(channels):
@@ -71,9 +76,10 @@ def steps_of(planes: Sequence[NDArray[Any]], bits: int) -> NDArray[Any]:
 
 
 def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], kind: str) -> None:
-    """Write a file of one part or several, (H, W, C) each with its OpenImageIO specification, atomically.
+    """Write a file of one or more parts, atomically: (H, W, C) each, with its OpenImageIO specification.
 
-    Raises ClsplatError if writing fails."""
+    Raises ClsplatError if writing fails.
+    """
 
     def steps(file: Any, name: str) -> Iterator[bool]:
         for index, pixels in enumerate(parts):
@@ -84,8 +90,12 @@ def write_spec(path: Path, parts: Sequence[NDArray[Any]], specs: Sequence[Any], 
 
 
 def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int]]) -> None:
-    """Write a file of one part from the top as its rows come, atomically. pieces: pixels, or OpenImageIO's deep data,
-    and how many rows they are. While deep ones are written the next are taken. Raises ClsplatError if writing fails."""
+    """Write a file of one part from the top, atomically, as its rows arrive.
+
+    pieces: pixels, or OpenImageIO's deep data, and their number of rows. While deep rows are written, the next are
+      requested.
+    Raises ClsplatError if writing fails.
+    """
     reasons: list[str] = []
 
     def steps(file: Any, _: str) -> Iterator[bool]:
@@ -99,10 +109,10 @@ def write_rows(path: Path, spec: Any, kind: str, pieces: Iterable[tuple[Any, int
         def written(row: int, count: int, pixels: Any) -> bool:
             done = bool(file.write_deep_scanlines(row, row + count, 0, pixels))
             if not done:
-                reasons.append(file.geterror())  # OpenImageIO tells it to this thread alone
+                reasons.append(file.geterror())  # OpenImageIO reports it to this thread only
             return done
 
-        with ThreadPoolExecutor(1) as pool:  # it compresses for longer than most frames are rendered
+        with ThreadPoolExecutor(1) as pool:  # compression takes longer than rendering most frames
             under_way = None
             for pixels, count in pieces:
                 if under_way is not None:
@@ -122,8 +132,11 @@ def _write(
     steps: Callable[[Any, str], Iterable[bool]],
     reasons: Sequence[str] = (),
 ) -> None:
-    """Write a file of these parts. steps: go on writing OpenImageIO's file, which is open under a name, and say of each
-    call whether it went well; reasons: why one in another thread did not."""
+    """Write a file of these parts.
+
+    steps: continues to write OpenImageIO's open file and yields the success of each call.
+    reasons: messages of calls that failed in another thread.
+    """
     # libjpeg ends the process when it cannot write
     most = jpeg_room(specs[0]) if kind in ("jpg", "jpeg") else 0
     with atomic_name(path) as temporary:
@@ -131,37 +144,37 @@ def _write(
         name = native_name(temporary)
         try:
             with require_room(path, most):
-                # several parts have to be announced together
+                # all parts have to be declared when the file is opened
                 opens = file.open(name, specs[0] if len(specs) == 1 else tuple(specs))
                 written = opens and all(steps(file, name)) and file.close()
-            # the last bytes of a full disk are lost without a word
+            # on a full disk the last bytes are lost without an error
             if written and _is_whole(temporary, kind, len(specs)):
                 if kind == "dpx":
                     _without_name(temporary)
                 return
             reason = "the file is not whole" if written else "; ".join(reasons) or file.geterror()
-            if error := room_error(temporary.parent):  # OpenImageIO seldom says that the system refuses to write
+            if error := room_error(temporary.parent):  # OpenImageIO seldom reports the system's error
                 raise OSError(error.errno, error.strerror)
             raise ClsplatError(f"{path}: cannot be written: {plain(one_line(reason))}")
         finally:
             file.close()
 
 
-_DPX_NAME = slice(36, 136)
-"""Bytes of a DPX's header that have the file's name (SMPTE ST 268)."""
+_DPX_FILE_NAME_BYTES = slice(36, 136)
+"""Bytes of a DPX header that hold the file name (SMPTE ST 268)."""
 
 
 def _without_name(path: Path) -> None:
-    """Empty the place of a DPX's header where OpenImageIO writes the path: of the same frame all bytes are the same."""
+    """Clear the path that OpenImageIO writes to a DPX header, so that equal frames have equal bytes."""
     with open(path, "r+b") as file:
-        file.seek(_DPX_NAME.start)
-        file.write(bytes(_DPX_NAME.stop - _DPX_NAME.start))
+        file.seek(_DPX_FILE_NAME_BYTES.start)
+        file.write(bytes(_DPX_FILE_NAME_BYTES.stop - _DPX_FILE_NAME_BYTES.start))
         file.flush()
         os.fsync(file.fileno())
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:
-    """True if the end of a picture that has been written is there: the last chunk of a PNG, the last row of others."""
+    """True if the end of a written image is there: the last chunk of a PNG, the last row of other formats."""
     if kind == "png":
         return png_is_whole(path)
     with opened(path) as source:
@@ -171,5 +184,5 @@ def _is_whole(path: Path, kind: str, parts: int) -> bool:
 
 
 def jpeg_room(spec: Any) -> int:
-    """More bytes than a JPEG of that size has."""
+    """Upper bound in bytes of a JPEG of that size."""
     return int(spec.width * spec.height * spec.nchannels * 5 // 4) + (1 << 16)

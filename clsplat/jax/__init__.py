@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 try:
-    import jax as _jax  # noqa: F401  # a plain "No module named 'jax'" would not say where to get it
+    import jax as _jax  # noqa: F401  # a plain "No module named 'jax'" would not say how to install it
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("clsplat.jax needs JAX: pip install 'clsplat[jax]'", name="jax") from error
 

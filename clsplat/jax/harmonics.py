@@ -17,13 +17,33 @@ from clsplat.library.checks import check_shape
 def spherical_harmonics(
     degree: int, directions: jax.Array, coefficients: jax.Array, masks: jax.Array | None = None
 ) -> jax.Array:
-    """`clsplat.library.harmonics.spherical_harmonics` with its gradient by directions and coefficients.
+    """Evaluate real spherical harmonics in given directions, with gradients of directions and coefficients.
 
-    degree: 0 to 4, the bands that are used; directions (..., 3), of any length; coefficients (..., K, 3), K at least
-    (degree + 1)^2; masks (...) bool: False where the result is 0. Returns float32 (..., 3), without 0.5 added. Inputs
-    of other dtypes become float32. Raises InputError for wrong shapes; other errors are those of `rasterize`.
+    Parameters
+    ----------
+    degree : int
+        Highest degree used, 0 to 4.
+    directions : (..., 3) jax.Array
+        Directions of any length.
+    coefficients : (..., K, 3) jax.Array
+        K is at least (degree + 1)^2.
+    masks : (...) jax.Array of bool, optional
+        Where it is False the result is 0.
 
-    Source: Kerbl et al. 2023; the basis is that of docs/conventions.md, as in gsplat's function of this name.
+    Returns
+    -------
+    (..., 3) jax.Array of float32
+        The sums, without 0.5 added.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong. Other errors are raised as by `clsplat.jax.rasterize`.
+
+    Notes
+    -----
+    `clsplat.library.harmonics.spherical_harmonics`. Kerbl et al. 2023; signs and order of the basis are in
+    docs/conventions.md, as in gsplat's function of this name. Arrays of other dtypes are converted to float32.
     """
     directions, coefficients = jnp.asarray(directions, jnp.float32), jnp.asarray(coefficients, jnp.float32)
     batch = directions.shape[:-1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls from JAX's programs to NumPy functions."""
+"""Calls from JAX programs to NumPy functions."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Any
 import jax
 import numpy as np
 
-SCHEDULABLE = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-if SCHEDULABLE == 1:
-    # XLA on one core has one thread, which a callback would block that waits for that thread to copy its arguments.
-    # XLA reads this when JAX makes its first array.
+SCHEDULABLE_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+if SCHEDULABLE_CORES == 1:
+    # On one core XLA has one thread. A callback would block it while waiting for that same thread to copy its
+    # arguments. XLA reads NPROC when JAX makes its first array.
     os.environ.setdefault("NPROC", "2")
 
 
@@ -23,9 +23,9 @@ def shape_like(array: Any) -> jax.ShapeDtypeStruct:
 
 
 def on_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any:
-    """Call a function of NumPy arrays in a program of JAX; `vmap` calls it once for each element.
+    """Call a function of NumPy arrays from a JAX program. `vmap` calls it once for each element.
 
-    shapes: a tree of jax.ShapeDtypeStruct like the function's result.
+    shapes: a tree of jax.ShapeDtypeStruct with the structure of the function's result.
     """
 
     def called(*given: Any) -> Any:

@@ -17,24 +17,39 @@ import numpy as np
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.jax.host import on_host, shape_like
+from clsplat.library.camera_pass import check_coefficients
 from clsplat.library.checks import Shape, check_shape, degree, plain
 from clsplat.library.checks import sizes as check_sizes
 from clsplat.library.projection import check_given, checked_planes
 from clsplat.library.rasterize import Rasterization, check_channels, checked_modes
 from clsplat.library.rasterize import rasterize as rasterize_numpy
-from clsplat.library.view import check_coefficients
-from clsplat.stages.harmonics import HIGHEST
+from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE
 
-KEPT = 8
-"""Forward passes that stay on the device for a gradient; of older ones the gradient makes them again, bit for bit."""
+MAX_CACHED_FORWARD_PASSES = 8
+"""Forward passes that stay on the device for a gradient. For older ones the gradient repeats the pass, bit for bit."""
 
 
 class Rasterized(NamedTuple):
-    """Images, and the Gaussians on them; float32 where nothing else is said.
+    """Images, and the projected Gaussians. All arrays but radii and tile_counts are differentiable.
 
-    images (C, H, W, X); alphas (C, H, W, 1); means2d (C, N, 2), pixels; depths (C, N), world units; conics (C, N, 3),
-    1 / pixels^2: the inverse 2D covariances' xx, xy, yy; opacities (C, N), those that are drawn; radii (C, N, 2) int32,
-    pixels, 0 where culled; tile_counts (C, N) int32. There is a gradient by all but the last two.
+    Attributes
+    ----------
+    images : (C, H, W, X) float32
+        Colours over the background, then the depth in world units.
+    alphas : (C, H, W, 1) float32
+        0 to 1.
+    means2d : (C, N, 2) float32
+        Pixels.
+    depths : (C, N) float32
+        World units.
+    conics : (C, N, 3) float32
+        xx, xy, yy of the inverse 2D covariances, 1 / px^2.
+    opacities : (C, N) float32
+        Blended opacities, 0 to 1.
+    radii : (C, N, 2) int32
+        Pixels; 0 if culled.
+    tile_counts : (C, N) int32
+        Number of 16 x 16 pixel tiles that a Gaussian's ellipse reaches.
     """
 
     images: jax.Array
@@ -47,9 +62,9 @@ class Rasterized(NamedTuple):
     tile_counts: jax.Array
 
 
-WITH_GRADIENT = ("images", "alphas", "means2d", "depths", "conics", "opacities")
-PROJECTED = ("means2d", "depths", "conics", "opacities")
-REQUIRED = ("means", "opacities", "colors", "viewmats", "intrinsics")
+DIFFERENTIABLE_OUTPUTS = ("images", "alphas", "means2d", "depths", "conics", "opacities")
+PROJECTED_OUTPUTS = ("means2d", "depths", "conics", "opacities")
+REQUIRED_ARRAYS = ("means", "opacities", "colors", "viewmats", "intrinsics")
 
 
 def rasterize(
@@ -78,20 +93,41 @@ def rasterize(
     means2d_probe: jax.Array | None = None,
     device: Device | str | None = None,
 ) -> Rasterized:
-    """`clsplat.rasterize` in a program of JAX, with the gradient of all its arrays.
+    """Render Gaussians in a JAX program, with gradients of all arrays.
 
-    The arguments are those of `clsplat.rasterize` but for `differentiable`, which JAX knows, and one size of all
-    cameras; all that are no arrays are static under `jit`, and so are shapes.
-    Arrays of other dtypes become float32. means2d_probe (C, N, 2): zeros, which are not used; its gradient is that of
-    the loss by `means2d` (with absolute_gradients, the sum of what pixels add to it, each without its sign), as
-    density control wants it. device: of OpenCL, open or by its name; JAX's own
-    devices have no part in it.
+    Parameters
+    ----------
+    means, quaternions, scales, opacities, colors, viewmats, intrinsics : jax.Array
+        The arrays of `clsplat.rasterize`. Arrays of other dtypes are converted to float32.
+    width, height : int
+        Pixels, one size for all cameras.
+    near_plane, far_plane, radius_clip, eps2d, sh_degree, render_mode, rasterize_mode, camera_model, alpha_max
+        The settings of `clsplat.rasterize`. They are static under `jit`, like shapes.
+    backgrounds, covars : jax.Array, optional
+        The arrays of `clsplat.rasterize`.
+    absolute_gradients : bool
+        Let the gradient of means2d_probe be the sum of the pixels' absolute contributions.
+    means2d_probe : (C, N, 2) jax.Array, optional
+        Zeros, whose values are not used. Its gradient is the loss's gradient with respect to `means2d`, for density
+        control.
+    device : Device or str, optional
+        An open OpenCL device, or a name as `clsplat devices` lists them. JAX's own devices are not used.
 
-    Raises InputError for wrong shapes and settings when it is called or traced. Arrays with numbers that are not
-    finite, and a device that is not there, are found when the program runs, and JAX raises an error of its own with
-    that message.
+    Returns
+    -------
+    Rasterized
+        Images and projected Gaussians.
 
-    Source: `clsplat.rasterize`, by jax.pure_callback and jax.custom_vjp.
+    Raises
+    ------
+    InputError
+        If a shape or setting is wrong, when the function is called or traced. If numbers are not finite or there is no
+        such device, JAX raises its own error with that message when the program runs.
+
+    Notes
+    -----
+    `clsplat.rasterize` (Kerbl et al. 2023), by jax.pure_callback and jax.custom_vjp. `differentiable` is not an
+    argument, since JAX knows it.
     """
     arrays = {
         "means": means,
@@ -105,31 +141,33 @@ def rasterize(
         "covars": covars,
         "means2d_probe": means2d_probe,
     }
-    settings = {
-        "near_plane": near_plane,
-        "far_plane": far_plane,
-        "radius_clip": radius_clip,
-        "eps2d": eps2d,
-        "sh_degree": sh_degree,
-        "render_mode": render_mode,
-        "rasterize_mode": rasterize_mode,
-        "camera_model": camera_model,
-        "alpha_max": alpha_max,
-        "absolute_gradients": absolute_gradients,
-        "device": device,
-    }
-    for name in REQUIRED:
+    for name in REQUIRED_ARRAYS:
         if arrays[name] is None:
             raise InputError(f"{name} is None, expected an array")
     check_given(covars, quaternions, scales)
     floats = {name: jnp.asarray(array, jnp.float32) for name, array in arrays.items() if array is not None}
     for name, side in (("viewmats", 4), ("intrinsics", 3)):
-        if floats[name].shape == (side, side):  # of one camera
+        if floats[name].shape == (side, side):  # one camera's matrix
             floats[name] = floats[name][None]
     if backgrounds is not None and floats["backgrounds"].shape == floats["colors"].shape[-1:]:
         floats["backgrounds"] = jnp.tile(floats["backgrounds"], (len(floats["viewmats"]), 1))
-    static = tuple((name, plain(value)) for name, value in settings.items())
-    return Rasterized(**_rasterize(Call(_side("width", width), _side("height", height), static), floats))
+    static = StaticArguments(
+        width=_side("width", width),
+        height=_side("height", height),
+        near_plane=plain(near_plane),
+        far_plane=plain(far_plane),
+        radius_clip=plain(radius_clip),
+        eps2d=plain(eps2d),
+        sh_degree=plain(sh_degree),
+        render_mode=plain(render_mode),
+        rasterize_mode=plain(rasterize_mode),
+        camera_model=plain(camera_model),
+        alpha_max=plain(alpha_max),
+        absolute_gradients=plain(absolute_gradients),
+        device=device,
+    )
+    made = _rasterize(static, floats)
+    return Rasterized(*(made[name] for name in Rasterized._fields))
 
 
 def _side(name: str, given: Any) -> int:
@@ -139,32 +177,61 @@ def _side(name: str, given: Any) -> int:
 
 
 @dataclass(frozen=True)
-class Call:
-    """All of a call that is no array."""
+class StaticArguments:
+    """The arguments of a call that are not arrays."""
 
     width: int
     height: int
-    settings: tuple[tuple[str, Any], ...]
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_degree: int | None
+    render_mode: str
+    rasterize_mode: str
+    camera_model: str
+    alpha_max: float
+    absolute_gradients: bool
+    device: Device | str | None
 
     def run(self, arrays: dict[str, Any]) -> Rasterization:
-        """The NumPy call; the arrays by their names, without those that are not there."""
-        given: dict[str, Any] = {"quaternions": None, "scales": None, **arrays, **dict(self.settings)}
-        given.pop("means2d_probe", None)
-        return rasterize_numpy(**given, width=self.width, height=self.height)
+        """Call the NumPy function with arrays by name; absent arrays are left out."""
+        return rasterize_numpy(
+            arrays["means"],
+            arrays.get("quaternions"),
+            arrays.get("scales"),
+            arrays["opacities"],
+            arrays["colors"],
+            arrays["viewmats"],
+            arrays["intrinsics"],
+            self.width,
+            self.height,
+            near_plane=self.near_plane,
+            far_plane=self.far_plane,
+            radius_clip=self.radius_clip,
+            eps2d=self.eps2d,
+            sh_degree=self.sh_degree,
+            backgrounds=arrays.get("backgrounds"),
+            render_mode=self.render_mode,
+            rasterize_mode=self.rasterize_mode,
+            camera_model=self.camera_model,
+            covars=arrays.get("covars"),
+            alpha_max=self.alpha_max,
+            absolute_gradients=self.absolute_gradients,
+            device=self.device,
+        )
 
     def shapes(self, arrays: dict[str, Any]) -> dict[str, jax.ShapeDtypeStruct]:
-        """Shapes and dtypes of the results. Raises InputError, which names the argument, for arrays of shapes that
-        `rasterize` does not take."""
-        settings, sizes = dict(self.settings), {name: array.shape for name, array in arrays.items()}
-        checked_modes(*(settings[name] for name in ("render_mode", "rasterize_mode", "alpha_max")))
-        planes = ("near_plane", "far_plane", "eps2d", "radius_clip", "camera_model")
-        checked_planes(*(settings[name] for name in planes))
+        """Shapes and dtypes of the results. Raises InputError, which names the argument, for shapes that do not fit."""
+        sizes = {name: array.shape for name, array in arrays.items()}
+        checked_modes(self.render_mode, self.rasterize_mode, self.alpha_max)
+        checked_planes(self.near_plane, self.far_plane, self.eps2d, self.radius_clip, self.camera_model)
         check_shape("means", sizes["means"], ("N", 3))
         check_shape("viewmats", sizes["viewmats"], ("C", 4, 4))
         count, views = sizes["means"][0], sizes["viewmats"][0]
-        highest = settings["sh_degree"]
+        highest = self.sh_degree
         if highest is not None:
-            highest = degree("sh_degree", highest, HIGHEST, ", or None")
+            highest = degree("sh_degree", highest, MAX_SH_BASIS_DEGREE, ", or None")
         colors: Shape = (count, "D") if highest is None else (count, "K", 3)
         check_shape("colors", sizes["colors"], colors, (views, *colors))
         if highest is not None:
@@ -184,7 +251,7 @@ class Call:
                 check_shape(name, sizes[name], shape)
         if "covars" in sizes:
             check_shape("covars", sizes["covars"], (count, 3, 3), (count, 6))
-        channels = {"RGB": values, "D": 1, "ED": 1}.get(settings["render_mode"], values + 1)
+        channels = {"RGB": values, "D": 1, "ED": 1}.get(self.render_mode, values + 1)
         results = {
             "images": (views, self.height, self.width, channels),
             "alphas": (views, self.height, self.width, 1),
@@ -196,13 +263,13 @@ class Call:
             "tile_counts": (views, count),
         }
         return {
-            name: jax.ShapeDtypeStruct(shape, jnp.float32 if name in WITH_GRADIENT else jnp.int32)
+            name: jax.ShapeDtypeStruct(shape, jnp.float32 if name in DIFFERENTIABLE_OUTPUTS else jnp.int32)
             for name, shape in results.items()
         }
 
 
-class Kept:
-    """The forward passes that wait for their gradient, by a number that is made with each."""
+class PendingForwards:
+    """Forward passes that await their gradient, by serial number."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -211,7 +278,7 @@ class Kept:
         self._lock = threading.Lock()
 
     def add(self, result: Rasterization) -> np.int32:
-        """Keep one, in place of the oldest where there are too many."""
+        """Store a pass, and drop the oldest if there are too many. Returns its number."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._results[number] = result
@@ -220,12 +287,12 @@ class Kept:
         return np.int32(number)
 
     def pop(self, number: int) -> Rasterization | None:
-        """Take one out, if it is still there."""
+        """Remove a pass and return it, or None if it is no longer there."""
         with self._lock:
             return self._results.pop(number, None)
 
 
-_kept = Kept(KEPT)
+_kept = PendingForwards(MAX_CACHED_FORWARD_PASSES)
 
 
 def _results(result: Rasterization, shapes: dict[str, jax.ShapeDtypeStruct]) -> dict[str, Any]:
@@ -233,16 +300,16 @@ def _results(result: Rasterization, shapes: dict[str, jax.ShapeDtypeStruct]) -> 
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _rasterize(call: Call, arrays: dict[str, Any]) -> Any:
+def _rasterize(call: StaticArguments, arrays: dict[str, Any]) -> Any:
     shapes = call.shapes(arrays)
     return on_host(lambda arrays: _results(call.run(arrays), shapes), shapes, arrays)
 
 
-def _forward(call: Call, arrays: dict[str, Any]) -> Any:
+def _forward(call: StaticArguments, arrays: dict[str, Any]) -> Any:
     shapes = call.shapes(arrays)
 
     def run(arrays: dict[str, Any]) -> Any:
-        # copies: the library reads arrays in place until the gradient, and XLA's memory is another's by then
+        # copies: the library reads arrays in place until the gradient, and XLA reuses its memory before
         result = call.run({name: np.array(array) for name, array in arrays.items()})
         return _results(result, shapes), _kept.add(result)
 
@@ -250,18 +317,24 @@ def _forward(call: Call, arrays: dict[str, Any]) -> Any:
     return results, (arrays, number)
 
 
-def _backward(call: Call, residuals: Any, cotangents: dict[str, Any]) -> Any:
+def _backward(call: StaticArguments, residuals: Any, cotangents: dict[str, Any]) -> Any:
     arrays, number = residuals
 
     def gradient(arrays: dict[str, Any], number: Any, d: dict[str, Any]) -> dict[str, Any]:
         result = _kept.pop(int(number)) or call.run(arrays)
         pixels = result.vjp_pixels(d["images"], d["alphas"])
-        projected = {name: d[name] + pixels.get(name, 0) for name in PROJECTED}
-        gradients = pixels | result.vjp_projection(**projected, colors2d=pixels["colors2d"])
+        projected = {name: d[name] + pixels.get(name, 0) for name in PROJECTED_OUTPUTS}
+        gradients = pixels | result.vjp_projection(
+            means2d=projected["means2d"],
+            conics=projected["conics"],
+            opacities=projected["opacities"],
+            colors2d=pixels["colors2d"],
+            depths=projected["depths"],
+        )
         gradients["means2d_probe"] = pixels.get("absolute", projected["means2d"])
         return {name: np.asarray(gradients[name], np.float32) for name in arrays}
 
-    wanted = {name: cotangents[name] for name in WITH_GRADIENT}
+    wanted = {name: cotangents[name] for name in DIFFERENTIABLE_OUTPUTS}
     shapes = {name: shape_like(array) for name, array in arrays.items()}
     return (on_host(gradient, shapes, arrays, number, wanted),)
 

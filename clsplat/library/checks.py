@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments of the library's calls as arrays for the kernels: errors name the argument."""
+"""Checks that turn the arguments of library calls into arrays for the kernels. Errors name the argument."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ Shape = tuple[int | str, ...]
 
 
 def floats(name: str, values: Any, *shapes: Shape) -> Float32:
-    """The argument `name` as a C-contiguous float32 array of one of these shapes, in which a text stands for any size.
+    """The argument `name` as a C-contiguous float32 array of one of these shapes, where a string stands for any size.
 
-    Raises InputError, which names the argument, for another shape, for what is no array of real numbers, and for
-    numbers that are not finite.
+    Raises InputError for another shape, for values that are not real numbers, and for NaN and infinite numbers.
     """
     array = _numbers(name, values)
     check_shape(name, array.shape, *shapes)
     with np.errstate(over="ignore", invalid="ignore"):
         result = np.ascontiguousarray(array, np.float32)
         flat = result.reshape(-1)
-        finite = np.isfinite(flat @ flat) or bool(np.isfinite(flat).all())  # a product is quicker, and may overflow
+        finite = np.isfinite(flat @ flat) or bool(np.isfinite(flat).all())  # faster than isfinite, but may overflow
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)
@@ -36,8 +35,10 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
 
 
 def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
-    """The gradient by an output as a C-contiguous float32 array of that output's shape; None where there is none.
-    Raises InputError, as `floats` does, but lets numbers pass that are not finite."""
+    """The gradient of an output as a C-contiguous float32 array of that output's shape, or None.
+
+    Raises InputError like `floats`, but accepts NaN and infinite numbers.
+    """
     if values is None:
         return None
     array = _numbers(name, values)
@@ -47,21 +48,20 @@ def gradient(name: str, values: Any, shape: tuple[int, ...]) -> Float32 | None:
 
 
 def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
-    """(count, side, side) float64, of one matrix or of many. Raises InputError as `floats`."""
+    """(count, side, side) float64, from one matrix or several. Raises InputError like `floats`."""
     floats(name, given, (count, side, side), (side, side))
-    array: Float64 = np.array(given, np.float64)  # a copy: the caller's may change before the gradient
+    array: Float64 = np.array(given, np.float64)  # a copy: the caller may change its array before the gradient
     return array.reshape(-1, side, side)
 
 
 def plain(given: Any) -> Any:
-    """A number that is given as an array or a tensor of one, as Python's; all else as it is."""
+    """A Python number if the argument is an array or tensor with one element; any other argument unchanged."""
     one = hasattr(given, "item") and prod(getattr(given, "shape", (0,))) == 1
     return given.item() if one else given
 
 
 def whole(given: Any) -> int | None:
-    """A whole number, that may be given as a real number (40.0) or an array or a tensor of one; None for what is
-    none."""
+    """An integer, also from a float (40.0) or from an array or tensor with one element; None for any other argument."""
     number = plain(given)
     if isinstance(number, bool) or not isinstance(number, (int, float)) or number != number // 1:
         return None
@@ -69,7 +69,7 @@ def whole(given: Any) -> int | None:
 
 
 def sizes(name: str, given: Any, count: int) -> list[int]:
-    """A length in pixels for each of `count` cameras, from one for all or one for each. Raises InputError."""
+    """A length in pixels for each of `count` cameras, from one length or one per camera. Raises InputError."""
     each = [whole(size) for size in ([given] * count if np.ndim(given) == 0 else given)]
     lengths = [size for size in each if size is not None and 0 < size < 2**24]
     if not len(lengths) == len(each) == count:
@@ -89,8 +89,10 @@ def number(name: str, given: Any, least: float, most: float = np.inf) -> float:
 
 
 def degree(name: str, given: Any, highest: int, otherwise: str = "") -> int:
-    """A degree of spherical harmonics, 0 to `highest`; otherwise: what else may be given, in words. Raises
-    InputError."""
+    """A degree of spherical harmonics, 0 to `highest`. Raises InputError.
+
+    otherwise: other accepted values, as text for the error message.
+    """
     found = whole(given)
     if found is None or not 0 <= found <= highest:
         raise InputError(f"{name} is {given!r:.80}, expected 0 to {highest}{otherwise}")
@@ -98,13 +100,13 @@ def degree(name: str, given: Any, highest: int, otherwise: str = "") -> int:
 
 
 def choice(name: str, given: Any, choices: Sequence[str]) -> None:
-    """Raise InputError unless an argument is one of the choices."""
+    """Raise InputError unless the argument is one of the choices."""
     if given not in choices:
         raise InputError(f"{name} is {given!r:.80}, expected one of {', '.join(choices)}")
 
 
 def check_shape(name: str, found: Sequence[int], *shapes: Shape) -> None:
-    """Raise InputError unless the shape of an argument is one of these, in which a text stands for any size."""
+    """Raise InputError unless the argument has one of these shapes, where a string stands for any size."""
 
     def fits(shape: Shape) -> bool:
         pairs = zip(found, shape, strict=True)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colours of spherical harmonics, and their vector-Jacobian product."""
+"""Colours from spherical harmonics, and their vector-Jacobian product."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from clsplat.arrays import Float32
 from clsplat.device.buffers import from_host, hosted
@@ -14,22 +14,43 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.library import checks
 from clsplat.library.checks import floats, gradient
-from clsplat.library.session import Session, session_of
-from clsplat.stages.harmonics import HIGHEST, Harmonics, harmonics, harmonics_grad
+from clsplat.library.session import LibrarySession, session_of
+from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE, Harmonics, HarmonicsGradients, harmonics, harmonics_grad
 
 
 @dataclass(frozen=True, eq=False)
 class HarmonicColors:
-    """colors (..., 3), 0 where the mask is."""
+    """Colours from spherical harmonics.
+
+    Attributes
+    ----------
+    colors : (..., 3) float32
+        0 where the mask is False.
+    """
 
     colors: Float32
     _given: Harmonics
-    _session: Session
+    _session: LibrarySession
 
     def vjp(self, colors: ArrayLike) -> dict[str, Float32]:
-        """The vector-Jacobian product: gradients by `directions` (..., 3) and `coefficients` (..., K, 3), zero where
-        the mask is and for degrees that are not looked at; colors (..., 3): the gradient by the colours. Raises
-        InputError for another shape."""
+        """Compute the vector-Jacobian product.
+
+        Parameters
+        ----------
+        colors : (..., 3) array_like
+            Gradient of the loss with respect to `colors`.
+
+        Returns
+        -------
+        dict
+            float32 arrays: "directions" (..., 3) and "coefficients" (..., K, 3). Both are zero where the mask is False;
+            the second is also zero above the degree.
+
+        Raises
+        ------
+        InputError
+            If the gradient has another shape.
+        """
         values = gradient("colors", colors, self.colors.shape)
         if values is None:
             raise InputError("colors: expected the gradient by them")
@@ -38,8 +59,9 @@ class HarmonicColors:
             device = session.device
             by_directions, by_sh = hosted(device, given.directions.shape), hosted(device, given.sh.shape)
             d_colours = from_host(device, values.reshape(-1, 3))
-            unused = given.directions  # of a camera alone
-            harmonics_grad(device, session.scratch, given, unused, d_colours, by_sh.array, by_directions.array)
+            unused = given.directions  # only used for a camera
+            gradients = HarmonicsGradients(by_sh.array, by_directions.array)
+            harmonics_grad(device, session.scratch, given, unused, d_colours, gradients)
             batch = self.colors.shape[:-1]
             return {
                 "directions": np.asarray(by_directions.get(), np.float32).reshape(*batch, 3),
@@ -55,29 +77,46 @@ def spherical_harmonics(
     *,
     device: Device | str | None = None,
 ) -> HarmonicColors:
-    """Sum up real spherical harmonics in directions, by the conventions of gsplat's function of that name.
+    """Evaluate real spherical harmonics in given directions, with the conventions of gsplat's function of this name.
 
-    degree: the highest that is looked at, 0 to 4; directions (..., 3), of any length; in the direction of length 0
-    degree 0 counts alone. coefficients (..., K, 3), K at least (degree + 1)^2; masks (...): what is false has the
-    colour 0 and no gradient. The signs and the order of the basis are in docs/conventions.md; there is no 0.5 more.
-    Float32 arrays are read in place, and must not change before the last `vjp`.
+    Parameters
+    ----------
+    degree : int
+        Highest degree used, 0 to 4.
+    directions : (..., 3) array_like
+        Directions of any length. At length 0 only degree 0 is used.
+    coefficients : (..., K, 3) array_like
+        K is at least (degree + 1)^2.
+    masks : (...) array_like of bool, optional
+        Where it is False the colour is 0 and there is no gradient.
+    device : Device or str, optional
+        An open device, or a name as `clsplat devices` lists them.
 
-    Raises InputError, which names the argument, for wrong shapes, degrees and numbers that are not finite, DeviceError
-    for a device that is not there.
+    Returns
+    -------
+    HarmonicColors
+        The colours. No 0.5 is added to them.
+
+    Raises
+    ------
+    InputError
+        If a shape or degree is wrong, or numbers are not finite; it names the argument.
+    DeviceError
+        If there is no such device.
+
+    Notes
+    -----
+    Signs and order of the basis are in docs/conventions.md. float32 arrays are read in place, and must not change
+    before the last `vjp`.
     """
     batch = np.shape(directions)[:-1]
     given = floats("directions", directions, (*batch, 3))
-    degree = checks.degree("degree", degree, HIGHEST)
+    degree = checks.degree("degree", degree, MAX_SH_BASIS_DEGREE)
     sh = floats("coefficients", coefficients, (*batch, "K", 3))
     used = (degree + 1) ** 2
     if sh.shape[-2] < used:
         raise InputError(f"coefficients: got {sh.shape[-2]} of them, expected {used} or more for degree {degree}")
-    mask = None
-    if masks is not None:
-        shown = np.asarray(masks)
-        if shown.shape != batch:
-            raise InputError(f"masks: got shape {shown.shape}, expected {batch}")
-        mask = np.ascontiguousarray(shown.reshape(-1) != 0, np.int32)
+    mask = None if masks is None else _mask(masks, batch)
     session = session_of(device)
     with session.lock:
         inputs = Harmonics(
@@ -89,3 +128,11 @@ def spherical_harmonics(
         colours = hosted(session.device, inputs.directions.shape)
         harmonics(session.device, inputs, colours.array)
         return HarmonicColors(np.asarray(colours.get(), np.float32).reshape(*batch, 3), inputs, session)
+
+
+def _mask(masks: ArrayLike, batch: tuple[int, ...]) -> NDArray[np.int32]:
+    """1 where a colour is wanted, flat. Raises InputError."""
+    shown = np.asarray(masks)
+    if shown.shape != batch:
+        raise InputError(f"masks: got shape {shown.shape}, expected {batch}")
+    return np.ascontiguousarray(shown.reshape(-1) != 0, np.int32)

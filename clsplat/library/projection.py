@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,90 +15,105 @@ from clsplat.device.buffers import DeviceArray, Hosted, from_host, hosted
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.library.checks import choice, floats, gradient, matrices, number, sizes
-from clsplat.library.session import Session, session_of
+from clsplat.library.session import LibrarySession, session_of
 from clsplat.stages.ewa import (
-    MODELS,
+    EWA_CAMERA_MODELS,
     Ewa,
     EwaCamera,
     EwaGradients,
+    EwaImageGradients,
     EwaInputs,
+    PlacedEwaCamera,
     camera_gradients,
     ewa,
-    ewa_array,
     ewa_grad,
 )
 
-_GIVEN = {"means2d": 2, "depths": None, "conics": 3, "compensations": None}
-"""Outputs that have gradients, and how many numbers each is."""
+_PROJECTED_ARRAY_WIDTHS = {"means2d": 2, "depths": None, "conics": 3, "compensations": None}
+"""Outputs that have gradients, and the numbers per Gaussian of each; None for a scalar."""
 
 
 class ProjectedView:
-    """Gaussians on the image of one camera, with all that the gradient needs, until it is dropped.
+    """Gaussians projected to one camera's image. It keeps the device memory for its gradient until it is dropped.
 
-    gaussians: on the session's device; they must not change before the last `gradient`. `arrays` has the results on the
-    device. Calls have to hold the session's lock.
+    gaussians: arrays on the session's device, which must not change before the last `gradient`.
+
+    `arrays` has the results on the device. Callers hold the session's lock.
     """
 
-    def __init__(self, session: Session, gaussians: EwaInputs, camera: EwaCamera, *, compensated: bool = False) -> None:
+    def __init__(
+        self, session: LibrarySession, gaussians: EwaInputs, camera: EwaCamera, *, compensated: bool = False
+    ) -> None:
         device, n = session.device, gaussians.count
-        self._session, self._gaussians, self.camera = session, gaussians, camera
-        self._hosted: dict[str, Hosted] = {
-            "radii": hosted(device, (n, 2), np.int32),
-            "means2d": hosted(device, (n, 2)),
-            "depths": hosted(device, (n,)),
-            "conics": hosted(device, (n, 3)),
-            **({"compensations": hosted(device, (n,))} if compensated else {}),
-        }
-        self.arrays = Ewa(**{name: array.array for name, array in self._hosted.items()})
-        self._camera_array = ewa_array(device, camera)
-        ewa(device, gaussians, camera, self._camera_array, self.arrays)
+        self._session, self._gaussians, self._camera = session, gaussians, PlacedEwaCamera.on(device, camera)
+        radii, means2d = hosted(device, (n, 2), np.int32), hosted(device, (n, 2))
+        depths, conics = hosted(device, (n,)), hosted(device, (n, 3))
+        self._hosted = {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics}
+        self.arrays = Ewa(radii.array, means2d.array, depths.array, conics.array)
+        if compensated:
+            compensations = self._hosted["compensations"] = hosted(device, (n,))
+            self.arrays = replace(self.arrays, compensations=compensations.array)
+        ewa(device, gaussians, self._camera, self.arrays)
 
     def get(self, name: str) -> NDArray[Any]:
-        """One of the results on the host, by its name in `Ewa`: the same memory each time. Waits for the device."""
+        """One of the results on the host, by its name in `Ewa`; the same memory each time. Waits for the device."""
         return self._hosted[name].get()
 
     def gradient(
-        self, gradients: EwaGradients, *, add: bool = False, by_camera: bool = False, **given: DeviceArray | None
+        self, given: EwaImageGradients, gradients: EwaGradients, *, add: bool = False, by_camera: bool = False
     ) -> DeviceArray | None:
-        """Fill `gradients` as `stages.ewa.ewa_grad` does, from those that are given by means2d, depths, conics and
-        compensations; by_camera: the result is that by the camera (16,)."""
-        return ewa_grad(
-            self._session.device,
-            self._session.scratch,
-            self._gaussians,
-            self.camera,
-            self._camera_array,
-            self.arrays,
-            gradients,
-            add=add,
-            by_camera=by_camera,
-            **given,
-        )
+        """Fill `gradients` like `stages.ewa.ewa_grad`.
+
+        by_camera: also return the gradient of the camera (16,).
+        """
+        session, view = self._session, (self._gaussians, self._camera, self.arrays)
+        return ewa_grad(session.device, session.scratch, *view, given, gradients, add=add, by_camera=by_camera)
+
+
+def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradients:
+    """Gradients on the device, from arrays on the host by their names in `Ewa`."""
+
+    def at(name: str) -> DeviceArray | None:
+        return from_host(device, by[name]) if name in by else None
+
+    return EwaImageGradients(at("means2d"), at("depths"), at("conics"), at("compensations"))
 
 
 class HostedGradients(NamedTuple):
-    """Gradients by Gaussians: arrays for `EwaGradients`, and what they are on the host by the names of arguments."""
+    """Gradients of Gaussians: device arrays for `EwaGradients`, and their host copies by argument names."""
 
     arrays: EwaGradients
     hosted: dict[str, Hosted]
 
 
 def hosted_gradients(device: Device, count: int, *, covariances: bool) -> HostedGradients:
-    """Room for gradients by `count` Gaussians."""
-    shapes: dict[str, tuple[int, ...]] = {"means": (count, 3)}
-    shapes |= {"covars": (count, 6)} if covariances else {"quaternions": (count, 4), "scales": (count, 3)}
-    room = {name: hosted(device, shape) for name, shape in shapes.items()}
-    names = {"covars": "covariances"}
-    return HostedGradients(EwaGradients(**{names.get(name, name): each.array for name, each in room.items()}), room)
+    """Allocate gradients of `count` Gaussians."""
+    means = hosted(device, (count, 3))
+    if covariances:
+        covars = hosted(device, (count, 6))
+        arrays = EwaGradients(means.array, covariances=covars.array)
+        return HostedGradients(arrays, {"means": means, "covars": covars})
+    quaternions, scales = hosted(device, (count, 4)), hosted(device, (count, 3))
+    arrays = EwaGradients(means.array, quaternions.array, scales.array)
+    return HostedGradients(arrays, {"means": means, "quaternions": quaternions, "scales": scales})
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """N Gaussians on the images of C cameras.
+    """N Gaussians projected to the images of C cameras. The rows of culled Gaussians are zero.
 
-    radii (C, N, 2) int32: whole pixels, 0 where culled; means2d (C, N, 2): pixels, the first one's middle at 0.5;
-    depths (C, N): z in the camera, world units; conics (C, N, 3): a, b, c of the inverse covariance, 1 / px^2;
-    compensations (C, N), 0 to 1, or None. Rows of what is culled are zero.
+    Attributes
+    ----------
+    radii : (C, N, 2) int32
+        Half sides of the bounding box, whole pixels; 0 if culled.
+    means2d : (C, N, 2) float32
+        Pixels; the first pixel's centre is at 0.5.
+    depths : (C, N) float32
+        z in the camera, world units.
+    conics : (C, N, 3) float32
+        a, b, c of the inverse covariance, 1 / px^2.
+    compensations : (C, N) float32 or None
+        Opacity factors for the low-pass filter, 0 to 1.
     """
 
     radii: NDArray[np.int32]
@@ -107,9 +122,9 @@ class Projection:
     conics: Float32
     compensations: Float32 | None
     _views: list[ProjectedView]
-    _session: Session
+    _session: LibrarySession
     _covariances: str
-    """The shape that they were given in: empty, "upper" or "full"."""
+    """Layout of the given covariances: empty for none, "upper" or "full"."""
 
     def vjp(
         self,
@@ -118,14 +133,26 @@ class Projection:
         conics: ArrayLike | None = None,
         compensations: ArrayLike | None = None,
     ) -> dict[str, Float32]:
-        """The vector-Jacobian product: gradients by `means` (N, 3), `quaternions` (N, 4) and `scales` (N, 3), or
-        `covars` in the shape that they were given in, `viewmats` (C, 4, 4), of any of their first three rows' numbers,
-        and `intrinsics` (C, 3, 3), of fx, fy, cx and cy.
+        """Compute the vector-Jacobian product.
 
-        The arguments are gradients by the outputs, of their shapes, and None is 0; by b of a conic as the one number
-        that it is. Of covars (N, 6) an off-diagonal number has the gradient of both its places; of (N, 3, 3) each
-        place its own, half of that. What is culled has no gradient. Raises InputError for another shape, and for
-        compensations that were not asked for.
+        Parameters
+        ----------
+        means2d, depths, conics, compensations : array_like, optional
+            Gradients of the loss with respect to the outputs, of the outputs' shapes. None means 0. The b of a conic
+            counts as one number.
+
+        Returns
+        -------
+        dict
+            float32 gradients by argument name: "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in
+            the given shape. Also "viewmats" (C, 4, 4), each number of the first three rows taken as free, and
+            "intrinsics" (C, 3, 3), of fx, fy, cx and cy. Culled Gaussians have no gradient. An off-diagonal number of
+            covars (N, 6) has the gradient of both its places; in (N, 3, 3) each place has half of it.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, or compensations are given that `calc_compensations` did not ask for.
         """
         values = {"means2d": means2d, "depths": depths, "conics": conics, "compensations": compensations}
         if compensations is not None and self.compensations is None:
@@ -133,7 +160,7 @@ class Projection:
         shape = self.depths.shape
         arrays = {
             name: array
-            for name, width in _GIVEN.items()
+            for name, width in _PROJECTED_ARRAY_WIDTHS.items()
             if (array := gradient(name, values[name], (*shape, width) if width else shape)) is not None
         }
         session, device = self._session, self._session.device
@@ -143,8 +170,8 @@ class Projection:
             for unseen in room.arrays.arrays if not self._views else ():
                 unseen.fill(0.0)
             for index, view in enumerate(self._views):
-                given = {name: from_host(device, array[index]) for name, array in arrays.items()}
-                by_camera = view.gradient(room.arrays, add=index > 0, by_camera=True, **given)
+                given = image_gradients(device, {name: array[index] for name, array in arrays.items()})
+                by_camera = view.gradient(given, room.arrays, add=index > 0, by_camera=True)
                 assert by_camera is not None
                 by_viewmat, by_intrinsics = camera_gradients(by_camera.get())
                 viewmats.append(by_viewmat)
@@ -176,41 +203,66 @@ def fully_fused_projection(
     opacities: ArrayLike | None = None,
     device: Device | str | None = None,
 ) -> Projection:
-    """Project Gaussians to the images of C cameras, by the conventions of gsplat's function of that name.
+    """Project Gaussians to the images of C cameras, with the conventions of gsplat's function of this name.
 
-    means (N, 3): world units. Either quaternions (N, 4), w x y z, of any length but 0, and scales (N, 3), which are
-    standard deviations in world units, or covars (N, 6), upper triangles xx, xy, xz, yy, yz, zz, or (N, 3, 3); the
-    others are None. viewmats (C, 4, 4) or (4, 4): camera from world; intrinsics (C, 3, 3) or (3, 3): pixels, a skew
-    is not looked at; width, height: pixels. eps2d: px^2, added to the diagonal of each projected covariance;
-    near_plane, far_plane: world units; radius_clip: pixels, what has no larger radius is culled; calc_compensations:
-    also the square root of the covariance's determinant without eps2d over that with it; camera_model: pinhole, ortho
-    or fisheye (equidistant); opacities (N,), 0 to 1: with them radii end where alpha is 1/255, and what is fainter is
-    culled.
-    Float32 arrays are read in place, and must not change before the last `vjp`.
+    Parameters
+    ----------
+    means : (N, 3) array_like
+        World units.
+    covars : (N, 6) or (N, 3, 3) array_like or None
+        Covariances: upper triangles xx, xy, xz, yy, yz, zz, or matrices. None if quaternions and scales are given.
+    quaternions : (N, 4) array_like or None
+        w, x, y, z, of any length but 0. None if covars are given.
+    scales : (N, 3) array_like or None
+        Standard deviations, world units. None if covars are given.
+    viewmats : (C, 4, 4) or (4, 4) array_like
+        Camera from world.
+    intrinsics : (C, 3, 3) or (3, 3) array_like
+        Pixels. Skew is ignored.
+    width, height : int
+        Image size, pixels.
+    eps2d : float
+        Added to the diagonal of each projected covariance, px^2.
+    near_plane, far_plane : float
+        World units.
+    radius_clip : float
+        Gaussians whose radii are not larger are culled, pixels.
+    calc_compensations : bool
+        Also compute sqrt(det(covariance without eps2d) / det(covariance with eps2d)).
+    camera_model : str
+        "pinhole", "ortho" or "fisheye" (equidistant).
+    opacities : (N,) array_like, optional
+        0 to 1. With them the radii end where alpha is 1/255, and fainter Gaussians are culled.
+    device : Device or str, optional
+        An open device, or a name as `clsplat devices` lists them.
 
-    Raises InputError, which names the argument, for wrong shapes and numbers that are not finite, DeviceError for a
-    device that is not there. Zwicker et al., EWA splatting, 2002; docs/gradients.md, section 22.
+    Returns
+    -------
+    Projection
+        The projected Gaussians, with their `vjp`.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong or numbers are not finite; it names the argument.
+    DeviceError
+        If there is no such device.
+
+    Notes
+    -----
+    Zwicker et al., EWA splatting, 2002; docs/gradients.md, section 22. float32 arrays are read in place, and must not
+    change before the last `vjp`.
     """
     given_means = floats("means", means, ("N", 3))
     count = len(given_means)
-    cameras = checked_cameras(
-        viewmats,
-        intrinsics,
-        width,
-        height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        eps2d=eps2d,
-        radius_clip=radius_clip,
-        camera_model=camera_model,
-    )
-    shapes, covariances = checked_shapes(count, covars, quaternions, scales)
-    if opacities is not None:
-        shapes["opacities"] = floats("opacities", opacities, (count,))
+    planes = checked_planes(near_plane, far_plane, eps2d, radius_clip, camera_model)
+    cameras = checked_cameras(viewmats, intrinsics, width, height, planes)
+    shapes = GivenShapes.checked(count, covars, quaternions, scales)
+    covers = None if opacities is None else floats("opacities", opacities, (count,))
     session = session_of(device)
     with session.lock:
-        arrays = {name: from_host(session.device, array) for name, array in {"means": given_means, **shapes}.items()}
-        inputs = EwaInputs(**arrays)
+        placed = from_host(session.device, given_means)
+        inputs = shapes.inputs(placed, None if covers is None else from_host(session.device, covers))
         views = [ProjectedView(session, inputs, camera, compensated=calc_compensations) for camera in cameras]
 
         def of_all(name: str, *width: int) -> NDArray[Any]:
@@ -225,7 +277,7 @@ def fully_fused_projection(
             of_all("compensations") if calc_compensations else None,
             views,
             session,
-            covariances,
+            shapes.covariance_layout,
         )
 
 
@@ -234,16 +286,13 @@ def checked_cameras(
     intrinsics: ArrayLike,
     width: int | Sequence[int],
     height: int | Sequence[int],
-    *,
-    near_plane: float,
-    far_plane: float,
-    eps2d: float,
-    radius_clip: float,
-    camera_model: str,
+    planes: CameraPlanes,
 ) -> list[EwaCamera]:
-    """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or of one of each, (4, 4) and (3, 3); width, height:
-    pixels of all cameras or of each. Raises InputError, which names the argument."""
-    planes = checked_planes(near_plane, far_plane, eps2d, radius_clip, camera_model)
+    """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or of one (4, 4) and one (3, 3).
+
+    width, height: pixels, of all cameras or one number per camera.
+    Raises InputError, which names the argument.
+    """
     poses = matrices("viewmats", viewmats, 4, "C")
     count = len(poses)
     lenses = matrices("intrinsics", intrinsics, 3, count)
@@ -252,23 +301,34 @@ def checked_cameras(
     if not (lenses[:, [0, 1], [0, 1]] != 0).all():
         raise InputError("intrinsics: a focal length is 0, expected those of a camera")
     listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
-    return [EwaCamera(*camera, *planes, camera_model) for camera in listed]
+    return [EwaCamera(pose, lens, across, down, *planes) for pose, lens, across, down in listed]
+
+
+class CameraPlanes(NamedTuple):
+    """Settings that all cameras of a call share, in the order of `EwaCamera`."""
+
+    near: float
+    far: float
+    eps2d: float
+    radius_clip: float
+    model: str
 
 
 def checked_planes(
     near_plane: float, far_plane: float, eps2d: float, radius_clip: float, camera_model: str
-) -> tuple[float, float, float, float]:
-    """Settings of `EwaCamera`, but for the model. Raises InputError, which names the argument."""
-    choice("camera_model", camera_model, tuple(MODELS))
+) -> CameraPlanes:
+    """The settings of all cameras. Raises InputError, which names the argument."""
+    choice("camera_model", camera_model, EWA_CAMERA_MODELS)
     near, far = number("near_plane", near_plane, -np.inf), number("far_plane", far_plane, -np.inf)
     if not near < far:
         raise InputError(f"near_plane is {near_plane} and far_plane {far_plane}, expected the second to be larger")
     most = float(np.finfo(np.float32).max)
-    return near, far, number("eps2d", eps2d, 0.0, most), number("radius_clip", radius_clip, 0.0, most)
+    low_pass, clip = number("eps2d", eps2d, 0.0, most), number("radius_clip", radius_clip, 0.0, most)
+    return CameraPlanes(near, far, low_pass, clip, camera_model)
 
 
 def check_given(covars: object, quaternions: object, scales: object) -> None:
-    """Raise InputError, which names the argument, unless there are covars or the other two, and None for the rest."""
+    """Raise InputError unless there are either covars, or quaternions and scales. It names the argument."""
     if covars is None and (quaternions is None or scales is None):
         missing = "quaternions" if quaternions is None else "scales"
         raise InputError(f"{missing} is None, expected an array, as covars is None too")
@@ -276,35 +336,55 @@ def check_given(covars: object, quaternions: object, scales: object) -> None:
         raise InputError("covars: expected either these, or quaternions and scales")
 
 
-def checked_shapes(
-    count: int, covars: ArrayLike | None, quaternions: ArrayLike | None, scales: ArrayLike | None
-) -> tuple[dict[str, Float32], str]:
-    """Arrays of `EwaInputs` for what shape the Gaussians have, and of covars "upper" or "full", how they were given;
-    empty of quaternions and scales. Raises InputError, which names the argument."""
-    check_given(covars, quaternions, scales)
-    if quaternions is not None and scales is not None:
-        return {
-            "quaternions": floats("quaternions", quaternions, (count, 4)),
-            "scales": floats("scales", scales, (count, 3)),
-        }, ""
-    assert covars is not None, "check_given"
-    given = floats("covars", covars, (count, 6), (count, 3, 3))
-    if given.ndim == 2:
-        return {"covariances": given}, "upper"
-    flat = given.reshape(count, 9)
-    upper = 0.5 * (flat[:, [0, 1, 2, 4, 5, 8]] + flat[:, [0, 3, 6, 4, 7, 8]])
-    return {"covariances": np.ascontiguousarray(upper, np.float32)}, "full"
+@dataclass(frozen=True, eq=False)
+class GivenShapes:
+    """The checked shapes of n Gaussians: quaternions (n, 4) and scales (n, 3), or covariances (n, 6).
+
+    covariance_layout: of the caller's covariances, "upper" for (n, 6) or "full" for (n, 3, 3); empty for none.
+    """
+
+    quaternions: Float32 | None = None
+    scales: Float32 | None = None
+    covariances: Float32 | None = None
+    covariance_layout: str = ""
+
+    @classmethod
+    def checked(
+        cls, count: int, covars: ArrayLike | None, quaternions: ArrayLike | None, scales: ArrayLike | None
+    ) -> GivenShapes:
+        """Check the arguments of a call. Raises InputError, which names the argument."""
+        check_given(covars, quaternions, scales)
+        if quaternions is not None and scales is not None:
+            turns = floats("quaternions", quaternions, (count, 4))
+            return cls(turns, floats("scales", scales, (count, 3)))
+        assert covars is not None, "check_given"
+        given = floats("covars", covars, (count, 6), (count, 3, 3))
+        if given.ndim == 2:
+            return cls(covariances=given, covariance_layout="upper")
+        flat = given.reshape(count, 9)
+        upper = 0.5 * (flat[:, [0, 1, 2, 4, 5, 8]] + flat[:, [0, 3, 6, 4, 7, 8]])
+        return cls(covariances=np.ascontiguousarray(upper, np.float32), covariance_layout="full")
+
+    def inputs(self, means: DeviceArray, opacities: DeviceArray | None) -> EwaInputs:
+        """The Gaussians on the device of the means."""
+        quaternions, scales, covariances = (
+            None if array is None else from_host(means.device, array)
+            for array in (self.quaternions, self.scales, self.covariances)
+        )
+        return EwaInputs(means, quaternions, scales, covariances, opacities)
 
 
 def full_gradient(upper: Float32) -> Float32:
-    """Gradients by the nine numbers of matrices from those by their upper triangles."""
+    """Gradients of the nine numbers of each matrix, from the gradients of the upper triangles."""
     halves = upper * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
     return np.asarray(halves[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), np.float32)
 
 
 def stacked(arrays: list[NDArray[Any]], each: NDArray[Any] | None = None) -> NDArray[Any]:
-    """One array of those of all cameras, of one camera its own memory; `each` is one like them where there may be no
-    camera."""
+    """The arrays of all cameras in one. A single camera's array is not copied.
+
+    each: an array of the same shape and dtype, for calls that may have no camera.
+    """
     if len(arrays) == 1:
         return arrays[0][None]
     return np.stack(arrays) if arrays or each is None else np.zeros((0, *each.shape), each.dtype)

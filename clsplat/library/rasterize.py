@@ -13,43 +13,71 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.arrays import Float32
 from clsplat.device.context import Device
 from clsplat.errors import InputError
+from clsplat.library.camera_pass import CameraPass, Given, Gradients, PassSettings, ViewGradients
 from clsplat.library.checks import choice, floats, gradient, number
-from clsplat.library.projection import checked_cameras, stacked
+from clsplat.library.projection import checked_cameras, checked_planes, stacked
 from clsplat.library.session import session_of
-from clsplat.library.view import Given, Gradients, View
-from clsplat.rendering.build_flags import ALPHA_MAX
+from clsplat.rendering.build_flags import DEFAULT_ALPHA_MAX
 
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-"""Colour, depth, expected depth, and both: depth is the last channel."""
-RASTERIZE_MODES = ("classic", "antialiased")
+RASTERIZE_RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+"""Colour, depth, expected depth, and colour with each of them. The depth is the last channel."""
+RASTERIZE_FILTER_MODES = ("classic", "antialiased")
 
 
 class Rasterization:
-    """Images of C cameras, and what belongs to them, on the host; its arrays wait for the device when they are first
-    looked at. It holds device memory, for the vector-Jacobian products, until it is dropped."""
+    """Images of C cameras, and the projected Gaussians, on the host.
 
-    def __init__(self, views: Sequence[View], given: Given, device: Device) -> None:
+    The first access to an array waits for the device. The object holds device memory for the vector-Jacobian products
+    until it is dropped. An array's rows of Gaussians that are not visible are 0.
+
+    Attributes
+    ----------
+    images : (C, H, W, X) float32
+        Colours over the background, then the depth in world units. A list of (H, W, X) if the cameras' sizes differ.
+    alphas : (C, H, W, 1) float32
+        0 to 1, or a list like `images`.
+    radii : (C, N, 2) int32
+        Half sides of a Gaussian's bounding box, pixels.
+    means2d : (C, N, 2) float32
+        Pixels; the first pixel's centre is at 0.5.
+    depths : (C, N) float32
+        World units along the camera's axis.
+    conics : (C, N, 3) float32
+        a, b, c of the inverse 2D covariance, 1 / px^2.
+    opacities : (C, N) float32
+        0 to 1; with rasterize_mode "antialiased" compensated for the low-pass filter.
+    colors2d : (C, N, D) float32
+        The blended values without the depth.
+    tile_counts : (C, N) int32
+        Number of 16 x 16 pixel tiles that a Gaussian's ellipse reaches.
+    """
+
+    def __init__(self, views: Sequence[CameraPass], given: Given, device: Device) -> None:
         self._views, self._given, self._device = views, given, device
 
     @cached_property
     def images(self) -> Float32 | list[Float32]:
-        """(C, H, W, X) float32: colours over the background, the depth behind them, in world units; a list of (H, W, X)
-        where cameras have several sizes."""
+        """(C, H, W, X) float32: colours over the background, then the depth in world units.
+
+        A list of (H, W, X) if the cameras' sizes differ.
+        """
         return self._of_pixels(lambda view: view.image)
 
     @cached_property
     def alphas(self) -> Float32 | list[Float32]:
-        """(C, H, W, 1) float32, 0 to 1, or a list as of `images`."""
+        """(C, H, W, 1) float32, 0 to 1, or a list like `images`."""
         return self._of_pixels(lambda view: view.alpha[:, :, None])
 
     @cached_property
     def radii(self) -> NDArray[np.int32]:
-        """(C, N, 2) int32: half sides in pixels of the box that a Gaussian is in, 0 where it is not seen."""
+        """(C, N, 2) int32: half sides of a Gaussian's bounding box in pixels, 0 if it is not visible."""
         return stacked([view.splats("radii") for view in self._views])
 
     @cached_property
     def means2d(self) -> Float32:
-        """(C, N, 2) float32: pixels, the first pixel's middle at 0.5; 0 where not seen, as all that follows."""
+        """(C, N, 2) float32: pixels; the first pixel's centre is at 0.5. This and the arrays below are 0 where not
+        visible.
+        """
         return stacked([view.splats("means2d") for view in self._views])
 
     @cached_property
@@ -59,34 +87,54 @@ class Rasterization:
 
     @cached_property
     def conics(self) -> Float32:
-        """(C, N, 3) float32: a, b, c of the inverse covariance on the image, per squared pixel."""
+        """(C, N, 3) float32: a, b, c of the inverse covariance on the image, 1 / px^2."""
         return stacked([view.splats("conics") for view in self._views])
 
     @cached_property
     def opacities(self) -> Float32:
-        """(C, N) float32: opacities on the image; with rasterize_mode "antialiased" compensated for the low-pass."""
+        """(C, N) float32: blended opacities; with rasterize_mode "antialiased" compensated for the low-pass filter."""
         return stacked([view.opacities for view in self._views])
 
     @cached_property
     def colors2d(self) -> Float32:
-        """(C, N, D) float32: the values that are blended, but for the depth."""
+        """(C, N, D) float32: the blended values without the depth."""
         colors = stacked([view.colors for view in self._views])
         return colors.copy() if np.may_share_memory(colors, self._given.colors) else colors
 
     @cached_property
     def tile_counts(self) -> NDArray[np.int32]:
-        """(C, N) int32: tiles of 16 x 16 pixels that a Gaussian's ellipse reaches."""
+        """(C, N) int32: number of 16 x 16 pixel tiles that a Gaussian's ellipse reaches."""
         return stacked([view.pixels.tile_counts for view in self._views])
 
     def vjp_pixels(
         self, d_images: ArrayLike | Sequence[ArrayLike], d_alphas: ArrayLike | Sequence[ArrayLike] | None = None
     ) -> dict[str, Float32]:
-        """The loss's gradients by what is blended, from those by `images` and `alphas`, of the same shapes.
+        """Compute gradients of the blended values from gradients of the images.
 
-        means2d (C, N, 2), conics (C, N, 3), of b as one number; opacities (C, N), the compensated ones; colors2d
-        (C, N, D); depths (C, N) where images have depth; backgrounds (C, D) where they were given; absolute (C, N, 2)
-        where absolute_gradients was: sums over pixels of absolute gradients by means2d (AbsGS, Ye et al. 2024).
-        Numbers that are not finite pass, to what they have a part in. Raises InputError for other shapes.
+        Parameters
+        ----------
+        d_images : (C, H, W, X) array_like, or a sequence of (H, W, X)
+            Gradient of the loss with respect to `images`.
+        d_alphas : (C, H, W, 1) array_like, or a sequence of (H, W, 1), optional
+            Gradient with respect to `alphas`. None means 0.
+
+        Returns
+        -------
+        dict
+            float32 gradients: "means2d" (C, N, 2); "conics" (C, N, 3), b as one number; "opacities" (C, N), of the
+            compensated ones. Also "colors2d" (C, N, D); "depths" (C, N) if the images have depth; "backgrounds" (C, D)
+            if they were given. Also "absolute" (C, N, 2) with `absolute_gradients`: sums over pixels of absolute
+            gradients of means2d.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong.
+
+        Notes
+        -----
+        NaN and infinite numbers propagate to the results that depend on them. Absolute gradients: AbsGS, Ye et al.
+        2024.
         """
         by_alphas = [None] * len(self._views) if d_alphas is None else self._each("d_alphas", d_alphas)
         pairs = zip(self._views, self._each("d_images", d_images), by_alphas, strict=True)
@@ -103,11 +151,26 @@ class Rasterization:
         depths: ArrayLike | None = None,
         cameras: bool = True,
     ) -> dict[str, Any]:
-        """The loss's gradients by the arguments of `rasterize`, from those of `vjp_pixels`; any may be missing.
+        """Compute gradients of the arguments of `rasterize` from the gradients that `vjp_pixels` returns.
 
-        means (N, 3), quaternions (N, 4), scales (N, 3) or in their place covars as given, opacities (N,), colors in
-        the given shape; and, with `cameras`, float64 viewmats (C, 4, 4) and intrinsics (C, 3, 3), all numbers of the
-        first three rows and fx, fy, cx, cy taken as free. Raises InputError for other shapes.
+        Parameters
+        ----------
+        means2d, conics, opacities, colors2d, depths : array_like, optional
+            Gradients as `vjp_pixels` returns them. None means 0.
+        cameras : bool
+            Also compute gradients of the view matrices and intrinsics.
+
+        Returns
+        -------
+        dict
+            "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in the given shape; "opacities" (N,);
+            "colors" in the given shape, all float32. With `cameras` also float64 "viewmats" (C, 4, 4), each number of
+            the first three rows taken as free, and "intrinsics" (C, 3, 3), of fx, fy, cx and cy.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong.
         """
         given, count, n = self._given, len(self._views), self._given.count
         shapes: dict[str, tuple[Any, tuple[int, ...]]] = {
@@ -121,7 +184,9 @@ class Rasterization:
         taken = {name: array for name, array in each.items() if array is not None}
         gradients = Gradients(given, self._device)
         for index, view in enumerate(self._views):
-            view.add_gradients(gradients, {name: array[index] for name, array in taken.items()}, cameras=cameras)
+            on_image = {name: array[index] for name, array in taken.items()}
+            by_opacity, by_colour = on_image.pop("opacities", None), on_image.pop("colors2d", None)
+            view.add_gradients(gradients, ViewGradients(on_image, by_opacity, by_colour), cameras=cameras)
         return gradients.by_name(cameras=cameras)
 
     def vjp(
@@ -131,13 +196,37 @@ class Rasterization:
         *,
         cameras: bool = True,
     ) -> dict[str, Any]:
-        """`vjp_pixels` and from there `vjp_projection`: gradients by all arguments of `rasterize`, and by the
-        backgrounds where they were given."""
-        found = self.vjp_pixels(d_images, d_alphas)
-        others: dict[str, Any] = {name: found.pop(name) for name in ("backgrounds", "absolute") if name in found}
-        return {**self.vjp_projection(**found, cameras=cameras), **others}
+        """Compute gradients of all arguments of `rasterize`: `vjp_pixels`, then `vjp_projection`.
 
-    def _of_pixels(self, part: Callable[[View], Float32]) -> Float32 | list[Float32]:
+        Parameters
+        ----------
+        d_images, d_alphas
+            Gradients with respect to `images` and `alphas`, as for `vjp_pixels`.
+        cameras : bool
+            Also compute gradients of the view matrices and intrinsics.
+
+        Returns
+        -------
+        dict
+            The result of `vjp_projection`, with "backgrounds" and "absolute" of `vjp_pixels` where it has them.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong.
+        """
+        found = self.vjp_pixels(d_images, d_alphas)
+        result = self.vjp_projection(
+            means2d=found["means2d"],
+            conics=found["conics"],
+            opacities=found["opacities"],
+            colors2d=found["colors2d"],
+            depths=found.get("depths"),
+            cameras=cameras,
+        )
+        return result | {name: found[name] for name in ("backgrounds", "absolute") if name in found}
+
+    def _of_pixels(self, part: Callable[[CameraPass], Float32]) -> Float32 | list[Float32]:
         arrays = [part(view) for view in self._views]
         return stacked(arrays) if len({array.shape for array in arrays}) == 1 else arrays
 
@@ -170,79 +259,108 @@ def rasterize(
     rasterize_mode: str = "classic",
     camera_model: str = "pinhole",
     covars: ArrayLike | None = None,
-    alpha_max: float = ALPHA_MAX,
+    alpha_max: float = DEFAULT_ALPHA_MAX,
     absolute_gradients: bool = False,
     differentiable: bool = True,
     device: Device | str | None = None,
 ) -> Rasterization:
-    """Images of N Gaussians as C cameras see them (Kerbl et al. 2023; gsplat's conventions, docs/library.md).
+    """Render N Gaussians to images of C cameras.
 
-    means (N, 3): world units. quaternions (N, 4): w x y z, of any length but 0. scales (N, 3): standard deviations,
-    world units. opacities (N,): 0 to 1. colors: (N, D) or (C, N, D), D of at least 1, or with sh_degree SH coefficients
-    (N, K, 3) or (C, N, K, 3), of which (sh_degree + 1)^2 count. viewmats (C, 4, 4) or (4, 4): camera from world.
-    intrinsics (C, 3, 3) or (3, 3): pixels. width, height: pixels, of all cameras or of each. Arrays of float32 are read
-    in place where the device shares the host's memory, and must not change before the last gradient; others are
-    converted to it.
+    Parameters
+    ----------
+    means : (N, 3) array_like
+        World units.
+    quaternions : (N, 4) array_like or None
+        w, x, y, z, of any length but 0. None if covars are given.
+    scales : (N, 3) array_like or None
+        Standard deviations, world units. None if covars are given.
+    opacities : (N,) array_like
+        0 to 1.
+    colors : (N, D) or (C, N, D) array_like
+        D at least 1. With sh_degree, SH coefficients (N, K, 3) or (C, N, K, 3); the first (sh_degree + 1)^2 are used.
+    viewmats : (C, 4, 4) or (4, 4) array_like
+        Camera from world.
+    intrinsics : (C, 3, 3) or (3, 3) array_like
+        Pixels.
+    width, height : int or sequence of int
+        Pixels, of all cameras or one number per camera.
+    near_plane, far_plane : float
+        World units.
+    radius_clip : float
+        Gaussians whose radii are not larger are not drawn, pixels.
+    eps2d : float
+        Low-pass filter: added to both variances on the image, px^2.
+    sh_degree : int, optional
+        Degree of the spherical harmonics, 0 to 4. None if colors are not SH coefficients.
+    backgrounds : (C, D) or (D,) array_like, optional
+        Black if None.
+    render_mode : str
+        "RGB", "D" (depth), "ED" (expected depth), "RGB+D" or "RGB+ED". Depths are along the camera's axis, world units.
+    rasterize_mode : str
+        "classic", or "antialiased": lower opacities to compensate for eps2d.
+    camera_model : str
+        "pinhole", "ortho" or "fisheye".
+    covars : (N, 3, 3) or (N, 6) array_like, optional
+        Symmetric covariances, or xx, xy, xz, yy, yz, zz, instead of quaternions and scales.
+    alpha_max : float
+        The cap of a Gaussian's alpha.
+    absolute_gradients : bool
+        Also compute sums of the absolute gradients of means2d.
+    differentiable : bool
+        False if only images are wanted, which takes less time and memory. A gradient is still possible: slower, with
+        the same bits.
+    device : Device or str, optional
+        An open device, or a name as `clsplat devices` lists them.
 
-    near_plane, far_plane: world units. radius_clip: pixels, up to which a Gaussian's radii are too small to be seen.
-    eps2d: px^2, added to both variances on the image. backgrounds (C, D) or (D,): black if None. render_mode: one of
-    RENDER_MODES; depths are along the axis. rasterize_mode: "antialiased" lowers opacities by what eps2d widens.
-    camera_model: pinhole, ortho or fisheye. covars (N, 3, 3), symmetric, or (N, 6), xx, xy, xz, yy, yz, zz: in place of
-    quaternions and scales, which are None then. alpha_max: the cap of a Gaussian's alpha. absolute_gradients:
-    gradients by means2d have their absolute sums too. differentiable: False for images alone, which takes less; their
-    gradient, of the same bits, is slower then. device: an open one, or a name as `clsplat devices` lists them.
+    Returns
+    -------
+    Rasterization
+        Images and projected Gaussians, with their `vjp`.
 
-    Raises InputError, which names the argument, for other shapes, settings out of range and arrays with numbers that
-    are not finite. Raises DeviceError.
+    Raises
+    ------
+    InputError
+        If a shape is wrong, a setting is out of range, or numbers are not finite; it names the argument.
+    DeviceError
+        If there is no such device, or it fails.
+
+    Notes
+    -----
+    Kerbl et al. 2023, with gsplat's conventions (docs/library.md). If the device shares the host's memory, float32
+    arrays are read in place and must not change before the last gradient. Other arrays are converted.
     """
     cap = checked_modes(render_mode, rasterize_mode, alpha_max)
-    cameras = checked_cameras(
-        viewmats,
-        intrinsics,
-        width,
-        height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        eps2d=eps2d,
-        radius_clip=radius_clip,
-        camera_model=camera_model,
-    )
+    compensated = rasterize_mode == "antialiased"
+    settings = PassSettings(render_mode, cap, compensated, absolute_gradients, differentiable)
+    planes = checked_planes(near_plane, far_plane, eps2d, radius_clip, camera_model)
+    cameras = checked_cameras(viewmats, intrinsics, width, height, planes)
     count = len(cameras)
     if count == 0:
         raise InputError("viewmats has no matrix, expected 1 or more")
     given = Given.checked(means, quaternions, scales, covars, opacities, colors, sh_degree, count)
     check_channels(given.channels)
-    behind: list[Float32 | None] = [None] * count
-    if backgrounds is not None:
-        rows = floats("backgrounds", backgrounds, (count, given.channels), (given.channels,))
-        behind = list(np.broadcast_to(rows, (count, given.channels)))
+    behind = _backgrounds(backgrounds, count, given.channels)
     session = session_of(device)
-    views = [
-        View(
-            session,
-            given,
-            camera,
-            index,
-            behind[index],
-            cap,
-            render_mode,
-            compensated=rasterize_mode == "antialiased",
-            absolute=absolute_gradients,
-            differentiable=differentiable,
-        )
-        for index, camera in enumerate(cameras)
-    ]
+    views = [CameraPass(session, given, camera, index, behind[index], settings) for index, camera in enumerate(cameras)]
     return Rasterization(views, given, session.device)
 
 
+def _backgrounds(given: ArrayLike | None, count: int, channels: int) -> list[Float32 | None]:
+    """The background (D,) of each camera, from one or several. Raises InputError."""
+    if given is None:
+        return [None] * count
+    rows = floats("backgrounds", given, (count, channels), (channels,))
+    return list(np.broadcast_to(rows, (count, channels)))
+
+
 def check_channels(channels: int) -> None:
-    """Raise InputError where colors has none."""
+    """Raise InputError if colors has no channel."""
     if channels < 1:
         raise InputError(f"colors has {channels} channels, expected 1 or more")
 
 
 def checked_modes(render_mode: str, rasterize_mode: str, alpha_max: float) -> float:
     """The cap of alpha. Raises InputError, which names the argument."""
-    choice("render_mode", render_mode, RENDER_MODES)
-    choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    choice("render_mode", render_mode, RASTERIZE_RENDER_MODES)
+    choice("rasterize_mode", rasterize_mode, RASTERIZE_FILTER_MODES)
     return number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists of the tiles that projected Gaussians reach, by the conventions of gsplat's functions of these names."""
+"""Lists of the tiles that projected Gaussians reach, with the conventions of gsplat's functions of these names."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from math import prod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clsplat.arrays import Float32, Int64
 from clsplat.errors import InputError
 from clsplat.library.checks import floats, whole
 
-DEPTH_BITS = 32
-"""Low bits of an id: those of the depth as a float32."""
+ISECT_ID_DEPTH_BITS = 32
+"""Low bits of an id, which hold the depth as a float32."""
 
 
 def isect_tiles(
@@ -27,14 +28,42 @@ def isect_tiles(
     image_ids: ArrayLike | None = None,
     n_images: int | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
-    """Pairs of a tile and a Gaussian whose box, its mean plus and minus the radii, overlaps the tile.
+    """List the (tile, Gaussian) pairs: each tile that overlaps the Gaussian's box, its mean plus and minus the radii.
 
-    means2d (..., N, 2) and radii (..., N, 2) in pixels, depths (..., N): of each image; packed: (M, 2), (M, 2), (M,)
-    with image_ids (M,), and n_images of them. tile_size: the side of a tile in pixels; tile_width, tile_height: tiles
-    across and down. Returns tiles_per_gauss (..., N) or (M,) int32, 0 where a radius is not over 0; isect_ids (pairs,)
-    int64: the image, the tile in row-major order and the bits of the depth, from the high bits down; flatten_ids
-    (pairs,) int32: the Gaussian among those of all images. By image, tile and depth, ties by Gaussian, unless `sort` is
-    off: then by Gaussian. Raises InputError for other shapes.
+    Parameters
+    ----------
+    means2d, radii : (..., N, 2) array_like
+        Pixels. Packed: (M, 2).
+    depths : (..., N) array_like
+        Packed: (M,).
+    tile_size : int
+        Side of a tile, pixels.
+    tile_width, tile_height : int
+        Number of tiles across and down.
+    sort : bool
+        Sort pairs by image, tile and depth, ties by Gaussian. If False, pairs are in the order of the Gaussians.
+    image_ids : (M,) array_like of int, optional
+        Image of each Gaussian, for packed arrays.
+    n_images : int, optional
+        Number of images, for packed arrays.
+
+    Returns
+    -------
+    tiles_per_gauss : (..., N) or (M,) int32
+        Tiles of each Gaussian, 0 if a radius is not over 0.
+    isect_ids : (pairs,) int64
+        From the high bits down: the image, the tile in row-major order, the 32 bits of the depth.
+    flatten_ids : (pairs,) int32
+        Index of the Gaussian, counted over all images.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, or the ids do not fit into 64 bits.
+
+    Notes
+    -----
+    Kerbl et al. 2023, section 6; gsplat 1.5.3's function of this name.
     """
     means = floats("means2d", means2d, ("N", 2), *_batched("N", 2, of=means2d))
     count = means.shape[:-1]
@@ -43,25 +72,13 @@ def isect_tiles(
     tile_size, tile_width, tile_height = _lengths(tile_size=tile_size, tile_width=tile_width, tile_height=tile_height)
     images, image = _images(count, image_ids, None if n_images is None else whole(n_images))
 
-    most = np.array([tile_width, tile_height])
-    middle, side = means.reshape(-1, 2) / np.float32(tile_size), reach / np.float32(tile_size)
-    low = np.clip(np.floor(middle - side), 0, most).astype(np.int64)
-    high = np.clip(np.ceil(middle + side), 0, most).astype(np.int64)
-    sides = (high - low) * (reach > 0).all(axis=1, keepdims=True)
-    counts = sides.prod(axis=1)
-
-    owner = np.repeat(np.arange(len(counts)), counts)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    across = sides[owner, 0]
-    tile = (
-        (low[owner, 1] + within // np.maximum(across, 1)) * tile_width + low[owner, 0] + within % np.maximum(across, 1)
-    )
+    counts, owner, tile = _tiles_of_boxes(means.reshape(-1, 2), reach, tile_size, (tile_width, tile_height))
     tile_bits = (tile_width * tile_height).bit_length()
-    if images.bit_length() + tile_bits + DEPTH_BITS > 64:
+    if images.bit_length() + tile_bits + ISECT_ID_DEPTH_BITS > 64:
         raise InputError(f"{images} images of {tile_width} x {tile_height} tiles: ids have 64 bits, expected fewer")
     ids = (
-        (image[owner] << (tile_bits + DEPTH_BITS))
-        | (tile << DEPTH_BITS)
+        (image[owner] << (tile_bits + ISECT_ID_DEPTH_BITS))
+        | (tile << ISECT_ID_DEPTH_BITS)
         | depth.view(np.uint32).astype(np.int64)[owner]
     )
     if sort:
@@ -70,14 +87,51 @@ def isect_tiles(
     return counts.reshape(count).astype(np.int32), ids, owner.astype(np.int32)
 
 
+def _tiles_of_boxes(
+    means: Float32, reach: Float32, tile_size: int, tiles: tuple[int, int]
+) -> tuple[Int64, Int64, Int64]:
+    """The number of tiles of each Gaussian's box, and the Gaussian and the tile of each pair.
+
+    tiles: their number across and down.
+    """
+    middle, side = means / np.float32(tile_size), reach / np.float32(tile_size)
+    low = np.clip(np.floor(middle - side), 0, np.array(tiles)).astype(np.int64)
+    high = np.clip(np.ceil(middle + side), 0, np.array(tiles)).astype(np.int64)
+    sides = (high - low) * (reach > 0).all(axis=1, keepdims=True)
+    counts = sides.prod(axis=1)
+    owner = np.repeat(np.arange(len(counts)), counts)
+    within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    across = np.maximum(sides[owner, 0], 1)
+    return counts, owner, (low[owner, 1] + within // across) * tiles[0] + low[owner, 0] + within % across
+
+
 def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, tile_height: int) -> NDArray[np.int32]:
-    """Places in sorted ids of `isect_tiles` where each tile's begin, (n_images, tile_height, tile_width) int32. Raises
-    InputError for ids of other images or tiles."""
+    """Find the start of each tile's list in the sorted ids of `isect_tiles`.
+
+    Parameters
+    ----------
+    isect_ids : (pairs,) array_like of int
+        Sorted ids of `isect_tiles`.
+    n_images : int
+        Number of images.
+    tile_width, tile_height : int
+        Number of tiles across and down.
+
+    Returns
+    -------
+    (n_images, tile_height, tile_width) int32
+        Index of the first id of each tile.
+
+    Raises
+    ------
+    InputError
+        If an id belongs to another image or tile.
+    """
     n_images, tile_width, tile_height = _lengths(n_images=n_images, tile_width=tile_width, tile_height=tile_height)
     ids, tiles = np.asarray(isect_ids), tile_width * tile_height
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"isect_ids: got {ids.dtype} of shape {ids.shape}, expected integers (pairs,)")
-    keys = ids.astype(np.int64) >> DEPTH_BITS
+    keys = ids.astype(np.int64) >> ISECT_ID_DEPTH_BITS
     bits = tiles.bit_length()
     image, tile = keys >> bits, keys & ((1 << bits) - 1)
     if len(keys) and (int(image.max()) >= n_images or int(image.min()) < 0 or int(tile.max()) >= tiles):
@@ -87,7 +141,7 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
 
 
 def _lengths(**given: int) -> list[int]:
-    """Arguments as whole numbers. Raises InputError where one is none, or below 1."""
+    """The arguments as integers. Raises InputError if one is not an integer of at least 1."""
     found = [whole(value) for value in given.values()]
     lengths = [length for length in found if length is not None and length >= 1]
     if len(lengths) < len(found):
@@ -96,13 +150,13 @@ def _lengths(**given: int) -> list[int]:
 
 
 def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
-    """The shape of rows with the leading axes that an array has."""
+    """The shape of rows, with the leading axes of the array."""
     more = max(np.ndim(of) - len(row), 0)
     return [(*(f"axis {axis}" for axis in range(more)), *row)]
 
 
 def _images(count: tuple[int, ...], image_ids: ArrayLike | None, n_images: int | None) -> tuple[int, NDArray[np.int64]]:
-    """How many images there are, and the one of each Gaussian. Raises InputError."""
+    """The number of images, and the image of each Gaussian. Raises InputError."""
     if image_ids is None:
         images = prod(count[:-1])
         return images, np.repeat(np.arange(images), count[-1])

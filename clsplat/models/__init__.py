@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians in files, and what is done to them without a device."""
+"""Model files, and edits of Gaussians that need no device."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Difference of a model from another that it should equal, row by row: the loss of a format."""
+"""Row-by-row error between a model and a copy that should equal it: the loss of a format."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.arrays import Float64
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values as packing
 
-UNITS = {
+ERROR_UNITS = {
     "position": "world units",
     "position_relative": "of the extent",
     "scale": "of the Gaussian's largest",
@@ -24,10 +24,11 @@ UNITS = {
 
 
 def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
-    """The largest and the mean error of each attribute of UNITS, over the Gaussians; of several numbers the largest
-    counts, of positions the distance. scale: of standard deviations, as a part of the Gaussian's largest: the thickness
-    of a disc may be far below anything that is seen, and be cut to what a format holds. sh: as if coefficients that one
-    of them lacks were 0.
+    """Largest and mean error of each attribute in ERROR_UNITS, over all Gaussians.
+
+    A position's error is a distance and a rotation's an angle; the others take the largest component. Scale errors
+    compare standard deviations and are fractions of the Gaussian's largest one. The thickness of a disc may be too
+    small to see, and formats clamp it. SH coefficients that only one model has count as 0 in the other.
 
     Raises ValueError for models of different sizes.
     """
@@ -52,12 +53,13 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
                 "sh": _sh_errors(original.sh[rows, 1:], read.sh[rows, 1:]),
             }
         )
-    whole = {name: np.concatenate([block[name] for block in blocks]) for name in UNITS}
+    whole = {name: np.concatenate([block[name] for block in blocks]) for name in ERROR_UNITS}
     return {name: {"largest": float(column.max()), "mean": float(column.mean())} for name, column in whole.items()}
 
 
 def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
-    """(n,), from logs (n, 3): against the largest of each a, so that nothing but their differences overflows."""
+    """(n,) errors of log scales (n, 3), relative to the largest scale of each `a`, so that only large differences
+    overflow."""
     largest = a.max(axis=1, keepdims=True).astype(np.float64)
     with np.errstate(over="ignore"):
         p, q = np.exp(a - largest), np.exp(b - largest)
@@ -65,7 +67,7 @@ def _scale_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
 
 
 def _angles(a: NDArray[Any], b: NDArray[Any]) -> Float64:
-    """Degrees between the rotations, (n,): by the chord, which is exact for small angles."""
+    """(n,) angles in degrees between the rotations, from the chord, which is accurate for small angles."""
     p, q = packing.unit_quaternions(a), packing.unit_quaternions(b)
     q *= np.where((p * q).sum(axis=1) < 0, -1, 1)[:, None]
     chord = np.linalg.norm(p - q, axis=1)
@@ -79,10 +81,10 @@ def _sh_errors(a: NDArray[Any], b: NDArray[Any]) -> Float64:
 
 
 def table(losses: dict[str, dict[str, float]]) -> str:
-    """A line for each attribute."""
+    """Table of the errors as text, one line for each attribute."""
     names = {"position_relative": "", "sh": "SH"}
     lines = ["error      largest      mean"]
-    for name, unit in UNITS.items():
+    for name, unit in ERROR_UNITS.items():
         label = names.get(name, name)
         lines.append(f"{label:9}  {losses[name]['largest']:<11.3g}  {losses[name]['mean']:<11.3g}  {unit}")
     return "\n".join(lines)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edits of a model without a device: cut, move, thin out, put together. Nothing is changed in place.
+"""Edits of a model without a device: crop, transform, thin out, merge. Inputs are never changed in place.
 
-A similarity (4, 4) takes the world to a new one: x' = s Q x + t, where Q is a rotation or one with a mirror. A Gaussian
-N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T), its colour f, a function of the direction of view, becomes
-f(Q^T .). The same frame is seen by a camera that is moved along, `transform_camera`.
+A similarity (4, 4) maps the world to a new one: x' = s Q x + t, where Q is a rotation, possibly with a reflection. A
+Gaussian N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T). Its colour f, a function of the view direction,
+becomes f(Q^T .). `transform_camera` moves a camera along, so that it sees the same image.
 """
 
 from __future__ import annotations
@@ -15,35 +15,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.camera import NEAR, Camera
+from clsplat.camera import DEFAULT_NEAR_PLANE, Camera
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.spherical_harmonics import C0, sh_basis
+from clsplat.spherical_harmonics import SH_C0, sh_basis
 
-FAR = 64.0
-"""Distance from the origin, in a model's own sizes, beyond which a model that is moved counts from there (decision
-0017)."""
-SCALES = (1e-12, 1e12)
-"""Smallest and largest scale; beyond them float32's means would be 0 or infinite."""
-_NOTHING = -80.0
-"""Logit of an opacity that is nothing: exp(80) is a float32."""
-_SIMILAR = 1e-6
-"""Most that Q^T Q may differ from 1: matrices are typed with six digits, or float32's."""
+MAX_WORLD_OFFSET_SIZES = 64.0
+"""Largest distance of a transformed model's origin, in standard deviations of its means, that is added to the means
+(decision 0017)."""
+TRANSFORM_SCALE_LIMITS = (1e-12, 1e12)
+"""Smallest and largest scale of a transform; beyond them float32 means would be 0 or infinite."""
+_INVISIBLE_LOGIT = -80.0
+"""Logit of an invisible opacity; exp(80) still fits float32."""
+_SIMILARITY_TOLERANCE = 1e-6
+"""Tolerance of Q^T Q against the identity, for matrices typed with six digits or stored as float32."""
 
 
 def take(gaussians: Gaussians, rows: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:
-    """The Gaussians of those rows, a slice or (n,) booleans or indices."""
+    """Select Gaussians by a slice, or by (n,) booleans or indices."""
     return replace(gaussians, **{name: array[rows] for name, array in gaussians.arrays().items()})
 
 
 def in_box(gaussians: Gaussians, low: Sequence[float], high: Sequence[float]) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians whose mean is in the box, its faces included; low, high (3,) in the world."""
+    """Mask (n,) of the Gaussians whose mean is inside the box or on its faces; low, high (3,) in world coordinates."""
     means = gaussians.means + gaussians.origin
     return np.asarray(((means >= low) & (means <= high)).all(axis=1))
 
 
 def in_sphere(gaussians: Gaussians, centre: Sequence[float], radius: float) -> NDArray[np.bool_]:
-    """Mask (n,) of the Gaussians whose mean is at most `radius` from the centre (3,) in the world."""
+    """Mask (n,) of the Gaussians whose mean is at most `radius` from the centre (3,) in world coordinates."""
     offsets = gaussians.means + (gaussians.origin - np.asarray(centre, np.float64))
     return np.asarray(np.linalg.norm(offsets, axis=1) <= radius)
 
@@ -52,18 +52,17 @@ def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
     """Mask (n,) of the Gaussians whose opacity is at least `least`."""
     if least >= 1:
         return np.zeros(len(gaussians), np.bool_)
-    with np.errstate(divide="ignore"):  # at least 0: every one
+    with np.errstate(divide="ignore"):  # log(0) = -inf: every Gaussian passes
         return np.asarray(gaussians.opacity_logits >= np.log(least) - np.log1p(-least))
 
 
 def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
-    """The model without SH beyond the degree; the same where there are none."""
+    """Drop the SH bands above the degree; a model without any is unchanged."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
 
 
 def without_empty_bands(gaussians: Gaussians) -> Gaussians:
-    """The model without its highest SH bands that are all zero; the same where there are none. A format that rounds
-    would write other values than zero for them."""
+    """Drop the highest SH bands that are all zero; a lossy format would store other values for them."""
     degree = gaussians.sh_degree
     while degree and not gaussians.sh[:, degree**2 :].any():
         degree -= 1
@@ -71,27 +70,29 @@ def without_empty_bands(gaussians: Gaussians) -> Gaussians:
 
 
 def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
-    """The model with each channel of its colours times a gain, at least 0, or with its colours times a matrix, of which
-    `gains` are the nine numbers by rows."""
+    """Scale the colours of a model.
+
+    gains: three factors of at least 0, one for each channel, or the nine elements of a colour matrix by rows.
+    """
     factors = np.asarray(gains, np.float64)
     if len(factors) == 9:
         return graded(gaussians, factors.reshape(3, 3), np.zeros(3))
     sh = gaussians.sh * factors
-    sh[:, 0] += 0.5 * (factors - 1) / C0  # colours are SH plus a half
+    sh[:, 0] += 0.5 * (factors - 1) / SH_C0  # colour = 0.5 + C0 SH
     return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))
 
 
 def graded(gaussians: Gaussians, linear: Float64, shift: Float64) -> Gaussians:
-    """The model whose colours c are linear c + shift, (3, 3) and (3,), before they are cut at 0."""
+    """Apply colour = linear colour + shift, (3, 3) and (3,), before colours are clamped at 0."""
     sh = np.einsum("cd,nkd->nkc", linear, gaussians.sh.astype(np.float64))
-    sh[:, 0] += (linear @ np.full(3, 0.5) + shift - 0.5) / C0  # colours are SH plus a half
+    sh[:, 0] += (linear @ np.full(3, 0.5) + shift - 0.5) / SH_C0  # colour = 0.5 + C0 SH
     return replace(gaussians, sh=np.ascontiguousarray(sh, np.float32))
 
 
 def faded(gaussians: Gaussians, factor: float) -> Gaussians:
-    """The model with each opacity times a factor from 0 to 1; of 0 so little is left that nothing is drawn."""
+    """Multiply opacities by a factor from 0 to 1; 0 makes the model invisible."""
     if factor <= 0:
-        return replace(gaussians, opacity_logits=np.full_like(gaussians.opacity_logits, _NOTHING))
+        return replace(gaussians, opacity_logits=np.full_like(gaussians.opacity_logits, _INVISIBLE_LOGIT))
     if factor >= 1:
         return gaussians
     # the logit of f / (1 + exp(-l)) is log(f) - log(1 - f + exp(-l))
@@ -100,8 +101,10 @@ def faded(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:
-    """One after the other, SH of lower degree padded with zeros; the means count from the first one's origin. Raises
-    InputError for models of which some are antialiased, or drawn along rays, and some are not."""
+    """Concatenate models. Lower SH degrees are padded with zeros, and means count from the first model's origin.
+
+    Raises InputError if only some of the models are antialiased, or only some are drawn along rays.
+    """
     if len(models) == 1:
         return models[0]
     if len({model.antialiased for model in models}) > 1:
@@ -126,38 +129,43 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(**whole, origin=origin, near=near, antialiased=first.antialiased, by_rays=first.by_rays)
 
 
-def decompose(matrix: Float64, slack: float = _SIMILAR) -> tuple[float, Float64, Float64]:
-    """s, Q (3, 3), t (3,) of a similarity (4, 4). Raises InputError for a matrix that is none; `slack`: the most that
-    Q^T Q may differ from 1."""
+def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[float, Float64, Float64]:
+    """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
+
+    slack: tolerance of Q^T Q against the identity.
+    Raises InputError if the matrix is not a similarity.
+    """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
     linear = matrix[:3, :3]
     scale = float(np.abs(np.linalg.det(linear)) ** (1 / 3))
-    if not SCALES[0] < scale < SCALES[1] or not np.array_equal(matrix[3], (0, 0, 0, 1)):
+    if not TRANSFORM_SCALE_LIMITS[0] < scale < TRANSFORM_SCALE_LIMITS[1] or not np.array_equal(matrix[3], (0, 0, 0, 1)):
         raise InputError(f"a transform that cannot be undone (of scale {scale:g}) or whose last row is not 0 0 0 1")
     turn = linear / scale
     if (off := float(np.abs(turn.T @ turn - np.eye(3)).max())) > slack:
         raise InputError(
-            f"a transform that is no similarity (its axes are {off:.2g} off right angles or equal lengths), expected "
-            "rotation, one scale and translation"
+            f"a transform that is not a similarity (its axes are {off:.2g} off right angles or equal lengths), "
+            "expected rotation, one scale and translation"
         )
-    u, _, vt = np.linalg.svd(turn)  # the nearest that is exactly orthogonal
+    u, _, vt = np.linalg.svd(turn)  # the nearest orthogonal matrix
     return scale, u @ vt, matrix[:3, 3]
 
 
-def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILAR) -> Gaussians:
-    """The model moved by a similarity (4, 4) of the world; a translation alone leaves rotations and SH their bits.
-    Raises InputError as `decompose`."""
+def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> Gaussians:
+    """Transform a model by a similarity (4, 4) of the world. A pure translation keeps rotations and SH bit for bit.
+
+    Raises InputError like `decompose`.
+    """
     scale, turn, shift = decompose(matrix, slack)
-    upright = np.allclose(turn, np.eye(3), rtol=0, atol=1e-12)  # what float64 makes of no rotation
+    upright = np.allclose(turn, np.eye(3), rtol=0, atol=1e-12)  # no rotation, up to float64 rounding
     linear = scale * turn
     origin = linear @ gaussians.origin + shift
-    with np.errstate(invalid="ignore"):  # of a file's values that are not finite, whose Gaussians will be left out
+    with np.errstate(invalid="ignore"):  # non-finite values; their Gaussians are dropped later
         means = gaussians.means.astype(np.float64) @ linear.T
         spread = float(means.std(axis=0).max())
         if np.isnan(spread) and (finite := np.isfinite(means).all(axis=1)).any():
             spread = float(means[finite].std(axis=0).max())
-    if np.linalg.norm(origin) <= FAR * spread:
+    if np.linalg.norm(origin) <= MAX_WORLD_OFFSET_SIZES * spread:
         means, origin = means + origin, np.zeros(3)
     return Gaussians(
         means.astype(np.float32),
@@ -173,12 +181,13 @@ def transform(gaussians: Gaussians, matrix: Float64, slack: float = _SIMILAR) ->
 
 
 def scaling(factor: float) -> Float64:
-    """(4, 4) that scales the world about its origin."""
+    """Matrix (4, 4) that scales the world about its origin."""
     return np.diag([factor, factor, factor, 1.0])
 
 
 def turning(degrees: Sequence[float]) -> Float64:
-    """(4, 4) that turns the world about its x, then its y, then its z axis, by the right-hand rule; degrees (3,)."""
+    """Matrix (4, 4) that rotates the world about its x, then its y, then its z axis, by the right-hand rule; degrees
+    (3,)."""
     from scipy.spatial.transform import Rotation
 
     matrix = np.eye(4)
@@ -187,34 +196,36 @@ def turning(degrees: Sequence[float]) -> Float64:
 
 
 def shifting(offset: Sequence[float]) -> Float64:
-    """(4, 4) that moves the world by `offset` (3,)."""
+    """Matrix (4, 4) that translates the world by `offset` (3,)."""
     matrix = np.eye(4)
     matrix[:3, 3] = offset
     return matrix
 
 
 def transform_camera(camera: Camera, matrix: Float64) -> Camera:
-    """The camera to which a model moved by the similarity looks as it did; with a mirror its axes are mirrored too."""
+    """Move a camera along with a model, so that it sees the same image. A reflection mirrors the camera's axes too."""
     scale, turn, shift = decompose(matrix)
     rotation = camera.rotation @ turn.T
     translation = scale * camera.translation - rotation @ shift
-    near = NEAR if camera.near == NEAR else scale * camera.near  # the model's, which moves with it
+    near = (
+        DEFAULT_NEAR_PLANE if camera.near == DEFAULT_NEAR_PLANE else scale * camera.near
+    )  # DEFAULT_NEAR_PLANE stands for the model's, which scales too
     return replace(camera, rotation=rotation, translation=translation, near=near, far=scale * camera.far)
 
 
 def _turned(quaternions: Float32, turn: Float64) -> Float32:
-    """w x y z of Q R, of the same length; of a mirror -Q, as R S S R^T knows no sign."""
+    """Quaternions w x y z of Q R, lengths kept. A reflection uses -Q, as R S S R^T does not depend on the sign."""
     from scipy.spatial.transform import Rotation
 
     proper = turn if np.linalg.det(turn) > 0 else -turn
     x, y, z, w = Rotation.from_matrix(proper).as_quat()
-    # Hamilton's product of (w, x, y, z) and each quaternion
+    # Hamilton product of (w, x, y, z) and each quaternion
     product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.asarray((quaternions.astype(np.float64) @ product.T).astype(np.float32))
 
 
 def rotate_sh(sh: Float32, turn: Float64) -> Float32:
-    """(n, K, 3) coefficients of the function turned by Q (3, 3), a rotation or one with a mirror."""
+    """SH coefficients (n, K, 3) of the function turned by Q (3, 3), a rotation, possibly with a reflection."""
     degree = round(sh.shape[1] ** 0.5) - 1
     turned = sh.copy()
     for band, matrix in enumerate(sh_rotations(turn, degree)[1:], start=1):
@@ -224,13 +235,14 @@ def rotate_sh(sh: Float32, turn: Float64) -> Float32:
 
 
 def sh_rotations(turn: Float64, degree: int) -> list[Float64]:
-    """The matrices (2 l + 1, 2 l + 1), l = 0 to degree, that take a band's coefficients of f to those of f(Q^T .).
+    """Matrices (2 l + 1, 2 l + 1), l = 0 to degree, that map a band's coefficients of f to the coefficients of f(Q^T
+    .).
 
-    A band's functions go into each other under rotations (Wigner 1931), so that the coefficients c' of f(Q^T d) follow
-    from its values at enough directions d: B c' = B_Q c, where the rows of B are the basis at d and of B_Q at Q^T d.
-    With many directions B has a condition number near 1, and c' is exact to float64's rounding.
+    Each band is closed under rotation (Wigner 1931), so enough directions d determine the coefficients c' of f(Q^T d):
+    B c' = B_Q c. Rows of B are the basis at d, rows of B_Q the basis at Q^T d. With many directions B has a condition
+    number near 1, and c' is exact to float64 rounding.
     """
-    at = np.arange(64) + 0.5  # Fibonacci's points on the sphere
+    at = np.arange(64) + 0.5  # Fibonacci points on the sphere
     z, angle = 1 - at / 32, np.pi * (1 + 5**0.5) * at
     radius = np.sqrt(1 - z * z)
     directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a model file. A PLY goes by in blocks, and may hold values that are not finite."""
+"""Statistics of a model file. A PLY is read in blocks, and values may be non-finite."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.camera import NEAR
+from clsplat.camera import DEFAULT_NEAR_PLANE
 from clsplat.errors import warn
-from clsplat.files import is_file
+from clsplat.files.documents import is_file
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec import soundness
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import Format, resolve
 
-PERCENTILES = (0, 1, 50, 99, 100)
-LARGEST_LOG = 709.0
-"""Of a scale that float64 holds."""
+INFO_PERCENTILES = (0, 1, 50, 99, 100)
+MAX_FLOAT64_LOG = 709.0
+"""Largest log scale whose exponential fits float64."""
 
 
 def model_info(path: Path) -> dict[str, Any]:
-    """Figures that `clsplat info --json` prints. Raises InputError for a file that no format reads."""
+    """Statistics that `clsplat info --json` prints. Raises InputError if no format reads the file."""
     path, form = resolve(path)
     result: dict[str, Any] = {"path": str(path), "format": form.name, "bytes": size(path, form)}
     if form.blocks:
@@ -37,17 +37,20 @@ def model_info(path: Path) -> dict[str, Any]:
     result |= {"loses": form.loses} | form.describe(path)
     result |= _summary(blocks, path)
     result["colorspace"] = form.space(path)
-    result["loses"] = result.pop("loses")  # the last
+    result["loses"] = result.pop("loses")  # move it to the end
     return result
 
 
 def size(path: Path, form: Format) -> int:
-    """Bytes of the model's files."""
+    """Total size of the model's files in bytes."""
     return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 
 def _summary(blocks: Iterator[Gaussians], path: Path) -> dict[str, Any]:
-    """Everything but SH is held for the percentiles, 28 bytes a Gaussian. Warns of doubtful values, as loading does."""
+    """Statistics over all blocks. Warns about doubtful values, as loading does.
+
+    Means, log scales and opacity logits are held for the percentiles: 28 bytes a Gaussian.
+    """
     parts: list[list[Float32]] = []
     not_finite = unturned = degree = used = 0
     for block in blocks:
@@ -69,18 +72,18 @@ def _summary(blocks: Iterator[Gaussians], path: Path) -> dict[str, Any]:
         inner = np.percentile(m, (1, 99), axis=0)
         result["bounds"] = {"min": low.tolist(), "max": high.tolist(), "extent": float(np.linalg.norm(high - low))}
         result["bounds"] |= {"p1": inner[0].tolist(), "p99": inner[1].tolist()}
-        result["scale"] = _percentiles(np.exp(np.minimum(s.astype(np.float64), LARGEST_LOG)))
+        result["scale"] = _percentiles(np.exp(np.minimum(s.astype(np.float64), MAX_FLOAT64_LOG)))
         result["opacity"] = _percentiles(packing.opacities(o))
     return result | {"origin": origin.tolist()}
 
 
 def _percentiles(values: NDArray[Any]) -> dict[str, float]:
-    results = np.percentile(values, PERCENTILES)
-    return {f"p{percent}": float(value) for percent, value in zip(PERCENTILES, results, strict=True)}
+    results = np.percentile(values, INFO_PERCENTILES)
+    return {f"p{percent}": float(value) for percent, value in zip(INFO_PERCENTILES, results, strict=True)}
 
 
 def text(info: dict[str, Any]) -> str:
-    """A line for each thing."""
+    """Statistics as text, one line for each."""
 
     def numbers(values: list[float]) -> str:
         return " ".join(f"{value:.6g}" for value in values)
@@ -107,7 +110,7 @@ def text(info: dict[str, Any]) -> str:
         lines += [(name, ", ".join(values)) for name, values in percentiles.items()]
     if any(info["origin"]):
         lines.append(("origin", " ".join(map(repr, info["origin"]))))
-    if info.get("near", NEAR) != NEAR:
+    if info.get("near", DEFAULT_NEAR_PLANE) != DEFAULT_NEAR_PLANE:
         lines.append(("near plane", f"{info['near']:.6g}"))
     if info.get("antialiased"):
         lines.append(("antialiased", "yes: to be drawn with Mip-Splatting's low-pass"))

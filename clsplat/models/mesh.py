@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes as volumes: what of a model lies inside. Read from OBJ files and USD stages."""
+"""Triangle meshes as volumes that select the Gaussians inside, from OBJ files and USD stages."""
 
 from __future__ import annotations
 
@@ -15,40 +15,45 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.errors import InputError
-from clsplat.files import open_input
-from clsplat.models.formats.usd import open_stage, readable, survive
+from clsplat.files.documents import open_input
+from clsplat.models.formats.usd import USD_SUFFIXES, open_stage, readable, survive
 
-USD = (".usd", ".usda", ".usdc", ".usdz")
-MOST_TRIANGLES = 100_000
-"""Triangles of a volume: each is looked at for every Gaussian in its box."""
-MOST_POINTS = 1_000_000
-"""Points of a file, of which triangles need not use all."""
-MOST_BYTES = 256 << 20
-_MOST_LINE = 1 << 16
-_AT_ONCE = 1 << 21
-"""Pairs of a point and a triangle that are worked on at once."""
+MAX_MESH_TRIANGLES = 100_000
+"""Triangle limit of a volume: each is tested against every Gaussian in the mesh's bounding box."""
+MAX_MESH_POINTS = 1_000_000
+"""Point limit of a file; triangles need not use all points."""
+MAX_MESH_FILE_BYTES = 256 << 20
+_MAX_OBJ_LINE_BYTES = 1 << 16
+_MAX_POINT_TRIANGLE_PAIRS = 1 << 21
+"""Point-triangle pairs processed at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """corners (T, 3, 3) float64: of each triangle its three points, counterclockwise from outside."""
+    """Triangle mesh that bounds a volume.
+
+    corners (T, 3, 3): float64, the three points of each triangle, counterclockwise from outside.
+    """
 
     corners: Float64
 
     def holds(self, points: Float64) -> NDArray[np.bool_]:
-        """Mask (n,) of the points (n, 3) that are inside: around which the mesh winds more than half once, whichever
-        way its triangles look, so that small holes do not matter (Jacobson et al. 2013, generalised winding number)."""
+        """Mask (n,) of the points (n, 3) inside the mesh.
+
+        Inside means that the generalised winding number exceeds 1/2 in magnitude (Jacobson et al. 2013), so that small
+        holes and reversed orientation do not matter.
+        """
         inside = np.zeros(len(points), np.bool_)
         low, high = self.corners.min(axis=(0, 1)), self.corners.max(axis=(0, 1))
         (near,) = np.nonzero(((points >= low) & (points <= high)).all(axis=1))
-        rows = max(_AT_ONCE // len(self.corners), 1)
+        rows = max(_MAX_POINT_TRIANGLE_PAIRS // len(self.corners), 1)
         for first in range(0, len(near), rows):
             chosen = near[first : first + rows]
             inside[chosen] = np.abs(self._turns(points[chosen])) > 0.5
         return inside
 
     def _turns(self, points: Float64) -> Float64:
-        """Winding numbers (n,): solid angles of the triangles over a full sphere's (Van Oosterom and Strackee 1983)."""
+        """Winding numbers (n,): solid angles of the triangles over the full sphere (Van Oosterom and Strackee 1983)."""
         a, b, c = (self.corners[None, :, k] - points[:, None] for k in range(3))
         la, lb, lc = (np.linalg.norm(side, axis=2) for side in (a, b, c))
         triple = np.einsum("ijk,ijk->ij", a, np.cross(b, c))
@@ -58,21 +63,21 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """The mesh of an OBJ file, or all meshes of a USD stage at its first time, where they stand in the stage.
+    """Read the mesh of an OBJ file, or all meshes of a USD stage at its start time, in the stage's world.
 
-    Polygons become fans of triangles. Raises InputError for another file, one that cannot be read, and none or too many
+    Polygons become triangle fans. Raises InputError for another file type, an unreadable file, and no or too many
     triangles.
     """
     extension = path.suffix.lower()
     if extension == ".obj":
         corners = _of_obj(path)
-    elif extension in USD:
+    elif extension in USD_SUFFIXES:
         survive(path, "clsplat.models.mesh:read_here")
         corners = read_here(path)
     else:
         raise InputError(f"{path}: expected a mesh, an .obj file or a USD stage")
-    if not 1 <= len(corners) <= MOST_TRIANGLES:
-        raise InputError(f"{path}: has {len(corners):,} triangles, expected 1 to {MOST_TRIANGLES:,}")
+    if not 1 <= len(corners) <= MAX_MESH_TRIANGLES:
+        raise InputError(f"{path}: has {len(corners):,} triangles, expected 1 to {MAX_MESH_TRIANGLES:,}")
     if not np.isfinite(corners).all():
         raise InputError(f"{path}: has points that are not finite")
     return Mesh(corners)
@@ -83,9 +88,9 @@ def _of_obj(path: Path) -> Float64:
     polygons: list[list[int]] = []
     count = 0
     with open_input(path, "a mesh") as file:
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise InputError(f"{path}: is of {size:,} bytes, expected a mesh of at most {MOST_BYTES:,}")
-        for number, line in enumerate(iter(partial(file.readline, _MOST_LINE), b""), 1):
+        if (size := path.stat().st_size) > MAX_MESH_FILE_BYTES:
+            raise InputError(f"{path}: is of {size:,} bytes, expected a mesh of at most {MAX_MESH_FILE_BYTES:,}")
+        for number, line in enumerate(iter(partial(file.readline, _MAX_OBJ_LINE_BYTES), b""), 1):
             words = line.split()
             try:
                 if words[:1] == [b"v"]:
@@ -94,28 +99,28 @@ def _of_obj(path: Path) -> Float64:
                     indices = [int(word.partition(b"/")[0]) for word in words[1:]]
                     polygons.append([index - 1 if index > 0 else len(points) + index for index in indices])
                     count += max(len(indices) - 2, 0)
-                ragged = len(line) == _MOST_LINE or (words[:1] == [b"v"] and len(points[-1]) < 3)
+                ragged = len(line) == _MAX_OBJ_LINE_BYTES or (words[:1] == [b"v"] and len(points[-1]) < 3)
             except ValueError:
                 ragged = True
             if ragged:
-                raise InputError(f"{path}: line {number} is {line[:40]!r}, expected numbers behind its letter")
+                raise InputError(f"{path}: line {number} is {line[:40]!r}, expected numbers after its letter")
             _check_counts(path, len(points), max(count, len(polygons)))
     return _fans(path, np.array(points, np.float64).reshape(-1, 3), polygons)
 
 
 def _check_counts(path: Path, points: int, triangles: int) -> None:
-    """Raise InputError for more than memory and time are meant for."""
-    if triangles > MOST_TRIANGLES:
-        raise InputError(f"{path}: has {triangles:,} triangles or more, expected 1 to {MOST_TRIANGLES:,}")
-    if points > MOST_POINTS:
-        raise InputError(f"{path}: has {points:,} points or more, expected at most {MOST_POINTS:,}")
+    """Raise InputError if there are more triangles or points than the limits allow."""
+    if triangles > MAX_MESH_TRIANGLES:
+        raise InputError(f"{path}: has {triangles:,} triangles or more, expected 1 to {MAX_MESH_TRIANGLES:,}")
+    if points > MAX_MESH_POINTS:
+        raise InputError(f"{path}: has {points:,} points or more, expected at most {MAX_MESH_POINTS:,}")
 
 
 def read_here(path: Path) -> Float64:
-    """`read_mesh` of a stage that is known not to end the process, corners (T, 3, 3)."""
+    """Corners (T, 3, 3) of a stage as in `read_mesh`, read in this process; only for files that do not crash USD."""
     from pxr import UsdGeom, UsdUtils
 
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # swallows the diagnostics that USD would print
     found = [np.empty((0, 3, 3))]
     stage = open_stage(path, path)
     with readable(path):
@@ -135,7 +140,7 @@ def _of_prim(path: Path, mesh: Any, time: float, world_from_mesh: Float64) -> Fl
     )
     _check_counts(path, len(points), max(len(counts), len(indices) - 2 * len(counts)))
     points = np.array(points, np.float64).reshape(-1, 3)
-    points = points @ world_from_mesh[:3, :3] + world_from_mesh[3, :3]  # USD's matrices are of rows
+    points = points @ world_from_mesh[:3, :3] + world_from_mesh[3, :3]  # USD multiplies row vectors
     indices, counts = list(indices), list(counts)
     ends = np.cumsum([0, *counts])
     if ends[-1] != len(indices):
@@ -144,8 +149,8 @@ def _of_prim(path: Path, mesh: Any, time: float, world_from_mesh: Float64) -> Fl
 
 
 def _fans(path: Path, points: Float64, polygons: list[list[int]]) -> Float64:
-    """Corners (T, 3, 3) of the polygons as fans of triangles."""
+    """Corners (T, 3, 3) of the polygons, as triangle fans."""
     fans = [(own[0], one, next_one) for own in polygons for one, next_one in pairwise(own[1:])]
     if fans and not 0 <= min(map(min, fans)) <= max(map(max, fans)) < len(points):
-        raise InputError(f"{path}: has faces of other points than its {len(points):,}; is it damaged?")
+        raise InputError(f"{path}: has faces with points beyond its {len(points):,}; is it damaged?")
     return points[np.array(fans, np.int64).reshape(-1, 3)]

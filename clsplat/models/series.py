@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model that changes: Gaussians at some frames, as a file a frame or a stage's time samples hold them, and what they
-are between these."""
+"""Models that change over time: a file for each frame or the time samples of a stage, interpolated between them."""
 
 from __future__ import annotations
 
@@ -18,28 +17,37 @@ from clsplat.errors import InputError, warn
 from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
-ALONE, PAIR = 2, 3
-"""Samples that are held once one was asked for, or two that follow each other: with the one that is read ahead."""
-LIKE = 0.25
-"""Gaussians keep their numbers from one sample to the next if the median change of a row is at most this part of the
-median difference of two rows: of means, scales and colours each. What is tracked is at a few hundredths, models that
-were trained apart at about 1, in scales also where their Gaussians are sorted by place."""
-COMPARED = 10_000
-"""Rows of which that is asked, spread evenly."""
+CACHED_SAMPLES_SINGLE, CACHED_SAMPLES_PAIR = 2, 3
+"""Samples held after a request for one sample, or for two neighbours; both include the one that is read ahead."""
+MAX_TRACKED_CHANGE_RATIO = 0.25
+"""Largest ratio of the median change of a row to the median difference of two rows at which Gaussians keep their rows
+between two samples.
+
+Tested separately for means, scales and colours. Tracked models are at a few hundredths. Models trained separately are
+at about 1, for scales even if their Gaussians are sorted by position.
+"""
+TRACKING_TEST_ROWS = 10_000
+"""Rows compared in that test, spread evenly."""
 
 
-class Series:
-    """Gaussians that change over time. May be asked from several threads.
+class ModelSeries:
+    """Gaussians that change over time. Thread-safe.
 
-    At a sample's frame they are its own. Between two they are interpolated where Gaussians keep their numbers, means
-    in straight lines, else they are those of the nearer sample. Beyond the ends they are the end's; where they are not
-    `held`, means go on as they did, mirrored.
+    At a sample's frame they are that sample. Between two samples they are interpolated, means linearly, if Gaussians
+    keep their rows; otherwise the nearer sample is used. Beyond the ends they are the end sample; unless `held`, its
+    means continue their motion, mirrored.
     """
 
     def __init__(
         self, frames: Sequence[float], read: Callable[[int], Gaussians], where: str, *, held: bool = False
     ) -> None:
-        """frames: of the samples, rising; read: the sample of an index, raises InputError; where: begins messages."""
+        """Read the first sample.
+
+        frames: frames of the samples, ascending.
+        read: reads the sample at an index; raises InputError.
+        where: prefix of messages.
+        held: keep the means of the end samples beyond the ends.
+        """
         self.frames, self.where, self.held = tuple(frames), where, held
         self._read = read
         self._lock = threading.RLock()
@@ -50,29 +58,30 @@ class Series:
         self._told = False
         first = read(0)
         self.count = len(first)
-        """Gaussians of the first sample."""
+        """Number of Gaussians in the first sample."""
         self.kind = take(first, slice(0))
-        """A model of no Gaussians that is drawn as all samples are."""
+        """Empty model with the rendering flags of all samples."""
         self._known[0] = Future()
         self._known[0].set_result(first)
 
     def at(self, frame: float) -> Gaussians:
-        """The Gaussians at a frame. Raises InputError for a sample that cannot be read, or is drawn otherwise than the
-        first."""
+        """Gaussians at a frame. Raises InputError if a sample cannot be read, or is drawn otherwise than the first."""
         with self._lock:
             inside = min(max(frame, self.frames[0]), self.frames[-1])
             if inside != frame and not self.held:
                 return self._beyond(frame, inside)
             index, share = self._place(frame)
             if share == 0:
-                return self._sample(index, ALONE)
+                return self._sample(index, CACHED_SAMPLES_SINGLE)
             if not self._follows(index):
                 return self._sample(index + round(share))
             return between(self._sample(index), self._sample(index + 1), share)
 
     def moved(self, start: float, end: float) -> Gaussians:
-        """The Gaussians at `start` with the means that they have at `end`: their own where Gaussians do not keep their
-        numbers from one to the other, which a warning says."""
+        """Gaussians at `start` with their means at `end`.
+
+        If Gaussians do not keep their rows between the two, they keep their means, and a warning is given.
+        """
         with self._lock:
             there = self.at(start)
             if not all(map(self._follows, self._sections(start, end))):
@@ -81,14 +90,13 @@ class Series:
             return replace(there, means=_means_from(self.at(end), there))
 
     def sources(self, frame: float) -> tuple[int, ...]:
-        """Indices of the samples that the Gaussians at a frame are made of, without reading any."""
+        """Indices of the samples that a frame depends on; reads none."""
         return tuple(sorted({at for section in self._sections(frame, frame) for at in (section, section + 1)})) or (
             self._place(frame)[0],
         )
 
     def _sections(self, start: float, end: float) -> range:
-        """The indices of the samples from each of which it is a part of the way to the next that the Gaussians of these
-        frames are made of."""
+        """Intervals between samples that the frames depend on; interval i lies between samples i and i + 1."""
         (first, _), (last, share) = (self._place(frame) for frame in sorted((start, end)))
         low, high = first, last + (share > 0)
         if not self.held and len(self.frames) > 1:
@@ -97,7 +105,7 @@ class Series:
         return range(low, high)
 
     def _place(self, frame: float) -> tuple[int, float]:
-        """The last sample at or before a frame, the ends beyond them, and the share of the way to the next."""
+        """Last sample at or before a frame, clamped to the ends, and the fraction of the way to the next sample."""
         frame = min(max(frame, self.frames[0]), self.frames[-1])
         index = bisect_right(self.frames, frame) - 1
         if index + 1 == len(self.frames):
@@ -112,20 +120,20 @@ class Series:
         return replace(now, means=(2 * now.means - _means_from(before, now)).astype(np.float32))
 
     def expect(self, frames: Sequence[float]) -> None:
-        """Say which frames will be asked for, so that the next of their samples is read ahead."""
+        """Announce the frames that will be requested, so that their samples are read ahead."""
         wanted = {index for frame in frames for index in self.sources(frame)}
         self._wanted = sorted({*self._wanted, *wanted})
 
-    def _sample(self, index: int, most: int = PAIR) -> Gaussians:
-        """The sample, of those that are held or from its file; the next that is expected begins to be read. most: that
-        are held then, those that were not asked for the longest go."""
+    def _sample(self, index: int, most: int = CACHED_SAMPLES_PAIR) -> Gaussians:
+        """Sample from memory or its file; starts to read the next expected one.
+
+        most: samples to hold; the least recently requested are dropped.
+        """
         future = self._future(index)
         self._known.move_to_end(index)
         later = self._wanted[bisect_right(self._wanted, index) :][:1]
         oldest = [other for other in self._known if other not in (index, *later)]
-        for other in oldest[
-            : max(len({*self._known, *later}) - most, 0)
-        ]:  # its memory is free before the next takes some
+        for other in oldest[: max(len({*self._known, *later}) - most, 0)]:  # frees memory before the next is allocated
             del self._known[other]
         for other in later:
             self._future(other)
@@ -146,11 +154,11 @@ class Series:
                     f"{self.where}: frame {self.frames[index]:g} is {_alike(sample, what)}, frame {self.frames[0]:g} "
                     f"is {_alike(self.kind, what)}, expected models that are drawn alike"
                 )
-        # cameras see from one near plane on in all frames
+        # all frames have the same near plane
         return sample if sample.near == self.kind.near else replace(sample, near=self.kind.near)
 
     def _follows(self, index: int) -> bool:
-        """True if Gaussians keep their numbers from a sample to the next."""
+        """True if Gaussians keep their rows from this sample to the next."""
         if index not in self._follow:
             self._follow[index] = follows(self._sample(index), self._sample(index + 1))
         return self._follow[index]
@@ -159,8 +167,8 @@ class Series:
         if not self._told:
             self._told = True
             warn(
-                f"{self.where}: Gaussians do not keep their numbers from frame to frame, so that motion channels have "
-                "the camera's motion alone"
+                f"{self.where}: Gaussians do not keep their numbers from frame to frame; motion channels have "
+                "the camera's motion only"
             )
 
 
@@ -170,10 +178,10 @@ def _alike(model: Gaussians, what: str) -> str:
 
 
 def follows(before: Gaussians, after: Gaussians) -> bool:
-    """True if each row is the same Gaussian in both models."""
+    """True if each row seems to be the same Gaussian in both models."""
     if len(before) != len(after) or before.sh.shape != after.sh.shape:
         return False
-    step = max(len(before) // COMPARED, 1)
+    step = max(len(before) // TRACKING_TEST_ROWS, 1)
     pairs = (
         (before.means, _means_from(after, before)),
         (before.log_scales, after.log_scales),
@@ -183,14 +191,16 @@ def follows(before: Gaussians, after: Gaussians) -> bool:
         ours, theirs = own[::step].astype(np.float64), other[::step].astype(np.float64)
         change = np.median(np.linalg.norm(theirs - ours, axis=1))
         apart = np.median(np.linalg.norm(np.roll(ours, max(len(ours) // 2, 1), axis=0) - ours, axis=1))
-        if change > LIKE * apart and len(ours) > 1:
+        if change > MAX_TRACKED_CHANGE_RATIO * apart and len(ours) > 1:
             return False
     return True
 
 
 def between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
-    """The model that share of the way from one to the other: means, logarithms of scales, logits and SH in straight
-    lines, rotations by normalised linear interpolation of their quaternions, the shorter way."""
+    """Interpolate two models: means, log scales, logits and SH linearly, rotations by nlerp along the shorter arc.
+
+    share: fraction of the way from `before` to `after`.
+    """
 
     def line(ours: Float32, theirs: Float32) -> Float32:
         return ((1 - share) * ours.astype(np.float64) + share * theirs).astype(np.float32)
@@ -213,6 +223,6 @@ def _normalised(quaternions: Float64) -> Float64:
 
 
 def _means_from(model: Gaussians, other: Gaussians) -> Float32:
-    """The means of a model, counted from the origin of another."""
+    """Means of a model relative to the origin of another."""
     shift = model.origin - other.origin
     return (model.means + shift).astype(np.float32) if shift.any() else model.means

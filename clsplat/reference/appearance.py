@@ -9,21 +9,26 @@ from clsplat.arrays import Float64
 
 
 def removed(photograph: Float64, logs: Float64) -> Float64:
-    """The photograph (H, W, 3), whose gains are 2^logs (3,), as the model is exposed."""
+    """Divide the gains 2^logs (3,) out of the photograph (H, W, 3)."""
     result: Float64 = photograph / np.exp2(logs)
     return result
 
 
 def gradient(image: Float64, by_image: Float64) -> Float64:
-    """Gradient by the logs (3,), of a loss whose gradient by the image (H, W, 3) is known: that by what the image is
-    times 2^logs, at 0."""
+    """Gradient by the logs (3,) at 0, for a loss of the image times 2^logs.
+
+    by_image: (H, W, 3), the loss's gradient by that product.
+    """
     by_logs: Float64 = np.log(2) * (image * by_image).sum(axis=(0, 1))
     return by_logs
 
 
 def pull(logs: Float64, start: Float64, weights: Float64) -> Float64:
-    """The pull that is added to the gradients by the logs, (photographs, 3) both: weights (photographs, photographs)
-    times the distances from where they started, less the mean of those that have weights."""
+    """The pull that is added to the gradients by the logs, (photographs, 3).
+
+    It is weights (photographs, photographs) times the distances from the start, less their mean over the photographs
+    with weights.
+    """
     told, apart = weights.any(axis=1), logs - start
     mean = apart[told].mean(axis=0) if told.any() else 0.0
     result: Float64 = weights @ (apart - mean)
@@ -40,8 +45,11 @@ def step(
     *,
     centred: bool = True,
 ) -> tuple[Float64, Float64, Float64]:
-    """Logs and moments (photographs, entries) after Adam's step along by_logs and, if they are centred, the removal of
-    each entry's mean. rate: of all entries, or of each."""
+    """Logs and moments (photographs, entries) after Adam's step along by_logs.
+
+    rate: of all entries, or of each.
+    centred: then subtract each entry's mean.
+    """
     first, second = 0.9 * first + 0.1 * by_logs, 0.999 * second + 0.001 * by_logs**2
     change = rate * (first / (1 - 0.9**number)) / (np.sqrt(second / (1 - 0.999**number)) + 1e-15)
     moved = logs - change

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blending front to back and its gradient, without tiles: float64 twin of kernels/blend*.cl.
 
-Equation numbers are those of docs/gradients.md.
+Equation numbers refer to docs/gradients.md.
 """
 
 from __future__ import annotations
@@ -13,19 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64, Int64
-from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Seen
+from clsplat.reference.project import ALPHA_MIN, BOX_SLACK, Footprint, Seen
 
-ALPHA_MAX = float(np.float32(0.99))
+BLEND_ALPHA_MAX = float(np.float32(0.99))
 TRANSMITTANCE_MIN = float(np.float32(1e-4))
-"""The kernels' constants to the bit: two layers at the cap leave (1 - 0.99)^2, in decimals the limit itself."""
+"""The kernels' constants to the bit. In decimals, two layers at the cap would leave (1 - 0.99)^2, exactly the limit."""
 
 
 @dataclass(frozen=True, eq=False)
-class Blended:
-    """image (H, W, 3); transmittance (H, W), what is left for the background; last (H, W), position in `order` of
-    the last Gaussian that was added, -1 for none; count (H, W), how many were added; nearness (H, W), the sum of weight
-    over depth; margin (H, W), the smallest
-    relative distance of a decision to its threshold (alpha to 1/255 and to 0.99, T to 1e-4), cut at 0.05.
+class BlendedTwin:
+    """A blended picture.
+
+    image: (H, W, 3).
+    transmittance: (H, W), of the background.
+    last: (H, W), position in `order` of the last Gaussian added, -1 for none.
+    count: (H, W), number of Gaussians added.
+    nearness: (H, W), the sum of weight over depth.
+    margin: (H, W), the smallest relative distance of a decision to its threshold (alpha to 1/255 and 0.99, T to 1e-4),
+    clamped to 0.05.
     """
 
     image: Float64
@@ -38,11 +43,16 @@ class Blended:
 
 @dataclass(frozen=True, eq=False)
 class BlendGradients:
-    """nearness (N,): by one over the depth, (122).
+    """Gradients by the projected Gaussians.
 
-    means2d (N, 2), abs_means2d (N, 2): per pixel of displacement, or of rays per radian along the axes of the
-    tangent plane, the latter the sum of the absolute values of every image pixel's part; conics (N, 3): by a, b, c;
-    opacities (N,); colors (N, 3); and contributions (N,), what each adds to the image: eq. (55)."""
+    means2d: (N, 2), per pixel of displacement; for rays per radian along the axes of the tangent plane.
+    abs_means2d: (N, 2), the same with the absolute values of every image pixel's part.
+    conics: (N, 3), by a, b, c.
+    opacities: (N,).
+    colors: (N, 3).
+    contributions: (N,), each Gaussian's contribution to the image: eq. (55).
+    nearness: (N,), by one over the depth, (122).
+    """
 
     means2d: Float64
     abs_means2d: Float64
@@ -55,8 +65,13 @@ class BlendGradients:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One Gaussian, `position` in the order, on the pixels of its box: alpha; before, after: transmittance in front of
-    it and behind; added: where it is in the picture; margin: as of `Blended`, infinite where nothing is decided."""
+    """One Gaussian on the pixels of its box.
+
+    position: in the order.
+    before, after: transmittance in front of it and behind it.
+    added: the pixels to which it is added.
+    margin: as in `BlendedTwin`, infinite where nothing is decided.
+    """
 
     position: int
     gaussian: int
@@ -75,11 +90,11 @@ def layers(projected: Seen, width: int, height: int) -> Iterator[Layer]:
         splat = projected.footprint(int(gaussian), width, height)
         if splat is None or not alive[box := splat.box].any():
             continue
-        alpha = np.minimum(ALPHA_MAX, splat.raw)
+        alpha = np.minimum(BLEND_ALPHA_MAX, splat.raw)
         before, seen = transmittance[box].copy(), alive[box] & (alpha >= ALPHA_MIN)
         after = before * (1 - alpha)
         added = seen & (after > TRANSMITTANCE_MIN)
-        margin = np.minimum(np.abs(splat.raw / ALPHA_MIN - 1), np.abs(splat.raw / ALPHA_MAX - 1))
+        margin = np.minimum(np.abs(splat.raw / ALPHA_MIN - 1), np.abs(splat.raw / BLEND_ALPHA_MAX - 1))
         margin = np.minimum(margin, np.where(seen, np.abs(after / TRANSMITTANCE_MIN - 1), np.inf))
         margin = np.where(alive[box], margin, np.inf)
         transmittance[box] = after = np.where(added, after, before)
@@ -92,8 +107,8 @@ def blend(
     width: int,
     height: int,
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
-) -> Blended:
-    """The picture of the `layers`."""
+) -> BlendedTwin:
+    """Blend the `layers`."""
     image = np.zeros((height, width, 3))
     transmittance = np.ones((height, width))
     last = np.full((height, width), -1, np.int64)
@@ -109,7 +124,7 @@ def blend(
         last[box] = np.where(added, layer.position, last[box])
         count[box] += added
     image += transmittance[:, :, None] * np.asarray(background, np.float64)
-    return Blended(image, transmittance, last, count, margin, nearness)
+    return BlendedTwin(image, transmittance, last, count, margin, nearness)
 
 
 def blend_grad(
@@ -121,8 +136,12 @@ def blend_grad(
     d_transmittance: Float64 | None = None,
     d_nearness: Float64 | None = None,
 ) -> BlendGradients:
-    """Eqs. (22) to (29) and (55), back to front: d_image (H, W, 3) is dL/dC, d_transmittance (H, W) dL/dT at the end,
-    (82), d_nearness (H, W) dL/dN, (122)."""
+    """Gradients by eqs. (22) to (29) and (55), back to front.
+
+    d_image: (H, W, 3), dL/dC.
+    d_transmittance: (H, W), dL/dT at the end, (82).
+    d_nearness: (H, W), dL/dN, (122).
+    """
     forward, order = blend(projected, width, height, background), projected.order
     transmittance = forward.transmittance.copy()
     behind = np.broadcast_to(np.asarray(background, np.float64), (height, width, 3)).copy()
@@ -145,7 +164,7 @@ def blend_grad(
         if splat is None:
             continue
         box = splat.box
-        alpha = np.minimum(ALPHA_MAX, splat.raw)
+        alpha = np.minimum(BLEND_ALPHA_MAX, splat.raw)
         added = (alpha >= ALPHA_MIN) & (position <= forward.last[box])
         if not added.any():
             continue
@@ -163,16 +182,23 @@ def blend_grad(
         gradients.colors[gaussian] = (weight[:, :, None] * d_image[box]).sum(axis=(0, 1))
         behind[box] += alpha[:, :, None] * (color - behind[box])
 
-        free = added & (splat.raw <= ALPHA_MAX)  # under the clamp alpha moves with its Gaussian
-        g = np.where(free, d_alpha * alpha, 0.0)
-        dx, dy = splat.dx, splat.dy
-        by_x, by_y = (g * along for along in projected.by_mean(gaussian, splat))
-        gradients.means2d[gaussian] = by_x.sum(), by_y.sum()
-        gradients.abs_means2d[gaussian] = np.abs(by_x).sum(), np.abs(by_y).sum()
-        gradients.conics[gaussian] = (
-            -0.5 * (g * dx * dx).sum(),
-            -(g * dx * dy).sum(),
-            -0.5 * (g * dy * dy).sum(),
-        )
-        gradients.opacities[gaussian] = np.where(free, d_alpha * splat.falloff, 0.0).sum()
+        free = added & (splat.raw <= BLEND_ALPHA_MAX)  # at the cap, alpha does not depend on the Gaussian
+        _set_shape_gradients(gradients, projected, gaussian, splat, np.where(free, d_alpha, 0.0), alpha)
     return gradients
+
+
+def _set_shape_gradients(
+    gradients: BlendGradients, projected: Seen, gaussian: int, splat: Footprint, d_alpha: Float64, alpha: Float64
+) -> None:
+    """Eqs. (25) to (29): one Gaussian's gradients by its mean, conic and opacity, from d_alpha (h, w) on its box."""
+    g = d_alpha * alpha
+    dx, dy = splat.dx, splat.dy
+    by_x, by_y = (g * along for along in projected.by_mean(gaussian, splat))
+    gradients.means2d[gaussian] = by_x.sum(), by_y.sum()
+    gradients.abs_means2d[gaussian] = np.abs(by_x).sum(), np.abs(by_y).sum()
+    gradients.conics[gaussian] = (
+        -0.5 * (g * dx * dx).sum(),
+        -(g * dx * dy).sum(),
+        -0.5 * (g * dy * dy).sum(),
+    )
+    gradients.opacities[gaussian] = (d_alpha * splat.falloff).sum()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The channels beside colour in float64: twin of kernels/features.cl and channels.cl. Equation numbers are those of
-docs/channels.md."""
+"""The channels other than colour in float64: twin of kernels/features.cl and channels.cl.
+
+Equation numbers refer to docs/channels.md.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,21 @@ from clsplat.arrays import Float64, Int64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import layers
-from clsplat.reference.cameras import period, pixel_from_world, wrapped
+from clsplat.reference.cameras import pixel_from_world
 from clsplat.reference.project import Seen, rotation_matrices, view_directions
 from clsplat.reference.render import parameters
 
 
 @dataclass(frozen=True, eq=False)
-class Channels:
-    """(H, W) each but for normal and position (H, W, 3), motion and backward (H, W, 2): eqs. (60) to (67). All 0, and
-    index -1, where nothing is added. doubt (H, W): the least distance of what decides to its threshold: transmittance
-    to one half, and the largest weight to the second largest, both as differences."""
+class ChannelsTwin:
+    """Channels, eqs. (60) to (67). All are 0, and index -1, where nothing is added.
+
+    normal, position: (H, W, 3).
+    motion, backward: (H, W, 2).
+    doubt: (H, W), the smallest distance of a decision to its threshold, as differences: of the transmittance to one
+    half, and of the largest weight to the second largest.
+    The others are (H, W).
+    """
 
     depth: Float64
     normal: Float64
@@ -36,23 +43,25 @@ class Channels:
 
 
 def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
-    """(62): (N, 3), the axis of the smallest scale, the first of equal ones, turned to the camera."""
+    """Eq. (62): the axis of the smallest scale, the first of equal ones, turned towards the camera, (N, 3)."""
     axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
     away = (view_directions(means, camera)[0] * axes).sum(axis=1)
     return np.where(away[:, None] > 0, -axes, axes)
 
 
 def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None = None) -> Float64:
-    """(64): (N, 2) in pixels, of any projection; of a panorama by the shorter way around. moved: the means that motion
-    goes to, where they do not stand still."""
+    """Eq. (64): motion (N, 2) in pixels, for any projection; in a panorama the shorter way around.
+
+    moved: the means after the motion; None if they do not move.
+    """
     to = means if moved is None else moved
     (here, _), (there, depths) = pixel_from_world(camera, means), pixel_from_world(after, to)
-    if camera.projection == "equirectangular":
-        # where the mean is shown may depend on the image's middle; a window's is that of its frame
+    if camera.model.wraps:
+        # the place of a mean may depend on the image's middle; a window uses the middle of its frame
         frame = camera.window or camera
-        here[:, 0] = wrapped(replace(camera, width=frame.width), here[:, 0])
+        here[:, 0] = camera.model.wrapped(replace(camera, width=frame.width), here[:, 0])
         turned = (there[:, 0] - after.cx) / after.fx - (here[:, 0] - camera.cx) / camera.fx
-        there[:, 0] -= np.round(turned / (2 * np.pi)) * period(after)
+        there[:, 0] -= np.round(turned / (2 * np.pi)) * after.model.turn(after)
     seen = (depths > after.near) & np.isfinite(here + there).all(axis=1)
     return np.where(seen[:, None], there - here, 0.0)
 
@@ -60,8 +69,10 @@ def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None
 def features(
     projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, before: Camera | None = None
 ) -> dict[str, Float64]:
-    """Features of each Gaussian, (N, 1 to 3), by the name of the channel that they are blended to. before: the camera
-    of backward motion, `after` if None."""
+    """Features of each Gaussian, (N, 1 to 3), by the name of their channel.
+
+    before: the camera of backward motion; None for `after`.
+    """
     arrays = parameters(gaussians)
     means = arrays["means"]
     return {
@@ -75,8 +86,8 @@ def features(
 
 def channels(
     projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, earlier: Camera | None = None
-) -> Channels:
-    """Blend front to back. earlier: the camera of backward motion, `after` if None."""
+) -> ChannelsTwin:
+    """Blend the channels front to back. earlier: the camera of backward motion; None for `after`."""
     width, height = camera.width, camera.height
     rows = np.concatenate(list(features(projected, gaussians, camera, after, earlier).values()), axis=1)
     sums, total = np.zeros((height, width, rows.shape[1])), np.zeros((height, width))
@@ -101,7 +112,7 @@ def channels(
     means_of = sums / np.where(some, total, 1.0)[:, :, None]
     length = np.linalg.norm(sums[:, :, 1:4], axis=2)
     normal = sums[:, :, 1:4] / np.where(length > 0, length, 1.0)[:, :, None]
-    return Channels(
+    return ChannelsTwin(
         depth=means_of[:, :, 0],
         normal=normal,
         position=means_of[:, :, 4:7],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame in slices by depth in float64: twin of kernels/deep.cl. Equation numbers are those of docs/pictures.md."""
+"""A frame in slices by depth in float64: twin of kernels/deep.cl. Equation numbers refer to docs/pictures.md."""
 
 from __future__ import annotations
 
@@ -10,17 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
+from clsplat.layouts.columns import DEEP_LEVELS
 from clsplat.reference.blend import Layer, layers
-from clsplat.reference.project import Projected
+from clsplat.reference.project import ProjectedTwin
 
-LEVELS, STEPS = 64, 8
-"""Slacks that a pixel may have, and in how many steps a walk tries them."""
+SLACKS_PER_WALK = 8
+"""Number of steps in each of the coarse and the fine search for a pixel's slack."""
 
 
 @dataclass(frozen=True, eq=False)
 class Deep:
-    """slices (bins, H, W, 5) by (70) to (72): red, green, blue, alpha, depth; slack (H, W) of each pixel, (74); margin
-    (H, W): the least distance of a decision to its threshold, of transmittances that are compared."""
+    """A frame in slices by depth.
+
+    slices: (bins, H, W, 5) by (70) to (72): red, green, blue, alpha, depth.
+    slack: (H, W), of each pixel, (74).
+    margin: (H, W), the smallest distance of a decision to its threshold, as differences of transmittance.
+    """
 
     slices: Float64
     slack: Float64
@@ -28,15 +33,15 @@ class Deep:
 
 
 class _Cut:
-    """The walk of (73) with one slack for each pixel."""
+    """The walk of (73) with one slack per pixel, starting from the light `whole`."""
 
-    def __init__(self, slack: Float64) -> None:
+    def __init__(self, slack: Float64, whole: Float64) -> None:
         self.slack, self.count = slack, np.ones(slack.shape, np.int64)
-        self.open, self.placed = np.ones(slack.shape), np.zeros(slack.shape, np.bool_)
+        self.open, self.placed = whole.copy(), np.zeros(slack.shape, np.bool_)
         self.margin = np.full(slack.shape, np.inf)
 
     def begins(self, layer: Layer, may: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
-        """True where the layer begins a slice; may: where it is allowed to."""
+        """True where the layer begins a slice. may: where it is allowed to."""
         box = layer.box
         opened, placed, slack, added = self.open[box], self.placed[box], self.slack[box], layer.added
         in_front = opened - layer.before - slack
@@ -53,11 +58,15 @@ class _Cut:
         return np.asarray(begins, np.bool_)
 
 
-def slacks(taken: Sequence[Layer], total: Float64, bins: int) -> tuple[Float64, Float64]:
-    """(74): (H, W), the least of LEVELS slacks with which no pixel has more slices than `bins`; and the margin."""
-    unit, level, margin = total / (LEVELS * bins), np.zeros(total.shape), np.full(total.shape, np.inf)
-    for step in (LEVELS // STEPS, 1):
-        cuts = [_Cut(unit * (level + step * k)) for k in range(1, STEPS)]
+def slacks(taken: Sequence[Layer], whole: Float64, total: Float64, bins: int) -> tuple[Float64, Float64]:
+    """Eq. (74): the smallest of DEEP_LEVELS slacks (H, W) with at most `bins` slices in each pixel; and the margin.
+
+    whole: the light in front of the layers.
+    total: the light that they absorb.
+    """
+    unit, level, margin = total / (DEEP_LEVELS * bins), np.zeros(total.shape), np.full(total.shape, np.inf)
+    for step in (DEEP_LEVELS // SLACKS_PER_WALK, 1):
+        cuts = [_Cut(unit * (level + step * k), whole) for k in range(1, SLACKS_PER_WALK)]
         for layer in taken:
             for cut in cuts:
                 cut.begins(layer)
@@ -67,24 +76,37 @@ def slacks(taken: Sequence[Layer], total: Float64, bins: int) -> tuple[Float64, 
     return unit * (level + 1), margin
 
 
-def deep(projected: Projected, width: int, height: int, bins: int) -> Deep:
+def sliced(
+    taken: Sequence[Layer], colours: Sequence[Float64], depths: Sequence[Float64], whole: Float64, bins: int
+) -> Deep:
+    """Cut layers into slices by (70) to (74).
+
+    colours: (h, w, 3), of each layer on its box, associated with the light that it absorbs.
+    depths: (h, w), of each layer on its box.
+    whole: (H, W), the light in front of them.
+    """
+    height, width = whole.shape
+    end = whole.copy()
+    for layer in taken:
+        end[layer.box] = np.where(layer.added, layer.after, end[layer.box])
+    slack, margin = slacks(taken, whole, whole - end, bins)
+    slices, cut = np.zeros((bins, height, width, 5)), _Cut(slack, whole)
+    first, places, at = whole.copy(), np.zeros((height, width)), np.mgrid[:height, :width]
+    for layer, colour, depth in zip(taken, colours, depths, strict=True):
+        box, added = layer.box, layer.added
+        begins = cut.begins(layer, (cut.count[box] < bins) & (depth > places[box]))
+        light = first[box] = np.where(begins, layer.before, first[box])
+        here = (cut.count[box] - 1, *at[(slice(None), *box)])
+        slices[(*here, slice(3))] += np.where(added[:, :, None], colour / light[:, :, None], 0.0)
+        slices[(*here, 3)] = np.where(added, 1 - layer.after / light, slices[(*here, 3)])
+        places[box] = np.where(added & ~cut.placed[box], depth, places[box])
+        slices[(*here, 4)] = np.where(added, places[box], slices[(*here, 4)])
+    return Deep(slices, slack, np.minimum(margin, cut.margin))
+
+
+def deep(projected: ProjectedTwin, width: int, height: int, bins: int) -> Deep:
     """The frame in slices by depth."""
     taken = list(layers(projected, width, height))
-    total = np.zeros((height, width))
-    for layer in taken:
-        total[layer.box] = np.where(layer.added, 1 - layer.after, total[layer.box])
-    slack, margin = slacks(taken, total, bins)
-    slices, cut = np.zeros((bins, height, width, 5)), _Cut(slack)
-    left, depths, at = np.ones((height, width)), np.zeros((height, width)), np.mgrid[:height, :width]
-    for layer in taken:
-        box, added, depth = layer.box, layer.added, np.float64(np.float32(projected.depths[layer.gaussian]))
-        begins = cut.begins(layer, (cut.count[box] < bins) & (depth > depths[box]))
-        u = left[box] = np.where(begins, 1.0, left[box])
-        here = (cut.count[box] - 1, *at[(slice(None), *box)])
-        weight = np.where(added, u * layer.alpha, 0.0)
-        slices[(*here, slice(3))] += weight[:, :, None] * projected.colors[layer.gaussian]
-        left[box] = np.where(added, u * (1 - layer.alpha), u)
-        slices[(*here, 3)] = 1 - left[box]
-        depths[box] = np.where(added & ~cut.placed[box], depth, depths[box])
-        slices[(*here, 4)] = np.where(added, depths[box], slices[(*here, 4)])
-    return Deep(slices, slack, np.minimum(margin, cut.margin))
+    colours = [(layer.before * layer.alpha)[:, :, None] * projected.colors[layer.gaussian] for layer in taken]
+    depths = [np.full(layer.alpha.shape, np.float64(np.float32(projected.depths[layer.gaussian]))) for layer in taken]
+    return sliced(taken, colours, depths, np.ones((height, width)), bins)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marks and lists of density control: NumPy twin of kernels/density.cl, in float32, in which it is decided."""
+"""Marks and lists of density control: NumPy twin of kernels/density.cl, in float32, in which the decisions are made."""
 
 from __future__ import annotations
 
@@ -9,24 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.marking import FRESH, UNWANTED, USELESS, MarkRules
+from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS, MarkRules
 
 
 def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
-    """Mean gradients (n,) of what may be densified; UNWANTED; USELESS. Statistics by the names in a checkpoint."""
+    """Mean gradients (n,) of the Gaussians that may be densified; UNWANTED or USELESS for others.
+
+    statistics: by their names in a checkpoint.
+    """
     with np.errstate(all="ignore"):
         means = statistics["gradient_sums"] / np.maximum(statistics["seen"], np.float32(1))
     means = np.where(np.isfinite(means), means, np.float32(0))
     wanted = means > np.float32(rules.gradient)
-    if "agreeing" in statistics:
-        wanted &= statistics["agreeing"] > np.float32(rules.agreeing)
     found = np.where(wanted, means, np.float32(UNWANTED))
-    if "whole_totals" in statistics:
-        totals, (value, row) = statistics["whole_totals"], rules.least
+    if "whole_largest" in statistics:
         largest = np.maximum(statistics["current_largest"], statistics["whole_largest"])
-        useless = (largest <= np.float32(rules.contribution)) | (totals < np.float32(value))
-        useless |= (totals == np.float32(value)) & (np.arange(len(totals)) <= row)
-        found[useless] = USELESS
+        found[largest <= np.float32(rules.contribution)] = USELESS
     return found.astype(np.float32)
 
 
@@ -35,11 +33,12 @@ def rows(
     statistics: Mapping[str, Float32],
     log_scales: Float32,
     opacity_logits: Float32,
-    given: Float32 | None = None,
 ) -> tuple[NDArray[np.uint32], int]:
-    """Row that each new one is a copy of, with FRESH: what stays, clones, first and second halves; number of halves.
-    given (n,): in place of `scores`."""
-    found, largest = scores(rules, statistics) if given is None else given, log_scales.max(axis=1)
+    """The source row of each new row, with FRESH, and the number of halves.
+
+    The order is: remaining rows, clones, first halves, second halves.
+    """
+    found, largest = scores(rules, statistics), log_scales.max(axis=1)
     value, row = rules.strongest
     wanted = (found > np.float32(value)) | ((found == np.float32(value)) & (np.arange(len(found)) <= row))
     wanted &= found >= 0

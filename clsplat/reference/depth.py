@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth loss and the gradient of nearness by the means: float64 twins of kernels/depth_loss.cl, and of its part in
-project_grad.cl."""
+"""The depth loss, and the gradient of nearness by the means.
+
+Float64 twins of kernels/depth_loss.cl and of the nearness terms in project_grad.cl.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,12 @@ def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float
 
 
 def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float64:
-    """Eq. (122): the gradient (N, 3) by the means, of that by one over the depth (N,), which is the distance where
-    pixels are rays."""
+    """Eq. (122): the gradient (N, 3) by the means.
+
+    d_nearness: (N,), the gradient by one over the depth, which is the distance if pixels are rays.
+    """
     local = means @ camera.rotation.T + camera.translation
-    if not camera.kind.rays:
+    if not camera.model.along_rays:
         along, depth = np.zeros_like(local), local[:, 2]
         along[:, 2] = 1
     else:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of any projection in float64, every Gaussian at every pixel: no tiles, no boxes, no bounds. Equation numbers
-are those of docs/gradients.md (14 to 16) and docs/channels.md (60 to 64)."""
+"""Pictures of any projection in float64, every Gaussian at every pixel: no tiles, no boxes, no bounds.
+
+Equation numbers refer to docs/gradients.md (14 to 16) and docs/channels.md (60 to 64).
+"""
 
 from __future__ import annotations
 
@@ -14,16 +16,19 @@ from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference import render as on_plane
 from clsplat.reference.blend import blend, blend_grad
-from clsplat.reference.channels import Channels, channels
+from clsplat.reference.channels import ChannelsTwin, channels
 from clsplat.reference.depth import nearness_grad
-from clsplat.reference.project import Footprint, Projected, Seen, project
-from clsplat.reference.rays import footprints, pixel_sides, tangents, tangents_grad
-from clsplat.reference.render import BLACK, Gradients, parameters
+from clsplat.reference.project import Footprint, ProjectedTwin, Seen
+from clsplat.reference.rays import pixel_sides, tangents, tangents_grad
+from clsplat.reference.render import BLACK_BACKGROUND, GradientsTwin, parameters, project_model
 
 
 @dataclass(frozen=True, eq=False)
-class Picture(Channels):
-    """image (H, W, 3), alpha (H, W); margin, nearness (H, W): as of `reference.blend`."""
+class Picture(ChannelsTwin):
+    """A picture with its channels: image (H, W, 3), alpha (H, W).
+
+    margin, nearness: (H, W), as in `reference.blend`.
+    """
 
     image: Float64
     alpha: Float64
@@ -31,7 +36,7 @@ class Picture(Channels):
     nearness: Float64
 
 
-class _Unbounded(Projected):
+class _Unbounded(ProjectedTwin):
     """Gaussians on the image plane, whose boxes are the whole image."""
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint:
@@ -47,22 +52,23 @@ class _Unbounded(Projected):
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    background: Sequence[float] | Float64 = BLACK,
+    background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     after: Camera | None = None,
 ) -> Picture:
-    """Front to back by depth. after: the camera that motion goes to. A pixel without a ray shows the background."""
+    """Render front to back by depth. A pixel without a ray shows the background.
+
+    after: the camera that motion leads to.
+    """
     seen: Seen
-    if not camera.kind.rays:
-        degree, antialiased = gaussians.sh_degree, gaussians.antialiased
-        projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=antialiased)
-        seen = _Unbounded(**vars(projected))
+    if not camera.model.along_rays:
+        seen = _Unbounded(**vars(project_model(gaussians, camera, gaussians.sh_degree)))
     else:
         seen = tangents(gaussians, camera)
     blended = blend(seen, camera.width, camera.height, background)
     others = channels(seen, gaussians, camera, after or camera)
     if (of_distances := camera.depths_of_distances()) is not None:
-        depths = {name: getattr(others, name) * of_distances for name in ("depth", "median", "first")}
-        others = replace(others, **depths)
+        depth, median, first = (each * of_distances for each in (others.depth, others.median, others.first))
+        others = replace(others, depth=depth, median=median, first=first)
     alpha, margin, nearness = 1 - blended.transmittance, blended.margin, blended.nearness
     return Picture(**vars(others), image=blended.image, alpha=alpha, margin=margin, nearness=nearness)
 
@@ -71,18 +77,22 @@ def render_grad(
     gaussians: Gaussians,
     camera: Camera,
     d_image: Float64,
-    background: Sequence[float] | Float64 = BLACK,
+    background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     d_nearness: Float64 | None = None,
-) -> Gradients:
-    """Gradients of a loss with dL/dimage = d_image (H, W, 3), and by nearness (H, W), of a
-    camera of any projection; those of means on the
-    image of rays are along the axes of the tangent plane, per pixel there."""
-    if not camera.kind.rays:
+) -> GradientsTwin:
+    """Gradients of a loss for a camera of any projection.
+
+    d_image: (H, W, 3), dL/dimage.
+    d_nearness: (H, W), dL/dnearness.
+
+    For rays, the gradients by the means on the image are along the axes of the tangent plane, per pixel there.
+    """
+    if not camera.model.along_rays:
         return on_plane.render_grad(gaussians, camera, d_image, background, d_nearness=d_nearness)
     seen = tangents(gaussians, camera)
     screen = blend_grad(seen, camera.width, camera.height, background, d_image, d_nearness=d_nearness)
     by_parameter = tangents_grad(gaussians, camera, seen, screen)
     by_parameter["means"] += nearness_grad(parameters(gaussians)["means"], camera, screen.nearness)
-    sides = pixel_sides(footprints(seen.directions, camera)[2])
-    on_image = {"means2d": sides * screen.means2d, "abs_means2d": sides * screen.abs_means2d}
-    return Gradients(**{**vars(screen), **on_image}, parameters=by_parameter, visible=seen.visible)
+    sides = pixel_sides(camera.model.footprints(camera, seen.directions)[2])
+    screen = replace(screen, means2d=sides * screen.means2d, abs_means2d=sides * screen.abs_means2d)
+    return GradientsTwin(**vars(screen), parameters=by_parameter, visible=seen.visible)

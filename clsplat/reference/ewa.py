@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """EWA projection with gsplat's conventions, and its gradient: float64 twin of kernels/ewa.cl and kernels/ewa_grad.cl.
 
-Equation numbers are those of docs/gradients.md. The view matrix may have any rows: its gradient is that of its twelve
-numbers, and not of rotations alone.
+Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation: its gradient is by its twelve
+numbers, not by rotations alone.
 """
 
 from __future__ import annotations
@@ -14,20 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
+from clsplat.reference.project import ALPHA_MIN
 
-ALPHA_MIN = 1.0 / 255.0
-EXTEND = 3.33
-"""Standard deviations that a Gaussian's box has, where its opacity does not make it smaller."""
-SLACK = 0.15
-"""Of the image's side: how far beyond an edge the Jacobian's place may be."""
-NEAR_AXIS = 1e-3
-"""Of a fisheye: (r / z)^2 up to which differences are taken by their series."""
+BOX_STANDARD_DEVIATIONS = 3.33
+"""Half size of a Gaussian's box in standard deviations, if its opacity does not make it smaller."""
+TWIN_EWA_CLAMP_FRACTION = 0.15
+"""Fraction of the image's side: how far beyond an edge the Jacobian is evaluated.
+
+`stages.ewa` has its own: a twin takes no number of a formula from the code that it checks."""
+SERIES_TANGENT_SQUARED = 1e-3
+"""For a fisheye: (r / z)^2 up to which differences are computed by their series."""
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A camera. viewmat (4, 4): camera from world; intrinsics (3, 3), of which the skew is not looked at; model:
-    pinhole, ortho or fisheye; planes in world units, eps2d in px^2, radius_clip in pixels."""
+class EwaViewTwin:
+    """A camera of the EWA projection.
+
+    viewmat: (4, 4), camera from world.
+    intrinsics: (3, 3); the skew is ignored.
+    model: pinhole, ortho or fisheye.
+    near, far: world units.
+    eps2d: px^2.
+    radius_clip: pixels.
+    """
 
     viewmat: Float64
     intrinsics: Float64
@@ -51,10 +60,20 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
-    """radii (N, 2) int32, 0 where culled; means2d (N, 2) pixels; depths (N,); conics (N, 3): a, b, c; compensations
-    (N,); points (N, 3): in the camera; jacobians (N, 2, 3); clamped (N, 2); covariances (N, 2, 2) with the low-pass;
-    determinants (N,): without it. Rows of culled Gaussians are filled too."""
+class EwaProjectedTwin:
+    """Projected Gaussians; rows of culled Gaussians are filled too.
+
+    radii: (N, 2) int32, 0 where culled.
+    means2d: (N, 2), pixels.
+    depths: (N,).
+    conics: (N, 3), a, b, c.
+    compensations: (N,).
+    points: (N, 3), in the camera.
+    jacobians: (N, 2, 3).
+    clamped: (N, 2).
+    covariances: (N, 2, 2), with the low-pass.
+    determinants: (N,), without it.
+    """
 
     radii: NDArray[np.int32]
     means2d: Float64
@@ -69,12 +88,12 @@ class Projected:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """(N,): not culled."""
+        """The Gaussians that are not culled, (N,)."""
         return self.radii[:, 0] > 0
 
 
 def rotations_of(quaternions: Float64) -> Float64:
-    """(N, 3, 3) of quaternions (N, 4), w x y z, of any length but 0."""
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4), w x y z, of any nonzero length."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -85,13 +104,13 @@ def rotations_of(quaternions: Float64) -> Float64:
 
 
 def covariances_of(quaternions: Float64, scales: Float64) -> Float64:
-    """(N, 3, 3): R S S^T R^T."""
+    """Covariances R S S^T R^T, (N, 3, 3)."""
     m = rotations_of(quaternions) * scales[:, None, :]
     return m @ m.transpose(0, 2, 1)
 
 
 def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) -> tuple[Float64, Float64]:
-    """Gradients by quaternions (N, 4) and scales (N, 3) from symmetric ones by covariances (N, 3, 3)."""
+    """Gradients by quaternions (N, 4) and scales (N, 3) from symmetric gradients by covariances (N, 3, 3)."""
     rotations = rotations_of(quaternions)
     d_m = 2 * gradients @ (rotations * scales[:, None, :])
     d_scales = (rotations * d_m).sum(axis=1)
@@ -113,18 +132,18 @@ def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) 
 
 
 def full_covariances(upper: Float64) -> Float64:
-    """(N, 3, 3) of upper triangles (N, 6): xx, xy, xz, yy, yz, zz."""
+    """Full matrices (N, 3, 3) from upper triangles (N, 6): xx, xy, xz, yy, yz, zz."""
     full: Float64 = upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     return full
 
 
 def upper_gradients(full: Float64) -> Float64:
-    """Gradients (N, 6) by the upper triangle of symmetric ones (N, 3, 3): an off-diagonal number is in two places."""
+    """Gradients (N, 6) by the upper triangle from symmetric ones (N, 3, 3): an off-diagonal entry has two places."""
     return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0]), np.float64)
 
 
 def _fisheye(points: Float64) -> tuple[Float64, Float64, Float64]:
-    """(157), (158): s = theta / r, h = (ds/dr) / r and (dh/dr) / r of points (N, 3) in the camera."""
+    """Eqs. (157), (158): s = theta / r, h = (ds/dr) / r and (dh/dr) / r of points (N, 3) in the camera."""
     x, y, z = points.T
     q = x * x + y * y
     r, d = np.sqrt(q), q + z * z
@@ -133,7 +152,7 @@ def _fisheye(points: Float64) -> tuple[Float64, Float64, Float64]:
         s = np.arctan2(r, z) / r
         h = (z / d - s) / q
         bend = (-2 * z / (d * d) - 3 * h) / q
-        near = (t < NEAR_AXIS) & (z > 0)
+        near = (t < SERIES_TANGENT_SQUARED) & (z > 0)
         k = np.arange(8)
         powers = t[:, None] ** k
         signs = (-1.0) ** k
@@ -143,9 +162,13 @@ def _fisheye(points: Float64) -> tuple[Float64, Float64, Float64]:
     return s, h, bend
 
 
-def project(means: Float64, covariances: Float64, view: View, opacities: Float64 | None = None) -> Projected:
-    """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156). With opacities (N,), 0 to 1, boxes end
-    where alpha is 1/255; with them compensations count."""
+def project(
+    means: Float64, covariances: Float64, view: EwaViewTwin, opacities: Float64 | None = None
+) -> EwaProjectedTwin:
+    """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156).
+
+    opacities: (N,), 0 to 1; boxes then end where alpha is 1/255. Include compensations in them if they are used.
+    """
     rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
     fx, fy = view.focal
     points = means @ rotation.T + translation
@@ -168,8 +191,8 @@ def project(means: Float64, covariances: Float64, view: View, opacities: Float64
             ratios = points[:, :2] / z[:, None]
             means2d = ratios * view.focal + view.centre
             size = np.array([view.width, view.height])
-            low = -(view.centre + SLACK * size) / view.focal
-            high = ((1 + SLACK) * size - view.centre) / view.focal
+            low = -(view.centre + TWIN_EWA_CLAMP_FRACTION * size) / view.focal
+            high = ((1 + TWIN_EWA_CLAMP_FRACTION) * size - view.centre) / view.focal
             limited = np.clip(ratios, low, high)
             clamped = limited != ratios
             rx, ry = limited.T
@@ -182,10 +205,10 @@ def project(means: Float64, covariances: Float64, view: View, opacities: Float64
         det = filtered[:, 0, 0] * filtered[:, 1, 1] - filtered[:, 0, 1] * filtered[:, 1, 0]
         conics = np.stack([filtered[:, 1, 1], -filtered[:, 0, 1], filtered[:, 0, 0]], axis=1) / det[:, None]
         compensations = np.sqrt(np.maximum(det0 / det, 0.0))
-        extend: Float64 | float = EXTEND
+        extend: Float64 | float = BOX_STANDARD_DEVIATIONS
         valid = (z > view.near) & (z < view.far) & (det > 0)
         if opacities is not None:
-            extend = np.minimum(EXTEND, np.sqrt(np.maximum(2 * np.log(opacities / ALPHA_MIN), 0.0)))
+            extend = np.minimum(BOX_STANDARD_DEVIATIONS, np.sqrt(np.maximum(2 * np.log(opacities / ALPHA_MIN), 0.0)))
             valid &= opacities >= ALPHA_MIN
         wide = np.ceil(extend * np.sqrt(filtered[:, 0, 0]))
         tall = np.ceil(extend * np.sqrt(filtered[:, 1, 1]))
@@ -193,17 +216,72 @@ def project(means: Float64, covariances: Float64, view: View, opacities: Float64
         valid &= (means2d[:, 1] + tall > 0) & (means2d[:, 1] - tall < view.height)
         valid &= (wide > view.radius_clip) | (tall > view.radius_clip)
         radii = np.where(valid[:, None], np.stack([wide, tall], axis=1), 0.0).astype(np.int32)
-    return Projected(radii, means2d, z.copy(), conics, compensations, points, jacobians, clamped, filtered, det0)
+    return EwaProjectedTwin(radii, means2d, z.copy(), conics, compensations, points, jacobians, clamped, filtered, det0)
+
+
+def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
+    """Of a fisheye: the gradient (N, 3) by the points in the camera, and that by the focal lengths (2,) through the
+    means on the image.
+
+    d_j: (N, 2, 3), by the Jacobians.
+    """
+    x, y, z = points.T
+    fx, fy = view.focal
+    s, h, bend = _fisheye(points)
+    d = (points * points).sum(axis=1)
+    g2 = d_means2d * view.focal
+    v0, v1, v2 = (fx * d_j[:, 0]).T
+    w0, w1, w2 = (fy * d_j[:, 1]).T
+    by_s = v0 + w1 + x * g2[:, 0] + y * g2[:, 1]
+    by_h = v0 * x * x + (v1 + w0) * x * y + w1 * y * y
+    by_d = (v2 * x + w2 * y) / (d * d)
+    d_p = np.zeros_like(points)
+    d_p[:, 0] = s * g2[:, 0] + 2 * x * h * v0 + y * h * (v1 + w0) - v2 / d + x * (by_s * h + by_h * bend + 2 * by_d)
+    d_p[:, 1] = s * g2[:, 1] + 2 * y * h * w1 + x * h * (v1 + w0) - w2 / d + y * (by_s * h + by_h * bend + 2 * by_d)
+    d_p[:, 2] = -by_s / d + 2 * by_h / (d * d) + 2 * z * by_d
+    return d_p, (points[:, :2] * s[:, None] * d_means2d).sum(axis=0)
+
+
+def _pinhole_grad(
+    view: EwaViewTwin,
+    points: Float64,
+    jacobians: Float64,
+    clamped: NDArray[np.bool_],
+    d_means2d: Float64,
+    d_j: Float64,
+) -> tuple[Float64, Float64, Float64]:
+    """Of a pinhole camera: the gradients by the points and the focal lengths, as `_fisheye_grad`, and the part (2,) by
+    the principal point that the clamp takes away.
+    """
+    z = points[:, 2]
+    jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]
+    ratios = points[:, :2] / z[:, None]
+    limited = -np.stack([jacobians[:, 0, 2] / jx, jacobians[:, 1, 2] / jy], axis=1)
+    d_limited = -np.stack([jx * d_j[:, 0, 2], jy * d_j[:, 1, 2]], axis=1)
+    d_ratios = d_means2d * view.focal + np.where(clamped, 0.0, d_limited)
+    d_p = np.zeros_like(points)
+    d_p[:, :2] = d_ratios / z[:, None]
+    d_p[:, 2] = -(d_ratios * ratios).sum(axis=1) / z - (d_j * jacobians).sum(axis=(1, 2)) / z
+    beyond = np.where(clamped, d_limited, 0.0)
+    by_focal = (ratios * d_means2d).sum(axis=0) - (beyond * limited).sum(axis=0) / view.focal
+    return d_p, by_focal, beyond.sum(axis=0) / view.focal
 
 
 def project_grad(
-    means: Float64, covariances: Float64, view: View, projected: Projected, gradients: Mapping[str, Float64]
+    means: Float64,
+    covariances: Float64,
+    view: EwaViewTwin,
+    projected: EwaProjectedTwin,
+    gradients: Mapping[str, Float64],
 ) -> dict[str, Float64]:
-    """Gradients by `means` (N, 3), `covariances` (N, 3, 3), symmetric, `viewmat` (4, 4) and `intrinsics` (3, 3) from
-    those by means2d, depths, conics and compensations, of which any may be missing: equations (159) to (166). What is
-    culled has none."""
+    """Gradients by means (N, 3), covariances (N, 3, 3), viewmat (4, 4) and intrinsics (3, 3): equations (159) to (166).
+
+    gradients: by means2d, depths, conics and compensations; each is optional.
+
+    The gradient by the covariances is symmetric. Culled Gaussians have none.
+    """
     seen = projected.visible
-    p, j, x, y, z = projected.points[seen], projected.jacobians[seen], *projected.points[seen].T
+    p, j = projected.points[seen], projected.jacobians[seen]
     count = len(p)
 
     def given(name: str, *width: int) -> Float64:
@@ -226,39 +304,19 @@ def project_grad(
     d_j = d_t @ rotation.T
     d_rotation = np.einsum("nai,naj->ij", j, d_t)
 
-    (fx, fy) = view.focal
     d_intrinsics = np.zeros((3, 3))
     d_intrinsics[:2, 2] = d_means2d.sum(axis=0)
-    d_p = np.zeros_like(p)
     d_focal = (d_j * j).sum(axis=(0, 2)) / view.focal
     if view.model == "ortho":
-        d_p[:, :2] = d_means2d * view.focal
+        d_p = np.concatenate([d_means2d * view.focal, np.zeros((count, 1))], axis=1)
         d_focal += (p[:, :2] * d_means2d).sum(axis=0)
     elif view.model == "fisheye":
-        s, h, bend = _fisheye(p)
-        d = (p * p).sum(axis=1)
-        g2 = d_means2d * view.focal
-        v0, v1, v2 = (fx * d_j[:, 0]).T
-        w0, w1, w2 = (fy * d_j[:, 1]).T
-        by_s = v0 + w1 + x * g2[:, 0] + y * g2[:, 1]
-        by_h = v0 * x * x + (v1 + w0) * x * y + w1 * y * y
-        by_d = (v2 * x + w2 * y) / (d * d)
-        d_p[:, 0] = s * g2[:, 0] + 2 * x * h * v0 + y * h * (v1 + w0) - v2 / d + x * (by_s * h + by_h * bend + 2 * by_d)
-        d_p[:, 1] = s * g2[:, 1] + 2 * y * h * w1 + x * h * (v1 + w0) - w2 / d + y * (by_s * h + by_h * bend + 2 * by_d)
-        d_p[:, 2] = -by_s / d + 2 * by_h / (d * d) + 2 * z * by_d
-        d_focal += (p[:, :2] * s[:, None] * d_means2d).sum(axis=0)
+        d_p, by_focal = _fisheye_grad(view, p, d_means2d, d_j)
+        d_focal += by_focal
     else:
-        jx, jy = j[:, 0, 0], j[:, 1, 1]
-        ratios = p[:, :2] / z[:, None]
-        limited = -np.stack([j[:, 0, 2] / jx, j[:, 1, 2] / jy], axis=1)
-        d_limited = -np.stack([jx * d_j[:, 0, 2], jy * d_j[:, 1, 2]], axis=1)
-        free = ~projected.clamped[seen]
-        d_ratios = d_means2d * view.focal + np.where(free, d_limited, 0.0)
-        d_p[:, :2] = d_ratios / z[:, None]
-        d_p[:, 2] = -(d_ratios * ratios).sum(axis=1) / z - (d_j * j).sum(axis=(1, 2)) / z
-        beyond = np.where(free, 0.0, d_limited)
-        d_focal += (ratios * d_means2d).sum(axis=0) - (beyond * limited).sum(axis=0) / view.focal
-        d_intrinsics[:2, 2] -= beyond.sum(axis=0) / view.focal
+        d_p, by_focal, by_centre = _pinhole_grad(view, p, j, projected.clamped[seen], d_means2d, d_j)
+        d_focal += by_focal
+        d_intrinsics[:2, 2] -= by_centre
     d_p[:, 2] += d_depths
     d_intrinsics[[0, 1], [0, 1]] = d_focal
     d_viewmat = np.zeros((4, 4))

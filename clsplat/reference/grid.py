@@ -7,8 +7,8 @@ import numpy as np
 
 from clsplat.arrays import Float64
 
-LUMINANCE = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue in the luminance that finds a pixel's level."""
+LUMINANCE_WEIGHTS = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in the luminance that selects a pixel's level."""
 
 
 def identity(shape: tuple[int, int, int]) -> Float64:
@@ -17,17 +17,18 @@ def identity(shape: tuple[int, int, int]) -> Float64:
 
 
 def _hats(places: Float64, count: int) -> Float64:
-    """Weights (..., count) of the vertices for each place among them."""
+    """Linear interpolation weights (..., count) of the vertices for each coordinate."""
     weights: Float64 = np.maximum(1 - np.abs(places[..., None] - np.arange(count)), 0)
     return weights
 
 
 def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, Float64, Float64]:
-    """Weights of each pixel (H, W) for rows, columns and levels, and the levels' derivatives by the luminance."""
+    """Weights of each pixel (H, W) for rows, columns and levels, and the level weights' derivatives by the
+    luminance."""
     (height, width, _), (levels, rows, columns) = image.shape, shape
     down = _hats((np.arange(height) + 0.5) / height * (rows - 1), rows)
     along = _hats((np.arange(width) + 0.5) / width * (columns - 1), columns)
-    luminance = image @ LUMINANCE
+    luminance = image @ LUMINANCE_WEIGHTS
     level = np.clip(luminance, 0, 1) * (levels - 1)
     low = np.minimum(np.floor(level), levels - 2)[..., None]
     slope = (np.arange(levels) == low + 1).astype(np.float64) - (np.arange(levels) == low)
@@ -36,7 +37,7 @@ def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, 
 
 
 def apply(image: Float64, grid: Float64) -> Float64:
-    """The image (H, W, 3) with the colours of a photograph of this grid."""
+    """The image (H, W, 3) with the colours of a photograph with this grid."""
     down, along, levels, _ = _weights(image, grid.shape[:3])
     maps = np.einsum("yj,xi,yxl,ljiab->yxab", down, along, levels, grid, optimize=True)
     seen: Float64 = np.einsum("yxab,yxb->yxa", maps[..., :3], image) + maps[..., 3]
@@ -44,7 +45,7 @@ def apply(image: Float64, grid: Float64) -> Float64:
 
 
 def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
-    """Gradients by the image and by the grid, from that by what is seen."""
+    """Gradients by the image and by the grid, from the gradient by the transformed image."""
     down, along, levels, slopes = _weights(image, grid.shape[:3])
     whole = np.concatenate([image, np.ones_like(image[..., :1])], axis=-1)
     by_grid: Float64 = np.einsum("yj,xi,yxl,yxa,yxb->ljiab", down, along, levels, by_seen, whole, optimize=True)
@@ -52,12 +53,12 @@ def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, 
         np.einsum("yj,xi,yxl,ljiab->yxab", down, along, each, grid, optimize=True) for each in (levels, slopes)
     )
     by_luminance = np.einsum("yxa,yxab,yxb->yx", by_seen, risen, whole)
-    by_image = np.einsum("yxa,yxab->yxb", by_seen, maps[..., :3]) + by_luminance[..., None] * LUMINANCE
+    by_image = np.einsum("yxa,yxab->yxb", by_seen, maps[..., :3]) + by_luminance[..., None] * LUMINANCE_WEIGHTS
     return by_image, by_grid
 
 
 def variation(grid: Float64) -> float:
-    """The mean squares of the differences between neighbours, summed over the three axes."""
+    """The mean squared difference between neighbours, summed over the three axes."""
     return float(sum(np.square(np.diff(grid, axis=axis)).mean() for axis in range(3)))
 
 
@@ -72,7 +73,7 @@ def variation_gradient(grid: Float64) -> Float64:
 
 
 def centre(grids: Float64) -> Float64:
-    """The grids (photographs, levels, rows, columns, 3, 4) with a mean that changes no colour."""
+    """The grids (photographs, levels, rows, columns, 3, 4), shifted so that their mean changes no colour."""
     centred: Float64 = grids - grids.mean(axis=0) + np.eye(3, 4)
     return centred
 
@@ -80,7 +81,7 @@ def centre(grids: Float64) -> Float64:
 def step(
     grid: Float64, first: Float64, second: Float64, by_grid: Float64, visit: int, rate: float
 ) -> tuple[Float64, Float64, Float64]:
-    """Grid and moments after Adam's step along by_grid at visit number `visit` (from 1) of the photograph."""
+    """Grid and moments after Adam's step along by_grid, at the photograph's visit number `visit` (from 1)."""
     first, second = 0.9 * first + 0.1 * by_grid, 0.999 * second + 0.001 * by_grid**2
     change = rate * (first / (1 - 0.9**visit)) / (np.sqrt(second / (1 - 0.999**visit)) + 1e-15)
     return grid - change, first, second

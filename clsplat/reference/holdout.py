@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame held out in float64: twin of kernels/holdout.cl. Equation numbers are those of docs/pictures.md."""
+"""A held-out frame in float64: twin of kernels/holdout.cl. Equation numbers refer to docs/pictures.md."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.reference.blend import layers
-from clsplat.reference.project import Projected
+from clsplat.reference.project import ProjectedTwin
 
 Surface = tuple[Float64, Float64, Float64]
-"""Depths (H, W) at which surfaces begin and end, infinite where there is none, and their alpha (H, W)."""
+"""Depths (H, W) at which a surface begins and ends, infinite where there is none, and its alpha (H, W)."""
 
 
 def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:
-    """(75): (H, W), the share of the light that comes through the surfaces to a depth."""
+    """Eq. (75): the fraction of the light (H, W) that passes the surfaces up to a depth."""
     left = np.ones(surfaces[0][0].shape)
     for begin, end, alpha in surfaces:
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -27,7 +27,7 @@ def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:
 
 
 def held_out(
-    projected: Projected,
+    projected: ProjectedTwin,
     width: int,
     height: int,
     surfaces: Sequence[Surface],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""L1 + D-SSIM and its gradient: float64 twin of kernels/loss*.cl. Equation numbers: docs/gradients.md."""
+"""L1 + D-SSIM and its gradient: float64 twin of kernels/loss*.cl. Equation numbers refer to docs/gradients.md."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import numpy as np
 
 from clsplat.arrays import Float64
 
-WINDOW = 11
-SIGMA = 1.5
-C1 = 0.01**2
-C2 = 0.03**2
+LOSS_WINDOW_PX = 11
+LOSS_WINDOW_SIGMA_PX = 1.5
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
 
 
 def window() -> Float64:
     """The 11 weights of the Gaussian window, sigma 1.5, sum 1; the 2D window is their outer product."""
-    offsets = np.arange(WINDOW) - WINDOW // 2
-    weights = np.exp(-(offsets**2) / (2 * SIGMA**2))
+    offsets = np.arange(LOSS_WINDOW_PX) - LOSS_WINDOW_PX // 2
+    weights = np.exp(-(offsets**2) / (2 * LOSS_WINDOW_SIGMA_PX**2))
     normalised: Float64 = weights / weights.sum()
     return normalised
 
@@ -24,12 +24,12 @@ def window() -> Float64:
 def blur(image: Float64) -> Float64:
     """The windowed mean with zeros beyond the edge, (H, W, C) -> (H, W, C). Symmetric, so it is its own adjoint."""
     height, width = image.shape[:2]
-    reach = WINDOW // 2
+    reach = LOSS_WINDOW_PX // 2
     weights = window()
     padded = np.pad(image, ((reach, reach), (0, 0), (0, 0)))
-    image = sum((weights[k] * padded[k : k + height] for k in range(WINDOW)), np.zeros_like(image))
+    image = sum((weights[k] * padded[k : k + height] for k in range(LOSS_WINDOW_PX)), np.zeros_like(image))
     padded = np.pad(image, ((0, 0), (reach, reach), (0, 0)))
-    return sum((weights[k] * padded[:, k : k + width] for k in range(WINDOW)), np.zeros_like(image))
+    return sum((weights[k] * padded[:, k : k + width] for k in range(LOSS_WINDOW_PX)), np.zeros_like(image))
 
 
 def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
@@ -38,21 +38,21 @@ def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     var_x = blur(x * x) - mean_x**2
     var_y = blur(y * y) - mean_y**2
     covariance = blur(x * y) - mean_x * mean_y
-    luminance, structure = 2 * mean_x * mean_y + C1, 2 * covariance + C2
-    luminance_norm, structure_norm = mean_x**2 + mean_y**2 + C1, var_x + var_y + C2
+    luminance, structure = 2 * mean_x * mean_y + SSIM_C1, 2 * covariance + SSIM_C2
+    luminance_norm, structure_norm = mean_x**2 + mean_y**2 + SSIM_C1, var_x + var_y + SSIM_C2
     values = luminance * structure / (luminance_norm * structure_norm)
 
     d_covariance = 2 * luminance / (luminance_norm * structure_norm)
     d_var = -values / structure_norm
     d_mean = 2 * mean_y * structure / (luminance_norm * structure_norm) - 2 * mean_x * values / luminance_norm
-    # the variances hold the mean too
+    # the variances depend on the mean too
     d_mean = d_mean - 2 * mean_x * d_var - mean_y * d_covariance
     gradient = blur(d_mean) + 2 * x * blur(d_var) + y * blur(d_covariance)
     return values, gradient
 
 
 def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Eq. (19): loss of the render x against the photo y, both (H, W, C), and its gradient by x.
+    """Eq. (19): loss of the render x against the photograph y, both (H, W, C), and its gradient by x.
 
     L = (1 - weight) mean |x - y| + weight (1 - mean SSIM), means over pixels and channels.
     """
@@ -64,7 +64,7 @@ def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float6
 
 
 def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Eq. (80): the same where only pixels with counts (H, W) of 1 count, those with 0 not."""
+    """Eq. (80): the same over the pixels where counts (H, W) is 1; it is 0 elsewhere."""
     mask = counts[:, :, None]
     samples = max(3 * counts.sum(), 1)
     difference = (x - y) * mask

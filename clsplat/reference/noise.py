@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise on means, and penalties on opacity and scale: float64 twin of kernels/noise.cl and of project_grad.cl's."""
+"""Noise on means, and penalties on opacity and scale: float64 twin of kernels/noise.cl and of project_grad.cl's
+penalties."""
 
 from __future__ import annotations
 
@@ -7,34 +8,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
-from clsplat.config.exploring import Exploration
+from clsplat.optimisation.step_noise import Exploration
 from clsplat.reference.project import rotation_matrices
 
-HALVES = 8
+HALF_WORDS_PER_NORMAL = 8
 
 
 def mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """A permutation of words of 32 bits (kernels/shared/random.h)."""
+    """A permutation of 32-bit words (kernels/shared/random.h)."""
     words = (words ^ (words >> np.uint32(16))) * np.uint32(0x7FEB352D)
     words = (words ^ (words >> np.uint32(15))) * np.uint32(0x846CA68B)
     return words ^ (words >> np.uint32(16))
 
 
 def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
-    """Eq. (93): three numbers for each of the rows (n,), (n, 3)."""
+    """Eq. (93): three numbers (n, 3) for each row (n,)."""
     of_row = mixed(rows.astype(np.uint32) ^ np.uint32(key[0])) + np.uint32(key[1])
-    counters = np.arange(3 * HALVES // 2, dtype=np.uint32) * np.uint32(0x9E3779B9)
+    counters = np.arange(3 * HALF_WORDS_PER_NORMAL // 2, dtype=np.uint32) * np.uint32(0x9E3779B9)
     words = mixed(of_row[:, None] + counters)
     halves = (words & np.uint32(0xFFFF)).astype(np.int64) + (words >> np.uint32(16)).astype(np.int64)
-    sums = halves.reshape(len(rows), 3, HALVES // 2).sum(axis=2) - HALVES * 65535 // 2
-    numbers: Float64 = sums / np.sqrt(HALVES * (65536.0**2 - 1) / 12)
+    sums = halves.reshape(len(rows), 3, HALF_WORDS_PER_NORMAL // 2).sum(axis=2) - HALF_WORDS_PER_NORMAL * 65535 // 2
+    numbers: Float64 = sums / np.sqrt(HALF_WORDS_PER_NORMAL * (65536.0**2 - 1) / 12)
     return numbers
 
 
 def displacements(
     explore: Exploration, quaternions: Float64, log_scales: Float64, opacity_logits: Float64, first_row: int = 0
 ) -> Float64:
-    """Eq. (92): what is added to the means, (n, 3)."""
+    """Eq. (92): the displacements of the means, (n, 3)."""
     eta = normal_numbers(explore.key, first_row + np.arange(len(opacity_logits)))
     opacities = 1 / (1 + np.exp(-opacity_logits))
     weights = explore.amount / (1 + np.exp(100 * (opacities - explore.dead)))
@@ -51,6 +52,6 @@ def penalty(explore: Exploration, log_scales: Float64, opacity_logits: Float64) 
 
 
 def penalty_grad(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> tuple[Float64, Float64]:
-    """Eq. (91): by log scales (n, 3) and opacity logits (n,)."""
+    """Eq. (91): gradients by log scales (n, 3) and opacity logits (n,)."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return explore.scale * np.exp(log_scales), explore.opacity * opacities * (1 - opacities)

@@ -11,19 +11,19 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.reference.project import view_directions
 from clsplat.reference.sh import sh_basis_grad
-from clsplat.spherical_harmonics import C0
+from clsplat.spherical_harmonics import SH_C0
 
 
 def pose_gradient(
     means: Float64, quaternions: Float64, sh: Float64, camera: Camera, sh_degree: int, gradients: Mapping[str, Float64]
 ) -> Float64:
-    """Gradient (6,) by a motion of the camera as `Camera.moved` has it: three of the turn, three of the shift.
+    """Gradient (6,) by a motion of the camera as in `Camera.moved`: three of the rotation, three of the translation.
 
-    gradients: those by means (N, 3), quaternions (N, 4) and sh (N, K, 3), zero where a Gaussian is not seen.
+    gradients: by means (N, 3), quaternions (N, 4) and sh (N, K, 3), zero where a Gaussian is not seen.
     """
     directions, _ = view_directions(means, camera)
     of_direction = sh_basis_grad(directions, sh_degree)
-    d_value = gradients["sh"][:, 0] / C0
+    d_value = gradients["sh"][:, 0] / SH_C0
     d_directions = np.einsum("nkd,nkc,nc->nd", of_direction, sh[:, : of_direction.shape[1]], d_value)
     w, v = quaternions[:, :1], quaternions[:, 1:]
     d_w, d_v = gradients["quaternions"][:, :1], gradients["quaternions"][:, 1:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole forward pass and its gradient in float64: what the kernels are held against."""
+"""The whole forward pass and its gradient in float64, with which the kernels are compared."""
 
 from __future__ import annotations
 
@@ -11,25 +11,36 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
-from clsplat.gaussians import GROUPS, Gaussians
-from clsplat.reference.blend import Blended, BlendGradients, blend, blend_grad
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.reference.blend import BlendedTwin, BlendGradients, blend, blend_grad
 from clsplat.reference.depth import nearness_grad
-from clsplat.reference.project import Projected, covariance_grad, lens_grad, project, project_grad
+from clsplat.reference.project import (
+    ProjectedGradients,
+    ProjectedTwin,
+    covariance_grad,
+    lens_grad,
+    project,
+    project_grad,
+)
 
-BLACK = (0.0, 0.0, 0.0)
+BLACK_BACKGROUND = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Forward:
-    """Everything the forward pass made."""
+    """The results of the forward pass."""
 
-    projected: Projected
-    blended: Blended
+    projected: ProjectedTwin
+    blended: BlendedTwin
 
 
 @dataclass(frozen=True, eq=False)
-class Gradients(BlendGradients):
-    """Those on the image, and parameters: by the name of the array in `Gaussians`, same shapes; visible (N,)."""
+class GradientsTwin(BlendGradients):
+    """Gradients on the image and by the parameters.
+
+    parameters: by the name of the array in `Gaussians`, same shapes.
+    visible: (N,).
+    """
 
     parameters: dict[str, Float64]
     visible: NDArray[np.bool_]
@@ -37,30 +48,45 @@ class Gradients(BlendGradients):
 
 def parameters(gaussians: Gaussians) -> dict[str, Float64]:
     """The five arrays by name, in float64; means in the world."""
-    fields = dict.fromkeys(group.field for group in GROUPS.values())
+    fields = dict.fromkeys(group.field for group in PARAMETER_GROUPS.values())
     arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in fields}
     return {**arrays, "means": arrays["means"] + gaussians.origin}
+
+
+def project_model(gaussians: Gaussians, camera: Camera, sh_degree: int) -> ProjectedTwin:
+    """Project a model, with the low-pass that it was trained with."""
+    arrays = parameters(gaussians)
+    return project(
+        arrays["means"],
+        arrays["quaternions"],
+        arrays["log_scales"],
+        arrays["opacity_logits"],
+        arrays["sh"],
+        camera,
+        sh_degree,
+        antialiased=gaussians.antialiased,
+    )
 
 
 def forward(
     gaussians: Gaussians,
     camera: Camera,
-    background: Sequence[float] | Float64 = BLACK,
+    background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     sh_degree: int | None = None,
 ) -> Forward:
-    """Project, sort, blend; sh_degree None uses all bands there are."""
+    """Project, sort, blend; sh_degree None uses all available bands."""
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
-    projected = project(**parameters(gaussians), camera=camera, sh_degree=degree, antialiased=gaussians.antialiased)
+    projected = project_model(gaussians, camera, degree)
     return Forward(projected, blend(projected, camera.width, camera.height, background))
 
 
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    background: Sequence[float] | Float64 = BLACK,
+    background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     sh_degree: int | None = None,
 ) -> tuple[Float64, Float64]:
-    """image (H, W, 3) over the background, alpha (H, W) = 1 - transmittance."""
+    """Render to image (H, W, 3) over the background, and alpha (H, W) = 1 - transmittance."""
     blended = forward(gaussians, camera, background, sh_degree).blended
     return blended.image, 1 - blended.transmittance
 
@@ -69,48 +95,38 @@ def render_grad(
     gaussians: Gaussians,
     camera: Camera,
     d_image: Float64,
-    background: Sequence[float] | Float64 = BLACK,
+    background: Sequence[float] | Float64 = BLACK_BACKGROUND,
     sh_degree: int | None = None,
     d_transmittance: Float64 | None = None,
     d_nearness: Float64 | None = None,
-) -> Gradients:
-    """Gradients of a loss with dL/dimage = d_image (H, W, 3), and by the transmittance at the end and nearness, each
-    (H, W)."""
+) -> GradientsTwin:
+    """Gradients of a loss.
+
+    d_image: (H, W, 3), dL/dimage.
+    d_transmittance: (H, W), by the transmittance at the end.
+    d_nearness: (H, W), by the nearness.
+    """
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
-    arrays = parameters(gaussians)
-    projected = project(**arrays, camera=camera, sh_degree=degree, antialiased=gaussians.antialiased)
+    projected = project_model(gaussians, camera, degree)
     screen = blend_grad(projected, camera.width, camera.height, background, d_image, d_transmittance, d_nearness)
-    by_parameter = project_grad(
-        **arrays,
-        camera=camera,
-        sh_degree=degree,
-        projected=projected,
-        d_means2d=screen.means2d,
-        d_covariances=covariance_grad(projected.conics, screen.conics),
-        d_opacities=screen.opacities,
-        d_colors=screen.colors,
-        antialiased=gaussians.antialiased,
-    )
+    arrays, on_image = parameters(gaussians), projected_gradients(projected, screen)
+    by_parameter = project_grad(arrays, camera, degree, projected, on_image, antialiased=gaussians.antialiased)
     by_parameter["means"] = by_parameter["means"] + nearness_grad(arrays["means"], camera, screen.nearness)
-    return Gradients(**vars(screen), parameters=by_parameter, visible=projected.visible)
+    return GradientsTwin(**vars(screen), parameters=by_parameter, visible=projected.visible)
+
+
+def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> ProjectedGradients:
+    """The gradients by covariances instead of conics."""
+    by_covariance = covariance_grad(projected.conics, screen.conics)
+    return ProjectedGradients(screen.means2d, by_covariance, screen.opacities, screen.colors)
 
 
 def render_lens_grad(
-    gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK
+    gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK_BACKGROUND
 ) -> Float64:
     """Gradient (4,) of a loss with dL/dimage = d_image (H, W, 3) by ln fx, ln fy, cx and cy."""
     arrays, camera = parameters(gaussians), camera.before(gaussians.near)
-    projected = project(**arrays, camera=camera, sh_degree=gaussians.sh_degree, antialiased=gaussians.antialiased)
+    projected = project_model(gaussians, camera, gaussians.sh_degree)
     screen = blend_grad(projected, camera.width, camera.height, background, d_image)
-    by_covariance = covariance_grad(projected.conics, screen.conics)
-    return lens_grad(
-        arrays["means"],
-        arrays["quaternions"],
-        arrays["log_scales"],
-        camera,
-        projected,
-        screen.means2d,
-        by_covariance,
-        screen.opacities,
-        antialiased=gaussians.antialiased,
-    )
+    geometry = (arrays["means"], arrays["quaternions"], arrays["log_scales"], camera, projected)
+    return lens_grad(*geometry, projected_gradients(projected, screen), antialiased=gaussians.antialiased)

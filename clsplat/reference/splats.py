@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splats of projected Gaussians that come as arrays, and the chain rule back: float64 twin of kernels/splats.cl and
-splats_grad.cl.
+"""Splats of projected Gaussians given as arrays, and the chain rule back.
 
-Equation numbers are those of docs/gradients.md.
+Float64 twin of kernels/splats.cl and splats_grad.cl. Equation numbers refer to docs/gradients.md.
 """
 
 from __future__ import annotations
@@ -18,8 +17,12 @@ from clsplat.reference.project import ALPHA_MIN
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """whitenings (n, 3): w11, w12, w22 of W with W^T W the conic; half_extents (n, 2): of the box of the ellipse where
-    alpha is 1/255; drawn (n,): what is not culled. Rows of others are 0."""
+    """Splats; rows of culled Gaussians are 0.
+
+    whitenings: (n, 3), w11, w12, w22 of W with W^T W the conic.
+    half_extents: (n, 2), of the box of the ellipse where alpha is 1/255.
+    drawn: (n,), not culled.
+    """
 
     whitenings: Float64
     half_extents: Float64
@@ -27,7 +30,7 @@ class Splats:
 
 
 def splats(conics: Float64, opacities: Float64, radii: NDArray[np.int32]) -> Splats:
-    """(170) to (172), of conics (n, 3) that are positive definite."""
+    """Eqs. (170) to (172), for positive definite conics (n, 3)."""
     a, b, c = conics.T
     det = a * c - b * b
     drawn = (radii > 0).all(axis=1) & (opacities > ALPHA_MIN)
@@ -39,7 +42,7 @@ def splats(conics: Float64, opacities: Float64, radii: NDArray[np.int32]) -> Spl
 
 @dataclass(frozen=True, eq=False)
 class SplatGradients:
-    """means2d (n, 2), conics (n, 3), opacities (n,): in loss per unit of each."""
+    """Gradients by means2d (n, 2), conics (n, 3) and opacities (n,), in loss per unit of each."""
 
     means2d: Float64
     conics: Float64
@@ -47,8 +50,11 @@ class SplatGradients:
 
 
 def splats_grad(conics: Float64, opacities: Float64, moments: Float64) -> SplatGradients:
-    """(173) to (175): moments (n, 6) of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels, with (u, v) = W d, d
-    from the pixel to the mean."""
+    """Eqs. (173) to (175).
+
+    moments: (n, 6), sums of g, g u, g v, g u^2, g u v, g v^2 over a Gaussian's pixels. (u, v) = W d, with d from the
+    pixel to the mean.
+    """
     a, b, c = conics.T
     l11, l12, l22 = np.sqrt(a), b / np.sqrt(a), np.sqrt((a * c - b * b) / a)
     g, gu, gv, guu, guv, gvv = moments.T

@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles that a Gaussian reaches, by looking at every pixel: float64 twin of the tile test in kernels/."""
+"""Tiles that a Gaussian reaches, by evaluating every pixel: float64 twin of the tile test in kernels/."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from clsplat.arrays import Int64
-from clsplat.reference.blend import ALPHA_MAX
-from clsplat.reference.project import ALPHA_MIN, Projected
+from clsplat.reference.blend import BLEND_ALPHA_MAX
+from clsplat.reference.project import ALPHA_MIN, ProjectedTwin
 
 
 def touched_tiles(
-    projected: Projected, width: int, height: int, tile: int = 16, threshold: float = ALPHA_MIN
+    projected: ProjectedTwin, width: int, height: int, tile: int = 16, threshold: float = ALPHA_MIN
 ) -> list[Int64]:
     """Per Gaussian the tiles, ascending and row-major, that hold a pixel centre with alpha >= threshold.
 
     The kernels' tile set must be a superset of this: a missing tile is a hole in the image, a spare one costs only
-    time. They test the ellipse against the tile's rectangle of pixel centres, which it may cut between two centres.
-    A float32 test can also round the other way within about 1e-5 of the threshold: compare at
-    threshold = ALPHA_MIN * (1 + 1e-5).
+    time. The kernels test the ellipse against the tile's rectangle of pixel centres, which it may cut between two
+    centres. A float32 test can also round the other way within about 1e-5 of the threshold: compare at threshold =
+    ALPHA_MIN * (1 + 1e-5).
     """
     tiles_x = -(-width // tile)
     result = []
@@ -27,7 +27,7 @@ def touched_tiles(
         if splat is None:
             result.append(np.zeros(0, np.int64))
             continue
-        rows, columns = np.nonzero(np.minimum(ALPHA_MAX, splat.raw) >= threshold)
+        rows, columns = np.nonzero(np.minimum(BLEND_ALPHA_MAX, splat.raw) >= threshold)
         above, left = (side.start for side in splat.box)
         tiles = (rows + above) // tile * tiles_x + (columns + left) // tile
         result.append(np.unique(tiles).astype(np.int64))

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blending any number of values a Gaussian and its gradient, every Gaussian at every pixel: float64 twin of
-kernels/values.cl and values_grad.cl.
+"""Blending any number of values per Gaussian and its gradient, every Gaussian at every pixel.
 
-Equation numbers are those of docs/gradients.md.
+Float64 twin of kernels/values.cl and values_grad.cl. Equation numbers refer to docs/gradients.md.
 """
 
 from __future__ import annotations
@@ -14,17 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
-from clsplat.reference.blend import ALPHA_MAX, TRANSMITTANCE_MIN
+from clsplat.reference.blend import BLEND_ALPHA_MAX, TRANSMITTANCE_MIN
 from clsplat.reference.project import ALPHA_MIN
 
-NEAR = 0.05
-"""Where the margin is cut."""
+MAX_VALUES_MARGIN = 0.05
+"""Upper limit of the margin."""
 
 
 @dataclass(frozen=True, eq=False)
 class FlatGaussians:
-    """means2d (n, 2) in pixels; conics (n, 3): a, b, c of the inverse covariance; opacities (n,); values (n, D); depths
-    (n,); drawn (n,)."""
+    """Projected Gaussians with values.
+
+    means2d: (n, 2), pixels.
+    conics: (n, 3), a, b, c of the inverse covariance.
+    opacities: (n,).
+    values: (n, D).
+    depths: (n,).
+    drawn: (n,).
+    """
 
     means2d: Float64
     conics: Float64
@@ -35,14 +41,19 @@ class FlatGaussians:
 
     @property
     def order(self) -> list[int]:
-        """Those that are drawn, front to back, ties by index."""
+        """The drawn Gaussians, front to back, ties by index."""
         return [int(i) for i in np.argsort(self.depths, kind="stable") if self.drawn[i]]
 
 
 @dataclass(frozen=True, eq=False)
 class ValuesBlended:
-    """image (H, W, D) over the background; transmittance (H, W); margin (H, W): the smallest relative distance of a
-    decision to its threshold (alpha to 1/255 and to the cap, T to 1e-4), cut at NEAR."""
+    """A blended picture.
+
+    image: (H, W, D), over the background.
+    transmittance: (H, W).
+    margin: (H, W), the smallest relative distance of a decision to its threshold (alpha to 1/255 and the cap, T to
+    1e-4), clamped to MAX_VALUES_MARGIN.
+    """
 
     image: Float64
     transmittance: Float64
@@ -51,8 +62,10 @@ class ValuesBlended:
 
 @dataclass(frozen=True, eq=False)
 class ValueGradients:
-    """means2d (n, 2), conics (n, 3), opacities (n,), values (n, D), background (D,); absolute (n, 2): sums of the
-    absolute values of every pixel's gradient by means2d."""
+    """Gradients by means2d (n, 2), conics (n, 3), opacities (n,), values (n, D) and background (D,).
+
+    absolute: (n, 2), sums of the absolute values of every pixel's gradient by means2d.
+    """
 
     means2d: Float64
     conics: Float64
@@ -64,8 +77,13 @@ class ValueGradients:
 
 @dataclass(frozen=True, eq=False)
 class _Layer:
-    """A Gaussian on all pixels, (H, W) each: offsets of its mean; alpha before the cap; alpha, 0 where it is not added;
-    transmittance in front of it."""
+    """A Gaussian on all pixels, (H, W) each.
+
+    dx, dy: the mean minus the pixel centre.
+    raw: alpha before the cap.
+    alpha: 0 where it is not added.
+    before: transmittance in front of it.
+    """
 
     gaussian: int
     dx: Float64
@@ -77,7 +95,7 @@ class _Layer:
 
 
 def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float) -> Iterator[_Layer]:
-    """(14) to (16): front to back."""
+    """Eqs. (14) to (16): front to back."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     transmittance, alive = np.ones((height, width)), np.ones((height, width), np.bool_)
     for i in gaussians.order:
@@ -97,11 +115,11 @@ def _layers(gaussians: FlatGaussians, width: int, height: int, alpha_max: float)
 
 
 def blend_values(
-    gaussians: FlatGaussians, width: int, height: int, background: Float64, alpha_max: float = ALPHA_MAX
+    gaussians: FlatGaussians, width: int, height: int, background: Float64, alpha_max: float = BLEND_ALPHA_MAX
 ) -> ValuesBlended:
-    """(177): the picture."""
+    """Eq. (177): the picture."""
     image = np.zeros((height, width, gaussians.values.shape[1]))
-    left, margin = np.ones((height, width)), np.full((height, width), NEAR)
+    left, margin = np.ones((height, width)), np.full((height, width), MAX_VALUES_MARGIN)
     for layer in _layers(gaussians, width, height, alpha_max):
         image += (layer.before * layer.alpha)[:, :, None] * gaussians.values[layer.gaussian]
         left = layer.before * (1 - layer.alpha)
@@ -116,9 +134,9 @@ def blend_values_grad(
     background: Float64,
     d_image: Float64,
     d_alpha: Float64,
-    alpha_max: float = ALPHA_MAX,
+    alpha_max: float = BLEND_ALPHA_MAX,
 ) -> ValueGradients:
-    """(178) to (180), back to front: d_image (H, W, D), d_alpha (H, W)."""
+    """Eqs. (178) to (180), back to front. d_image: (H, W, D); d_alpha: (H, W)."""
     layers = list(_layers(gaussians, width, height, alpha_max))
     n, depth = gaussians.values.shape
     means2d, absolute, conics = np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 3))

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames from models, and the plan of the memory that they take."""
+"""Rendering of models to frames, and the plan of the device memory for it."""

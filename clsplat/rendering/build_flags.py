@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build defines of the kernels for a RasterizerConfig. The default has none: its kernels are the plain text."""
+"""Build defines of the kernels for a RasterizerConfig. The default needs none: its kernels are the unchanged source."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from clsplat.config.rasterizer import RasterizerConfig
 _HALF_LOG2E = 0.5 * math.log2(math.e)
 
 
-ALPHA_MAX = 0.99
-"""The cap of alpha unless another one is asked for."""
+DEFAULT_ALPHA_MAX = 0.99
+"""The default cap of alpha."""
 
 
 def kernel_defines(
-    config: RasterizerConfig, *, antialiased: bool = False, alpha_max: float = ALPHA_MAX
+    config: RasterizerConfig, *, antialiased: bool = False, alpha_max: float = DEFAULT_ALPHA_MAX
 ) -> dict[str, object]:
-    """The defines that make the kernels do as `config` says; only for what differs from the default. antialiased: of
-    the model; alpha_max: the cap of alpha, of the library's calls."""
+    """The kernels' defines for `config`, only for settings that differ from the default.
+
+    antialiased: True for an antialiased model.
+    alpha_max: the cap of alpha in library calls.
+    """
     config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
-        # Within a tile whole cells are skipped, so that what is cut would depend on the kernels' shape.
+        # Within a tile whole cells are skipped, so that the cut would depend on the kernels' shape.
         defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_ROW_SKIP=True, NO_COLUMN_SKIP=True)
     elif config.extent == "constant":
         defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))
@@ -33,12 +36,8 @@ def kernel_defines(
         "SQUARE_TILE_TEST": config.tile_test == "square",
         "NO_ROW_SKIP": not config.row_skip,
         "NO_COLUMN_SKIP": not config.column_skip,
-        "NO_VECTOR_SKIP": not config.vector_skip,
         "NO_EARLY_STOP": not config.early_stop,
-        "NO_LAST_CONTRIBUTOR": not config.last_contributor,
-        "NO_GRADIENT_SKIP": not config.gradient_skip,
         "NO_FRUSTUM_CULL": not config.frustum_cull,
-        "NO_OPACITY_CULL": not config.opacity_cull,
         "ANTIALIASED": antialiased,
     }
     defines.update({name: True for name, wanted in flags.items() if wanted})
@@ -48,7 +47,7 @@ def kernel_defines(
         defines.update(ALPHA_MIN=_literal(config.alpha_min), LOG2_ALPHA_MIN=_literal(math.log2(config.alpha_min)))
     if config.transmittance_min != default.transmittance_min:
         defines["TRANSMITTANCE_MIN"] = _literal(config.transmittance_min)
-    if alpha_max != ALPHA_MAX:
+    if alpha_max != DEFAULT_ALPHA_MAX:
         defines["ALPHA_MAX"] = _literal(alpha_max)
     return defines
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contributions of each Gaussian to the pictures of given cameras: the statistic that density control prunes by."""
+"""Contributions of each Gaussian to the images of given cameras: the statistic for pruning in density control."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
-from clsplat.device.layout import SlotFields
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import SlotFields
 from clsplat.models.edit import drop_sh
 from clsplat.rendering.memory_needs import plan_step
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.stages.device_gaussians import host_gaussians, upload_gaussians
 from clsplat.stages.project import add_slots
 
-FIELDS = SlotFields(contributions=True)
+CONTRIBUTION_SLOT_FIELDS = SlotFields(contributions=True)
 
 
 def largest_contributions(
     gaussians: Gaussians, cameras: Sequence[Camera], device: Device, config: RasterizerConfig | None = None
 ) -> Float32:
-    """(n,) the most that each adds to one camera's picture: the sum over its pixels of alpha times transmittance, in
-    pixels, like `--density.min-contribution`; 0 where no camera sees it.
+    """The largest contribution (n,) of each Gaussian to one camera's image, in pixels.
 
-    It comes from the gradient of blending, and is the same for any gradient of the image. Raises CapacityError where
-    the device is too small.
+    A contribution is the sum over the image's pixels of alpha times transmittance, like `--density.min-contribution`.
+    It is 0 if no camera sees the Gaussian. It comes from the gradient of blending, and is the same for any gradient of
+    the image. Raises CapacityError if the device is too small.
     """
     config = config or RasterizerConfig()
     alpha_alone = drop_sh(gaussians, 0)  # colour does not matter
-    plan = plan_step(device, len(gaussians), 1, cameras, config, fields=FIELDS, agreement=False)
+    plan = plan_step(device, len(gaussians), 1, cameras, config, fields=CONTRIBUTION_SLOT_FIELDS)
     rasterizer = Rasterizer(device, config)
     rasterizer.antialias(on=gaussians.antialiased)
     rasterizer.follow(plan)
@@ -48,10 +48,10 @@ def largest_contributions(
     return largest
 
 
-def sums_of_weights(rasterizer: Rasterizer, frame: Frame) -> Float32:
-    """(n,) the sum over the frame's pixels of each Gaussian's alpha times transmittance."""
-    slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=FIELDS)
+def sums_of_weights(rasterizer: Rasterizer, frame: ForwardPass) -> Float32:
+    """The sum (n,) over the frame's pixels of each Gaussian's alpha times transmittance."""
+    slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=CONTRIBUTION_SLOT_FIELDS)
     sums, tile_counts = slots.values, frame.projected.tile_counts
     if slots.first_slots is not None:
-        sums = add_slots(rasterizer.device, rasterizer.work, tile_counts, slots, None, fields=FIELDS)
+        sums = add_slots(rasterizer.device, rasterizer.work, tile_counts, slots, None, fields=CONTRIBUTION_SLOT_FIELDS)
     return np.where(tile_counts.get() > 0, sums.get()[:, -1], np.float32(0))

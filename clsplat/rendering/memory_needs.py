@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Device memory that frames and training steps need: the sums of the bytes that the stages state, for the plan."""
+"""Device memory that frames and training steps need: the sums of the stages' byte counts, for the memory plan."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from dataclasses import replace
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import POSE_ROWS, TILE, SlotFields
 from clsplat.gaussians import floats_of
+from clsplat.layouts.columns import POSE_ROWS, TILE, SlotFields
 from clsplat.rendering.memory_plan import Need, Plan, plan
-from clsplat.stages import blend, density, duplicate, loss, pose, project, ranges, sampling, target
+from clsplat.stages import blend, density, duplicate, loss, loss_terms, project, ranges, target
 from clsplat.stages.device_camera import tiles_of
-from clsplat.stages.duplicate import MAX_PAIRS
+from clsplat.stages.duplicate import MAX_PAIRS_PER_BAND
 from clsplat.stages.sort import scratch_bytes
 
-_CHANNEL_PLANES = 4
-"""Planes of a frame with channels beside those of its features: median, first, count and index."""
-_MODELS = 3
-"""Arrays of a training step for each parameter: itself and two moments."""
-_SHOWN = 4
-"""Bytes of each Gaussian where a step has several views: of the mark that any of them shows it."""
-_SMALL = 4096
-"""Bytes of camera, background, totals and the like."""
+_EXTRA_CHANNEL_PLANES = 4
+"""Planes that a frame with extra channels needs in addition to its features: median, first, count and index."""
+MODELS = 3
+"""Arrays per parameter in a training step: the parameter and two moments."""
+_VISIBLE_MARK_BYTES = 4
+"""Bytes per Gaussian in a step with several views: the mark that some view shows it."""
+_SMALL_ARRAYS_BYTES = 4096
+"""Bytes of camera, background, totals and other small arrays."""
 
 
 def plan_frame(
@@ -37,9 +37,13 @@ def plan_frame(
     planes: int = 0,
     moved: int = 0,
 ) -> Plan:
-    """Memory plan of a frame, without training. floats: parameters of a Gaussian (`ShStorage.floats`); features: floats
-    of each Gaussian's that go into channels beside colour; planes: bytes of a pixel in further planes; moved: how
-    many means there are that motion goes to. Raises CapacityError."""
+    """Memory plan of a frame without training. Raises CapacityError.
+
+    floats: parameters of a Gaussian (`ShStorage.floats`).
+    features: floats of each Gaussian that are blended to extra channels.
+    planes: bytes per pixel of further planes.
+    moved: number of further sets of means, for motion.
+    """
     need = _frame_need(device, gaussians, floats, _plane_bytes(camera, _pixel_bytes(features, planes)), config)
     return _plan(device, replace(need, row=need.row + 4 * (features + 3 * moved)))
 
@@ -52,75 +56,82 @@ def plan_step(
     config: RasterizerConfig,
     *,
     fields: SlotFields,
-    agreement: bool,
     photographs: int = 0,
     turns: int = 1,
-    antialiased: bool = False,
-    models: int = _MODELS,
+    models: int = MODELS,
     masks: bool = False,
-    lens: bool = False,
-    further: int = 0,
+    row_bytes: int = 0,
+    pixel_bytes: int = 0,
 ) -> Plan:
-    """Memory plan of a training step, from any of the cameras. agreement: True if agreeing views are counted;
-    photographs: pixels of all that may stay on the device; turns: of `loss`; antialiased: of the model; models: arrays
-    for each parameter, where they are not those of a step of one view; masks: photographs have masks, or an alpha loss;
-    lens: gradients by the lens are wanted; further: bytes of a pixel in further planes. Raises CapacityError."""
-    planes, extra = 0, masks * (target.MASK_BYTES + loss.ALPHA_PIXEL_BYTES + turns)
+    """Memory plan of a training step with any of the cameras. Raises CapacityError.
+
+    fields: the columns of a slot.
+    photographs: pixels of all photographs that may stay on the device.
+    turns: the `turns` of `stages.loss`.
+    models: arrays per parameter, if not as in a step of one view.
+    masks: True if photographs have masks, or there is an alpha loss.
+    row_bytes: bytes per Gaussian of the training's components.
+    pixel_bytes: bytes per pixel of the training's components.
+    """
+    planes, extra = 0, masks * (target.MASK_PIXEL_BYTES + loss_terms.ALPHA_PIXEL_BYTES + turns)
     for camera in cameras:
-        pixels = _plane_bytes(camera, _pixel_bytes(planes=further) + target.PIXEL_BYTES + loss.PIXEL_BYTES + extra)
+        pixels = _plane_bytes(
+            camera, _pixel_bytes(planes=pixel_bytes) + target.TARGET_PIXEL_BYTES + loss.LOSS_PIXEL_BYTES + extra
+        )
         planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
-    screen = project.SCREEN_BYTES + 4 * fields.contributions
-    statistics = density.gaussian_bytes(agreement=agreement, contributions=fields.contributions)
+    screen = project.SCREEN_GRADIENT_BYTES + 4 * fields.contributions
+    statistics = density.gaussian_bytes(contributions=fields.contributions)
     step = replace(
         frame,
-        row=frame.row
-        + screen
-        + statistics
-        + (_SHOWN if models > _MODELS else 0)
-        + sampling.GAUSSIAN_BYTES * antialiased
-        + 4 * pose.LENS * lens,
+        row=frame.row + screen + statistics + (_VISIBLE_MARK_BYTES if models > MODELS else 0) + row_bytes,
         banded=frame.banded + 4 * fields.floats,
         model=models * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),
-        most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS),
-        photographs=0 if device.shares_memory else (target.SOURCE_BYTES + masks * target.MASK_BYTES) * photographs,
+        most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS_PER_BAND),
+        photographs=0
+        if device.shares_memory
+        else (target.SOURCE_PIXEL_BYTES + masks * target.MASK_PIXEL_BYTES) * photographs,
     )
     return _plan(device, step)
 
 
 def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
-    """Pixels that a frame may have, for its planes to leave three quarters of the device's memory to the model and its
-    pairs, and to be allocated at all."""
-    per_pixel = _pixel_bytes(features, planes) + 1  # with its share of the tile's
+    """Largest number of pixels of a frame, by memory.
+
+    Its planes must leave three quarters of the device's memory to the model and its pairs, and fit one allocation each.
+    """
+    per_pixel = _pixel_bytes(features, planes) + 1  # with a share of the tile's bytes
     largest = max(12, 4 * (features + 2) if features else 0, planes)
     return min(device.budget // (4 * per_pixel), device.max_allocation // largest)
 
 
 def _pixel_bytes(features: int = 0, planes: int = 0) -> int:
-    return blend.PIXEL_BYTES + (4 * (features + _CHANNEL_PLANES) if features else 0) + planes
+    return blend.BLEND_PIXEL_BYTES + (4 * (features + _EXTRA_CHANNEL_PLANES) if features else 0) + planes
 
 
 def _plane_bytes(camera: Camera, pixel_bytes: int) -> int:
     tiles_x, tiles_y = tiles_of(camera)
-    return tiles_x * tiles_y * (TILE * TILE * pixel_bytes + ranges.TILE_BYTES + duplicate.TILE_BYTES)
+    return tiles_x * tiles_y * (TILE * TILE * pixel_bytes + ranges.RANGE_TILE_BYTES + duplicate.BAND_TILE_BYTES)
 
 
 def _frame_need(device: Device, gaussians: int, floats: int, planes: int, config: RasterizerConfig) -> Need:
-    """The need of a frame without channels. planes: bytes of all that is as large as the image."""
+    """The memory need of a frame without extra channels.
+
+    planes: bytes of all arrays that are as large as the image.
+    """
     switches = config.switches()
-    keeps_culled = not (switches.frustum_cull and switches.opacity_cull)
-    pair = duplicate.pair_bytes(sorts_pairs=switches.depth_sort == "pairs") + ranges.PAIR_BYTES
+    pair = duplicate.pair_bytes(sorts_pairs=switches.depth_sort == "pairs") + ranges.TILE_SORT_PAIR_BYTES
     return Need(
         gaussians=gaussians,
-        row=project.gaussian_bytes(keeps_culled=keeps_culled) + duplicate.GAUSSIAN_BYTES,
-        banded=duplicate.BAND_BYTES,
+        row=project.gaussian_bytes(keeps_culled=not switches.frustum_cull) + duplicate.DUPLICATE_GAUSSIAN_BYTES,
+        banded=duplicate.BAND_GAUSSIAN_BYTES,
         model=4 * floats,
-        widest=4 * max(floats - floats_of(1), 4),  # of the higher SH bands, or quaternions
+        widest=4 * max(floats - floats_of(1), 4),  # the higher SH bands, or quaternions
         pair=pair,
-        most_pairs=min(device.max_allocation // 4, MAX_PAIRS),
+        most_pairs=min(device.max_allocation // 4, MAX_PAIRS_PER_BAND),
         planes=planes,
-        scratch=scratch_bytes(device, max(gaussians, device.budget // pair)) + _SMALL,
+        scratch=scratch_bytes(device, max(gaussians, device.budget // pair)) + _SMALL_ARRAYS_BYTES,
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limit of device memory, and the pieces that work is cut into because of it. Policy only: no OpenCL."""
+"""The limit of device memory, and the division of the work that follows from it. Policy only: no OpenCL."""
 
 from __future__ import annotations
 
@@ -9,19 +9,24 @@ from clsplat.errors import CapacityError, amount
 
 
 def mebibytes(nbytes: int) -> str:
-    """So many bytes for a line of text, to a tenth of a MiB; fewer than 10 MiB in a unit that tells them apart."""
+    """A number of bytes as text, to a tenth of a MiB; below 10 MiB in a smaller unit."""
     return f"{nbytes / 2**20:,.1f} MiB" if nbytes >= 10 * 2**20 else amount(nbytes)
 
 
 @dataclass(frozen=True)
 class Need:
-    """Device memory that a frame, or a training step, needs, in bytes unless said otherwise.
+    """Device memory that a frame or a training step needs, in bytes unless noted.
 
-    gaussians: their number; model: each one's parameters, in a step with moments; widest: each one's part
-    of the widest of these arrays; row: of each, all the rest; banded: of each, what several bands of tiles add; pair:
-    of each pair; most_pairs: their number at which the widest of their arrays is full; planes: all that is as large as
-    the image; scratch: whatever is left over; photographs: those that the device may keep from step to step, as far as
-    there is room.
+    gaussians: number of Gaussians.
+    model: parameters of a Gaussian, in a step with moments.
+    widest: a Gaussian's row in the largest parameter array.
+    row: all other arrays of a Gaussian.
+    banded: further bytes of a Gaussian if tiles are divided into bands.
+    pair: arrays of a (tile, Gaussian) pair.
+    most_pairs: number of pairs at which the largest pair array reaches its limit.
+    planes: all arrays that are as large as the image.
+    scratch: all other arrays.
+    photographs: photographs that the device may keep between steps, if there is room.
     """
 
     gaussians: int
@@ -37,12 +42,12 @@ class Need:
 
     @property
     def pairs(self) -> int:
-        """A guess, before the first frame: how many there will be."""
-        return PAIRS_EACH * self.gaussians
+        """Estimated number of pairs, before the first frame."""
+        return ESTIMATED_PAIRS_PER_GAUSSIAN * self.gaussians
 
     @property
     def total(self) -> int:
-        """Bytes with everything on the device at once, but for photographs."""
+        """Bytes with everything on the device at once, without photographs."""
         return self.planes + self.scratch + self.gaussians * (self.row + self.model) + self.pairs * self.pair
 
     @property
@@ -51,17 +56,21 @@ class Need:
         return self.gaussians * self.model
 
 
-PAIRS_EACH = 8
-"""Tiles that a Gaussian reaches, as a guess. Trained scenes have 3 to 8."""
+ESTIMATED_PAIRS_PER_GAUSSIAN = 8
+"""Estimated number of tiles that a Gaussian reaches. Trained scenes have 3 to 8."""
 
 
 @dataclass(frozen=True)
 class Plan:
     """Division of the work, so that it fits the memory.
 
-    rows: Gaussians whose parameters and moments are on the device at once; streamed: not all of them; pairs: most
-    (tile, Gaussian) pairs at once; gathers: rows move on the device; allowed: bytes; groups: of tiles, estimated;
-    photographs: bytes of those that stay on the device.
+    rows: Gaussians whose parameters and moments are on the device at once.
+    streamed: True if that is not all of them.
+    pairs: largest number of (tile, Gaussian) pairs at once.
+    gathers: True if rows are moved on the device.
+    allowed: memory limit, bytes.
+    groups: estimated number of groups of tiles.
+    photographs: bytes of photographs that stay on the device.
     """
 
     need: Need
@@ -75,12 +84,12 @@ class Plan:
 
     @property
     def pieces(self) -> tuple[bool, bool]:
-        """True for each that is done in pieces: parameters, image."""
+        """True for each part that is divided: parameters, image."""
         return self.streamed, self.groups > 1
 
     @property
     def tight(self) -> bool:
-        """True if there is no room to spare."""
+        """True if there is no spare memory."""
         return any(self.pieces) or not self.gathers
 
     def __str__(self) -> str:
@@ -95,10 +104,13 @@ class Plan:
 
 
 def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
-    """All at once if the guess of the pairs says so; else the tiles in bands, and when those would be many, the
-    parameters in parts: bands repeat little, parts go over the bus in every step.
+    """Divide the work by the estimated number of pairs.
 
-    alignment: what the number of rows is a multiple of. Raises CapacityError where not even the smallest pieces fit.
+    If everything does not fit at once, the tiles are divided into bands. If that makes many bands, the parameters are
+    streamed in parts. Bands repeat little work, but parts cross the bus in every step.
+
+    alignment: the number of rows is a multiple of it.
+    Raises CapacityError if not even the smallest pieces fit.
     """
     photographs = min(max(budget - need.total - need.moving, 0) // 2, need.photographs)
     room = budget - need.planes - need.scratch - need.gaussians * (need.row + need.banded) - photographs
@@ -113,7 +125,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     enough = min(need.pairs // 8, need.gaussians) + 1
     if need.gaussians * need.widest <= max_allocation and whole.pairs >= enough:
         return whole
-    for_rows = min(room // 4, room - need.gaussians * need.pair)  # a tile may have all Gaussians
+    for_rows = min(room // 4, room - need.gaussians * need.pair)  # a tile may contain all Gaussians
     rows = max(min(for_rows // need.model, max_allocation // need.widest, need.gaussians), alignment)
     rows -= rows % alignment
     streamed = made(rows, streamed=True)

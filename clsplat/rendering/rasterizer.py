@@ -5,27 +5,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.camera import KINDS, Camera
+from clsplat.camera import CAMERA_MODELS, Camera
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.config.thinning import Thinning
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, pinned
 from clsplat.device.context import Device
-from clsplat.device.layout import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, SlotFields
+from clsplat.layouts.columns import CAMERA, PLAIN_SLOTS, READBACK, WIDEST_SLOTS, SlotFields
+from clsplat.optimisation.dropout import Thinning
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.memory_plan import Plan
-from clsplat.stages.blend import Blended, blend, blend_grad
-from clsplat.stages.channels import Channels, Features, Floats, channels, features
+from clsplat.stages.blend import Blended, ImageInputs, blend, blend_grad
+from clsplat.stages.channels import Channels, Features, Floats, Motion, channels, features
 from clsplat.stages.deep import deep
 from clsplat.stages.device_camera import pack_camera, tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians
 from clsplat.stages.duplicate import (
-    MAX_PAIRS,
+    MAX_PAIRS_PER_BAND,
     Band,
     Counted,
     Pairs,
@@ -44,7 +44,7 @@ R = TypeVar("R")
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class TileBand:
     """The unit of listing and blending: the pairs of a band of tiles."""
 
     counted: Counted
@@ -52,24 +52,28 @@ class Part:
     lists: TileLists
 
 
-TURNS = 3
-"""Passes by capacity whose counts are kept apart: that under way, the one before, and the one that is redone."""
+MAX_COUNTED_PASSES = 3
+"""Passes by capacity whose counts are kept: the current one, the one before, and one that is repeated."""
 
 
 @dataclass(frozen=True)
-class Room:
-    """Arrays of a pass by capacity: for so many pairs; turn: below TURNS, that of its counts."""
+class PairCapacity:
+    """Arrays of a pass by capacity.
+
+    pairs: number of pairs that fit.
+    turn: index below MAX_COUNTED_PASSES of the pass's counts.
+    """
 
     pairs: int
     turn: int
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ForwardPass:
     """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass.
 
-    bands: one of all tiles, unless memory is short; then `part` is the last one's; refused: what `adam` had counted in
-    `Rasterizer.readback` by then.
+    bands: one band of all tiles, unless memory is short. With several, `part` is the last one's.
+    refused: the counts that `adam` had written to `Rasterizer.readback` by then.
     """
 
     camera: Camera
@@ -77,16 +81,22 @@ class Frame:
     background: DeviceArray
     projected: Projected
     bands: tuple[Band, ...]
-    part: Part
+    part: TileBand
     blended: Blended
     refused: tuple[int, ...] = ()
 
+    @property
+    def inputs(self) -> ImageInputs:
+        """Input of the stages that make more of the image."""
+        camera = self.camera
+        return ImageInputs(self.projected.splats, self.background, camera.width, camera.height, self.camera_array)
+
 
 class Rasterizer:
-    """The pipeline on one device, with the memory that it works in, which can be another's.
+    """The rendering pipeline on one device, with its workspace, which may be shared.
 
-    capacity: most (tile, Gaussian) pairs that are worked on together; the rasterizer's owner plans it; readback
-    (READBACK_SIZE,) uint32: what a pass reads back each time, with the counts of `adam`.
+    capacity: largest number of (tile, Gaussian) pairs in one band; the owner sets it from its memory plan.
+    readback: (len(READBACK),) uint32, the numbers that each pass reads back, with the counts of `adam`.
     """
 
     def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
@@ -103,20 +113,20 @@ class Rasterizer:
         self.readback.fill(0)
         self._arriving: NDArray[np.uint32] | None = None
         self._all_bits = self._switches.key_bits == "all"
-        self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS)
+        self.capacity = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)
 
     def antialias(self, *, on: bool) -> None:
-        """Draw models that are antialiased from here on, or those that are not (`Gaussians.antialiased`)."""
+        """Switch to antialiased models, or back to others (`Gaussians.antialiased`)."""
         if on == self._antialiased:
             return
         self._antialiased = on
         self.device = self._bare.with_switches(kernel_defines(self.config, antialiased=on))
-        self._by_kind = {
-            id(kind): self.device.with_switches(kind.defines) if kind.defines else self.device for kind in KINDS
+        self._by_model = {
+            model: self.device.with_switches(model.defines) if model.defines else self.device for model in CAMERA_MODELS
         }
 
     def follow(self, plan: Plan) -> None:
-        """Work in as much memory as the plan has for it. Where that is tight, what an earlier plan left goes."""
+        """Use as much memory as the plan allows. If that is tight, free the arrays of an earlier plan."""
         self.work.tight = self.device.memory.limit is not None or plan.tight
         if self.work.tight:
             self.work.clear()
@@ -124,11 +134,11 @@ class Rasterizer:
 
     @property
     def takes_room(self) -> bool:
-        """True if a pass may be by capacity: there is memory to spare, and the order by depth is that of Gaussians."""
+        """True if a pass may run by capacity: memory is not tight, and Gaussians, not pairs, are sorted by depth."""
         return not self.work.tight and self._switches.depth_sort != "pairs"
 
     def _send(self, camera: Camera, background: NDArray[np.float32] | DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-        """Camera and background on the device, where a background on the host goes up with the camera, in one copy."""
+        """Camera and background on the device. A background on the host is sent with the camera, in one copy."""
         pack = self._packs.get(camera)
         if pack is None:
             pack = self._packs[camera] = pack_camera(camera)
@@ -147,21 +157,23 @@ class Rasterizer:
         background: NDArray[np.float32] | DeviceArray,
         *,
         backward: bool = True,
-        room: Room | None = None,
+        room: PairCapacity | None = None,
         thinning: Thinning | None = None,
         nearness: bool = False,
-    ) -> Frame:
+    ) -> ForwardPass:
         """Project, sort by depth, duplicate, sort by tile, blend (Kerbl et al. 2023, algorithm 2).
 
-        background: (3,) float32, on the host or the device; backward: True if the gradient will be asked for. Without
-        it, what only that needs is left out. room: do not wait for the number of pairs, and have nothing of the pass
-        come to anything where there are more (docs/decisions/0025-launch-by-capacity.md); thinning: of the model, for
-        this pass; nearness: of `blend`.
+        background: (3,) float32, on the host or the device.
+        backward: True if a gradient will follow. If False, the work that only a gradient needs is left out.
+        room: run by capacity, without waiting for the number of pairs. If there are more pairs than `room` holds, the
+        pass has no effect (docs/decisions/0025-launch-by-capacity.md).
+        thinning: random dropout of the model's Gaussians in this pass.
+        nearness: like `nearness` of `blend`.
         """
         device, work = self.device_of(camera), self.work
         camera_array, background = self._send(camera, background)
 
-        def make() -> tuple[Projected, tuple[Band, ...], Part, Blended, tuple[int, ...]]:
+        def make() -> tuple[Projected, tuple[Band, ...], TileBand, Blended, tuple[int, ...]]:
             projected = project(device, work, gaussians, camera, camera_array, thinning)
             if room is None:
                 counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
@@ -169,80 +181,85 @@ class Rasterizer:
                 counted = count_by_capacity(device, work, projected, self.readback, room.pairs, self._host(room.turn))
             bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
             record = backward and len(bands) == 1 and self._switches.record_cells
-            wanted: dict[str, Any] = {"record": record, "nearness": nearness, "camera_array": camera_array}
+            inputs = ImageInputs(projected.splats, background, camera.width, camera.height, camera_array)
             part = None
             for band in bands:
-                del part  # its arrays may have to make room for larger ones
+                del part  # its arrays may have to be freed for larger ones
                 part = self._part(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
-                pixels = (projected.splats, background, camera.width, camera.height)
-                blended = blend(device, work, part.lists, *pixels, **wanted)
+                blended = blend(device, work, part.lists, inputs, record=record, nearness=nearness)
             assert part is not None, "an image has a tile"
             return projected, bands, part, blended, counted.refused
 
         if room is None:
-            return Frame(camera, camera_array, background, *make())
+            return ForwardPass(camera, camera_array, background, *make())
         size, how = (camera.width, camera.height), (backward, thinning is not None, nearness)
         key = (self.readback, device, background, *size, *how, room.pairs, room.turn)
-        return Frame(camera, camera_array, background, *work.replayed(gaussians, key, make, thinning_numbers(thinning)))
+        return ForwardPass(
+            camera, camera_array, background, *work.replayed(gaussians, key, make, thinning_numbers(thinning))
+        )
 
     def _host(self, turn: int) -> NDArray[np.uint32]:
-        """Memory on the host for a copy of the counts."""
+        """Host memory for a copy of the counts."""
         if self._arriving is None:
-            self._arriving = pinned(self.device, (TURNS, len(READBACK)), np.uint32)
+            self._arriving = pinned(self.device, (MAX_COUNTED_PASSES, len(READBACK)), np.uint32)
         row: NDArray[np.uint32] = self._arriving[turn]
         return row
 
-    def part(self, frame: Frame, band: Band) -> Part:
-        """The band with its pairs and lists; where there are several bands it takes the memory of the one before."""
+    def part(self, frame: ForwardPass, band: Band) -> TileBand:
+        """The band with its pairs and lists. With several bands it reuses the memory of the previous one."""
         if len(frame.bands) == 1:
             return frame.part
         return self._part(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
-    def by_band(self, frame: Frame, work_on: Callable[[Part], R]) -> list[R]:
-        """Results of `work_on` for each of the frame's bands in turn. No part is kept: its arrays may have to make room
-        for larger ones of the next."""
+    def by_band(self, frame: ForwardPass, work_on: Callable[[TileBand], R]) -> list[R]:
+        """Results of `work_on` for each of the frame's bands in turn.
+
+        No part is kept, since its arrays may have to be freed for larger ones of the next band.
+        """
         return [work_on(self.part(frame, band)) for band in frame.bands]
 
-    def hold_out(self, frame: Frame, held: Held) -> None:
-        """Take from the frame's image and transmittance what is behind the surfaces."""
+    def hold_out(self, frame: ForwardPass, held: Held) -> None:
+        """Remove from the frame's image and transmittance everything behind the holdout's surfaces."""
         device = self.device_of(frame.camera)
-        pixels = (frame.projected.splats, frame.background, frame.blended, frame.camera.height, frame.camera_array)
-        self.by_band(frame, lambda part: holdout(device, held, part.lists, *pixels))
+        self.by_band(frame, lambda part: holdout(device, held, part.lists, frame.inputs, frame.blended))
 
     def channels(
         self,
         gaussians: AnyGaussians,
-        frame: Frame,
+        frame: ForwardPass,
         wanted: Features,
-        after: DeviceArray,
-        before: DeviceArray | None = None,
+        motion: Motion,
         held: Held | None = None,
-        *moved: AnyGaussians | None,
     ) -> Channels:
-        """The frame's channels beside colour; after, before: the packed cameras that motion goes to, and back to; held:
-        as of `hold_out`; moved: as `moved` and `earlier` of `features`."""
-        device, work, projected = self.device_of(frame.camera), self.work, frame.projected
-        rows = features(device, work, wanted, gaussians, frame.camera_array, after, projected, before, *moved)
-        pixels = (projected, frame.blended, frame.camera.height, frame.camera_array, held)
+        """The frame's extra channels.
+
+        held: the holdout, as for `hold_out`.
+        """
+        device, work = self.device_of(frame.camera), self.work
+        rows = features(device, work, wanted, gaussians, frame.camera_array, frame.projected, motion)
+        pixels = (frame.inputs, frame.blended, held)
         return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
 
-    def shares(self, frame: Frame, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
-        """Planes (floats + 2, rows, stride), of which the first are the means of the rows (n, floats), any values of
-        each Gaussian; held: as of `hold_out`."""
+    def shares(self, frame: ForwardPass, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
+        """Planes (floats + 2, height, stride); the first `floats` are weighted means of `rows`.
+
+        rows: (n, floats), any values of each Gaussian.
+        held: the holdout, as for `hold_out`.
+        """
         device, work = self.device_of(frame.camera), self.work
         wanted = Floats(rows.shape[1])
-        pixels = (frame.projected, frame.blended, frame.camera.height, frame.camera_array, held)
+        pixels = (frame.inputs, frame.blended, held)
         return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1].means
 
-    def deep(self, frame: Frame, bins: int) -> DeviceArray:
+    def deep(self, frame: ForwardPass, bins: int) -> DeviceArray:
         """The frame in slices by depth: the array of `stages.deep`."""
         device = self.device_of(frame.camera)
-        pixels = (frame.projected.splats, frame.blended, frame.camera.height, frame.camera_array)
+        pixels = (frame.inputs, frame.blended)
         return self.by_band(frame, lambda part: deep(device, self.work, bins, part.lists, *pixels))[-1]
 
     def device_of(self, camera: Camera) -> Device:
-        """The device with the switches that the camera's projection wants of the kernels."""
-        return self._by_kind[id(camera.kind)]
+        """The device with the kernel switches of the camera's projection."""
+        return self._by_model[camera.model]
 
     def _part(
         self,
@@ -251,25 +268,27 @@ class Rasterizer:
         band: Band,
         tiles: tuple[int, int],
         counted: Counted | None = None,
-    ) -> Part:
+    ) -> TileBand:
         work = self.work
         counted = counted or count_band(device, work, projected, tiles, band, all_bits=self._all_bits)
         listing = duplicate_and_sort if self._switches.depth_sort == "pairs" else duplicate
         pairs = listing(device, work, projected.splats, counted, tiles, band)
-        return Part(counted, pairs, tile_lists(device, work, pairs, band, all_bits=self._all_bits))
+        return TileBand(counted, pairs, tile_lists(device, work, pairs, band, all_bits=self._all_bits))
 
     def backward(
         self,
         gaussians: DeviceGaussians,
-        frame: Frame,
+        frame: ForwardPass,
         image_gradient: DeviceArray,
         gradients: DeviceGaussians,
         *,
         fields: SlotFields = PLAIN_SLOTS,
         by_lens: DeviceArray | None = None,
     ) -> Screen:
-        """Fill the visible rows of `gradients`, and of by_lens (`project_grad`); returns what density control has of
-        the view, as `fields` wants it."""
+        """Fill the visible rows of `gradients`, and `by_lens` (see `project_grad`).
+
+        Returns the view's screen-space gradients for density control, with the columns of `fields`.
+        """
         slots = self.pair_gradients(frame, image_gradient, fields=fields)
         screen = self.screen(gaussians.count, fields)
         arrays = (gaussians, frame.camera_array, frame.projected, slots, gradients, screen)
@@ -277,30 +296,30 @@ class Rasterizer:
         return screen
 
     def screen(self, count: int, fields: SlotFields) -> Screen:
-        """Room for what density control has of `count` Gaussians in a view, as `fields` wants it."""
+        """Arrays for the screen-space gradients of `count` Gaussians, with the columns of `fields`."""
         contributions = self.work.array("contributions", (count,)) if fields.contributions else None
         return Screen(self.work.array("screen", (count, 2)), contributions)
 
     def pair_gradients(
         self,
-        frame: Frame,
+        frame: ForwardPass,
         image_gradient: DeviceArray,
         *,
         fields: SlotFields = PLAIN_SLOTS,
     ) -> Slots:
-        """The gradient of blending: of every pair, or with several bands their sums by Gaussian."""
+        """The gradient of blending: one row per pair, or with several bands one sum per Gaussian."""
         device, work = self.device_of(frame.camera), self.work
-        pixels = (frame.projected.splats, frame.background, frame.blended, image_gradient)
+        pixels = (frame.inputs, frame.blended, image_gradient)
 
-        def slots(part: Part) -> Slots:
-            values = blend_grad(device, work, part.lists, *pixels, fields=fields, camera_array=frame.camera_array)
+        def slots(part: TileBand) -> Slots:
+            values = blend_grad(device, work, part.lists, *pixels, fields=fields)
             return Slots(values, part.counted.first_slots)
 
         if len(frame.bands) == 1:
             return slots(frame.part)
         sums: DeviceArray | None = None
 
-        def add(part: Part) -> None:
+        def add(part: TileBand) -> None:
             nonlocal sums
             sums = add_slots(device, work, part.counted.tile_counts, slots(part), sums, fields=fields)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The renderer that callers use: a model and a camera to arrays on the host."""
+"""The renderer that callers use: from a model and a camera to arrays on the host."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32
+from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.config.checks import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.device.buffers import upload
+from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device, open_device
-from clsplat.device.layout import DEEP
 from clsplat.errors import InputError, of_argument
 from clsplat.gaussians import Gaussians
 from clsplat.images.holdouts import Surfaces
+from clsplat.layouts.columns import DEEP_SLICE
 from clsplat.rendering.memory_needs import plan_frame
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed_degrees
-from clsplat.stages.channels import DEPTHS, Features
+from clsplat.stages.channels import DEPTH_PLANES, Features, Motion
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import (
@@ -40,23 +40,37 @@ from clsplat.stages.holdout import Held, held_bytes, upload_held
 
 @dataclass(frozen=True, eq=False)
 class RenderResult:
-    """image (H, W, 3) float32, composited over the background; alpha (H, W) float32."""
+    """A rendered image.
+
+    Attributes
+    ----------
+    image : (H, W, 3) float32
+        Red, green, blue, composited over the background.
+    alpha : (H, W) float32
+        0 to 1.
+    """
 
     image: Float32
     alpha: Float32
 
 
-SHARES = 8
-"""Objects whose shares are blended at a time."""
+OBJECTS_PER_COVERAGE_PASS = 8
+"""Objects that are blended in one pass of `render_shares`."""
 ChannelResult = dict[str, NDArray[Any]]
-"""Channels beside colour by their names in the kernels. depth, median, first (H, W) float32, along the camera's axis;
-count, index (H, W) int32, index -1 for nothing. normal and position (H, W, 3), in the world, and motion (H, W, 2), in
-pixels, are there if they were asked for."""
+"""Extra channels by their names in the kernels.
+
+depth, median, first: (H, W) float32, along the camera's axis.
+count, index: (H, W) int32; index is -1 for empty pixels.
+normal, position: (H, W, 3), in world coordinates, if they were asked for.
+motion: (H, W, 2), pixels, if it was asked for.
+"""
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """The part of the SH that the settings keep of a model that is held to be rendered. Raises InputError where a
-    coefficient is more than a half holds."""
+    """The SH coefficients that the settings keep of a model for rendering.
+
+    Raises InputError if a coefficient is too large for float16.
+    """
     half = config.sh_storage == "half"
     if half:
         check_half(gaussians.sh)
@@ -66,7 +80,17 @@ def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
 
 
 class Renderer:
-    """Renders models; keeps the last one on the device. It can work in another's rasterizer and its memory."""
+    """Renders models, and keeps the last one on the device. It may share another owner's rasterizer and its memory.
+
+    Parameters
+    ----------
+    device : Device, optional
+        An open device. None opens the default device (docs/drivers.md).
+    rasterizer : Rasterizer, optional
+        A rasterizer to share. None makes one.
+    config : RasterizerConfig, optional
+        Settings of a new rasterizer.
+    """
 
     def __init__(
         self,
@@ -91,12 +115,34 @@ class Renderer:
         contiguous: bool = True,
         holdout: Surfaces | None = None,
     ) -> RenderResult:
-        """Render one view. A Gaussians object is taken to be unchanged for as long as it is the same object; of what is
-        on the device the camera has to count from where the means do.
+        """Render one view.
 
-        contiguous: as arrays in memory. Else they are views of planes, which costs the device less waiting; holdout:
-        surfaces of other elements in the picture, behind which the model is not seen, at the depths of the
-        kernels. Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera that is none.
+        Parameters
+        ----------
+        gaussians : Gaussians
+            The model. The same object is assumed to be unchanged. A model on the device is accepted too; the camera
+            then has the same origin as its means.
+        camera : Camera
+            In world coordinates.
+        background : sequence of 3 float
+            Red, green, blue.
+        contiguous : bool
+            Return contiguous arrays. False returns views of planes, for which the device waits less.
+        holdout : Surfaces, optional
+            Surfaces of other elements of the picture, which hide the model behind them. Their depths are measured as in
+            the kernels.
+
+        Returns
+        -------
+        RenderResult
+            Image and alpha.
+
+        Raises
+        ------
+        ValueError
+            If arrays are not as `Gaussians` requires.
+        InputError
+            If the camera or the background is not valid.
         """
         camera.check()
         on_device, camera = self._placed(gaussians, camera, planes=held_bytes(holdout))
@@ -118,52 +164,58 @@ class Renderer:
         contiguous: bool = True,
         holdout: Surfaces | None = None,
     ) -> tuple[RenderResult, ChannelResult]:
-        """Render a view with channels beside colour (docs/channels.md).
+        """Render a view with extra channels (docs/channels.md).
 
-        wanted: of "normal", "position", "motion" and "backward"; after, before: the cameras that motion and backward
-        motion go to, the view's own if None; moved, earlier: the same Gaussians where these go to, of which the means
-        count, None if they stand still. The rest is like `render`. Raises InputError for motion from one projection to
-        another, ValueError for another number of Gaussians that move.
+        Parameters
+        ----------
+        gaussians : Gaussians
+            The model, as for `render`.
+        camera : Camera
+            In world coordinates.
+        wanted : collection of str
+            Any of "normal", "position", "motion" and "backward".
+        after, before : Camera, optional
+            Cameras for motion and backward motion. None means the view's own.
+        moved, earlier : Gaussians, optional
+            The same Gaussians with the means for motion and backward motion. None means that they do not move.
+        background, contiguous, holdout
+            As for `render`.
+
+        Returns
+        -------
+        result : RenderResult
+            Image and alpha.
+        channels : dict
+            depth, median and first (H, W) float32, along the camera's axis, world units; count and index (H, W) int32,
+            index -1 for empty pixels. If asked for, also normal and position (H, W, 3), in world coordinates, and
+            motion and backward (H, W, 2), pixels.
+
+        Raises
+        ------
+        InputError
+            If motion is between two projections, or the camera is a fisheye with coefficients.
+        ValueError
+            If the number of moved Gaussians differs.
         """
         features = Features.of(wanted)
         camera.check()
-        others = {"motion": after or camera, "backward": before or camera}
-        for name, other in others.items():
-            other.check()
-            if name in wanted and any(camera.radial):
-                raise InputError(
-                    f"{name} is not defined for a fisheye with coefficients, expected one without or a pinhole"
-                )
-            if name in wanted and other.projection != camera.projection:
-                raise InputError(
-                    f"{name} goes from a camera to one that is {other.projection}, expected {camera.projection}"
-                )
+        after, before = after or camera, before or camera
+        _check_motion("motion", camera, after, asked="motion" in wanted)
+        _check_motion("backward", camera, before, asked="backward" in wanted)
         origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
         moved, earlier = (moved if "motion" in wanted else None), (earlier if "backward" in wanted else None)
-        size = (features.floats, held_bytes(holdout))
-        on_device, camera = self._placed(
-            gaussians, camera, *size, moved=sum(one is not None for one in (moved, earlier))
-        )
+        sets = sum(one is not None for one in (moved, earlier))
+        on_device, camera = self._placed(gaussians, camera, features.floats, held_bytes(holdout), moved=sets)
         frame = self._forward(on_device, camera, background)
-        goes_to = []
-        for other, then in zip(others.values(), (moved, earlier), strict=True):
-            counted = gaussians if then is None else then
-            local = counted.local(other) if isinstance(counted, Gaussians) else other
-            goes_to.append(upload(self.device, pack_camera(local)))
+        cameras = self._sent(after, gaussians, moved), self._sent(before, gaussians, earlier)
         held = self._hold_out(frame, holdout)
-        there = [None if then is None else self._moved(on_device, then) for then in (moved, earlier)]
-        cameras = (goes_to[0], goes_to[1])
-        planes = self._rasterizer.channels(on_device, frame, features, *cameras, held, *there)
+        motion = Motion(*cameras, self._moved(on_device, moved), self._moved(on_device, earlier))
+        planes = self._rasterizer.channels(on_device, frame, features, motion, held)
         height, width = camera.height, camera.width
         means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
         if contiguous:
             means, whole = np.ascontiguousarray(means), np.ascontiguousarray(whole)
-        named = features.named(means, whole)
-        if (of_distances := camera.depths_of_distances()) is not None:
-            named |= {name: named[name] * of_distances for name in ("depth", *DEPTHS)}
-        if "position" in named and origin.any():  # in the world: float32 keeps what it can of that
-            shown = named["count"][:, :, None] > 0
-            named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
+        named = _in_the_world(features.named(means, whole), camera, origin)
         return self._result(frame, contiguous=contiguous), named
 
     def render_shares(
@@ -174,55 +226,72 @@ class Renderer:
         count: int,
         holdout: Surfaces | None = None,
     ) -> Float32:
-        """(H, W, count): what each of `count` objects covers of each pixel, the sum of the weights of its Gaussians;
-        owners (n,): the object of each; holdout: as of `render`. Raises as `render`."""
+        """(H, W, count): coverage of each pixel by each of `count` objects, the sum of the weights of its Gaussians.
+
+        owners: (n,), the object of each Gaussian.
+        holdout: as for `render`.
+        Raises errors like `render`.
+        """
         camera.check()
         shares = np.zeros((camera.height, camera.width, count), np.float32)
-        on_device, local = self._placed(gaussians, camera, SHARES, held_bytes(holdout))
+        on_device, local = self._placed(gaussians, camera, OBJECTS_PER_COVERAGE_PASS, held_bytes(holdout))
         frame = self._forward(on_device, local, (0.0, 0.0, 0.0))
         held = self._hold_out(frame, holdout)
         alpha = self._result(frame, contiguous=False).alpha[:, :, None]
-        for first in range(0, count, SHARES):
-            rows = np.equal.outer(owners, np.arange(first, first + SHARES)).astype(np.float32)
+        for first in range(0, count, OBJECTS_PER_COVERAGE_PASS):
+            rows = np.equal.outer(owners, np.arange(first, first + OBJECTS_PER_COVERAGE_PASS)).astype(np.float32)
             planes = self._rasterizer.shares(frame, upload(self.device, rows), held)
-            means = planes.get()[:SHARES, : camera.height, : camera.width].transpose(1, 2, 0)
-            shares[:, :, first : first + SHARES] = (means * alpha)[:, :, : count - first]
+            means = planes.get()[:OBJECTS_PER_COVERAGE_PASS, : camera.height, : camera.width].transpose(1, 2, 0)
+            shares[:, :, first : first + OBJECTS_PER_COVERAGE_PASS] = (means * alpha)[:, :, : count - first]
         return shares
 
     def render_deep(self, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-        """(bins, H, W, 5): the view in slices by depth, each pixel's front to back, where its light is taken: red,
-        green, blue, associated with alpha; alpha; the slice's depth. All 0 behind a pixel's last slice; a view of
-        planes."""
+        """(bins, H, W, 5): the view in slices by depth, front to back in each pixel.
+
+        The last axis is red, green, blue (premultiplied), alpha, and the slice's depth. All are 0 behind a pixel's last
+        slice.
+        The result is a view of planes.
+        """
         camera.check()
         on_device, camera = self._placed(gaussians, camera, planes=4 * DEEP_FLOATS * bins)
         frame = self._forward(on_device, camera, (0.0, 0.0, 0.0))
         planes = self._rasterizer.deep(frame, bins).get()[:, :, : camera.height, : camera.width]
         if (of_distances := camera.depths_of_distances()) is not None:
-            planes[:, DEEP.index("DEPTH")] *= of_distances
+            planes[:, DEEP_SLICE.index("DEPTH")] *= of_distances
         return np.asarray(planes.transpose(0, 2, 3, 1), np.float32)
 
-    def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> Frame:
+    def _forward(self, gaussians: AnyGaussians, camera: Camera, background: Sequence[float]) -> ForwardPass:
         with np.errstate(over="ignore"):
             colour = np.asarray(background, np.float32)
         if colour.shape != (3,) or not np.isfinite(colour).all():
             raise InputError(f"background {background}: expected three finite numbers")
         return self._rasterizer.forward(gaussians, camera, colour, backward=False)
 
-    def _hold_out(self, frame: Frame, holdout: Surfaces | None) -> Held | None:
+    def _hold_out(self, frame: ForwardPass, holdout: Surfaces | None) -> Held | None:
         if holdout is None or len(holdout.rows) == 0:
             return None
         held = upload_held(self.device, holdout)
         self._rasterizer.hold_out(frame, held)
         return held
 
-    def _result(self, frame: Frame, *, contiguous: bool) -> RenderResult:
+    def _result(self, frame: ForwardPass, *, contiguous: bool) -> RenderResult:
         height, width = frame.camera.height, frame.camera.width
         image = frame.blended.image.get()[:, :height, :width].transpose(1, 2, 0)
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
 
-    def _moved(self, gaussians: AnyGaussians, moved: Gaussians) -> AnyGaussians:
-        """The means of `moved`, where the Gaussians are. Raises ValueError for another number of them."""
+    def _sent(self, camera: Camera, gaussians: Gaussians | AnyGaussians, then: Gaussians | None) -> DeviceArray:
+        """A camera of motion on the device, relative to the origin of the means at its time."""
+        counted = gaussians if then is None else then
+        local = counted.local(camera) if isinstance(counted, Gaussians) else camera
+        return upload(self.device, pack_camera(local))
+
+    def _moved(self, gaussians: AnyGaussians, moved: Gaussians | None) -> AnyGaussians | None:
+        """The means of `moved`, on the device or on the host like the Gaussians. Raises ValueError if their number
+        differs.
+        """
+        if moved is None:
+            return None
         if len(moved) != gaussians.count:
             raise ValueError(f"{len(moved)} Gaussians to move to, expected {gaussians.count}")
         if isinstance(gaussians, HostGaussians):
@@ -238,9 +307,12 @@ class Renderer:
         *,
         moved: int = 0,
     ) -> tuple[AnyGaussians, Camera]:
-        """The model on the device, or on the host if a frame of this size leaves too little room for it; and the camera
-        that counts from where it does. planes: bytes of a pixel beside the picture's; moved: how many further
-        means there are."""
+        """The model on the device, or on the host if a frame of this size leaves too little room, and the camera
+        relative to its origin.
+
+        planes: bytes per pixel in addition to the picture's.
+        moved: number of further sets of means.
+        """
         if not isinstance(gaussians, Gaussians):
             return gaussians, camera
         if self._sh is None or self._sh[0] is not gaussians:
@@ -263,6 +335,25 @@ class Renderer:
         return self._held, gaussians.local(camera)
 
 
+def _check_motion(name: str, camera: Camera, other: Camera, *, asked: bool) -> None:
+    """Check the camera that motion leads to. Raises InputError, which names the channel."""
+    other.check()
+    if asked and camera.model.without_motion:
+        raise InputError(f"{name} is not defined for {camera.model.without_motion}")
+    if asked and other.projection != camera.projection:
+        raise InputError(f"{name} goes from a camera to one that is {other.projection}, expected {camera.projection}")
+
+
+def _in_the_world(named: ChannelResult, camera: Camera, origin: Float64) -> ChannelResult:
+    """The channels with depths along the camera's axis, and positions in world coordinates."""
+    if (of_distances := camera.depths_of_distances()) is not None:
+        named |= {name: named[name] * of_distances for name in ("depth", *DEPTH_PLANES)}
+    if "position" in named and origin.any():  # as precise as float32 allows
+        shown = named["count"][:, :, None] > 0
+        named["position"] = np.where(shown, named["position"] + origin, 0).astype(np.float32)
+    return named
+
+
 def render(
     gaussians: Gaussians,
     camera: Camera,
@@ -271,14 +362,40 @@ def render(
     device: str | None = None,
     max_device_mem: str | int | None = None,
 ) -> RenderResult:
-    """Render one view.
+    """Render one view. Each call opens the device and uploads the model; `Renderer` keeps both.
 
-    camera: in the world; its near plane is the model's unless it has its own. background: red, green, blue, any finite
-    numbers. device: as `clsplat devices` lists it. max_device_mem: the most of its memory to use, in bytes or such as
-    "256MiB". Each call opens the device and uploads the model; `Renderer` keeps both.
+    Parameters
+    ----------
+    gaussians : Gaussians
+        The model.
+    camera : Camera
+        In world coordinates. Its near plane is the model's unless it has its own.
+    background : sequence of 3 float
+        Red, green, blue, any finite numbers.
+    device : str, optional
+        A device as `clsplat devices` lists it. None means the default device (docs/drivers.md).
+    max_device_mem : str or int, optional
+        Largest amount of its memory to use, in bytes or such as "256MiB".
 
-    Raises ValueError for arrays that are not as `Gaussians` says, InputError for a camera or a background that is none,
-    DeviceError for a device that is not there, CapacityError where a picture does not fit into its memory.
+    Returns
+    -------
+    RenderResult
+        Image and alpha.
+
+    Raises
+    ------
+    ValueError
+        If arrays are not as `Gaussians` requires.
+    InputError
+        If the camera or the background is not valid.
+    DeviceError
+        If there is no such device.
+    CapacityError
+        If the picture does not fit into the device's memory.
+
+    Notes
+    -----
+    Kerbl et al. 2023; docs/gradients.md has the equations.
     """
     with of_argument():
         opened = open_device(device, parse_bytes(max_device_mem))

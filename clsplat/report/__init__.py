@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""report.html, what a run came to in one file, and runs side by side (docs/report.md).
+"""HTML pages: report.html, the results of a run in one file, and the comparison of runs (docs/report.md).
 
-`figures` reads a run, `svg` draws, `thumbnails` embeds, `page` and `compare` put pages together; `training.telemetry`
-is what training notes for them.
+`figures` reads a run, `svg` draws charts, `thumbnails` embeds pictures, `page` and `compare` build the pages.
+`training.telemetry` records their input during training.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from clsplat.errors import InputError
-from clsplat.files import check_new
+from clsplat.files.atomic import check_new
 
-NAME = "report.html"
+REPORT_FILE_NAME = "report.html"
 """File name of the report in a run's folder."""
 
 
 def check_page(path: Path, *, overwrite: bool) -> None:
-    """Raise InputError where no page may be written at `path`, as `check_new`, or by its name."""
+    """Raise InputError if no page may be written at `path`: like `check_new`, or because of its ending."""
     check_new(path, overwrite=overwrite)
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: its ending is {path.suffix or 'none'}, expected .html or .htm: a page is written")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs side by side: scores, Gaussians, times, settings that differ, curves overlaid, and time against error."""
+"""Comparison of runs: scores, Gaussians, times, differing settings, overlaid curves, and time against error."""
 
 from __future__ import annotations
 
@@ -12,37 +12,40 @@ from markupsafe import Markup
 
 from clsplat.errors import InputError, examples, plain
 from clsplat.progress import aligned
-from clsplat.report.figures import SCORES, Figures, read_figures, settings_of, smooth
-from clsplat.report.page import TITLES, duration, render_page, score, setting_text
-from clsplat.report.svg import COLORS, Series, chart
+from clsplat.report.figures import SCORE_NAMES, Figures, read_figures, settings_of, smooth
+from clsplat.report.page import SCORE_TITLES, duration, render_page, score, setting_text
+from clsplat.report.svg import SERIES_COLOUR_COUNT, ChartSeries, chart
 from clsplat.runs.run import Run
 
-MAX_RUNS = 24
-MAX_ROWS = 100
-"""Views in the table."""
+MAX_COMPARED_RUNS = 24
+MAX_COMPARED_VIEWS = 100
+"""Largest number of views in the table."""
 
 
 @dataclass
 class Comparison:
-    """Runs by their labels, which are unique; notes: what makes figures hard to compare."""
+    """Runs by unique labels.
+
+    notes: reasons why the figures are hard to compare.
+    """
 
     runs: dict[str, Figures]
     notes: list[str] = field(default_factory=list)
 
     @property
     def scores(self) -> list[str]:
-        """The scores that a run has a mean of."""
-        return [name for name in SCORES if any(_mean(figures, name) is not None for figures in self.runs.values())]
+        """Names of the scores for which at least one run has a mean."""
+        return [name for name in SCORE_NAMES if any(_mean(figures, name) is not None for figures in self.runs.values())]
 
     @property
     def differing(self) -> dict[str, list[Any]]:
-        """Values of each run by flag, where they are not all the same."""
+        """Settings that differ between the runs: values of each run, by flag."""
         settings = [dict(settings_of(figures.run.config)) for figures in self.runs.values()]
         values = {name: [setting[name] for setting in settings] for name in settings[0]}
         return {name: listed for name, listed in values.items() if any(value != listed[0] for value in listed)}
 
     def document(self) -> dict[str, Any]:
-        """The comparison for --json and for the page's data."""
+        """The comparison as data, for --json and the page."""
         runs = [
             {
                 "run": label,
@@ -63,9 +66,9 @@ class Comparison:
 
 
 def compare_runs(runs: Sequence[Run]) -> Comparison:
-    """Read them. Raises InputError as `read_figures`, and for too many."""
-    if len(runs) > MAX_RUNS:
-        raise InputError(f"{len(runs)} runs: expected at most {MAX_RUNS} to compare")
+    """Read the runs. Raises InputError like `read_figures`, and for too many runs."""
+    if len(runs) > MAX_COMPARED_RUNS:
+        raise InputError(f"{len(runs)} runs: expected at most {MAX_COMPARED_RUNS} to compare")
     all_figures = [read_figures(run, describe=False) for run in runs]
     comparison = Comparison(dict(zip(_labels([run.path for run in runs]), all_figures, strict=True)))
     notes = comparison.notes
@@ -88,37 +91,37 @@ def compare_runs(runs: Sequence[Run]) -> Comparison:
 
 
 def comparison_page(comparison: Comparison) -> str:
-    """The page's HTML."""
+    """HTML of the comparison page."""
     columns, runs = comparison.scores, comparison.runs
     views = view_rows(comparison)
     return render_page(
         "compare.html",
         labels=list(runs),
         notes=comparison.notes,
-        columns=[(name, TITLES[name]) for name in columns],
+        columns=[(name, SCORE_TITLES[name]) for name in columns],
         rows=[
-            (index % COLORS, label, figures, [_mean(figures, name) for name in columns])
+            (index % SERIES_COLOUR_COUNT, label, figures, [_mean(figures, name) for name in columns])
             for index, (label, figures) in enumerate(runs.items())
         ],
         best=[_best([_mean(figures, name) for figures in runs.values()], name) for name in columns],
         charts=[figure for figure in charts(comparison) if figure],
         settings=[(name, list(map(setting_text, values))) for name, values in comparison.differing.items()],
-        views=views[:MAX_ROWS],
-        views_left_out=max(len(views) - MAX_ROWS, 0),
+        views=views[:MAX_COMPARED_VIEWS],
+        views_left_out=max(len(views) - MAX_COMPARED_VIEWS, 0),
         runs=runs,
         data=comparison.document(),
     )
 
 
 def charts(comparison: Comparison) -> list[Markup]:
-    """Time against error first, then what a run's own page has, by step."""
+    """Charts: time against error first, then the curves of a run's own page, by step."""
     drawn = []
     for x, title, x_label in (
         ("seconds", "Time against error", "seconds of training"),
         ("step", "Held-out PSNR", "step"),
     ):
         series = [
-            Series(label, figures.held_out(x), "dots", index)
+            ChartSeries(label, figures.held_out(x), "dots", index)
             for index, (label, figures) in enumerate(comparison.runs.items())
         ]
         drawn.append(chart(title, series, x_label, "PSNR of the held-out views, dB"))
@@ -135,14 +138,14 @@ def charts(comparison: Comparison) -> list[Markup]:
             steps, values = figures.curves["step"], figures.curves[name]
             if is_noisy and len(steps) > 20:
                 values = smooth(values, max(len(steps) // 50, 5))
-            series.append(Series(label, list(zip(steps, values, strict=True)), "line", index))
+            series.append(ChartSeries(label, list(zip(steps, values, strict=True)), "line", index))
         note = "means of neighbouring records" if is_noisy else ""
         drawn.append(chart(title, series, "step", y_label, log_y=log_y, from_zero=not is_noisy, note=note))
     return drawn
 
 
 def view_rows(comparison: Comparison) -> list[tuple[str, list[float | None], float | None]]:
-    """Rows of the views that two runs or more have: name, PSNR in each, and the best of them."""
+    """Rows of the views that at least two runs share: name, PSNR in each run, best PSNR."""
     views = [figures.evaluation["views"] if figures.evaluation else [] for figures in comparison.runs.values()]
     scores = [{view["name"]: view.get("psnr") for view in listed} for listed in views]
     rows = []
@@ -170,7 +173,7 @@ def comparison_table(comparison: Comparison) -> str:
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """The folders' names, with those above them as far as it takes to tell them apart."""
+    """Folder names, with as many parent folders as needed to make them unique."""
     parts = [path.resolve().parts for path in paths]
     for length in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-length:]) for part in parts]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a run, from its files: nothing is measured again, and what is missing or damaged is noted."""
+"""Figures of a run, read from its files. Nothing is measured again; missing or damaged files become notes."""
 
 from __future__ import annotations
 
@@ -12,29 +12,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError, plain
-from clsplat.files import digest, parse_json, read_document
+from clsplat.files.documents import digest, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 
 Record = dict[str, Any]
 
-SCORES = ("psnr", "ssim", "lpips")
-CURVES = ("step", "loss", "psnr", "gaussians", "seconds")
-"""Keys that every record of metrics.jsonl has."""
-MAX_NAME = 200
-"""Characters of a name of a view, a stage or a device that are shown."""
-MAX_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""Entries that are kept of a file that has more, as none of ours does: the last."""
-LARGEST = 1e30
+SCORE_NAMES = ("psnr", "ssim", "lpips")
+CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
+"""Keys of every record in metrics.jsonl."""
+MAX_NAME_CHARACTERS = 200
+"""Characters that are shown of the name of a view, a stage or a device."""
+MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
+"""Limits for foreign files; clsplat itself writes fewer entries. The last samples and sessions are kept."""
+MAX_DRAWN_VALUE = 1e30
 
 
 @dataclass
 class Figures:
     """Figures from a run's files.
 
-    curves: equally long lists by the names of CURVES; stages: step and milliseconds by stage; evaluations: held-out
-    scores on the way and at the end, by step; evaluation: eval.json; model: of model.ply, without its Gaussians;
-    histograms by name: edges and counts; notes: what is missing, a sentence each.
+    curves: lists of equal length, by the key of the records.
+    stages: step, and milliseconds by stage.
+    evaluations: held-out scores during training and at its end, by step.
+    evaluation: content of eval.json.
+    sessions: start, device, driver and versions of each training session.
+    elapsed: seconds of wall time.
+    model: description of model.ply, without its Gaussians.
+    histograms: edges and counts, by name.
+    notes: sentences on missing or damaged data, and other caveats.
     """
 
     run: Run
@@ -51,19 +57,19 @@ class Figures:
 
     @property
     def step(self) -> int:
-        """The last that is known of."""
+        """The last known step."""
         steps = [self.curves["step"][-1]] if self.curves["step"] else []
         return int(max([*steps, *(record["step"] for record in self.evaluations)], default=0))
 
     @property
     def seconds(self) -> float | None:
-        """Seconds of training, so far."""
+        """Seconds of training so far."""
         known = self.evaluation["seconds"] if self.evaluation else None
         return known if known is not None else next(reversed(self.curves["seconds"]), None)
 
     @property
     def gaussians(self) -> int | None:
-        """Number of Gaussians in the model, as it or eval.json says, or at the last step."""
+        """Number of Gaussians in the model, from model.ply, else eval.json, else the last step."""
         for record in (self.model, self.evaluation):
             if record is not None and record["gaussians"] is not None:
                 return int(record["gaussians"])
@@ -71,25 +77,28 @@ class Figures:
         return None if last is None else int(last)
 
     def held_out(self, x: str) -> list[tuple[float, float]]:
-        """PSNR of the held-out views by `x`, seconds or step, where both are known."""
+        """PSNR of the held-out views against `x` (seconds or step), where both are known."""
         points = [(evaluation.get(x), evaluation.get("psnr")) for evaluation in self.evaluations]
         return [(float(at), psnr) for at, psnr in points if at is not None and psnr is not None]
 
     def document(self) -> Record:
-        """Everything for --json."""
+        """All figures as data, for --json."""
         document = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "run"}
         scene = self.run.scene.name if self.run.scene is not None else None
         return {**document, "settings": asdict(self.run.config), "scene": scene}
 
 
 def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = True) -> Figures:
-    """All that the run's folder has. model: what model.ply holds, if that is known; describe: whether the model is
-    read at all.
+    """Read all figures of a run's folder.
 
-    Raises InputError for metrics that are no metrics at all; whatever else is missing or damaged is a note.
+    model: content of model.ply, if already loaded.
+    describe: read the model.
+    Raises InputError if metrics.jsonl cannot be read. Anything else missing or damaged becomes a note.
     """
-    records = [record for record in run.read_metrics() if all(number(record.get(name)) is not None for name in CURVES)]
-    curves = {name: [float(record[name]) for record in records] for name in CURVES}
+    records = [
+        record for record in run.read_metrics() if all(number(record.get(name)) is not None for name in CURVE_KEYS)
+    ]
+    curves = {name: [float(record[name]) for record in records] for name in CURVE_KEYS}
     figures = Figures(run, run.path.resolve().name, curves)
     for record in records:
         stages = record.get("stages")
@@ -124,14 +133,14 @@ def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = T
 
 
 def number(value: object) -> float | None:
-    """The value as a number of a size that can be drawn, or None."""
+    """The value as a float in the range of the charts; None for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    return float(value) if -LARGEST <= value <= LARGEST else None
+    return float(value) if -MAX_DRAWN_VALUE <= value <= MAX_DRAWN_VALUE else None
 
 
 def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """Each setting by the name of its flag."""
+    """Each setting with the name of its flag."""
     for setting in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
         value, name = getattr(config, setting.name), prefix + setting.name.replace("_", "-")
         if is_dataclass(value):
@@ -141,7 +150,7 @@ def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]
 
 
 def smooth(values: list[float], count: int) -> list[float]:
-    """The mean of `count` values about each, fewer at the ends."""
+    """Moving average over `count` values, fewer at the ends."""
     sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, np.float64))])
     at = np.arange(len(values))
     low, high = np.maximum(at - count // 2, 0), np.minimum(at + count // 2 + 1, len(values))
@@ -151,29 +160,31 @@ def smooth(values: list[float], count: int) -> list[float]:
 
 def _texts(values: Mapping[str, Any]) -> Record:
     pairs = list(values.items())[:MAX_STAGES]
-    return {name[:MAX_NAME]: value[:MAX_NAME] for name, value in pairs if isinstance(value, str)}
+    return {name[:MAX_NAME_CHARACTERS]: value[:MAX_NAME_CHARACTERS] for name, value in pairs if isinstance(value, str)}
 
 
 def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
-    numbers = {name[:MAX_NAME]: number(value) for name, value in list(values.items())[:limit]}
+    numbers = {name[:MAX_NAME_CHARACTERS]: number(value) for name, value in list(values.items())[:limit]}
     return {name: value for name, value in numbers.items() if value is not None}
 
 
 def _evaluation(value: object) -> Record | None:
-    """An evaluation as eval.json holds it, if the value is one."""
+    """Validate an evaluation in the format of eval.json; None for anything else."""
     if not isinstance(value, dict) or not isinstance(value.get("views"), list):
         return None
     views = []
-    for view in value["views"][:MAX_VIEWS]:
+    for view in value["views"][:MAX_EVALUATED_VIEWS]:
         if not isinstance(view, dict) or not isinstance(name := view.get("name"), str):
             return None
-        views.append({"name": name, **_numbers({key: view.get(key) for key in SCORES}, len(SCORES))})
+        views.append({"name": name, **_numbers({key: view.get(key) for key in SCORE_NAMES}, len(SCORE_NAMES))})
     mean, missing = value.get("mean"), value.get("lpips_missing")
     counts = {name: number(value.get(name)) for name in ("step", "gaussians")}
     return {
         **{name: None if count is None else int(count) for name, count in counts.items()},
         "seconds": number(value.get("seconds")),
-        "mean": _numbers({key: mean.get(key) for key in SCORES}, len(SCORES)) if isinstance(mean, dict) else {},
+        "mean": _numbers({key: mean.get(key) for key in SCORE_NAMES}, len(SCORE_NAMES))
+        if isinstance(mean, dict)
+        else {},
         "views": views,
         **({"lpips_missing": plain(missing)[:500]} if isinstance(missing, str) else {}),
     }
@@ -194,7 +205,7 @@ def _session(value: Mapping[str, Any]) -> Record:
 
 
 def _elapsed(records: list[Record]) -> float | None:
-    """Seconds of wall time until the last record, of all sessions together."""
+    """Seconds of wall time until the last record, summed over all sessions."""
     total, last = 0.0, None
     for record in records:
         if "session" in record and last is not None:
@@ -268,7 +279,7 @@ def _add_contributions(figures: Figures, records: list[Record]) -> None:
 
 
 def _add_gate(figures: Figures, records: list[Record]) -> None:
-    """A note where the refinement of cameras was ended."""
+    """Add a note if the refinement of cameras was ended early."""
     gates = (gate for record in reversed(records) if isinstance(gate := record.get("gate"), dict))
     gate = next(gates, {})
     if (ended := number(gate.get("ended"))) is not None and (best := number(gate.get("best"))) is not None:
@@ -279,7 +290,7 @@ def _add_gate(figures: Figures, records: list[Record]) -> None:
 
 
 def _list(value: object) -> list[float]:
-    """The value as a list of numbers, empty if it is none."""
+    """The value as a list of numbers; empty if it is anything else."""
     listed = value if isinstance(value, list) else []
     numbers = [known for item in listed if (known := number(item)) is not None]
     return numbers if len(numbers) == len(listed) else []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""report.html: a run on one page that needs nothing else, neither files nor a network."""
+"""report.html: a run on one self-contained page, which needs neither other files nor a network."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from typing import Any
 
 from markupsafe import Markup
 
-import clsplat
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import amount
 from clsplat.evaluation import depths
-from clsplat.files import atomic_write
+from clsplat.files.atomic import atomic_write
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
-from clsplat.report import NAME, thumbnails
+from clsplat.report import REPORT_FILE_NAME, thumbnails
 from clsplat.report.figures import (
-    CURVES,
+    CURVE_KEYS,
     MAX_STAGES,
-    SCORES,
+    SCORE_NAMES,
     Figures,
     read_figures,
     settings_of,
     smooth,
 )
-from clsplat.report.photographs import SIDE, MaskedPhotograph, exposure_chart, masked_photographs
-from clsplat.report.svg import Series, chart, short, templates
+from clsplat.report.photographs import SMALL_PICTURE_SIDE_PX, MaskedPhotograph, exposure_chart, masked_photographs
+from clsplat.report.svg import ChartSeries, chart, short, templates
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
+from clsplat.version import package_version
 
-MAX_VIEWS = 8
-"""Held-out views with pictures, unless asked for others."""
-MAX_RECORDS = 2000
-"""Records of metrics.jsonl whose figures are in the page."""
-MAX_ROWS = 200
-"""Views in the table."""
-NAMED_STAGES = 7
-"""Stages with a colour of their own; the smaller ones are drawn together."""
-TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
+MAX_PICTURED_VIEWS = 8
+"""Default number of held-out views with pictures."""
+MAX_EMBEDDED_RECORDS = 2000
+"""Number of metrics.jsonl records whose figures are embedded in the page."""
+MAX_TABLE_VIEWS = 200
+"""Number of views in the table."""
+MAX_COLOURED_STAGES = 7
+"""Number of stages with their own colour. The smaller ones are drawn together."""
+SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
 
 
 def write_report(
@@ -53,30 +53,32 @@ def write_report(
     *,
     scene: Scene | str | None = None,
     model: Gaussians | None = None,
-    views: int = MAX_VIEWS,
+    views: int = MAX_PICTURED_VIEWS,
 ) -> Figures:
-    """Write the page, atomically, to `path` or into the run's folder; what it shows.
+    """Write the page atomically to `path`, or into the run's folder. Returns its figures.
 
-    scene: the run's, or why there is none, if that is known; model: what model.ply holds, likewise; views: most
-    held-out views with pictures. Raises InputError for metrics that cannot be read, OSError as writing does.
+    scene: the run's scene, or the reason why there is none; looked up if not given.
+    model: content of model.ply, if already loaded.
+    views: largest number of held-out views with pictures.
+    Raises InputError if metrics cannot be read, and OSError if the page cannot be written.
     """
     figures = read_figures(run, model)
     page = report_page(figures, scene, views)
-    atomic_write(path or run.path / NAME, page.encode("utf-8", "replace"))
+    atomic_write(path or run.path / REPORT_FILE_NAME, page.encode("utf-8", "replace"))
     return figures
 
 
 def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
-    """Write the report of a finished training. A failure is a warning: hours of training must not fail for a page."""
+    """Write the report of a finished training. A failure is only a warning: a page must not fail hours of training."""
     try:
         write_report(run, scene=scene, model=model)
     except Exception as error:  # noqa: BLE001
         why = " ".join(str(error).split()) or type(error).__name__
-        warnings.warn(f"no {NAME} ({why}); try again with: clsplat report {run.path}", stacklevel=2)
+        warnings.warn(f"no {REPORT_FILE_NAME} ({why}); try again with: clsplat report {run.path}", stacklevel=2)
 
 
-def report_page(figures: Figures, scene: Scene | str | None = None, views: int = MAX_VIEWS) -> str:
-    """The page's HTML."""
+def report_page(figures: Figures, scene: Scene | str | None = None, views: int = MAX_PICTURED_VIEWS) -> str:
+    """HTML of the report page."""
     evaluation = figures.evaluation
     listed = evaluation["views"] if evaluation else []
     shown: list[thumbnails.Shown] = []
@@ -98,7 +100,11 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         known = None if isinstance(scene, str) else scene
         shown = thumbnails.show(figures.run, names, wanted, known, background)
         worst = depths.worst(listed) if isinstance(scene, Scene) else []
-        low = [view for view in thumbnails.show(figures.run, names, worst, known, background, SIDE) if view.depth]
+        low = [
+            view
+            for view in thumbnails.show(figures.run, names, worst, known, background, SMALL_PICTURE_SIDE_PX)
+            if view.depth
+        ]
         if len(shown) < len(wanted):
             notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
     scores = {view["name"]: view for view in listed}
@@ -108,7 +114,7 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         "report.html",
         figures=figures,
         notes=notes,
-        titles=TITLES,
+        titles=SCORE_TITLES,
         charts=list(filter(None, [*charts(figures), exposure_chart(figures.run)])),
         masks=masks,
         masked_count=masked_count,
@@ -119,10 +125,10 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         places=places,
         low=[(view, scores[view.name]) for view in low],
         left_out=len(listed) - len(shown),
-        white_error=thumbnails.WHITE_ERROR,
-        columns=[(name, TITLES[name]) for name in SCORES if any(name in view for view in listed)],
-        views=listed[:MAX_ROWS],
-        views_left_out=max(len(listed) - MAX_ROWS, 0),
+        white_error=thumbnails.MAX_COLOURED_ERROR,
+        columns=[(name, SCORE_TITLES[name]) for name in SCORE_NAMES if any(name in view for view in listed)],
+        views=listed[:MAX_TABLE_VIEWS],
+        views_left_out=max(len(listed) - MAX_TABLE_VIEWS, 0),
         settings=[
             (name, setting_text(value), setting_text(defaults[name]), value != defaults[name])
             for name, value in settings_of(figures.run.config)
@@ -132,7 +138,7 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
 
 
 def render_page(name: str, **values: Any) -> str:
-    """A template filled in, with everything escaped that is not Markup."""
+    """Fill in a template. Every value that is not Markup is escaped."""
     pages = templates()
     pages.filters.update(short=short, duration=duration, score=score, count="{:,.0f}".format, amount=amount)
     folder = Path(__file__).parent / "templates"
@@ -141,54 +147,55 @@ def render_page(name: str, **values: Any) -> str:
         style=Markup(style),  # noqa: S704  # our own files
         script=Markup(script),  # noqa: S704
         hashes=[_hash(style), _hash(script)],
-        version=clsplat.__version__,
+        version=package_version(),
         **values,
     )
 
 
 def charts(figures: Figures) -> list[Markup]:
-    """Loss, PSNR, Gaussians, time of stages, time of training, by step."""
+    """Charts of loss, PSNR, Gaussians, stage times and training time, by step, and of PSNR by training time."""
     curves, steps = figures.curves, figures.curves["step"]
     around = max(len(steps) // 50, 5)
     note = f"each tenth step, of one view; the line is the mean of {around} records" if len(steps) > 20 else ""
     made = []
     for title, name, label in (("Loss", "loss", "loss"), ("PSNR", "psnr", "PSNR, dB")):
-        series = [Series("training view", list(zip(steps, curves[name], strict=True)))]
+        series = [ChartSeries("training view", list(zip(steps, curves[name], strict=True)))]
         if len(steps) > 20:
             means = list(zip(steps, smooth(curves[name], around), strict=True))
-            series = [replace(series[0], kind="faint"), Series("training views, mean", means)]
+            series = [replace(series[0], kind="faint"), ChartSeries("training views, mean", means)]
         if name == "psnr":
-            series.append(Series("held-out views", figures.held_out("step"), "dots", 1))
+            series.append(ChartSeries("held-out views", figures.held_out("step"), "dots", 1))
         made.append(chart(title, series, "step", label, log_y=name == "loss", note=note))
-    grown = Series("Gaussians", list(zip(steps, curves["gaussians"], strict=True)), color=2)
+    grown = ChartSeries("Gaussians", list(zip(steps, curves["gaussians"], strict=True)), color=2)
     made.append(chart("Number of Gaussians", [grown], "step", "Gaussians", from_zero=True))
     made.append(stage_chart(figures))
-    trained = Series("training", [(0.0, 0.0), *zip(steps, curves["seconds"], strict=True)], color=4)
+    trained = ChartSeries("training", [(0.0, 0.0), *zip(steps, curves["seconds"], strict=True)], color=4)
     if steps:
         made.append(chart("Time", [trained], "step", "seconds of training", from_zero=True))
-    series = [Series("held-out views", figures.held_out("seconds"), "dots", 1)]
+    series = [ChartSeries("held-out views", figures.held_out("seconds"), "dots", 1)]
     made.append(chart("Time against PSNR", series, "seconds of training", "PSNR, dB"))
     return made
 
 
 def stage_chart(figures: Figures) -> Markup:
-    """Milliseconds of each stage, stacked, the small ones together; bars where there are too few for a curve."""
+    """Stacked chart of milliseconds per stage, with the small stages together. Empty with fewer than two
+    measurements."""
     if len(figures.stages) < 2:
         return Markup("")
     names = [name for name, *_ in stage_rows(figures)]
-    named = names if len(names) <= NAMED_STAGES + 1 else names[:NAMED_STAGES]
+    named = names if len(names) <= MAX_COLOURED_STAGES + 1 else names[:MAX_COLOURED_STAGES]
     groups = [(name, [name]) for name in named]
     if rest := names[len(named) :]:
         groups.append((f"{len(rest)} smaller ones", rest))
     series = []
     for color, (label, members) in enumerate(groups):
         times = [(float(record["step"]), sum(record["ms"].get(n, 0.0) for n in members)) for record in figures.stages]
-        series.append(Series(label, times, "area", color))
+        series.append(ChartSeries(label, times, "area", color))
     return chart("Time per stage", series, "step", "ms of a step", note="waiting for the device after each stage")
 
 
 def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
-    """Rows of the stages: name, median and last milliseconds, share of the last step; the largest first."""
+    """Rows of the stages, largest first: name, median and last milliseconds, fraction of the last step."""
     if not figures.stages:
         return []
     last = figures.stages[-1]["ms"]
@@ -202,33 +209,33 @@ def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
 
 
 def histograms(figures: Figures) -> list[Markup]:
-    """Scales, opacities, contributions."""
+    """Histograms of scales, opacities and contributions."""
     bars = {
         name: list(zip(data["edges"], [*data["counts"], 0], strict=True)) for name, data in figures.histograms.items()
     }
     scales = (("largest scale", 0), ("smallest scale", 1))
-    series = [Series(name, bars[name], "bars", color) for name, color in scales if name in bars]
+    series = [ChartSeries(name, bars[name], "bars", color) for name, color in scales if name in bars]
     made = [chart("Scales", series, "world units", "Gaussians", powers=True, note="standard deviations")]
     if "opacity" in bars:
-        made.append(chart("Opacity", [Series("opacity", bars["opacity"], "bars", 2)], "opacity", "Gaussians"))
+        made.append(chart("Opacity", [ChartSeries("opacity", bars["opacity"], "bars", 2)], "opacity", "Gaussians"))
     if "contribution" in bars:
         record = figures.histograms["contribution"]
         views = f"{record['views']} of {record['of']} training views"
         note = f"largest to one of {views}; {record['none']:,} contribute to none"
-        series = [Series("contribution", bars["contribution"], "bars", 3)]
+        series = [ChartSeries("contribution", bars["contribution"], "bars", 3)]
         made.append(chart("Contribution", series, "pixels", "Gaussians", powers=True, note=note))
     return made
 
 
 def setting_text(value: object) -> str:
-    """Text of a setting for people, lists with spaces, so that they can be wrapped."""
+    """Text of a setting for readers. Lists have spaces, so that lines can wrap."""
     if isinstance(value, tuple):
         return ", ".join(map(str, value)) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def duration(seconds: float | None) -> str:
-    """12.3 s, 4 min 5 s, 2 h 3 min."""
+    """Duration as text: 12.3 s, 4 min 5 s, 2 h 3 min."""
     if seconds is None:
         return "not known"
     if seconds < 60:
@@ -238,22 +245,22 @@ def duration(seconds: float | None) -> str:
 
 
 def score(value: float, name: str) -> str:
-    """A score with the digits that mean something."""
+    """Score with its significant digits."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
 
 
 def _mask_words(use: MaskUse) -> list[str]:
-    """Meanings of the colours that are drawn over photographs with masks."""
+    """Legend for the colours that are drawn over photographs with masks."""
     words = {"ignore": "red is ignored", "transparent": "blue is transparent"}
     return [text for meaning, text in words.items() if meaning in (use.masks, use.alpha)]
 
 
 def _data(figures: Figures) -> dict[str, Any]:
-    """The page's data for programs: the figures, unrounded."""
+    """Data of the page for programs: the figures, unrounded."""
     length = len(figures.curves["step"])
-    every = -(-length // MAX_RECORDS) or 1
+    every = -(-length // MAX_EMBEDDED_RECORDS) or 1
     kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})
-    curves = {name: [figures.curves[name][index] for index in kept] for name in CURVES}
+    curves = {name: [figures.curves[name][index] for index in kept] for name in CURVE_KEYS}
     return {
         "run": figures.name,
         "records": length,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a report that is about the photographs: their masks, and the exposures that were learnt of them."""
+"""Photographs in a report: their masks, and their learnt exposures."""
 
 from __future__ import annotations
 
@@ -10,25 +10,28 @@ from typing import Any
 from markupsafe import Markup
 
 from clsplat.errors import InputError, examples
-from clsplat.files import parse_json, read_document
+from clsplat.files.documents import parse_json, read_document
 from clsplat.images.colour import displayed, photos_space
 from clsplat.report.figures import number
-from clsplat.report.svg import Series, chart
+from clsplat.report.svg import ChartSeries, chart
 from clsplat.report.thumbnails import data_uri
 from clsplat.runs.run import Run
-from clsplat.scenes.doubts import spread
-from clsplat.scenes.marked import masked
+from clsplat.scenes.analysis.mask_overlay import masked
+from clsplat.scenes.analysis.sanity_checks import spread
 from clsplat.scenes.scene import Scene, View
 
-SHOWN = 6
-"""Photographs with masks that are shown."""
-SIDE = 320
-"""Pixels of their longer side."""
+MAX_MASKED_PHOTOGRAPHS = 6
+"""Number of masked photographs shown."""
+SMALL_PICTURE_SIDE_PX = 320
+"""Pixels of the longer side of small pictures."""
 
 
 @dataclass(frozen=True)
 class MaskedPhotograph:
-    """A photograph with what its masks leave out drawn over it, as a data URI; left_out: that share of its pixels."""
+    """Photograph as a data URI, with the masked-out areas drawn over it.
+
+    left_out: fraction of its pixels that are masked out.
+    """
 
     name: str
     width: int
@@ -38,12 +41,14 @@ class MaskedPhotograph:
 
 
 def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPhotograph], int]:
-    """Some of the photographs that have masks, spread evenly, and how many have one; photographs that cannot be read
-    are passed over. only_files: alpha channels are no masks."""
+    """Evenly chosen photographs with masks, and the number of all of them. Unreadable photographs are skipped.
+
+    only_files: do not count alpha channels as masks.
+    """
     views = [view for view in scene.views if view.mask is not None and (view.mask.path is not None or not only_files)]
     space = photos_space(view.path for view in scene.views)
     shown = []
-    for view in spread(views, SHOWN) if views else []:
+    for view in spread(views, MAX_MASKED_PHOTOGRAPHS) if views else []:
         try:
             shown.append(_shown(view, space))
         except InputError:
@@ -52,7 +57,7 @@ def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPh
 
 
 def _shown(view: View, space: str) -> MaskedPhotograph:
-    scale = min(1.0, SIDE / max(view.camera.width, view.camera.height))
+    scale = min(1.0, SMALL_PICTURE_SIDE_PX / max(view.camera.width, view.camera.height))
     width, height = max(1, round(view.camera.width * scale)), max(1, round(view.camera.height * scale))
     picture = masked(view, width, height)
     picture = replace(picture, photograph=displayed(picture.photograph, space))
@@ -60,7 +65,7 @@ def _shown(view: View, space: str) -> MaskedPhotograph:
 
 
 def exposure_chart(run: Run) -> Markup:
-    """The gains that were learnt of the photographs, in the order of their names; "" where there are none."""
+    """Chart of the photographs' learnt gains, by name; "" if there are none."""
     path = run.appearance_path
     if not path.exists():
         return Markup("")
@@ -71,7 +76,7 @@ def exposure_chart(run: Run) -> Markup:
     except (InputError, ValueError, KeyError, TypeError, AttributeError):
         return Markup("")
     series = [
-        Series(name, [(float(place), row[channel]) for place, row in enumerate(rows, 1)], color=color)
+        ChartSeries(name, [(float(place), row[channel]) for place, row in enumerate(rows, 1)], color=color)
         for channel, (name, color) in enumerate((("red", 1), ("green", 2), ("blue", 0)))
     ]
     note = "what the model's colours are multiplied by; +1 is twice as bright as the mean" + corners
@@ -79,7 +84,7 @@ def exposure_chart(run: Run) -> Markup:
 
 
 def _corners(photographs: Mapping[str, Any]) -> str:
-    """The light that the lenses leave in the corners, by the vignettes that were learnt; "" where none were."""
+    """Text on the light that remains in the corners with the learnt vignettes; "" without any."""
     vignettes = {tuple(_three(row["vignette"])) for row in photographs.values() if "vignette" in row}
     octaves = sorted(min(sum(vignette), 16.0) for vignette in vignettes if any(vignette))
     left = dict.fromkeys(f"{2.0**value:.0%}" for value in octaves)
@@ -87,12 +92,12 @@ def _corners(photographs: Mapping[str, Any]) -> str:
 
 
 def _gains(record: Any) -> Sequence[float]:
-    """Three numbers. Raises ValueError, KeyError or TypeError for what is none."""
+    """Three gains in stops. Raises ValueError, KeyError or TypeError if the record has no such numbers."""
     return _three(record["log2_gains"])
 
 
 def _three(values: Any) -> list[float]:
-    """Three numbers. Raises ValueError or TypeError for what is none."""
+    """Three numbers. Raises ValueError or TypeError for anything else."""
     numbers = [number(value) for value in values]
     if len(numbers) != 3 or None in numbers:
         raise ValueError("not three numbers")

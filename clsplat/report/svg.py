@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts as inline SVG, coloured by the page's style sheet. Text is escaped; lines carry the figures they are drawn by,
-for the page's script to show."""
+"""Charts as inline SVG, coloured by the page's style sheet.
+
+Text is escaped. Lines carry their data, which the page's script shows.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +17,27 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-WIDTH, HEIGHT = 420, 250
-LEFT, RIGHT, TOP, BOTTOM = 52, 412, 22, 214
-MAX_POINTS = 400
-COLORS = 8
-"""Classes c0 to c7 of the style sheet."""
+CHART_WIDTH_PX, CHART_HEIGHT_PX = 420, 250
+PLOT_LEFT_PX, PLOT_RIGHT_PX, PLOT_TOP_PX, PLOT_BOTTOM_PX = 52, 412, 22, 214
+MAX_LINE_POINTS = 400
+SERIES_COLOUR_COUNT = 8
+"""Number of colour classes in the style sheet: c0 to c7."""
 
-FILLED = ("area", "bars")
+FILLED_KINDS = ("area", "bars")
 
 Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Series:
-    """Points by x, and how they are drawn: line, faint (a line behind others), dots (a line with dots), area (stacked,
-    the first series lowest, all by the same x), bars (x is a bin's lower edge; the last point ends the last bin)."""
+class ChartSeries:
+    """Points sorted by x, and their way of drawing.
+
+    line: a line.
+    faint: a line behind others.
+    dots: a line with dots.
+    area: stacked areas, the first series lowest; all series have the same x.
+    bars: x is the lower edge of a bin, and the last point ends the last bin.
+    """
 
     name: str
     points: Points
@@ -39,7 +47,10 @@ class Series:
 
 @dataclass(frozen=True)
 class Axis:
-    """The axis from values low to high, to pixels from start to end; ticks: value and label."""
+    """Axis that maps the values low to high to the pixels start to end.
+
+    ticks: value and label of each.
+    """
 
     low: float
     high: float
@@ -53,7 +64,7 @@ class Axis:
 
 def chart(
     title: str,
-    series: Sequence[Series],
+    series: Sequence[ChartSeries],
     x: str,
     y: str,
     *,
@@ -62,17 +73,24 @@ def chart(
     powers: bool = False,
     note: str = "",
 ) -> Markup:
-    """A figure with a legend: title, labels of both axes. log_y: a logarithmic axis, values that are not positive are
-    left out; from_zero: y begins there; powers: x are powers of ten. "" where there are no points at all."""
+    """Figure with a legend, a title and axis labels; "" if no points remain.
+
+    log_y: logarithmic y axis. Values that are not positive are left out.
+    from_zero: y begins at zero.
+    powers: x values are exponents of ten.
+    """
     drawn = [replace(curve, points=_kept(curve, log_y)) for curve in series]
     drawn = [curve for curve in drawn if curve.points]
     if not drawn:
         return Markup("")
     heights = _heights(drawn, log_y)
     xs, ys = [x for curve in drawn for x, _ in curve.points], list(chain(*heights))
-    if from_zero or any(curve.kind in FILLED for curve in drawn):
+    if from_zero or any(curve.kind in FILLED_KINDS for curve in drawn):
         ys.append(0.0)
-    across, up = _axis(xs, LEFT, RIGHT, powers=powers), _axis(ys, BOTTOM, TOP, powers=log_y)
+    across, up = (
+        _axis(xs, PLOT_LEFT_PX, PLOT_RIGHT_PX, powers=powers),
+        _axis(ys, PLOT_BOTTOM_PX, PLOT_TOP_PX, powers=log_y),
+    )
     shapes = [
         _shape(curve, [(across(x), up(y)) for (x, _), y in zip(curve.points, tops, strict=True)], up(0.0))
         for curve, tops in zip(drawn, heights, strict=True)
@@ -90,10 +108,10 @@ def chart(
             powers=powers,
             note=note,
             label=f"{title}: {y} by {x}. " + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
-            # in front of others: means of what is faint, and what is lower in a stack
+            # draw in front: means over faint curves, and lower areas of a stack
             shapes=sorted(shapes[:: -1 if drawn[0].kind == "area" else 1], key=lambda shape: shape["kind"] != "faint"),
-            width=WIDTH,
-            height=HEIGHT,
+            width=CHART_WIDTH_PX,
+            height=CHART_HEIGHT_PX,
         )
     )
     return Markup(html)  # noqa: S704  # escaped by the template
@@ -101,7 +119,7 @@ def chart(
 
 @cache
 def templates() -> Environment:
-    """The pages' templates, which escape everything that is not Markup."""
+    """Environment of the page templates, which escape everything that is not Markup."""
     return Environment(
         loader=PackageLoader("clsplat.report", "templates"),
         autoescape=True,
@@ -112,7 +130,7 @@ def templates() -> Environment:
 
 
 def short(value: float) -> str:
-    """A short number for people: 235k, 1.2M, 0.025."""
+    """Short text of a number: 235k, 1.2M, 0.025."""
     size = abs(value)
     for limit, factor, unit in ((1e9, 1e-9, "G"), (1e6, 1e-6, "M"), (1e4, 1e-3, "k")):
         if size >= limit:
@@ -120,8 +138,8 @@ def short(value: float) -> str:
     return f"{value:.4g}"
 
 
-def thinned(points: Points, limit: int = MAX_POINTS) -> Points:
-    """At most about `limit` of the points: of each stretch the lowest and the highest, so that no peak is lost."""
+def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
+    """Thin out points to about `limit`. The lowest and highest of each interval stay, so no peak is lost."""
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)
@@ -132,14 +150,14 @@ def thinned(points: Points, limit: int = MAX_POINTS) -> Points:
     return [points[index] for index in sorted(kept)]
 
 
-def _kept(curve: Series, log_y: bool) -> Points:
-    """The points that can be drawn, of a line no more than can be seen."""
+def _kept(curve: ChartSeries, log_y: bool) -> Points:
+    """Points that can be drawn; for lines no more than are visible."""
     points = [point for point in curve.points if all(map(math.isfinite, point)) and (not log_y or point[1] > 0)]
-    return points if curve.kind in FILLED else thinned(points)
+    return points if curve.kind in FILLED_KINDS else thinned(points)
 
 
-def _heights(drawn: Sequence[Series], log_y: bool) -> list[list[float]]:
-    """Where on the axis the points of each series are: areas are stacked."""
+def _heights(drawn: Sequence[ChartSeries], log_y: bool) -> list[list[float]]:
+    """Positions of each series' points on the y axis. Areas are stacked."""
     heights = [[math.log10(y) if log_y else y for _, y in curve.points] for curve in drawn]
     stacked: list[list[float]] = np.cumsum(heights, axis=0).tolist() if drawn[0].kind == "area" else heights
     return stacked
@@ -165,22 +183,25 @@ def _power(value: float) -> str:
 
 
 def _step(span: float, count: int) -> float:
-    """1, 2 or 5 times a power of ten, about `count` of them in the span."""
+    """Tick distance, 1, 2 or 5 times a power of ten, for about `count` ticks in the span."""
     rough = span / count
     power = 10.0 ** math.floor(math.log10(rough))
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
 
 
-def _shape(curve: Series, pixels: Points, floor: float) -> dict[str, Any]:
-    """A series for the template; shown: the values that the page's script shows, at these places."""
+def _shape(curve: ChartSeries, pixels: Points, floor: float) -> dict[str, Any]:
+    """Template data of a series.
+
+    shown: values that the page's script shows, in the order of `places`.
+    """
     step = "H{:.1f}V{:.1f}" if curve.kind == "bars" else "L{:.1f} {:.1f}"
     path = "M{:.1f} {:.1f}".format(*pixels[0]) + "".join(step.format(*pixel) for pixel in pixels[1:])
-    if curve.kind in FILLED:
+    if curve.kind in FILLED_KINDS:
         path += f"V{floor:.1f}H{pixels[0][0]:.1f}Z"
     return {
         "name": curve.name,
         "kind": curve.kind,
-        "color": curve.color % COLORS,
+        "color": curve.color % SERIES_COLOUR_COUNT,
         "path": path,
         "shown": " ".join(f"{x:.7g} {y:.7g}" for x, y in curve.points),
         "places": " ".join(f"{x:.1f}" for x, _ in pixels),
@@ -188,7 +209,7 @@ def _shape(curve: Series, pixels: Points, floor: float) -> dict[str, Any]:
     }
 
 
-def _described(curve: Series) -> str:
+def _described(curve: ChartSeries) -> str:
     if curve.kind == "bars":
         top = max(curve.points, key=lambda point: point[1])
         return f"{curve.name}: most, {short(top[1])}, from {short(top[0])} on."

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Held-out photographs, renders and their errors, small enough to be in a page, as data URIs."""
+"""Held-out photographs, renders and error pictures as data URIs, small enough to embed in a page."""
 
 from __future__ import annotations
 
@@ -25,27 +25,32 @@ from clsplat.images.colour import displayed, photos_space
 from clsplat.images.reading import downscale, read_image
 from clsplat.images.writing import write_spec
 from clsplat.runs.run import Run
-from clsplat.scenes.layouts import detect
+from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.masks import after_sfm
 from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.supervision.masks import after_sfm
 
-MAX_SIDE = 640
-"""Pixels of the longer side in a page."""
-SMALL = 160
-"""Up to this side a picture is a PNG, and is shown with its pixels as squares."""
-QUALITY = 85
-WHITE_ERROR = 0.25
-"""Mean absolute error of a pixel's channels from which on the error is drawn in the last colour."""
-RAMP = np.array(
+MAX_PICTURE_SIDE_PX = 640
+"""Pixels of the longer side of a picture in a page."""
+MAX_PNG_SIDE_PX = 160
+"""Largest side of a picture that is stored as PNG and shown with its pixels as squares."""
+REPORT_JPEG_QUALITY = 85
+MAX_COLOURED_ERROR = 0.25
+"""Mean absolute error of a pixel's channels at which the colour map ends."""
+INFERNO_RGB = np.array(
     [(0, 0, 0), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (250, 193, 39)], np.float32
 )
-"""Colours from no error to WHITE_ERROR and more, in even steps of lightness: matplotlib's inferno."""
+"""Colour map of the error, from zero to its end, in even steps of lightness: matplotlib's inferno."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A view's pictures as data URIs; photo and error None where there is no photograph, depth where none was kept."""
+    """Pictures of a view as data URIs.
+
+    photo, error: None without a photograph.
+    trouble: reason why the photograph cannot be read.
+    depth: None if no depth picture was kept.
+    """
 
     name: str
     width: int
@@ -58,12 +63,12 @@ class Shown:
 
     @property
     def small(self) -> bool:
-        """True if its pixels are few."""
-        return max(self.width, self.height) <= SMALL
+        """True for a picture with few pixels, which are shown as squares."""
+        return max(self.width, self.height) <= MAX_PNG_SIDE_PX
 
 
 def scene_of(run: Run) -> Scene | str:
-    """The run's scene, or why there is none: nothing is reconstructed for a report."""
+    """Load the run's scene, or return the reason why there is none. A report never reconstructs a scene."""
     source = run.scene
     if source is None:
         return "config.toml does not name the scene"
@@ -88,7 +93,7 @@ def scene_of(run: Run) -> Scene | str:
 
 
 def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
-    """Indices of at most `limit` views to show, ascending: the worst, the best, and evenly between by score."""
+    """Indices of at most `limit` views to show, ascending: the worst, the best, and others evenly by score."""
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
@@ -102,13 +107,15 @@ def show(
     wanted: Sequence[int],
     scene: Scene | None,
     background: ArrayLike,
-    side: int = MAX_SIDE,
+    side: int = MAX_PICTURE_SIDE_PX,
 ) -> list[Shown]:
-    """The pictures of the views `names[index]`, for each index wanted, whose render is in the run's test/. side: pixels
-    of the longer side, at most."""
+    """Pictures of the views `names[index]` for the wanted indices, if their render is in the run's test/.
+
+    side: pixels of the longer side, at most.
+    """
     try:
         paths = picture_names(names)
-    except ValueError:  # a name that no file has, such as ""
+    except ValueError:  # an impossible file name, such as ""
         return []
     views = {view.name: view for view in scene.views} if scene is not None else {}
     space = photos_space(view.path for view in views.values())
@@ -132,24 +139,24 @@ def show(
 
 
 def error_colors(error: Float32) -> Float32:
-    """(H, W, 3) of the mean absolute error (H, W)."""
-    at = np.clip(error / np.float32(WHITE_ERROR), 0, 1) * (len(RAMP) - 1)
-    low = np.minimum(at.astype(int), len(RAMP) - 2)
+    """Colours (H, W, 3) of a mean absolute error (H, W)."""
+    at = np.clip(error / np.float32(MAX_COLOURED_ERROR), 0, 1) * (len(INFERNO_RGB) - 1)
+    low = np.minimum(at.astype(int), len(INFERNO_RGB) - 2)
     part = (at - low)[..., None]
-    colors: Float32 = ((1 - part) * RAMP[low] + part * RAMP[low + 1]) / np.float32(255)
+    colors: Float32 = ((1 - part) * INFERNO_RGB[low] + part * INFERNO_RGB[low + 1]) / np.float32(255)
     return colors
 
 
 def data_uri(image: NDArray[Any]) -> str:
-    """(H, W, 3) floats, clipped to [0, 1], as JPEG; as PNG if small. Raises ClsplatError."""
+    """Encode (H, W, 3) floats, clipped to [0, 1], as JPEG, or as PNG if small. Raises ClsplatError."""
     height, width = image.shape[:2]
-    small = max(width, height) <= SMALL
+    small = max(width, height) <= MAX_PNG_SIDE_PX
     kind = "png" if small else "jpeg"
     pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
     spec = oiio.ImageSpec(width, height, 3, oiio.UINT8)
     if not small:
-        spec.attribute("Compression", f"jpeg:{QUALITY}")
-    with tempfile.TemporaryDirectory() as folder:  # OpenImageIO's Python writes to files alone
+        spec.attribute("Compression", f"jpeg:{REPORT_JPEG_QUALITY}")
+    with tempfile.TemporaryDirectory() as folder:  # OpenImageIO's Python binding can only write to files
         path = Path(folder) / f"picture.{kind}"
         write_spec(path, [pixels], [spec], kind)
         data = path.read_bytes()
@@ -157,7 +164,7 @@ def data_uri(image: NDArray[Any]) -> str:
 
 
 def _is_within(path: Path, folder: Path) -> bool:
-    """True if the file is in the folder, wherever its name and links lead."""
+    """True if the path lies in the folder, after resolving links."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError):

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run folder: settings, model, metrics, checkpoints, evaluation."""
+"""Run folders: settings, model, metrics, checkpoints, evaluation and the scene record."""

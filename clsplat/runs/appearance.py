@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearance of a run's photographs as it was learnt: appearance.json, by a photograph's name."""
+"""Learnt appearance of a run's photographs: reading appearance.json, which is keyed by photograph name."""
 
 from __future__ import annotations
 
@@ -13,30 +13,35 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.errors import InputError, examples
-from clsplat.files import parse_json, read_document
+from clsplat.files.documents import parse_json, read_document
 from clsplat.images.alpha import Image
 from clsplat.runs.run import Run, run_of
 
-MAX_BYTES = 1 << 28
-MOST_LOG = 16.0
-MOST_MIX = 0.25
-"""Under which any six mixes can be undone."""
-EXPECTED = "what clsplat train --appearance writes"
+MAX_APPEARANCE_BYTES = 1 << 28
+MAX_LOG2_GAIN = 16.0
+MAX_CHANNEL_MIX = 0.25
+"""Below this limit the matrix of any six mixes can be inverted."""
+EXPECTED_APPEARANCE_FILE = "what clsplat train --appearance writes"
 
-MOST_PART = 100.0
-"""Pictures that a principal point is beside its own, at most."""
+MAX_CENTRE_PICTURE_SIZES = 100.0
+"""Limit of a vignette centre's coordinates, in picture widths and heights."""
 
 Row = Mapping[str, Any]
-"""A photograph's entry of appearance.json."""
+"""Entry of one photograph in appearance.json."""
 Look = Callable[[str, Image], Image]
-"""Makes a render (H, W, 3) what the camera of a held-out photograph, by its name, shows of it."""
+"""Function of a held-out photograph's name and a render (H, W, 3) that returns the render with that photograph's
+appearance."""
 
 
 def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
-    """The three gains by which colours of a run's model become the photograph's, or the nine numbers of a matrix, by
-    rows, where channels mix; of a held-out one the gains that EXIF tells, or 1, and no mixes. model: the run's folder,
-    or a file there; photograph: its name in the data set, or the end of that from a folder on, with or without
-    extension. Raises InputError."""
+    """Gains, or a colour matrix, that give a run's model the appearance of one photograph.
+
+    model: the run's folder, or a file in it.
+    photograph: its name in the data set, or the end of it from a folder boundary, with or without extension.
+    Returns three gains, or the nine entries of a 3 x 3 matrix by rows if channels mix.
+    A held-out photograph has the gains that follow from its EXIF, or 1, and no mixes.
+    Raises InputError.
+    """
     run = run_of(model)
     path = run.appearance_path if run is not None else None
     if run is None or path is None or not path.exists():
@@ -66,12 +71,13 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """`held_out_looks` of a run, where it has an appearance.json. Raises InputError."""
+    """The `held_out_looks` of a run that has an appearance.json; else looks that change nothing. Raises InputError."""
     return _looks(_read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {})
 
 
 def held_out_looks(record: Mapping[str, Any] | None) -> Look:
-    """The looks of held-out photographs, as far as the content of an appearance.json tells."""
+    """Looks of held-out photographs from the content of an appearance.json. Photographs without an entry stay
+    unchanged."""
     return _looks(_rows_in(record, "held_out") if record is not None else {})
 
 
@@ -91,7 +97,7 @@ def _looks(rows: Mapping[str, Row]) -> Look:
 
 
 def unmixing(mixes: Float64) -> Float64:
-    """The matrix (3, 3) that takes the mixes (6,) from colours (docs/gradients.md, "Colours and vignettes")."""
+    """Matrix (3, 3) that removes the mixes (6,) from colours (docs/gradients.md, "Colours and vignettes")."""
     matrix = np.eye(3)
     for c, (next_share, last_share) in enumerate(mixes.reshape(3, 2)):
         matrix[c, c] += next_share + last_share
@@ -101,7 +107,7 @@ def unmixing(mixes: Float64) -> Float64:
 
 
 def inverse(matrix: Float64) -> Float64:
-    """The inverse of a matrix (3, 3), with the same bits on every processor, as frames are known by them."""
+    """Inverse of a matrix (3, 3) with the same bits on every processor: frames are identified by these values."""
     columns = np.stack([np.cross(matrix[(row + 1) % 3], matrix[(row + 2) % 3]) for row in range(3)], axis=1)
     first, second, third = (matrix[0] * columns[:, 0]).tolist()
     result: Float64 = columns / (first + second + third)
@@ -109,25 +115,31 @@ def inverse(matrix: Float64) -> Float64:
 
 
 def _light(vignette: Float64, centre: Float64, width: int, height: int) -> Float64:
-    """The share of light (H, W) that a lens leaves, by its vignette (3,) and its centre in parts of the picture."""
+    """Fraction of light (H, W) that a lens transmits.
+
+    vignette: (3,), coefficients of the falloff.
+    centre: (2,), as fractions of the picture's width and height.
+    """
     across, down = np.arange(width) + 0.5 - centre[0] * width, np.arange(height) + 0.5 - centre[1] * height
     s = 4 * (across**2 + down[:, None] ** 2) / (width**2 + height**2)
-    light: Float64 = np.exp2(np.clip(s * (vignette[0] + s * (vignette[1] + s * vignette[2])), -MOST_LOG, MOST_LOG))
+    light: Float64 = np.exp2(
+        np.clip(s * (vignette[0] + s * (vignette[1] + s * vignette[2])), -MAX_LOG2_GAIN, MAX_LOG2_GAIN)
+    )
     return light
 
 
 def _kind(path: Path) -> Any:
     try:
-        return parse_json(read_document(path, EXPECTED, MAX_BYTES)).get("kind")
+        return parse_json(read_document(path, EXPECTED_APPEARANCE_FILE, MAX_APPEARANCE_BYTES)).get("kind")
     except (ValueError, AttributeError):
         return None
 
 
 def _read(path: Path, key: str) -> dict[str, Row]:
     try:
-        return _rows_in(parse_json(read_document(path, EXPECTED, MAX_BYTES)), key)
+        return _rows_in(parse_json(read_document(path, EXPECTED_APPEARANCE_FILE, MAX_APPEARANCE_BYTES)), key)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED}") from None
+        raise InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED_APPEARANCE_FILE}") from None
 
 
 def _rows_in(record: Any, key: str) -> dict[str, Row]:
@@ -135,23 +147,26 @@ def _rows_in(record: Any, key: str) -> dict[str, Row]:
 
 
 def _ends(name: str) -> list[str]:
-    """Shorter names that mean a photograph: without extension, and without folders."""
+    """Shorter names that identify a photograph: without extension and without leading folders."""
     parts = name.split("/")
     whole = ["/".join(parts[start:]) for start in range(len(parts))]
     return whole + [end.rpartition(".")[0] for end in whole if "." in end]
 
 
 def _row(record: Any) -> Row:
-    """Gains (3,), mixes (6,) where there are any, and a vignette (3,) with its centre (2,). Raises ValueError,
-    TypeError, KeyError or OverflowError."""
-    logs = _numbers("log2_gains", record["log2_gains"], 3, MOST_LOG).tolist()
-    row = {"gains": np.array([2.0**log for log in logs])}  # which NumPy's processors round in several ways
+    """Parsed entry of a photograph: gains (3,), optional mixes (6,), optional vignette (3,) with its centre (2,).
+
+    Raises ValueError, TypeError, KeyError or OverflowError.
+    """
+    logs = _numbers("log2_gains", record["log2_gains"], 3, MAX_LOG2_GAIN).tolist()
+    # powers of Python floats: NumPy rounds its powers differently between processors
+    row = {"gains": np.array([2.0**log for log in logs])}
     if "mixes" in record:
-        row["mixes"] = _numbers("mixes", record["mixes"], 6, MOST_MIX)
+        row["mixes"] = _numbers("mixes", record["mixes"], 6, MAX_CHANNEL_MIX)
     if "vignette" in record:
         row |= {
-            "vignette": _numbers("vignette", record["vignette"], 3, MOST_LOG),
-            "centre": _numbers("centre", record["centre"], 2, MOST_PART),
+            "vignette": _numbers("vignette", record["vignette"], 3, MAX_LOG2_GAIN),
+            "centre": _numbers("centre", record["centre"], 2, MAX_CENTRE_PICTURE_SIZES),
         }
     return row
 

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints: arrays in a file that is checked before it is used."""
+"""Checkpoints: NumPy arrays in a zip file that is verified before use."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,50 +18,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError, examples
-from clsplat.files import open_input, parse_json
+from clsplat.files.atomic import atomic_writer
+from clsplat.files.documents import open_input, parse_json
+from clsplat.version import package_version
 
 STATE_KEY = "state.json"
-"""The member of a checkpoint that holds its state, as JSON bytes; no array may have this name."""
+"""Zip member that holds a checkpoint's state, as JSON bytes. No array may have this name."""
 NPY_MAGIC = b"\x93NUMPY\x01\x00"
 NPY_HEADER = re.compile(
     r"\{'descr': '([<>|][biufc]\d{1,2})', 'fortran_order': (False|True), "
     r"'shape': \(((?:\d{1,18}(?:, \d{1,18}){0,7},?)?)\), \} *\n"
 )
-"""The text that np.save writes before an array of numbers."""
+"""Header text that np.save writes before a numeric array."""
 Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """step: optimisation steps done; arrays by name; state: JSON values."""
+    """One checkpoint.
+
+    step: optimisation steps done.
+    arrays: by name.
+    state: JSON values.
+    """
 
     step: int
     arrays: Arrays
     state: dict[str, Any]
 
     def named(self, prefix: str) -> Arrays:
-        """Arrays whose names begin so, by the rest of their names."""
+        """Arrays whose names start with `prefix`, keyed by the rest of their names."""
         return {name.removeprefix(prefix): array for name, array in self.arrays.items() if name.startswith(prefix)}
 
 
 def unusable(checkpoint: Checkpoint, why: str) -> InputError:
-    """The error of a checkpoint that is whole, and not one to go on with."""
+    """Error for a checkpoint that is intact but cannot be resumed from."""
     advice = "is it of another run or version?"
     return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")
 
 
 def digest_of(array: NDArray[Any]) -> str:
-    """Digest of an array's dtype, shape and values."""
+    """SHA-256 of an array's dtype, shape and values."""
     digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
     digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 
 def read_arrays(path: Path, expected: str) -> Arrays:
-    """The arrays of numbers of a file that np.savez has made, by name. `expected` as of `open_input`.
+    """Read all numeric arrays of an np.savez file, by name.
 
-    Raises ValueError, InputError or what zipfile does where it is no such file. Not by np.load, which takes an array's
-    size from its header, and unpacks what was packed.
+    expected: as in `open_input`.
+    Raises ValueError, InputError or an error of zipfile if the file is anything else.
+    np.load is not used: it trusts the array size in the header, and it decompresses.
     """
     arrays: Arrays = {}
     with open_input(path, expected) as file, ZipFile(_Bounded(file)) as archive:
@@ -68,34 +78,53 @@ def read_arrays(path: Path, expected: str) -> Arrays:
             name = member.filename.removesuffix(".npy")
             left -= member.file_size
             if member.compress_type != ZIP_STORED or name == member.filename or name in arrays or left < 0:
-                raise ValueError(f"its member {member.filename[:80]!r} is none of {expected}'s")
+                raise ValueError(f"its member {member.filename[:80]!r} does not belong to {expected}")
             arrays[name] = _array(archive.read(member), name)
     return arrays
 
 
-def read_checkpoint(path: Path, expected: int) -> Checkpoint:
-    """Raises ValueError, InputError or what zipfile does where it is not as `save_checkpoint` makes it of that step."""
+def write_checkpoint(path: Path, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> None:
+    """Write a checkpoint atomically, with a digest of each array.
+
+    arrays: of any dtype but object.
+    state: values that JSON can hold.
+    """
+    if STATE_KEY in arrays:
+        raise ValueError(f"no array of a checkpoint may be called {STATE_KEY}")
+    digests = {name: digest_of(array) for name, array in arrays.items()}
+    text = json.dumps({"version": package_version(), "step": step, "sha256": digests, "state": dict(state)})
+    members: Arrays = {STATE_KEY: np.frombuffer(text.encode(), np.uint8), **arrays}
+    with atomic_writer(path, sum(array.nbytes + 512 for array in members.values())) as file:
+        np.savez(file, allow_pickle=False, **members)
+
+
+def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
+    """Read a checkpoint and check that it is the one that `write_checkpoint` wrote, and that it is of step `expected`
+    if that is given.
+
+    Raises ValueError, InputError or an error of zipfile.
+    """
     arrays = read_arrays(path, "a checkpoint")
     record = parse_json(arrays.pop(STATE_KEY).tobytes())
     if not isinstance(record, dict) or type(step := record.get("step")) is not int or step < 0:
         raise ValueError("its state names no step")
     if not isinstance(state := record.get("state"), dict):
-        raise ValueError("its state is none")
-    digests = record.get("sha256")  # runs of earlier versions have none
+        raise ValueError("its state is missing")
+    digests = record.get("sha256")  # earlier versions wrote no digests
     if digests is not None:
         if not isinstance(digests, dict) or arrays.keys() != digests.keys():
             other = examples(sorted(arrays.keys() ^ set(digests)))[:200] if isinstance(digests, dict) else "no list"
-            raise ValueError(f"it has not the arrays it was written with ({other})")
+            raise ValueError(f"its arrays are not those that were written ({other})")
         for name, array in arrays.items():
             if digest_of(array) != digests[name]:
-                raise ValueError(f"{name} is not what was written: its sha256 differs")
-    if step != expected:
+                raise ValueError(f"{name} has changed since it was written: its sha256 differs")
+    if expected is not None and step != expected:
         raise ValueError(f"it is of step {step}")
     return Checkpoint(step, arrays, state)
 
 
 def scene_of(path: Path) -> str | None:
-    """The digest of the scene that a checkpoint's state names; None where it names none, or is damaged."""
+    """Digest of the scene that a checkpoint's state names; None if it names none or the file is damaged."""
     try:
         with open_input(path, "a checkpoint") as file, ZipFile(_Bounded(file)) as archive:
             member = archive.getinfo(f"{STATE_KEY}.npy")
@@ -103,13 +132,15 @@ def scene_of(path: Path) -> str | None:
                 return None
             scene = parse_json(_array(archive.read(member), STATE_KEY).tobytes())["state"].get("scene")
             return scene if isinstance(scene, str) else None
-    except Exception:  # noqa: BLE001  # as of load_latest_checkpoint, which tells of it
+    except Exception:  # noqa: BLE001  # as in load_latest_checkpoint, which reports the damage
         return None
 
 
 class _Bounded:
-    """A file that is never asked for more than it has: `read` makes room for all that it is asked for, and zipfile asks
-    for what a header says."""
+    """File whose `read` is limited to the bytes that remain.
+
+    zipfile asks for the sizes that headers claim, and a plain `read` allocates all that is asked for.
+    """
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._size = file, os.fstat(file.fileno()).st_size
@@ -121,15 +152,15 @@ class _Bounded:
 
 
 def _array(data: bytes, name: str) -> NDArray[Any]:
-    """An array of numbers as np.save writes it. Raises ValueError."""
+    """Parse a numeric array in np.save's format. Raises ValueError."""
     length = int.from_bytes(data[8:10], "little")
     text = data[10 : 10 + length].decode("latin-1")
     match = NPY_HEADER.fullmatch(text) if data[:8] == NPY_MAGIC else None
     if match is None:
-        raise ValueError(f"its member {name[:80]!r} is no array of numbers")
+        raise ValueError(f"its member {name[:80]!r} is not a numeric array")
     kind, shape = np.dtype(match[1]), tuple(int(size) for size in match[3].split(",") if size.strip())
     body = data[10 + length :]
     if math.prod(shape) * kind.itemsize != len(body):
         raise ValueError(f"its array {name[:80]!r} has {len(body)} bytes, expected {shape} of {kind}")
-    array = np.frombuffer(bytearray(body), kind)  # of its own, to be written to
+    array = np.frombuffer(bytearray(body), kind)  # a copy, because np.frombuffer on bytes is read-only
     return array.reshape(shape, order="F" if match[2] == "True" else "C")

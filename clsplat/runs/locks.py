@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One writer for a folder: a lock that the system holds, so that a process that is killed does not leave it behind."""
+"""Exclusive write lock on a folder. The operating system holds it, so a killed process leaves no stale lock."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from pathlib import Path
 from typing import IO
 
 from clsplat.errors import InputError, warn
-from clsplat.files import parse_json
+from clsplat.files.documents import parse_json
 
-NAME = ".clsplat-lock"
-"""The file in the folder that is locked, as long as a process writes there. It names the process."""
-_FAR = 1 << 30
-"""Place of the byte that is locked. On Windows no other process may read a locked byte: this one is behind all that the
-file holds."""
-_TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL, errno.EIO)
+LOCK_FILE_NAME = ".clsplat-lock"
+"""File in the folder that is locked while a process writes there. It names the process."""
+_LOCKED_BYTE_OFFSET = 1 << 30
+"""Offset of the locked byte. Windows forbids other processes to read a locked byte, so it lies beyond the file's
+content."""
+_LOCK_HELD_ERRNOS = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
+_NO_LOCKING_ERRNOS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL, errno.EIO)
 _held: dict[str, int] = {}
-"""Folders that this process has locked, and how often."""
+"""Number of times that this process has locked each folder."""
 
 
 @contextmanager
 def locked(folder: Path, verb: str) -> Iterator[None]:
-    """Be the only process that writes to a folder, which has to exist; inside, the same process may do so again.
+    """Hold the exclusive write lock of an existing folder. The same process may enter again.
 
-    Raises InputError that names the process that has it, OSError where no file can be made there. On a file system
-    without locks there is a warning, and no other process is kept out.
+    Raises InputError, which names the process that holds the lock, and OSError if no file can be created there.
+    On a file system without locks it warns and keeps no other process out.
     """
     key = os.path.realpath(folder)
     if key in _held:
@@ -43,7 +43,7 @@ def locked(folder: Path, verb: str) -> Iterator[None]:
         finally:
             _held[key] -= 1
         return
-    path = Path(key) / NAME
+    path = Path(key) / LOCK_FILE_NAME
     file = _take(path, folder)
     _held[key] = 1
     try:
@@ -55,19 +55,19 @@ def locked(folder: Path, verb: str) -> Iterator[None]:
 
 
 def _take(path: Path, folder: Path) -> IO[bytes]:
-    """The file, open and locked."""
+    """Open and lock the file."""
     while True:
-        file = open(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)  # noqa: SIM115  # given back
+        file = open(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0)  # noqa: SIM115  # closed by `_give_back`
         try:
             try_lock(file)
         except OSError as error:
-            if error.errno in _TAKEN:
+            if error.errno in _LOCK_HELD_ERRNOS:
                 who = _who(file)
                 file.close()
                 raise InputError(
                     f"{folder}: is being written by {who}; wait until that has ended, or choose another folder"
                 ) from None
-            if error.errno not in _NO_LOCKS:
+            if error.errno not in _NO_LOCKING_ERRNOS:
                 file.close()
                 raise
             why = error.strerror or str(error)
@@ -76,12 +76,12 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
-        file.close()  # the one before has just removed it: once more
+        file.close()  # the previous holder has just removed this file: try again
 
 
 def try_lock(file: IO[bytes]) -> None:
     """Lock the file, or raise OSError."""
-    file.seek(_FAR)
+    file.seek(_LOCKED_BYTE_OFFSET)
     if sys.platform == "win32":
         import msvcrt
 
@@ -91,7 +91,7 @@ def try_lock(file: IO[bytes]) -> None:
 
 
 def _sign(file: IO[bytes], verb: str) -> None:
-    """Write which process this is; failing to, as on a full disk, is no reason to stop."""
+    """Write this process's identity. A failure, such as a full disk, is ignored."""
     text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "verb": verb, "since": time.time()})
     with suppress(OSError):
         file.seek(0)
@@ -105,16 +105,16 @@ def _who(file: IO[bytes]) -> str:
         record = parse_json(file.read(1 << 12))
         here = "" if record["host"] == socket.gethostname() else f" on {record['host']}"
         return f"clsplat {record['verb']} (process {record['pid']}{here})"
-    except (OSError, ValueError, KeyError, TypeError):  # it has not signed yet
+    except (OSError, ValueError, KeyError, TypeError):  # the holder has not written its identity yet
         return "another process"
 
 
 def _give_back(file: IO[bytes], path: Path) -> None:
     with suppress(OSError):
-        if sys.platform == "win32":  # there an open file cannot be removed
+        if sys.platform == "win32":  # Windows cannot remove an open file
             import msvcrt
 
-            file.seek(_FAR)
+            file.seek(_LOCKED_BYTE_OFFSET)
             msvcrt.locking(file.fileno(), msvcrt.LK_UNLCK, 1)
             file.close()
         path.unlink()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/, test/ (held-out renders). What is in
-scene.json `clsplat.runs.scene_record` knows."""
+"""The run folder: config.toml, model.ply, metrics.jsonl, eval.json, checkpoints/ and test/ (held-out renders).
+
+`clsplat.runs.scene_record` reads and writes scene.json.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +17,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import clsplat
 from clsplat.config.training import TrainConfig
 from clsplat.errors import ClsplatError, InputError, warn
-from clsplat.files import (
-    TEMPORARY_SUFFIX,
-    atomic_write,
-    atomic_writer,
-    open_input,
-    parse_json,
-    read_document,
-    remove,
-    write_error,
-)
+from clsplat.files.atomic import TEMPORARY_SUFFIX, atomic_write, atomic_writer, remove, write_error
+from clsplat.files.documents import open_input, parse_json, read_document
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import comment
 from clsplat.models.formats import model_path
-from clsplat.runs.checkpoints import STATE_KEY, Arrays, Checkpoint, digest_of, read_checkpoint
+from clsplat.runs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
 from clsplat.runs.locks import locked
-from clsplat.runs.settings import MAX_LINE, MAX_METRICS, MAX_SETTINGS, config_text, read_config
+from clsplat.runs.settings import (
+    MAX_METRICS_BYTES,
+    MAX_METRICS_LINE_BYTES,
+    MAX_SETTINGS_BYTES,
+    config_text,
+    read_config,
+)
 
 KEPT_CHECKPOINTS = 2
 
 
 class Run:
-    """A run folder. Make one with `Run.create`, open one that is there with `Run.open`."""
+    """A run folder. `Run.create` makes one, `Run.open` opens an existing one."""
 
     def __init__(self, path: Path, config: TrainConfig, scene: Path | None, *, resuming: bool = False) -> None:
         self.path, self.config, self.scene, self.resuming = path, config, scene, resuming
@@ -63,16 +62,17 @@ class Run:
         resume: bool = False,
         overwrite: bool = False,
     ) -> Run:
-        """Make the folder and its config.toml; `scene` is recorded there as an absolute path.
+        """Make the folder and its config.toml, which records `scene` as an absolute path.
 
-        resume: go on in a run that is there, with `config` (see `check_resumed`); overwrite: remove the files of the
-        run that is there, and nothing else. Raises InputError where `check_output` and `locks.locked` do.
+        resume: continue an existing run with `config` (see `check_resumed`).
+        overwrite: remove the files of an existing run, and nothing else.
+        Raises InputError like `check_output` and `locks.locked`.
         """
         path = Path(path)
         check_output(path, resume=resume, overwrite=overwrite)
         path.mkdir(parents=True, exist_ok=True)
         with locked(path, "train"):
-            check_output(path, resume=resume, overwrite=overwrite)  # again: another process may just have been there
+            check_output(path, resume=resume, overwrite=overwrite)  # again: another process may have been faster
             if resume:
                 earlier = cls.open(path)
                 check_resumed(earlier, config)
@@ -92,7 +92,7 @@ class Run:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Run:
-        """A run that is there. Raises InputError where it is none or its config.toml is wrong."""
+        """Open an existing run. Raises InputError if the folder is not a run or its config.toml is wrong."""
         path = Path(path)
         if not path.is_dir():
             raise InputError(f"{path}: no such folder, expected a run")
@@ -102,13 +102,16 @@ class Run:
         return cls(path, config, scene)
 
     def keep_config(self, config: TrainConfig) -> None:
-        """Write config.toml where the settings are others than those there."""
+        """Write config.toml if the settings differ from those in it."""
         if config != self.config:
             atomic_write(self.config_path, config_text(config, self.scene).encode())
             self.config = config
 
     def save_model(self, gaussians: Gaussians, space: str = "sRGB") -> None:
-        """Write model.ply; space: the colour space that it was trained in (`colour.photos_space`)."""
+        """Write model.ply.
+
+        space: the colour space that the model was trained in (`colour.photos_space`).
+        """
         gaussians.save(self.model_path, comments=[comment(space)])
 
     def write_eval(self, result: Mapping[str, Any]) -> None:
@@ -116,17 +119,19 @@ class Run:
         atomic_write(self.eval_path, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
 
     def write_appearance(self, record: Mapping[str, Any], tables: Mapping[str, NDArray[Any]] | None = None) -> None:
-        """Write appearance.json, and of the tables that are too large for it appearance.npz."""
+        """Write appearance.json, and appearance.npz for the tables that are too large for it."""
         if tables:
             with atomic_writer(self.appearance_path.with_suffix(".npz")) as file:
                 np.savez(file, **dict[str, Any](tables))
         atomic_write(self.appearance_path, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
 
     def model_record(self) -> dict[str, Any]:
-        """`step` and `seconds` of model.ply, where they are known.
+        """The `step` and `seconds` of model.ply, if known.
 
-        From eval.json, which is written after the model: a run that was resumed and stopped has later metrics. An
-        older eval.json is of the model before, as when the evaluation was interrupted.
+        They come from eval.json, which is written after the model: a run that was resumed and stopped has later
+        metrics.
+        An eval.json older than the model describes an earlier model, as after an interrupted evaluation.
+        Then the last record of metrics.jsonl is used.
         """
         with suppress(OSError, ValueError, InputError):
             if self.eval_path.stat().st_mtime_ns < self.model_path.stat().st_mtime_ns:
@@ -137,7 +142,7 @@ class Run:
         return next(reversed(self.read_metrics()), {})
 
     def append_metrics(self, record: Mapping[str, Any]) -> None:
-        """Add a line to metrics.jsonl, out of the program at once. Raises ClsplatError for a number not finite."""
+        """Append a line to metrics.jsonl and flush it. Raises ClsplatError for a number that is not finite."""
         try:
             line = json.dumps(record, allow_nan=False)
         except ValueError:
@@ -145,15 +150,15 @@ class Run:
         try:
             with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")
-        except OSError as error:  # a full disk does not say which file it was
+        except OSError as error:  # the error of a full disk names no file
             raise write_error(self.metrics_path, error, needs=len(line) + 1) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """The records of metrics.jsonl; a cut last line, as a crash leaves it, is left out."""
+        """Records of metrics.jsonl, without an incomplete last line as left by a crash."""
         return [record for _, record in self._metrics_lines()]
 
     def truncate_metrics(self, step: int) -> None:
-        """Drop the records of later steps, and a cut last line."""
+        """Drop the records of later steps, and an incomplete last line."""
         if self.metrics_path.exists():
             kept = [line for line, record in self._metrics_lines() if record.get("step", 0) <= step]
             atomic_write(self.metrics_path, "".join(line + "\n" for line in kept).encode())
@@ -162,9 +167,9 @@ class Run:
         if not self.metrics_path.exists():
             return
         with open_input(self.metrics_path, "the metrics of a run") as file:
-            if (size := os.fstat(file.fileno()).st_size) > MAX_METRICS:
-                raise InputError(f"{self.metrics_path}: has {size} bytes, expected at most {MAX_METRICS}")
-            while data := file.readline(MAX_LINE):
+            if (size := os.fstat(file.fileno()).st_size) > MAX_METRICS_BYTES:
+                raise InputError(f"{self.metrics_path}: has {size} bytes, expected at most {MAX_METRICS_BYTES}")
+            while data := file.readline(MAX_METRICS_LINE_BYTES):
                 with suppress(ValueError):
                     line = data.decode("utf-8").rstrip("\r\n")
                     record = parse_json(line)
@@ -174,18 +179,12 @@ class Run:
     def save_checkpoint(self, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> Path:
         """Write checkpoints/step-STEP.npz atomically and keep the latest two.
 
-        arrays: any dtype but object; state: what JSON holds. The digest of each array is kept with the state.
-        Checkpoints of later steps are removed: training has gone back before them.
+        arrays, state: as in `write_checkpoint`.
+        Checkpoints of later steps are removed, because training has gone back before them.
         """
-        if STATE_KEY in arrays:
-            raise ValueError(f"no array of a checkpoint may be called {STATE_KEY}")
-        digests = {name: digest_of(array) for name, array in arrays.items()}
-        text = json.dumps({"version": clsplat.__version__, "step": step, "sha256": digests, "state": dict(state)})
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
         path = self.checkpoints_path / f"step-{step:07d}.npz"
-        members: Arrays = {STATE_KEY: np.frombuffer(text.encode(), np.uint8), **arrays}
-        with atomic_writer(path, sum(array.nbytes + 512 for array in members.values())) as file:
-            np.savez(file, allow_pickle=False, **members)
+        write_checkpoint(path, step, arrays, state)
         earlier = [(s, p) for s, p in self.checkpoints() if s <= step]
         keep = {p for _, p in earlier[-KEPT_CHECKPOINTS:]}
         for _, other in self.checkpoints():
@@ -199,11 +198,11 @@ class Run:
         return sorted((int(match[1]), path) for match, path in matches if match)
 
     def load_latest_checkpoint(self) -> Checkpoint | None:
-        """The latest checkpoint that is whole; None where there is none at all.
+        """The latest intact checkpoint; None if there are no checkpoints.
 
-        A damaged one gives a warning and the one before it is taken; with none left, InputError. In a run that
-        resumes, metrics.jsonl is cut back to the checkpoint's step, and what a killed process left half-written is
-        removed.
+        A damaged one is skipped with a warning; InputError if none is intact.
+        In a resuming run, metrics.jsonl is truncated to the checkpoint's step.
+        Temporary files left by a killed process are removed.
         """
         checkpoints = self.checkpoints()
         checkpoint: Checkpoint | None = None
@@ -211,7 +210,7 @@ class Run:
             try:
                 checkpoint = read_checkpoint(path, step)
                 break
-            except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly anything for a flipped bit
+            except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly any exception for a flipped bit
                 why = str(error) or type(error).__name__
                 warn(f"{path}: checkpoint is damaged and was passed over ({why})")
         if checkpoints and checkpoint is None:
@@ -226,8 +225,8 @@ class Run:
 
 
 def model_file(path: Path) -> Path:
-    """The model file that a run's folder, a folder of a format that is one, or the path of a file means. Raises
-    InputError for a run without one."""
+    """Path of the model file for a run's folder, a model folder or a model file. Raises InputError for a run without a
+    model."""
     if not path.is_dir():
         return path
     if not is_run(path) and (model := model_path(path)) != path:
@@ -241,19 +240,19 @@ def model_file(path: Path) -> Path:
 def is_run(path: Path) -> bool:
     """True if the folder holds a config.toml that clsplat wrote."""
     try:
-        text = read_document(path / "config.toml", "the settings of a run", MAX_SETTINGS)
+        text = read_document(path / "config.toml", "the settings of a run", MAX_SETTINGS_BYTES)
     except InputError:
         return False
     return any(line.startswith("clsplat = ") for line in text.split("\n"))
 
 
 def run_of(model: Path) -> Run | None:
-    """The run that a model is of: the folder itself, or the folder that the file is in."""
+    """The run that a model belongs to: the folder itself, or the folder that holds the file."""
     return next((Run.open(path) for path in (model, model.parent) if is_run(path)), None)
 
 
 def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
-    """Raise InputError where a run may not be put at `path`. Writes nothing."""
+    """Raise InputError if a run may not be created at `path`. Writes nothing."""
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other")
     if path.exists() and not path.is_dir():
@@ -270,7 +269,7 @@ def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
 
 
 def owned_files(path: Path) -> list[Path]:
-    """The files in a run's folder that clsplat wrote, and that --overwrite may therefore remove."""
+    """Files in a run's folder that clsplat wrote, which --overwrite may therefore remove."""
     patterns = (
         "checkpoints/step-*.npz",
         "trouble-step-*.npz",
@@ -279,7 +278,7 @@ def owned_files(path: Path) -> list[Path]:
         "refined/*.txt",
         "**/.*" + TEMPORARY_SUFFIX,
     )
-    # config.toml last: a removal that is cut short still leaves a run, which --overwrite can remove.
+    # config.toml last: an interrupted removal still leaves a run, which --overwrite can remove.
     learnt = ("appearance.json", "appearance.npz")
     names = ("model.ply", "metrics.jsonl", "eval.json", *learnt, "report.html", "scene.json", "config.toml")
     files = [file for pattern in patterns for file in sorted(path.glob(pattern))] + [path / name for name in names]
@@ -287,7 +286,7 @@ def owned_files(path: Path) -> list[Path]:
 
 
 def check_resumed(earlier: Run, config: TrainConfig) -> None:
-    """Raise InputError where `config` changes what a run cannot change on its way."""
+    """Raise InputError if `config` changes a setting that a resumed run has to keep."""
     of_model = ("sh_degree", "seed", "test_every", "lenses", "appearance", "antialiased", "perspective")
     for name in (*of_model, "refine_poses", "refine_lenses"):
         was, now = getattr(earlier.config, name), getattr(config, name)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The record that a run keeps of its scene, scene.json: names, sizes and cameras of the views, a digest of each
-photograph."""
+"""The run's record of its scene, scene.json: name, size and camera of each view, and a digest of each photograph."""
 
 from __future__ import annotations
 
@@ -13,31 +12,35 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import clsplat
 from clsplat.camera import Camera
 from clsplat.errors import InputError, examples, warn
-from clsplat.files import atomic_write, parse_json, read_document, short_digest
+from clsplat.files.atomic import atomic_write
+from clsplat.files.documents import parse_json, read_document, short_digest
 from clsplat.runs.checkpoints import scene_of
+from clsplat.version import package_version
 
 if TYPE_CHECKING:
     from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene, View
 
-NAME = "scene.json"
-MAX_SCENE = 256 << 20
-"""Bytes of scene.json: of some hundred thousand views."""
-SAME = 1e-6
-"""Relative difference up to which numbers of a camera are the same: another version may round otherwise."""
-_EXPECTED = "what a run knows of its scene"
+SCENE_RECORD_FILE_NAME = "scene.json"
+MAX_SCENE_RECORD_BYTES = 256 << 20
+"""Size limit of scene.json in bytes, enough for some hundred thousand views."""
+CAMERA_RELATIVE_TOLERANCE = 1e-6
+"""Relative tolerance for equal camera parameters: another version may round differently."""
+_EXPECTED_SCENE_RECORD = "what a run knows of its scene"
 
 
 def record_of(scene: Scene, resolution: int) -> dict[str, Any]:
-    """Contents of scene.json; resolution: the setting. Reads every photograph, if that has not been done."""
+    """Content of scene.json. Reads every photograph that has no digest yet.
+
+    resolution: the setting.
+    """
     points = hashlib.blake2b(np.ascontiguousarray(scene.points, "<f8").tobytes(), digest_size=16)
     points.update(np.ascontiguousarray(scene.point_colors, "<f4").tobytes())
     digests = scene.digests
     return {
-        "clsplat": clsplat.__version__,
+        "clsplat": package_version(),
         "resolution": resolution,
         "origin": scene.origin.tolist(),
         "points": {"count": len(scene.points), "blake2b": points.hexdigest()},
@@ -56,37 +59,37 @@ def _view(view: View, digest: str | None) -> dict[str, Any]:
         "size": [camera.width, camera.height],
         "lens": [float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)],
         "pose": [float(value) for value in (*np.ravel(camera.rotation), *camera.translation)],
-        **(bent if camera.projection != "perspective" else {}),
+        **(bent if not camera.is_pinhole else {}),
     }
 
 
 def digest_of(record: dict[str, Any]) -> str:
-    """128 bits of SHA-256 of a scene, in hexadecimal, whatever version has written it down."""
+    """First 128 bits of the SHA-256 of a scene, in hexadecimal, independent of the version that wrote the record."""
     scene = {key: value for key, value in record.items() if key not in ("clsplat", "earlier")}
     return hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def known_digests(record: dict[str, Any] | None) -> set[str]:
-    """Digests of the scene of a record, and of those that it has taken the place of."""
+    """Digests of a record's scene and of the earlier scenes that it replaced."""
     return {digest_of(record), *record.get("earlier", [])} if record is not None else set()
 
 
 def write(run: Run, scene: Scene) -> None:
-    """Write scene.json. Checkpoints that are there stay those of the run: their scenes are kept as earlier ones."""
+    """Write scene.json. Existing checkpoints stay valid: their scenes are listed as earlier ones."""
     record, there = record_of(scene, run.config.resolution), {scene_of(path) for _, path in run.checkpoints()}
     earlier = known_digests(read(run)) | {digest for digest in there if digest}
     record["earlier"] = sorted(earlier - {digest_of(record)})
-    atomic_write(run.path / NAME, (json.dumps(record, allow_nan=False) + "\n").encode())
+    atomic_write(run.path / SCENE_RECORD_FILE_NAME, (json.dumps(record, allow_nan=False) + "\n").encode())
 
 
 def read(run: Run) -> dict[str, Any] | None:
-    """Contents of scene.json; None where there is none, as in runs of earlier versions. Raises InputError."""
-    path = run.path / NAME
+    """Content of scene.json; None if the file is missing, as in runs of earlier versions. Raises InputError."""
+    path = run.path / SCENE_RECORD_FILE_NAME
     if not path.exists():
         return None
     advice = "remove it, and the run resumes without a comparison"
     try:
-        record = parse_json(read_document(path, _EXPECTED, MAX_SCENE))
+        record = parse_json(read_document(path, _EXPECTED_SCENE_RECORD, MAX_SCENE_RECORD_BYTES))
         views, points = record["views"], record["points"]
         assert isinstance(views, dict)
         assert isinstance(points["count"], int)
@@ -100,13 +103,15 @@ def read(run: Run) -> dict[str, Any] | None:
             assert "radial" not in view or ("projection" in view and len(np.array(view["radial"], float)) == 4)
     except (ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
         why = str(error) or "not of its form"
-        raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED}; {advice}") from None
+        raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED_SCENE_RECORD}; {advice}") from None
     return dict(record)
 
 
 def own_cameras(run: Run | None) -> list[Camera]:
-    """The cameras of all photographs that a run was trained on or held against, by their names; none where it does not
-    know them. Raises InputError as `read`."""
+    """Cameras of all photographs of a run, training and held-out, sorted by name; empty if they are not recorded.
+
+    Raises InputError like `read`.
+    """
     record = read(run) if run is not None else None
     if record is None:
         return []
@@ -121,8 +126,10 @@ def own_cameras(run: Run | None) -> list[Camera]:
 
 
 def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """Differences between a scene and the one that a run has begun with, in few words each. With another --resolution
-    sizes may differ, and files of another size stand in."""
+    """Short descriptions of the differences between a run's recorded scene and the scene as it is now.
+
+    With another --resolution, different sizes and replacement files of another size are not differences.
+    """
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
     held_out = "held out in one and not in the other"
     changed: dict[str, list[str]] = {
@@ -152,9 +159,10 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 
 def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool = False) -> bool:
-    """Compare a scene, read from `path`, with the one that a run has begun with; True where it differs, as `accept`ed.
+    """Compare the scene read from `path` with the run's recorded scene; True if it differs and `accept` is set.
 
-    Raises InputError where it differs otherwise, or where the model would not lie where its numbers say.
+    Raises InputError if it differs and `accept` is not set.
+    Raises InputError if the world's origin differs, because the model would then be displaced.
     """
     earlier = read(run)
     if earlier is None:
@@ -163,8 +171,8 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
     others = [path for _, path in run.checkpoints() if (digest := scene_of(path)) and digest not in known]
     if others and not accept:
         raise InputError(
-            f"{others[-1]}: is of a training on another scene than {run.path} is of, expected one of this run; remove "
-            "it, or --accept-changes goes on from it"
+            f"{others[-1]}: is from a training on another scene than {run.path}, expected a checkpoint of this run; "
+            "remove it, or go on from it with --accept-changes"
         )
     now = record_of(scene, resolution)
     changes = differences(earlier, now)
@@ -175,28 +183,29 @@ def check(run: Run, scene: Scene, path: Path, resolution: int, *, accept: bool =
         )
     if earlier["origin"] != now["origin"]:
         raise InputError(
-            f"{path}: lies elsewhere in the world than the scene that {run.path} began with (numbers count from "
-            f"{now['origin']}, not {earlier['origin']}), expected the same place; start a new run"
+            f"{path}: has another origin in the world than the scene that {run.path} began with "
+            f"({now['origin']}, not {earlier['origin']}), expected the same; start a new run"
         )
     return bool(changes or others)
 
 
 def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
-    """Write scene.json, but for a run that goes on with what is there; a warning where nothing was."""
+    """Write scene.json, unless the run resumes with a record for its resolution. Warns if a resumed run has no
+    record."""
     known = read(run) if resuming else None
     if known is not None and known["resolution"] == run.config.resolution:
         return
     if known is None and resuming and run.checkpoints():
         warn(
-            f"{run.path}: has no {NAME}, as runs of earlier versions: whether this is the scene it began with is "
-            "not known; from now on it is"
+            f"{run.path}: has no {SCENE_RECORD_FILE_NAME}, as runs of earlier versions: it is not known whether this "
+            "is the scene that "
+            "it began with; from now on it will be"
         )
     write(run, scene)
 
 
 def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
-    """Reasons that scores of these views are not those of held-out photographs of the scene that the run has begun
-    with."""
+    """Reasons why scores of these views do not count as held-out scores of the run's scene."""
     try:
         record = read(run)
     except InputError:
@@ -208,24 +217,24 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         view.name
         for view in known
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
-        and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")  # before its mask's
+        and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")  # without the mask's
     ]
     reasons = []
     if seen:
         reasons.append(f"{len(seen):,} of {len(views):,} views were trained on ({examples(seen)}): they score too well")
     if changed:
-        reasons.append(_listed("with another photograph than at the training", changed))
+        reasons.append(_listed("with another photograph than in training", changed))
     if was and not known:
         reasons.append(f"none of the views is of the scene that {run.path} began with")
     return reasons
 
 
 def _close(a: list[float], b: list[float]) -> bool:
-    """True if two vectors are equal to SAME of their largest number, as a scene may be of any size."""
+    """True if two vectors agree relative to their largest number, because a scene may have any scale."""
     one, other = np.array(a), np.array(b)
-    return bool(np.abs(one - other).max() <= SAME * max(np.abs(one).max(), np.abs(other).max()))
+    return bool(np.abs(one - other).max() <= CAMERA_RELATIVE_TOLERANCE * max(np.abs(one).max(), np.abs(other).max()))
 
 
 def _listed(what: str, names: list[str]) -> str:
-    """Such as "3 views not there any more (a.png, b.png, c.png)"."""
+    """Text such as "3 views not there any more (a.png, b.png, c.png)"."""
     return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({examples(names)})"

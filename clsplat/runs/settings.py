@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings as config.toml, and back."""
+"""Writing settings as config.toml, and reading them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import Any, TypeVar, get_origin, get_type_hints
 
 import tomli_w
 
-import clsplat
 from clsplat.config.checks import misfit
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, plain
-from clsplat.files import read_document
+from clsplat.files.documents import read_document
+from clsplat.version import package_version
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -27,22 +27,35 @@ else:
     import tomli as tomllib
 
 
-MAX_SETTINGS, MAX_METRICS, MAX_LINE = 1 << 20, 64 << 20, 1 << 16
-"""Bytes of config.toml, of metrics.jsonl, hundreds of times what the longest training writes, and of a line of it."""
+MAX_SETTINGS_BYTES, MAX_METRICS_BYTES, MAX_METRICS_LINE_BYTES = 1 << 20, 64 << 20, 1 << 16
+"""Size limits in bytes: config.toml, metrics.jsonl, and one line of metrics.jsonl.
+
+The limit of metrics.jsonl is hundreds of times the output of the longest training.
+"""
 T = TypeVar("T")
-RETIRED: dict[str, Any] = {"train.rasterizer.sh_angle": 0.0} | {
+RETIRED_SETTINGS: dict[str, object] = {"train.rasterizer.sh_angle": 0.0} | {
     f"train.rasterizer.{name}": value
     for name, value in vars(BenchSwitches()).items()
     if name not in vars(RasterizerConfig())
 }
-"""Settings that earlier versions had, and the value of each with which it did nothing."""
+RETIRED_SETTINGS |= {
+    f"train.rasterizer.{name}": True for name in ("vector_skip", "last_contributor", "gradient_skip", "opacity_cull")
+}
+RETIRED_SETTINGS |= {
+    "train.density.edge_views": 0,
+    "train.density.prune_at": [],
+    "train.density.prune_fraction": 0.0,
+    "train.density.views_agree": 1,
+    "train.frequency_steps": 0,
+}
+"""Settings of earlier versions, each with the value that switched it off."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
-"""Values that settings had in earlier versions. In place of each there is the default."""
+"""Retired values of current settings. The default replaces them."""
 
 
 def config_text(config: TrainConfig, scene: Path | None) -> str:
-    """The content of config.toml."""
-    document: dict[str, Any] = {"clsplat": clsplat.__version__}
+    """Content of config.toml."""
+    document: dict[str, Any] = {"clsplat": package_version()}
     if scene is not None:
         document["scene"] = str(scene)
     document["train"] = json.loads(json.dumps(asdict(config), default=lambda number: number.item()))  # no NumPy
@@ -50,13 +63,13 @@ def config_text(config: TrainConfig, scene: Path | None) -> str:
 
 
 def read_config(path: Path) -> tuple[TrainConfig, Path | None]:
-    """The configuration and the scene's path. Raises InputError naming the file and the key that is wrong."""
-    return parse_config(read_document(path, "the settings of a run", MAX_SETTINGS), path)
+    """Read the configuration and the scene's path. Raises InputError, which names the file and the wrong key."""
+    return parse_config(read_document(path, "the settings of a run", MAX_SETTINGS_BYTES), path)
 
 
 def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
-    """The configuration and the scene's path from the file's text (see `read_config`). A warning names the settings of
-    earlier versions that are passed over."""
+    """Configuration and scene path from the file's text (see `read_config`). Warns about ignored settings of earlier
+    versions."""
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -81,8 +94,10 @@ def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
 
 
 def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: list[str]) -> T:
-    """An instance of the dataclass `cls`; keys that are not there keep their defaults. Settings of earlier versions
-    are added to `passed_over`, where they did something."""
+    """Build the dataclass `cls` from a table; missing keys keep their defaults.
+
+    Settings of earlier versions that had an effect are added to `passed_over`.
+    """
     if not isinstance(table, dict):
         raise InputError(f"{path}: {where} is {table!r}, expected a table")
     types = get_type_hints(cls)
@@ -90,8 +105,8 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
     values = {}
     for key, value in table.items():
         name = f"{where}.{key}"
-        if name in RETIRED or (isinstance(value, str) and (name, value) in _RETIRED_VALUES):
-            if value != RETIRED.get(name):
+        if name in RETIRED_SETTINGS or (isinstance(value, str) and (name, value) in _RETIRED_VALUES):
+            if value != RETIRED_SETTINGS.get(name):
                 passed_over.append(f"{name} = {value!r:.100}")
             continue
         if key not in names:
@@ -107,7 +122,7 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
 
 
 def _meant(key: str, where: str) -> str:
-    """Hint at the table in which a setting of that name, or one like it, belongs."""
+    """Hint at the table that has a setting of that name, or of a similar one."""
     tables = {"train": TrainConfig} | {
         f"train.{name}": kind for name, kind in get_type_hints(TrainConfig).items() if is_dataclass(kind)
     }
@@ -123,5 +138,5 @@ def _meant(key: str, where: str) -> str:
 
 @cache
 def _warn_once(text: str) -> None:
-    """A warning, once however often a file is read."""
+    """Warn once, however often a file is read."""
     warnings.warn(text)

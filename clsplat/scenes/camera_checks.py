@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of pictures, and warnings of those that cannot be right: by their numbers, and by what they see of the
-points. A line each."""
+"""Cameras of images, and one-line warnings about implausible ones, judged by intrinsics, poses and visible points."""
 
 from __future__ import annotations
 
@@ -14,40 +13,53 @@ from clsplat.camera import Camera
 from clsplat.config.training import Lenses
 from clsplat.errors import examples, warn
 from clsplat.rotations import quaternion_of, rotation_from_quaternion
-from clsplat.scenes.data_set import PANORAMA, SHORTEST, SMALLEST, Lens, PosedImage, pixels_of
+from clsplat.scenes.dataset import (
+    MIN_CENTRE_CHECK_SIDE_PX,
+    MIN_FOCAL_PER_SIDE,
+    Lens,
+    PosedImage,
+    pixels_of,
+)
 
 Named = tuple[str, Camera, Lens]
-FEWEST = 4
-"""Cameras without which nothing is said of their poses."""
-LOOKED_AT = 40
-"""Cameras that are looked through, spread evenly."""
-POINTS = 1000
-"""Points that are looked for, spread evenly; with fewer than LEAST_POINTS poses are judged by the cameras alone."""
-LEAST_POINTS = 30
-SEEN, TIMES = 0.25, 4.0
-"""Share of the points that the mean picture shows at least if poses are taken another way, and how many times as much
-as the poses as given. Pictures of a survey show a hundredth each, either way."""
-LITTLE, BLIND = 0.01, 0.2
-"""A picture shows nothing of the points with under this share of them; a way in which all pictures show more is told
-from this share of such pictures on. In the captures tried each shows a quarter at least."""
-FACING, MEETING = 0.2, 0.9
-"""Shares of the cameras that face one point: at most as given, and at least with the poses turned round."""
-ASTRAY = 0.7
-"""Length of the cameras' mean axis from which on they look one way, as in front of a facade or from a drone. There
-poses that are turned round meet by chance."""
-ALIKE = 0.02
-"""Part by which a principal point's place across and down may differ where both are those of a smaller picture."""
-AIM = np.cos(np.deg2rad(20.0))
-"""Cosine of the angle to its axis within which a camera faces a point."""
-BENT = 0.5
-"""Half widths or heights of the picture by which a lens may move what is at its edge."""
-FLIP = np.array([1.0, -1.0, -1.0])
-"""Signs between COLMAP's camera axes and OpenGL's."""
+MIN_CHECKED_POSES = 4
+"""Minimum number of cameras to judge their poses."""
+MAX_CHECKED_POSES = 40
+"""Maximum number of cameras whose poses are checked, evenly spaced."""
+MAX_POSE_CHECK_POINTS = 1000
+"""Maximum number of points that are checked, evenly spaced. With fewer than MIN_POSE_CHECK_POINTS, only the cameras are
+used."""
+MIN_POSE_CHECK_POINTS = 30
+MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
+"""Minimum mean fraction of the points in view if poses are read another way, and minimum ratio to the poses as given.
+
+Each picture of an aerial survey shows about 1 % of the points, either way.
+"""
+BLIND_VIEW_POINT_FRACTION, MIN_BLIND_VIEW_FRACTION = 0.01, 0.2
+"""Fraction of the points below which a view is blind, and fraction of blind views that makes the poses doubtful.
+
+Another reading of the poses is then reported if it has no blind views. In the captures tried, each view shows at least
+a quarter of the points.
+"""
+MAX_CONVERGING_FRACTION_AS_GIVEN, MIN_CONVERGING_FRACTION_INVERTED = 0.2, 0.9
+"""Maximum fraction of the cameras that face a common point as given, and minimum fraction with inverted poses."""
+PARALLEL_MEAN_AXIS_LENGTH = 0.7
+"""Length of the mean optical axis above which the cameras look the same way, as along a facade or from a drone.
+
+There, inverted poses converge by chance.
+"""
+CENTRE_RATIO_TOLERANCE = 0.02
+"""Relative tolerance between cx / width and cy / height. They agree if the principal point belongs to another size."""
+FACING_COSINE = np.cos(np.deg2rad(20.0))
+"""Cosine of the maximum angle between the optical axis and a point that a camera faces."""
+MAX_EDGE_DISTORTION = 0.5
+"""Maximum shift by a lens at the picture's edge, as a fraction of half the width or height."""
+OPENGL_AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
+"""Signs that convert between COLMAP's and OpenGL's camera axes."""
 
 
 def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """The cameras that the images become, as of `Lens.camera`, at full size, by name. Warns of cameras that cannot be
-    right."""
+    """Cameras of the images by name, at full size, from `Lens.camera`. Warns of implausible cameras."""
     by_lens = {
         lens: lens.camera(np.eye(3), np.zeros(3), lenses) for lens in dict.fromkeys(image.lens for image in images)
     }
@@ -62,9 +74,13 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 
 
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
-    """Warnings about the cameras of pictures, at any size, by name. points: (N, 3) of the world, if there are any."""
-    flat = [(name, camera) for name, camera, _ in views if camera.projection == "perspective"]
-    points = np.empty((0, 3)) if points is None else points[:: -(-len(points) // POINTS) or 1]
+    """Warnings about cameras at any size.
+
+    views: names, cameras and lenses.
+    points: (N, 3), world coordinates.
+    """
+    flat = [(name, camera) for name, camera, _ in views if camera.is_pinhole]
+    points = np.empty((0, 3)) if points is None else points[:: -(-len(points) // MAX_POSE_CHECK_POINTS) or 1]
     found = (_focal(views), _corner(views), _another_size(views), _poses(flat, points))
     return [text for text in found if text]
 
@@ -73,7 +89,7 @@ def _focal(views: Sequence[Named]) -> str:
     short = [
         (name, lens)
         for name, _, lens in views
-        if lens.model != PANORAMA and lens.focal < SHORTEST * max(lens.width, lens.height)
+        if not lens.is_panorama and lens.focal < MIN_FOCAL_PER_SIDE * max(lens.width, lens.height)
     ]
     if not short:
         return ""
@@ -87,10 +103,10 @@ def _focal(views: Sequence[Named]) -> str:
 def _corner(views: Sequence[Named]) -> str:
     odd = []
     for name, _, lens in views:
-        x, y = (0.5 * lens.width, 0.5 * lens.height) if lens.model == PANORAMA else lens.centre
-        near = abs(x) < SHORTEST * lens.width and abs(y) < SHORTEST * lens.height
-        part = 0 <= x <= 1 or 0 <= y <= 1  # of the width or height, one of them alone
-        if (near or part) and min(lens.width, lens.height) >= SMALLEST:
+        x, y = (0.5 * lens.width, 0.5 * lens.height) if lens.is_panorama else lens.centre
+        near = abs(x) < MIN_FOCAL_PER_SIDE * lens.width and abs(y) < MIN_FOCAL_PER_SIDE * lens.height
+        part = 0 <= x <= 1 or 0 <= y <= 1  # one of them is a fraction of the width or height
+        if (near or part) and min(lens.width, lens.height) >= MIN_CENTRE_CHECK_SIDE_PX:
             odd.append((name, x, y, lens))
     if not odd:
         return ""
@@ -104,9 +120,9 @@ def _corner(views: Sequence[Named]) -> str:
 def _another_size(views: Sequence[Named]) -> str:
     odd = []
     for name, _, lens in views:
-        if lens.model != PANORAMA and min(lens.width, lens.height) >= SMALLEST:
+        if not lens.is_panorama and min(lens.width, lens.height) >= MIN_CENTRE_CHECK_SIDE_PX:
             part, other = lens.centre[0] / lens.width, lens.centre[1] / lens.height
-            if SHORTEST < part < 1 / 3 and abs(part - other) < ALIKE * part:
+            if MIN_FOCAL_PER_SIDE < part < 1 / 3 and abs(part - other) < CENTRE_RATIO_TOLERANCE * part:
                 odd.append((name, lens))
     if not odd:
         return ""
@@ -120,28 +136,35 @@ def _another_size(views: Sequence[Named]) -> str:
 
 
 def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
-    """A doubt whether the poses mean what they are taken for: by the points that the pictures show if they are taken
-    another way, or without points by the cameras that face one place. If only some are odd, these."""
-    flat = [camera for _, camera in views[:: -(-len(views) // LOOKED_AT) or 1]]
-    if len(flat) < FEWEST:
+    """Warn if the poses look as if they follow another convention.
+
+    With points, the test is the fraction of them in view under each reading of the poses. If no other reading fits
+    better, blind views are reported. Without points, the test is the fraction of cameras that face a common point.
+    """
+    flat = [camera for _, camera in views[:: -(-len(views) // MAX_CHECKED_POSES) or 1]]
+    if len(flat) < MIN_CHECKED_POSES:
         return ""
-    if len(points) >= LEAST_POINTS:
+    if len(points) >= MIN_POSE_CHECK_POINTS:
         shares = _shares(flat, points)
-        ways = ((_shares(list(map(how, flat)), points), words) for words, how in OTHER_WAYS)
+        ways = ((_shares(list(map(how, flat)), points), words) for words, how in POSE_MISREADINGS)
         others, words = max(ways, key=lambda way: float(way[0].mean()))
         given, best = shares.mean(), others.mean()
-        some_blind = (shares < LITTLE).mean() >= BLIND and not (others < LITTLE).any()
-        if best < SEEN or (best < TIMES * given and not some_blind):
+        some_blind = (shares < BLIND_VIEW_POINT_FRACTION).mean() >= MIN_BLIND_VIEW_FRACTION and not (
+            others < BLIND_VIEW_POINT_FRACTION
+        ).any()
+        if best < MIN_VISIBLE_POINT_FRACTION or (best < MIN_VISIBLE_POINT_GAIN * given and not some_blind):
             return _blind(views, points)
         evidence = (
             f"the pictures show {100 * given:.0f} % of the points, and {100 * best:.0f} % if the poses are {words}"
         )
     else:
-        if np.linalg.norm(np.mean([camera.rotation[2] for camera in flat], axis=0)) > ASTRAY:
+        if np.linalg.norm(np.mean([camera.rotation[2] for camera in flat], axis=0)) > PARALLEL_MEAN_AXIS_LENGTH:
             return ""
-        inverted = ((_facing(list(map(how, flat))), words) for words, how in OTHER_WAYS if words == INVERTED)
+        inverted = (
+            (_facing(list(map(how, flat))), words) for words, how in POSE_MISREADINGS if words == INVERTED_POSES
+        )
         meeting, words = max(inverted)
-        if meeting < MEETING or _facing(flat) > FACING:
+        if meeting < MIN_CONVERGING_FRACTION_INVERTED or _facing(flat) > MAX_CONVERGING_FRACTION_AS_GIVEN:
             return ""
         evidence = (
             f"the cameras face nothing in common, and {100 * meeting:.0f} % face one place if the poses are {words}"
@@ -150,10 +173,14 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
 
 
 def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
-    """A doubt about the poses of the pictures that show none of the points, where the others show many."""
+    """Warn of views that show almost none of the points where the others show many."""
     shares = _shares([camera for _, camera in views], points)
-    blind = shares < LITTLE
-    if not blind.any() or (~blind).sum() < FEWEST or (usual := np.median(shares[~blind])) < SEEN:
+    blind = shares < BLIND_VIEW_POINT_FRACTION
+    if (
+        not blind.any()
+        or (~blind).sum() < MIN_CHECKED_POSES
+        or (usual := np.median(shares[~blind])) < MIN_VISIBLE_POINT_FRACTION
+    ):
         return ""
     names = examples(name for (name, _), none in zip(views, blind, strict=True) if none)
     return (
@@ -168,22 +195,30 @@ def _inverted(camera: Camera) -> Camera:
 
 
 def _flipped(camera: Camera) -> Camera:
-    return replace(camera, rotation=FLIP[:, None] * camera.rotation, translation=FLIP * camera.translation)
+    return replace(
+        camera,
+        rotation=OPENGL_AXIS_SIGNS[:, None] * camera.rotation,
+        translation=OPENGL_AXIS_SIGNS * camera.translation,
+    )
 
 
 def _inverted_opengl(camera: Camera) -> Camera:
-    """The pose of a camera whose matrix in OpenGL's axes was taken the wrong way round."""
+    """Pose of a camera whose matrix in OpenGL's axes was inverted by mistake."""
     turned = _inverted(camera)
-    return replace(turned, rotation=FLIP[:, None] * turned.rotation * FLIP, translation=FLIP * turned.translation)
+    return replace(
+        turned,
+        rotation=OPENGL_AXIS_SIGNS[:, None] * turned.rotation * OPENGL_AXIS_SIGNS,
+        translation=OPENGL_AXIS_SIGNS * turned.translation,
+    )
 
 
 def _of_places(camera: Camera) -> Camera:
-    """The camera whose place was given where its translation is expected."""
+    """Camera whose position was given in place of its translation."""
     return replace(camera, translation=-camera.rotation @ camera.translation)
 
 
 def _of_last_w(camera: Camera) -> Camera:
-    """The camera whose quaternion was given as x y z w and read as w x y z."""
+    """Camera whose quaternion was given as x y z w and read as w x y z."""
     return replace(camera, rotation=rotation_from_quaternion(np.roll(quaternion_of(camera.rotation), 1)))
 
 
@@ -197,33 +232,35 @@ def _transposed_in_place(camera: Camera) -> Camera:
 
 
 def _transposed_opengl(camera: Camera) -> Camera:
-    """The camera of `_transposed_in_place`, of a matrix in OpenGL's axes."""
-    turn = FLIP[:, None] * camera.rotation.T * FLIP
+    """Camera like `_transposed_in_place`, for a matrix in OpenGL's axes."""
+    turn = OPENGL_AXIS_SIGNS[:, None] * camera.rotation.T * OPENGL_AXIS_SIGNS
     return replace(camera, rotation=turn, translation=-turn @ camera.position)
 
 
-INVERTED = "inverted (camera from world in place of world from camera, or the other way round)"
-TRANSPOSED = "of transposed rotations (camera from world in place of world from camera, or the other way round)"
-OTHER_WAYS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
-    (INVERTED, _inverted),
-    (INVERTED, _inverted_opengl),
+INVERTED_POSES = "inverted (camera from world in place of world from camera, or the other way round)"
+TRANSPOSED_ROTATIONS = (
+    "of transposed rotations (camera from world in place of world from camera, or the other way round)"
+)
+POSE_MISREADINGS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
+    (INVERTED_POSES, _inverted),
+    (INVERTED_POSES, _inverted_opengl),
     ("in the other camera axes (COLMAP's and OpenCV's have y down and z ahead, OpenGL's y up and z back)", _flipped),
     ("of the cameras' places where translations are expected", _of_places),
     ("of quaternions in the order x y z w (COLMAP's is w x y z)", _of_last_w),
-    (TRANSPOSED, _transposed),
-    (TRANSPOSED, _transposed_in_place),
-    (TRANSPOSED, _transposed_opengl),
+    (TRANSPOSED_ROTATIONS, _transposed),
+    (TRANSPOSED_ROTATIONS, _transposed_in_place),
+    (TRANSPOSED_ROTATIONS, _transposed_opengl),
 )
-"""Ways in which poses are mistaken for others, in words and as a change of the camera."""
+"""Common misreadings of poses: their description, and the change of the camera that corrects them."""
 
 
 def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:
-    """Share of the points that each picture shows, (cameras,)."""
+    """Fraction of the points in each view, (cameras,)."""
     return np.array([pixels_of(points, camera)[2].mean() for camera in cameras])
 
 
 def _facing(cameras: Sequence[Camera]) -> float:
-    """Share of the cameras that face the point nearest to all optical axes, from as far as they are spread."""
+    """Fraction of the cameras that face the point nearest to all optical axes, from at least half their spread away."""
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -235,11 +272,11 @@ def _facing(cameras: Sequence[Camera]) -> float:
     spread = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     if spread == 0:
         return 0.0
-    return float(((away * axes).sum(axis=1) > AIM * np.maximum(distances, 0.5 * spread)).mean())
+    return float(((away * axes).sum(axis=1) > FACING_COSINE * np.maximum(distances, 0.5 * spread)).mean())
 
 
 def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
-    """A warning of the pictures whose lens bends beyond reason, or nothing. lenses: with the pictures' names."""
+    """Warning about lenses with implausible distortion, "" for none. lenses: with the names of their pictures."""
     bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
     bent = [(name, lens) for name, lens in lenses if bend[lens]]
     if not bent:
@@ -253,9 +290,11 @@ def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
 
 
 def _bends(lens: Lens) -> bool:
-    """True if the lens moves what a pinhole camera of its focal length has at the picture's edge by a large part of it.
-    Fisheyes and the like are meant to, and count as False."""
-    if lens.is_pinhole or lens.model in ("FOV", "EUCM", PANORAMA) or "FISHEYE" in lens.model:
+    """True if the lens shifts pixels at the picture's edge by a large part of it, compared with a pinhole camera.
+
+    False for fisheyes and similar models, which do so by design.
+    """
+    if lens.is_pinhole or lens.is_bent_by_design:
         return False
     pinhole = lens.pinhole(np.eye(3), np.zeros(3))
     half = np.array([lens.width, lens.height]) / 2
@@ -263,4 +302,4 @@ def _bends(lens: Lens) -> bool:
     rays = np.concatenate([edge / [pinhole.fx, pinhole.fy], np.ones((len(edge), 1))], axis=1)
     pixels = lens.img_from_cam(rays)
     moved = pixels - pixels[len(pixels) // 2] - edge
-    return not bool((np.abs(moved) <= BENT * half).all())
+    return not bool((np.abs(moved) <= MAX_EDGE_DISTORTION * half).all())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values of JSON files of cameras, by key, with errors that name file and key."""
+"""Values of camera files in JSON, with errors that name the file and the key."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 
 from clsplat.arrays import Float64, numbers
-from clsplat.camera import Projection, focal_length
+from clsplat.camera import Camera, Projection, focal_length
 from clsplat.errors import InputError
-from clsplat.files import parse_json, read_document
-from clsplat.scenes.data_set import MAX_NUMBER, MAX_SIZE
+from clsplat.files.documents import parse_json, read_document
+from clsplat.scenes.dataset import MAX_COORDINATE, MAX_IMAGE_SIDE_PX
 
-EXPORT_AGAIN = "export the data set anew or add it"
+EXPORT_AGAIN_ADVICE = "export the data set anew or add it"
 
 
 class Keys:
-    """Values of one frame or camera, or of the file where that does not have them; `where` begins every error. Every
-    method raises InputError for a value that cannot be."""
+    """Values of one frame or camera; the file's values are the defaults.
+
+    where: beginning of every error message.
+    Each method raises InputError for an invalid value.
+    """
 
     def __init__(self, path: Path, part: str | None, frame: dict[str, Any], document: dict[str, Any]) -> None:
         self.path, self.frame, self.document = path, frame, document
@@ -34,19 +37,19 @@ class Keys:
         value = self.get(key)
         if not isinstance(value, str) or not value.strip():
             trouble = f"has no '{key}'" if value is None else f"'{key}' is {short(value)}, expected text"
-            raise InputError(f"{self.where}: {trouble}; {EXPORT_AGAIN}")
+            raise InputError(f"{self.where}: {trouble}; {EXPORT_AGAIN_ADVICE}")
         return value
 
     def number(self, key: str) -> float | None:
         value = self.get(key)
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_NUMBER:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_COORDINATE:
             raise self.wrong(key, "a number")
         return float(value)
 
     def require(self, key: str, default: float | None = None) -> float:
-        """The number of `key`, else the default; InputError for what `number` refuses, and where there is neither."""
+        """Number under `key`, or the default. Raises InputError for an invalid value, or if there is neither."""
         value = self.number(key)
         if (value := default if value is None else value) is None:
             raise self.wrong(key, "a number")
@@ -55,8 +58,8 @@ class Keys:
     def side(self, key: str) -> int:
         """Width or height in pixels."""
         side = self.number(key)
-        if side is None or not 1 <= side <= MAX_SIZE or side != round(side):
-            raise self.wrong(key, f"a whole number of pixels from 1 to {MAX_SIZE}")
+        if side is None or not 1 <= side <= MAX_IMAGE_SIDE_PX or side != round(side):
+            raise self.wrong(key, f"a whole number of pixels from 1 to {MAX_IMAGE_SIDE_PX}")
         return round(side)
 
     def vector(self, key: str, size: int) -> Float64:
@@ -66,15 +69,15 @@ class Keys:
             raise self.wrong(key, f"a list of {size} numbers")
         return vector
 
-    def focal(self, key: str, size: int, projection: Projection = "perspective") -> float:
-        """The focal length in pixels of an angle of view in degrees across `size` pixels."""
+    def focal(self, key: str, size: int, projection: Projection = Camera.projection) -> float:
+        """Focal length in pixels, from an angle of view in degrees across `size` pixels."""
         try:
             return focal_length(math.radians(self.require(key)), size, projection)
         except ValueError as error:
             raise InputError(f"{self.where}: '{key}': {error}") from None
 
     def wrong(self, key: str, expected: str) -> InputError:
-        """The error for a value that is missing or cannot be."""
+        """Error for a missing or invalid value."""
         value = self.get(key)
         shown = f"{value:g}" if isinstance(value, float) else short(value)
         problem = f"has no '{key}'" if value is None else f"'{key}' is {shown}"
@@ -82,7 +85,7 @@ class Keys:
 
 
 def short(value: object) -> str:
-    """A value for an error's line."""
+    """Value, shortened for an error message."""
     try:
         return repr(value)[:60]
     except ValueError:  # an integer of thousands of digits
@@ -90,7 +93,12 @@ def short(value: object) -> str:
 
 
 def load_document(path: Path, expected: str = "a transforms.json", key: str = "'frames'") -> dict[str, Any]:
-    """The JSON object in a file. Raises InputError, which says that `expected`, an object with `key`, was."""
+    """Load the JSON object in a file.
+
+    expected: kind of file, for the error message.
+    key: key that the object should have, for the error message.
+    Raises InputError.
+    """
     try:
         document = parse_json(read_document(path, expected), once=True)
     except ValueError as error:
@@ -101,6 +109,6 @@ def load_document(path: Path, expected: str = "a transforms.json", key: str = "'
 
 
 def objects(document: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    """The list of objects under a key, empty where that is none."""
+    """List of objects under a key; empty if there is no such list."""
     given = document.get(key)
     return given if isinstance(given, list) and all(isinstance(entry, dict) for entry in given) else []

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loading of scenes: the pictures of a folder with their cameras, at the working size, split, checked, with points."""
+"""Loading of scenes: pictures with their cameras at the working size, the split, checks, and points."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,31 +13,33 @@ import numpy as np
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.checks import misfit
+from clsplat.config.cli_defaults import TEST_EVERY
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import Lenses, Missing
-from clsplat.config.verbs import TEST_EVERY
 from clsplat.errors import InputError, examples, plain, warn
-from clsplat.files import digest
+from clsplat.files.documents import digest
 from clsplat.images.reading import image_size
 from clsplat.progress import Progress
 from clsplat.scenes.camera_checks import camera_checks
-from clsplat.scenes.cloud import with_cloud_beside, without_stray_points
-from clsplat.scenes.data_set import Lens, PosedImage
-from clsplat.scenes.layouts import detect, read_colmap, read_transforms
-from clsplat.scenes.masks import after_sfm, for_sfm, masks_of
+from clsplat.scenes.dataset import DataSet, Lens, PosedImage
+from clsplat.scenes.folder_layouts import Kind, detect, read_colmap, read_transforms
+from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO
 from clsplat.scenes.scene import Scene, Split, View
-from clsplat.scenes.sfm import reconstruct
-from clsplat.scenes.strays import FACTOR
+from clsplat.scenes.sfm.reconstruct import reconstruct
+from clsplat.scenes.start.point_cloud import with_cloud_beside, without_stray_points
+from clsplat.scenes.supervision.masks import after_sfm, for_sfm, masks_of
 
-MAX_SIZE = 1600
-"""Longest side in pixels where no resolution is asked for."""
-UNEVEN = 1.5
-"""Factor by which a picture's shape may differ from its camera's; from 4:3 to 16:9 it is a third. Beyond, or turned, it
-is another picture."""
-ROUNDED = 2.5
-"""Pixels of the camera's size by which sides that were rounded can differ."""
-BLENDER_CUBE = 1.3
-"""Half the side of the cube that the synthetic scenes lie in, for random points: the authors' value."""
+DEFAULT_MAX_SIDE_PX = 1600
+"""Default maximum of the longest side in pixels."""
+MAX_ASPECT_RATIO_CHANGE = 1.5
+"""Maximum ratio between the aspect ratios of a picture and its camera; from 4:3 to 16:9 it is 1.33.
+
+Beyond it, or if rotated, the file is another picture.
+"""
+SIDE_ROUNDING_PX = 2.5
+"""Maximum difference in pixels, at the camera's size, that rounding of the sides explains."""
+BLENDER_CUBE_HALF_SIDE = 1.3
+"""Half the side of the cube for random points in the synthetic scenes: the authors' value."""
 
 
 def load_scene(
@@ -52,27 +54,32 @@ def load_scene(
     masks: MaskUse = NO_MASKS,
     missing: Missing = "few",
 ) -> Scene:
-    """Read a scene's cameras, points and picture headers; the pixels are read by `View.load`.
+    """Read a scene's cameras, points and picture headers. `View.load` reads the pixels.
 
-    path: a folder as `detect` knows, or a transforms.json. resolution: the longest side of the views in pixels, never
-    larger than the pictures are; 0 keeps their size up to 1600. test_every: each n-th view by name is held out, 0 for
-    none; a data set's own split goes before it. images: another folder of the pictures, relative to `path`, such as
-    "images_4". Without it, images_2, images_4 or images_8 of a COLMAP scene stand in where their pictures have just the
-    size that is wanted, and any of them where there are no others. lenses: fisheyes become pinhole cameras, or stay
-    what they are ("native"). missing: how many of the listed pictures need not be there, "few" (a tenth), "skip" (any
-    number but all) or "error" (none).
+    path: a folder in a layout that `detect` knows, or a transforms.json.
+    resolution: longest side of the views in pixels, never larger than the pictures; 0 keeps their size up to 1600.
+    test_every: each n-th view by name is held out, 0 for none. The data set's own split takes precedence.
+    images: another folder of the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
+        images_8 of a COLMAP scene replace larger pictures if they have exactly the wanted size. Any of them is used if
+        there are no other pictures.
+    lenses: "undistort" turns fisheyes into pinhole cameras, "native" keeps them.
+    work_dir: output of structure from motion, by default NAME_colmap next to `path`.
+    progress: called with a text and a fraction or None.
+    masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
+        are not used, and structure from motion finds no features in left-out pixels.
+    missing: how many listed pictures may be missing, "few" (a tenth), "skip" (any number but not all) or "error"
+        (none).
 
-    A folder of photos goes through `clsplat.scenes.sfm` first, into work_dir (NAME_colmap beside it if not given),
-    where a result for the same photos is found again; progress(text, fraction or None) is called on the way.
+    A folder of photographs goes through `clsplat.scenes.sfm.reconstruct` first. An earlier result for the same
+    photographs is reused.
 
-    Raises InputError naming the file for whatever is wrong with the input: see `detect`, `colmap.read_model` and
-    `transforms.read_transforms`; pictures that are listed and missing, or of another size than their camera; pictures
-    whose header does not decode. The scene's warnings name pictures that are there and not listed, but for masks,
-    depths and the like (`reading.companions`), those on both sides of the split, those that are missing or found under
-    other names, strays (`strays`), and cameras that cannot be right (`camera_checks`).
+    Raises InputError that names the file for invalid input: see `detect`, `colmap.read_model` and
+    `transforms.read_transforms`. Also raises it for listed pictures that are missing or have another size than their
+    camera, and for headers that do not decode.
 
-    masks: what masks and alpha channels mean (`clsplat.scenes.masks`); no other folder of pictures stands in then, and
-    photos that go through sfm have no features where they leave something out.
+    `Scene.warnings` reports unlisted pictures, except for masks, depths and the like (`reading.companions`). It also
+    reports pictures on both sides of the split, missing pictures, and pictures found under other names. Outliers
+    (`outliers`) and implausible cameras (`camera_checks`) are reported too.
     """
     path = Path(path)
     for name, number in (("resolution", resolution), ("test_every", test_every)):
@@ -83,59 +90,96 @@ def load_scene(
         raise InputError(
             f"{path}: is a folder of photos, a folder of images can be chosen only where there are cameras"
         )
-    smaller: list[Path] = []
-    source = path
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        if kind in ("blender", "transforms"):
-            data = read_transforms(path, kind, images, missing, masks=masks.masks != "none")
-        else:
-            folder = path
-            if kind == "photos":
-                photos = path.resolve()
-                folder = work_dir or photos.with_name(f"{photos.name}_colmap")
-                folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
-                masks = after_sfm(masks, folder)
-            source = folder
-            data, smaller = read_colmap(folder, images, missing)
-        posed = sorted(data.images, key=lambda image: image.name)
-        if masks != NO_MASKS:
-            smaller = []
-        of_pictures = masks_of(masks, posed, path, strict=not data.missing)
-        own_split = any(image.split for image in posed)
-        every = {name: index for index, name in enumerate(sorted([*(image.rank for image in posed), *data.missing]))}
-        views = []
-        for image in posed:
-            by_name = test_every > 0 and every[image.rank] % test_every == 0
-            held_out = image.split == "test" if own_split else by_name
-            view = _view(image, "test" if held_out else "train", resolution, smaller, lenses)
-            views.append(replace(view, mask=of_pictures.get(image.name), depth_file=image.depth))
-        _warn_of_copies(views)
-        _warn_of_uneven(posed, views)
-        cube = np.full(3, BLENDER_CUBE)
-        name = path.resolve().name if path.is_dir() else path.resolve().parent.name
-        scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=source, clouds=tuple(data.clouds))
-        scene.missing = tuple(data.missing)
-        if len(scene.points) == 0:
-            scene = with_cloud_beside(scene)
-            if not len(scene.points) and kind in ("colmap", "photos"):
-                warn(f"{path}: has no points, training starts from random ones")
-        if kind != "blender":
-            near = [view.camera for view in views if view.name not in scene.stray_cameras]
-            scene.bounds = camera_bounds(near, data.box)
-        scene = without_strays(scene)
-        near_views = [view for view in views if view.name not in scene.stray_cameras]  # those are named
+        files = _read(path, kind, images, missing, masks, work_dir, progress)
+        views = _views(files, path, resolution, test_every, lenses)
+        scene = _scene(files, path, kind, views)
+        near_views = [view for view in views if view.name not in scene.stray_cameras]  # outliers are reported already
         for doubt in camera_checks([(view.name, view.camera, view.lens) for view in near_views], scene.points):
             warn(doubt)
     scene.warnings = [plain(str(warning.message)) for warning in caught]
     return scene
 
 
+@dataclass(frozen=True)
+class _SceneFiles:
+    """A data set, before its pictures' headers are read.
+
+    source: the folder that it was read from. For photographs it is the result of structure from motion.
+    smaller: folders of downscaled pictures that may replace its pictures.
+    masks: the meaning of the masks in `source`.
+    """
+
+    data: DataSet
+    source: Path
+    smaller: Sequence[Path]
+    masks: MaskUse
+
+
+def _read(
+    path: Path,
+    kind: Kind,
+    images: str | Path | None,
+    missing: Missing,
+    masks: MaskUse,
+    work_dir: Path | None,
+    progress: Progress | None,
+) -> _SceneFiles:
+    """Read the data set of the layout; photographs go through structure from motion first."""
+    if kind in ("blender", "transforms"):
+        return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)
+    folder = path
+    if kind == "photos":
+        photos = path.resolve()
+        folder = work_dir or photos.with_name(f"{photos.name}_colmap")
+        folder = reconstruct(photos, folder, masks=for_sfm(masks), progress=progress)
+        masks = after_sfm(masks, folder)
+    data, smaller = read_colmap(folder, images, missing)
+    return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks)
+
+
+def _views(files: _SceneFiles, path: Path, resolution: int, test_every: int, lenses: Lenses) -> list[View]:
+    """Views of the data set, by name, with the split and the masks. Warns of copies and of uneven sizes."""
+    data = files.data
+    posed = sorted(data.images, key=lambda image: image.name)
+    of_pictures = masks_of(files.masks, posed, path, strict=not data.missing)
+    own_split = any(image.split for image in posed)
+    every = {name: index for index, name in enumerate(sorted([*(image.rank for image in posed), *data.missing]))}
+    views = []
+    for image in posed:
+        by_name = test_every > 0 and every[image.rank] % test_every == 0
+        held_out = image.split == "test" if own_split else by_name
+        view = _view(image, "test" if held_out else "train", resolution, files.smaller, lenses)
+        views.append(replace(view, mask=of_pictures.get(image.name), depth_file=image.depth))
+    _warn_of_copies(views)
+    _warn_of_uneven(posed, views)
+    return views
+
+
+def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Scene:
+    """Scene of the views, with its points, and with bounds for random ones. Warns of outliers and of no points."""
+    data = files.data
+    cube = np.full(3, BLENDER_CUBE_HALF_SIDE)
+    name = path.resolve().name if path.is_dir() else path.resolve().parent.name
+    scene = Scene(name, views, data.points, data.colors, (-cube, cube), source=files.source, clouds=tuple(data.clouds))
+    scene.missing = tuple(data.missing)
+    if len(scene.points) == 0:
+        scene = with_cloud_beside(scene)
+        if not len(scene.points) and kind in ("colmap", "photos"):
+            warn(f"{path}: has no points, training starts from random ones")
+    if kind != "blender":
+        near = [view.camera for view in views if view.name not in scene.stray_cameras]
+        scene.bounds = camera_bounds(near, data.box)
+    return without_strays(scene)
+
+
 def without_strays(scene: Scene) -> Scene:
-    """The scene without points that are strays. Warns of these, and of cameras that are."""
+    """Scene without outlier points. Warns of outlier points and outlier cameras."""
     if scene.stray_cameras:
         warn(
-            f"{scene.name}: {len(scene.stray_cameras):,} camera(s) stand over {FACTOR:g} times as far off as the "
+            f"{scene.name}: {len(scene.stray_cameras):,} camera(s) stand over {OUTLIER_DISTANCE_RATIO:g} times as "
+            "far off as the "
             f"others ({examples(sorted(scene.stray_cameras))}): the scene's size is that of the others; if their poses "
             "are wrong, correct them or leave them out"
         )
@@ -144,11 +188,11 @@ def without_strays(scene: Scene) -> Scene:
 
 
 def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = None) -> tuple[Float64, Float64]:
-    """A cube (low, high) to put random points in: about the point that the cameras look at, as large as holds them.
+    """Cube (low, high) for random points, around the point that the cameras face, large enough to hold the cameras.
 
-    The point is nearest to all optical axes, drawn a little to one ahead of the cameras, which decides where the axes
-    are parallel. Where the cameras look away from it (outward from one place) the cube is three times as large.
-    Cut to `box` where they overlap.
+    The centre is the point nearest to all optical axes. A weak pull towards a point ahead of the cameras decides where
+    the axes are parallel. If the cameras face away from it (outward from one place), the cube is three times as large.
+    The cube is clipped to `box` where they overlap.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
@@ -171,7 +215,7 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
 
 
 def _warn_of_copies(views: list[View]) -> None:
-    """A held-out picture that is trained on as well says nothing about how good the model is."""
+    """Warn of held-out pictures that are also trained on, as their scores say nothing about the model's quality."""
     by_size: dict[int, list[View]] = {}
     for view in views:
         by_size.setdefault(view.path.stat().st_size, []).append(view)
@@ -188,12 +232,12 @@ def _warn_of_copies(views: list[View]) -> None:
         )
 
 
-def _view(image: PosedImage, split: Split, resolution: int, smaller: list[Path], lenses: Lenses) -> View:
-    """The image at the working size, its header checked."""
+def _view(image: PosedImage, split: Split, resolution: int, smaller: Sequence[Path], lenses: Lenses) -> View:
+    """View of an image at the working size. Reads and checks the picture's header."""
     lens, upright = _fit(image.path, image.lens)
     camera = lens.camera(image.rotation, image.translation, lenses)
     longest = max(camera.width, camera.height)
-    scale = min(1.0, (resolution or MAX_SIZE) / longest)
+    scale = min(1.0, (resolution or DEFAULT_MAX_SIDE_PX) / longest)
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
     path = image.path
     if scale < 1 and lens.is_pinhole and not upright:
@@ -208,13 +252,15 @@ def _view(image: PosedImage, split: Split, resolution: int, smaller: list[Path],
 
 
 def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None:
-    """Pictures that were resized by other factors across and down are taken so, as gsplat takes them. Pictures of
-    another camera may look the same."""
+    """Warn of pictures that were resized by different factors across and down.
+
+    They are used as resized, as in gsplat. Pictures of another camera may look the same.
+    """
     uneven = []
     for image, view in zip(images, views, strict=True):
         across, down = view.lens.width / image.lens.width, view.lens.height / image.lens.height
         by_one = max(abs(across - down) * image.lens.width, abs(across - down) * image.lens.height)
-        if by_one > ROUNDED:
+        if by_one > SIDE_ROUNDING_PX:
             uneven.append((image.name, across, down))
     if uneven:
         _, across, down = uneven[0]
@@ -225,17 +271,17 @@ def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None
 
 
 def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
-    """True if a smaller picture has just the size that is wanted; tools round the shorter side up or down."""
+    """True if a downscaled picture has exactly the wanted size. Tools round the shorter side up or down."""
     size = image_size(path, orient=False)
     near = abs(size[0] - width) <= 1 and abs(size[1] - height) <= 1
     return near and max(size) == max(width, height) and max(size) < max(lens.width, lens.height)
 
 
 def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
-    """The lens at the file's size, and whether the picture is to be turned upright. Raises InputError by the path.
+    """Lens at the file's size, and True if the picture must be rotated upright. Raises InputError that names the path.
 
-    COLMAP, instant-ngp and nerfstudio all take the pixels as stored. Where only the turned picture has the camera's
-    proportions, another tool has turned it, and so it is turned.
+    COLMAP, instant-ngp and nerfstudio use the pixels as stored. If only the rotated picture has the camera's
+    proportions, another tool rotated it, so it is rotated here too.
     """
     stored = image_size(path, orient=False)
     if stored == (lens.width, lens.height):
@@ -247,7 +293,7 @@ def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
         scale = max(size) / max(lens.width, lens.height)
         if abs(lens.width * scale - size[0]) <= 1 and abs(lens.height * scale - size[1]) <= 1:
             return lens.resized(*size), upright
-    if 1 / UNEVEN <= stored[0] / lens.width / (stored[1] / lens.height) <= UNEVEN:
+    if 1 / MAX_ASPECT_RATIO_CHANGE <= stored[0] / lens.width / (stored[1] / lens.height) <= MAX_ASPECT_RATIO_CHANGE:
         return lens.resized(*stored), False
     raise InputError(
         f"{path}: is {stored[0]} x {stored[1]} pixels, expected its camera's {lens.width} x {lens.height} or the same "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds of points in files: PLY, LAS and LAZ, and the names under which programs leave one beside a scene."""
+"""Point clouds in files: PLY, LAS and LAZ, and the names of clouds that programs store next to a scene."""
 
 from __future__ import annotations
 
@@ -13,47 +13,53 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError, warn
-from clsplat.files import is_file, open_input
+from clsplat.files.documents import is_file, open_input
 from clsplat.images.reading import one_line
 from clsplat.models.codec import ply_file
 from clsplat.models.codec.values import colours, full_scale
-from clsplat.models.formats.ply import DC
+from clsplat.models.formats.ply import DC_PROPERTIES
 
-COLOURS = (
+PLY_COLOUR_PROPERTIES = (
     ("red", "green", "blue"),
     ("r", "g", "b"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
     ("scalar_red", "scalar_green", "scalar_blue"),
     ("color_red", "color_green", "color_blue"),
 )
-"""Names of a PLY's colours, in any case; the first that are there count."""
-UNCOLOURED = 0.5
-"""Grey, of points in a file without colours."""
-LAS = (".las", ".laz")
-BESIDE = ("points3d.ply", "sparse_pc.ply", "init.ply", "point_cloud.ply", "pointcloud.ply", "points.ply")
-"""Names of clouds that programs start from without being told of them, in lower case, in the order in which they are
-taken: the 3DGS authors', nerfstudio's, Brush's, and others'."""
+"""Names of a PLY's colour properties, in any case. The first set that is present is used."""
+UNCOLOURED_GREY = 0.5
+"""Grey value of points from a file without colours."""
+LAS_EXTENSIONS = (".las", ".laz")
+START_CLOUD_NAMES = ("points3d.ply", "sparse_pc.ply", "init.ply", "point_cloud.ply", "pointcloud.ply", "points.ply")
+"""Names of clouds that programs start from by default, in lower case, in order of precedence.
+
+They are used by the 3DGS authors, nerfstudio, Brush and others.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """points (N, 3) float64 in the world; colors (N, 3) float32 in [0, 1], None where the file has none."""
+    """A point cloud.
+
+    points: (N, 3) float64, world coordinates.
+    colors: (N, 3) float32 in [0, 1], None if the file has none.
+    """
 
     points: Float64
     colors: Float32 | None
 
 
 def clouds_beside(folders: Iterable[Path]) -> list[Path]:
-    """The files in these folders that are called as clouds to start from are, by BESIDE, then by folder."""
+    """Files in these folders that have the name of a start cloud, in the order of START_CLOUD_NAMES, then by folder."""
     found = [path for folder in dict.fromkeys(folders) if folder.is_dir() for path in sorted(folder.iterdir())]
-    named = [path for path in found if path.name.lower() in BESIDE and is_file(path)]
-    return sorted(named, key=lambda path: BESIDE.index(path.name.lower()))
+    named = [path for path in found if path.name.lower() in START_CLOUD_NAMES and is_file(path)]
+    return sorted(named, key=lambda path: START_CLOUD_NAMES.index(path.name.lower()))
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read a PLY (ascii or binary, of points or of Gaussians), LAS or LAZ. Raises InputError for what is none, or has
-    no points."""
-    if path.suffix.lower() in LAS:
+    """Read a PLY (ascii or binary, points or Gaussians), LAS or LAZ. Raises InputError for other files and for no
+    points."""
+    if path.suffix.lower() in LAS_EXTENSIONS:
         cloud = _read_las(path)
     else:
         with open_input(path, "a cloud of points") as file:
@@ -61,7 +67,7 @@ def read_cloud(path: Path) -> Cloud:
         if head == b"LASF":
             cloud = _read_las(path)
         elif not head.startswith(b"ply"):
-            raise InputError(f"{path}: begins as no PLY, LAS or LAZ, expected a cloud of points in one of these")
+            raise InputError(f"{path}: is not a PLY, LAS or LAZ, expected a point cloud in one of these formats")
         else:
             points, colors = read_point_cloud(path)
             cloud = Cloud(points, None if of_one_colour(colors) else colors)
@@ -71,27 +77,27 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def of_one_colour(colors: Float32) -> bool:
-    """True if several points (N, 3) have the same colour, as a file without colours is read."""
+    """True if several points (N, 3) all have the same colour, as after reading a file without colours."""
     return len(colors) > 1 and bool((colors == colors[0]).all())
 
 
 def point_colours(levels: NDArray[Any]) -> Float32:
-    """Colours (N, 3) in [0, 1] of stored ones, whose white follows from their values (`full_scale`)."""
+    """Convert stored colours (N, 3) to [0, 1]. The white level follows from their values (`full_scale`)."""
     colors: Float32 = np.clip(np.asarray(levels, np.float32) / np.float32(full_scale(levels)), 0, 1)
     return colors
 
 
 def count_points(path: Path) -> int:
-    """The number of points that a PLY's header names. Raises InputError."""
+    """Number of points in a PLY's header. Raises InputError."""
     with open_input(path, "a PLY of points") as file:
         return ply_file.read_header(file, path).vertex.count
 
 
 def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
-    """Positions (N, 3) float64 and colours (N, 3) float32 in [0, 1] of a PLY, grey where it has no colours.
+    """Read positions (N, 3) float64 and colours (N, 3) float32 in [0, 1] of a PLY; grey if it has no colours.
 
-    Of a 3DGS model colours are those of SH coefficient 0. Raises InputError for a file that is none, cut short, without
-    x y z, or with positions or colours that are not finite.
+    Colours of a 3DGS model come from SH coefficient 0. Points that are not finite are left out, with a warning. Raises
+    InputError if the file is not a PLY, is truncated, has no x, y or z, or only points that are not finite.
     """
     with open_input(path, "a PLY of points") as file:
         header = ply_file.read_header(file, path)
@@ -102,14 +108,16 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
         if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
         lower = {name.lower(): name for name in kinds}
-        named = next((names for names in (*COLOURS, DC) if all(name in lower for name in names)), None)
+        named = next(
+            (names for names in (*PLY_COLOUR_PROPERTIES, DC_PROPERTIES) if all(name in lower for name in names)), None
+        )
         coloured = named and tuple(lower[name] for name in named)
         parts: list[tuple[NDArray[Any], NDArray[Any]]] = [(np.empty((0, 3)), np.empty((0, 3), np.float32))]
         for block in ply_file.read_vertices(file, header, "point"):
             points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
-            levels: NDArray[Any] = np.full(points.shape, UNCOLOURED, np.float32)
+            levels: NDArray[Any] = np.full(points.shape, UNCOLOURED_GREY, np.float32)
             if coloured:
-                with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, refused below
+                with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, left out below
                     levels = np.stack([block[name] for name in coloured], axis=1).astype(np.float32)
             parts.append((points, levels))
     points, levels = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -118,17 +126,17 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
     _warn_of_left_out(path, good)
     if not coloured:
         return points, levels
-    if named == DC:
+    if named == DC_PROPERTIES:
         return points, np.clip(colours(levels), 0, 1).astype(np.float32)
-    stored = np.dtype(kinds[coloured[0]])  # floats hold all values of 8 and 16 bits
+    stored = np.dtype(kinds[coloured[0]])  # float32 holds all values of 8 and 16 bits
     return points, point_colours(levels.astype(stored) if stored.kind in "iu" else levels)
 
 
 def _read_las(path: Path) -> Cloud:
-    """A LAS or LAZ, through laspy."""
+    """Read a LAS or LAZ with laspy."""
     with open_input(path, "a cloud of points") as file:
         if file.read(4) != b"LASF":
-            raise InputError(f"{path}: begins as no LAS or LAZ, expected one by its name")
+            raise InputError(f"{path}: is not a LAS or LAZ, expected one by its name")
     try:
         import laspy
     except ImportError:
@@ -142,7 +150,7 @@ def _read_las(path: Path) -> Cloud:
             levels = np.stack([np.asarray(las[name]) for name in ("red", "green", "blue")], axis=1)
             if levels.any() and not of_one_colour(levels):
                 colors = point_colours(levels)
-    except Exception as error:  # noqa: BLE001  # laspy raises its own, those of struct and NumPy, and LAZ's decoder panics
+    except Exception as error:  # noqa: BLE001  # errors of laspy, struct and NumPy, and panics of LAZ's decoder
         why = one_line(f"{type(error).__name__}: {error}")
         raise InputError(f"{path}: does not read as LAS or LAZ ({why}); export it again") from None
     good = np.asarray(np.isfinite(points).all(axis=1))
@@ -151,7 +159,7 @@ def _read_las(path: Path) -> Cloud:
 
 
 def _warn_of_left_out(path: Path, good: NDArray[np.bool_]) -> None:
-    """Warn of points that are not finite. Raises InputError where all are such."""
+    """Warn of points that are not finite. Raises InputError if all of them are."""
     if good.all():
         return
     bad = int(np.count_nonzero(~good))

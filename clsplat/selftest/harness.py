@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Harness of the self-test's stages: a frozen scene on a device, errors and digests."""
+"""Test harness of the self-test: a frozen scene on a device, errors and digests."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT
+from clsplat.layouts.columns import SPLAT
 from clsplat.reference import blend as reference_blend
 from clsplat.reference import project as reference_project
 from clsplat.selftest.scenes import Frozen
-from clsplat.stages.blend import Blended
+from clsplat.stages.blend import Blended, ImageInputs
 from clsplat.stages.device_camera import pack_camera, tiles_of
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.stages.duplicate import Band, Counted, Pairs
@@ -28,16 +28,21 @@ from clsplat.stages.ranges import TileLists
 T = TypeVar("T")
 Array = NDArray[Any]
 
-WHITEN = np.sqrt(0.5 * np.log2(np.e))
-MARGIN = 1e-4
-"""Pixels where alpha, or what is left of the light, is relatively nearer than this to a threshold are not compared:
-there a rounding decides. It is a hundred times what rounding moves them by."""
+WHITENING_FACTOR = np.sqrt(0.5 * np.log2(np.e))
+MIN_DECISION_MARGIN = 1e-4
+"""Relative distance of alpha or transmittance to a threshold below which a pixel is not compared, as rounding decides
+it. It is a hundred times the effect of rounding."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """The outcome of one stage on one scene: arrays that the digest is of, errors by the name of what was compared,
-    absolute and in ulp; trouble in words; otherwise: operations that round in another way than IEEE 754's."""
+class StageOutcome:
+    """The outcome of one stage on one scene.
+
+    arrays: the arrays in the digest.
+    errors: absolute error and error in ulp, by the name of the compared quantity.
+    trouble: a fault in words, or empty.
+    otherwise: operations that do not round like IEEE 754.
+    """
 
     arrays: list[Array] = field(default_factory=list)
     errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -45,17 +50,18 @@ class Outcome:
     trouble: str = ""
     otherwise: tuple[str, ...] = ()
 
-    def compared(self, parts: Mapping[str, tuple[Array, Array]], **wrong: int) -> Outcome:
-        """The same with `error_of` what was got and what is wanted, by name. wrong: how many whole numbers are."""
+    def compared(self, parts: Mapping[str, tuple[Array, Array]], **wrong: int) -> StageOutcome:
+        """Return the outcome with the errors of each (got, wanted) pair, by name. wrong: numbers of wrong integers, by
+        name."""
         errors = {name: error_of(got, wanted) for name, (got, wanted) in parts.items()}
         counts = ", ".join(f"{count} {name.replace('_', ' ')} wrong" for name, count in wrong.items() if count)
         return replace(self, errors=errors, trouble=self.trouble or counts)
 
 
-def joined(outcomes: Sequence[Outcome]) -> Outcome:
-    """The outcome of a stage that is run in several ways: every array, the worst errors, the first trouble."""
+def joined(outcomes: Sequence[StageOutcome]) -> StageOutcome:
+    """The outcome of a stage that runs in several ways: every array, the worst errors, the first fault."""
     every = [item for outcome in outcomes for item in outcome.errors.items()]
-    return Outcome(
+    return StageOutcome(
         [array for outcome in outcomes for array in outcome.arrays],
         {name: max(error for other, error in every if other == name) for name, _ in every},
         sum(outcome.ms for outcome in outcomes),
@@ -64,8 +70,11 @@ def joined(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def error_of(got: Array, wanted: Array) -> tuple[float, float]:
-    """(worst absolute error, worst in ulp): ulp of the wanted value, or where that is smaller of the array's root mean
-    square, as what is left of a sum that cancels has no digits of its own. Infinite where a value is not finite."""
+    """(worst absolute error, worst error in ulp).
+
+    The ulp is of the wanted value or, if larger, of the array's root mean square: the result of a sum that cancels has
+    no accurate digits. Infinite if a value is not finite.
+    """
     if wanted.size == 0:
         return 0.0, 0.0
     with np.errstate(all="ignore"):
@@ -78,7 +87,7 @@ def error_of(got: Array, wanted: Array) -> tuple[float, float]:
 
 
 def digest_of(arrays: Sequence[Array]) -> str:
-    """CRC-32 of the bytes one after the other."""
+    """CRC-32 of the arrays' bytes in order."""
     total = 0
     for array in arrays:
         total = zlib.crc32(np.ascontiguousarray(array).tobytes(), total)
@@ -86,13 +95,13 @@ def digest_of(arrays: Sequence[Array]) -> str:
 
 
 def cropped(planes: Array, camera: Camera) -> Array:
-    """(H, W) or (H, W, fields) of planes with their padding."""
+    """Crop padded planes to (H, W) or (H, W, fields)."""
     inside = planes[..., : camera.height, : camera.width]
     return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside
 
 
-class Bench:
-    """One frozen scene on one device, with what the stages have made so far."""
+class CaseBench:
+    """One frozen scene on one device, with the results of the stages so far."""
 
     def __init__(self, device: Device, frozen: Frozen) -> None:
         self.device, self.frozen = device, frozen
@@ -109,34 +118,42 @@ class Bench:
         self.lists: TileLists
         self.blended: Blended
         self.features: DeviceArray
+        self.slices: DeviceArray
 
-    def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, Outcome]:
-        """The stage's value, and its arrays on the host and ms, of a second run; trouble where that differs from the
-        first, which had the kernels to build."""
+    def twice(self, launch: Callable[[], T], take: Callable[[T], list[Array]]) -> tuple[T, StageOutcome]:
+        """Run the stage twice; return the second value, and its host arrays and milliseconds.
+
+        A difference from the first run, which included the kernel builds, is reported as trouble.
+        """
         first = take(launch())
         value, ms = self.device.timed(launch)
         arrays = take(value)
         same = digest_of(first) == digest_of(arrays)
         trouble = "" if same else "two runs on the same input gave different bits"
-        return value, Outcome(arrays, ms=ms, trouble=trouble)
+        return value, StageOutcome(arrays, ms=ms, trouble=trouble)
+
+    @property
+    def inputs(self) -> ImageInputs:
+        """Input of the image's stages."""
+        return ImageInputs(self.projected.splats, self.background, self.camera.width, self.camera.height)
 
     @property
     def visible(self) -> NDArray[np.bool_]:
         shown: NDArray[np.bool_] = self.projected.tile_counts.get() > 0
         return shown
 
-    def splats(self) -> reference_project.Projected:
-        """The splats that the device made, in the reference's form."""
+    def splats(self) -> reference_project.ProjectedTwin:
+        """The device's splats in the reference's form."""
         visible = self.visible
         raw = self.projected.splats.get()
         raw[~visible] = 1.0  # memory that was never written
         splats = raw.astype(np.float64)
         field = {name: splats[:, index] for index, name in enumerate(SPLAT)}
         means = np.stack([field["PIXEL_X"] + field["SUB_X"], field["PIXEL_Y"] + field["SUB_Y"]], axis=1)
-        l11, l12, l22 = (field[name] / WHITEN for name in ("L11", "L12", "L22"))
+        l11, l12, l22 = (field[name] / WHITENING_FACTOR for name in ("L11", "L12", "L22"))
         conics = np.stack([l11 * l11, l11 * l12, l12 * l12 + l22 * l22], axis=1)
         det = (l11 * l22) ** 2
-        return reference_project.Projected(
+        return reference_project.ProjectedTwin(
             means2d=means,
             covariances=np.stack([conics[:, 2] / det, -conics[:, 1] / det, conics[:, 0] / det], axis=1),
             conics=conics,
@@ -148,9 +165,9 @@ class Bench:
             visible=visible,
         )
 
-    def blend_reference(self) -> tuple[reference_blend.Blended, NDArray[np.bool_]]:
-        """The frame of the splats that the device made, and the pixels that are compared (MARGIN)."""
+    def blend_reference(self) -> tuple[reference_blend.BlendedTwin, NDArray[np.bool_]]:
+        """The reference frame of the device's splats, and the pixels that are compared (MIN_DECISION_MARGIN)."""
         splats = self.splats()
         camera, background = self.camera, self.frozen.background.astype(np.float64)
         frame = reference_blend.blend(splats, camera.width, camera.height, background)
-        return frame, frame.margin > MARGIN
+        return frame, frame.margin > MIN_DECISION_MARGIN

@@ -1,48 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stages of the self-test, how far each may be off, and what it says of one: what the parent needs of the child."""
+"""Self-test stages, their error bounds and their results, shared by the parent and the worker process."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-FORWARD = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
+FORWARD_STAGES = ("arithmetic", "project", "duplicate", "sort", "ranges", "blend")
 """Stages that a frame needs."""
-CHANNELS = ("features", "channels")
-"""Stages that a frame with more than colour and alpha needs beside FORWARD."""
-DEEP = ("deep",)
-"""A frame in slices by depth."""
-HOLDOUT = ("holdout",)
-"""A frame behind the surfaces of other elements."""
-RAYS = ("rays",)
-"""A frame of an equirectangular or a fisheye camera."""
-MASKS = ("masks",)
-"""Stages that photographs with masks or alpha to learn need beside TRAINING."""
-BACKWARD = ("loss", "blend_grad", "project_grad", "adam", "statistics")
-"""Stages that training needs beside a frame's."""
-APPEARANCE: dict[str, tuple[str, ...]] = {
+CHANNEL_STAGES = ("features", "channels")
+"""Stages that a frame with channels other than colour and alpha needs in addition to FORWARD_STAGES."""
+DEEP_STAGES = ("deep", "deep_merge")
+"""Stages of a frame in slices by depth, and of a merge of several."""
+HOLDOUT_STAGES = ("holdout",)
+"""The stage of a frame behind the surfaces of CG elements."""
+RAY_STAGES = ("rays",)
+"""The stage of a frame of an equirectangular or fisheye camera."""
+MASK_STAGES = ("masks",)
+"""Stages for training photographs with masks or alpha, in addition to TRAINING_STAGES."""
+BACKWARD_STAGES = ("loss", "blend_grad", "project_grad", "adam", "statistics")
+"""Stages that training needs in addition to a frame's."""
+APPEARANCE_STAGES: dict[str, tuple[str, ...]] = {
     "none": (),
     "exposure": ("appearance",),
     "ppisp": ("appearance", "ppisp"),
     "grid": ("grid",),
 }
-"""Stages of what is learnt of each photograph, which training needs beside TRAINING, by the setting."""
-DEPTH = ("depth",)
-"""Stages of known depths, which training needs where they are compared."""
-POSES = ("pose",)
-"""Stages of poses, which training needs where they are refined."""
-LENSES = ("lens",)
-"""The same of lenses."""
-LIBRARY = ("ewa", "harmonics", "splats", "values")
-"""Stages of the library's calls, beside a frame's."""
-TRAINING = (*FORWARD, *BACKWARD)
-STAGES = (
-    *(*FORWARD, *CHANNELS, *DEEP, *HOLDOUT, *RAYS, *MASKS, *BACKWARD),
-    *("appearance", "ppisp", "grid", *DEPTH, *POSES, *LENSES, *LIBRARY),
+"""Stages of the appearance model that training needs in addition to TRAINING_STAGES, by setting."""
+DEPTH_STAGES = ("depth",)
+"""Stages that training with depth comparison needs."""
+POSE_STAGES = ("pose",)
+"""Stages that training with pose refinement needs."""
+LENS_STAGES = ("lens",)
+"""Stages that training with lens refinement needs."""
+LIBRARY_STAGES = ("ewa", "harmonics", "splats", "values")
+"""Stages of the library's calls, in addition to a frame's."""
+TRAINING_STAGES = (*FORWARD_STAGES, *BACKWARD_STAGES)
+SELFTEST_STAGES = (
+    *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),
+    *("appearance", "ppisp", "grid", *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *LIBRARY_STAGES),
 )
-INDICES = ("project", "duplicate", "sort", "ranges")
-"""Stages by whose counts and lists the next ones find their way."""
+INDEX_STAGES = ("project", "duplicate", "sort", "ranges")
+"""Stages whose counts and lists index the arrays of later stages."""
 
-BOUNDS: dict[str, tuple[float, str]] = {
+STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "arithmetic": (3.01, "what OpenCL 1.2 allows a square root, 3 ulp; a division may have 2.5"),
     "project": (256, "30 found, at opacities near 1; six times that for roots and divisions of 3 ulp, not 0.5"),
     "duplicate": (0, "whole numbers"),
@@ -52,6 +52,7 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "features": (64, "6 found; two divisions and a root one after the other"),
     "channels": (256, "13 found, of normals that cancel; else as blend"),
     "deep": (256, "27 found; as blend"),
+    "deep_merge": (256, "4 found; as blend"),
     "holdout": (256, "8 found; as blend"),
     "rays": (512, "47 found; directions and rays have several quotients and roots of 3 ulp, not 0.5"),
     "masks": (128, "as loss"),
@@ -71,17 +72,24 @@ BOUNDS: dict[str, tuple[float, str]] = {
     "splats": (64, "2 found; a root and two quotients"),
     "values": (1024, "71 found; as blend_grad"),
 }
-"""Ulp that a stage may be off, and why. Each bound is the error found where every operation is rounded as in IEEE 754,
-with room for a GPU whose divisions and roots are not. A wrong operation is off by thousands."""
+"""Error bound of each stage in ulp, and the reason for it.
+
+Each bound is the error measured where every operation rounds like IEEE 754, with room for a GPU whose divisions and
+roots do not. A wrong operation is off by thousands.
+"""
 
 
 @dataclass(frozen=True)
 class Result:
-    """The result of a stage over all frozen scenes: the worst error, absolute and in ulp; the bound in ulp; same_bits:
-    True if the bits are those of the stored digest (None: none is stored for this shape); ms of all scenes; trouble: in
-    words what is wrong beside the error, or empty.
+    """The result of a stage over all frozen scenes.
 
-    where: the place of the worst error in ulp; otherwise: operations that round in another way than IEEE 754's.
+    absolute, ulp: the worst error.
+    bound: the error bound in ulp.
+    same_bits: True if the bits match the stored digest; None if none is stored for this shape.
+    ms: of all scenes.
+    trouble: a fault other than the error, in words, or empty.
+    where: the place of the worst error in ulp.
+    otherwise: operations that do not round like IEEE 754.
     """
 
     stage: str
@@ -96,5 +104,5 @@ class Result:
 
     @property
     def passed(self) -> bool:
-        """True if the stage can be trusted. Other bits alone do not condemn it."""
+        """True if the stage can be trusted. Different bits alone are no failure."""
         return not self.trouble and self.ulp <= self.bound

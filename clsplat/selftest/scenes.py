@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frozen scenes of the self-test: numbers that are the same on every machine, to the last bit.
 
-All come from one integer hash and are multiples of a power of two, so that neither NumPy's generators nor a
-mathematical library has a say in them. The digests in digests.json are of these and no others.
+All come from one integer hash and are multiples of a power of two, independent of NumPy's generators and of
+mathematical libraries. The digests in digests.json belong to these scenes.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.stages.device_camera import padded_size
 
-STEPS = 1 << 12
-"""Values between two ends."""
+HASH_STEPS = 1 << 12
+"""Number of equidistant values in a range."""
 
 
 def hashed(seed: int, count: int) -> NDArray[np.uint64]:
-    """(count,) of 64 bits: SplitMix64 (Steele, Lea and Flood 2014) at `count` places of its sequence."""
+    """(count,) uint64: SplitMix64 (Steele, Lea and Flood 2014) at `count` places of its sequence."""
     with np.errstate(over="ignore"):
         z = (np.arange(1, count + 1, dtype=np.uint64) + np.uint64(seed << 32)) * np.uint64(0x9E3779B97F4A7C15)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -30,22 +30,24 @@ def hashed(seed: int, count: int) -> NDArray[np.uint64]:
         return z ^ (z >> np.uint64(31))
 
 
-def evenly(seed: int, shape: tuple[int, ...], low: float, high: float, steps: int = STEPS) -> NDArray[np.float64]:
-    """Numbers from low to below high, ends with few binary digits: each is a float32, exactly."""
+def evenly(seed: int, shape: tuple[int, ...], low: float, high: float, steps: int = HASH_STEPS) -> NDArray[np.float64]:
+    """Numbers in [low, high), which have few binary digits: each is exactly a float32."""
     values = (hashed(seed, int(np.prod(shape))) >> np.uint64(20)) % np.uint64(steps)
     return low + (high - low) / steps * values.astype(np.float64).reshape(shape)
 
 
 def keys(seed: int, count: int, bits: int) -> NDArray[np.uint32]:
-    """Keys (count,) of `bits` bits to sort, each some three times."""
+    """Sort keys (count,) of `bits` bits, each about three times."""
     pool = (hashed(seed, count // 3 + 1) >> np.uint64(64 - bits)).astype(np.uint32)
     return pool[(hashed(seed + 1, count) % np.uint64(len(pool))).astype(np.int64)]
 
 
 @dataclass(frozen=True, eq=False)
 class Frozen:
-    """A model, a view of it, its background, and planes (3, rows, stride) for the loss: a photograph, zero in the
-    padding."""
+    """A model, a view of it, its background, and a photograph for the loss.
+
+    photograph: planes (3, rows, stride), zero in the padding.
+    """
 
     name: str
     gaussians: Gaussians
@@ -55,7 +57,7 @@ class Frozen:
 
 
 def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
-    """Planes (3, rows, stride) of noise in the image and zeros beside it."""
+    """Planes (3, rows, stride) of noise in the image and zeros in the padding."""
     height, width = camera.height, camera.width
     planes = np.zeros((3, *padded_size(width, height)), np.float32)
     planes[:, :height, :width] = evenly(seed, (3, height, width), low, high)
@@ -63,8 +65,11 @@ def padded(camera: Camera, seed: int, low: float, high: float) -> Float32:
 
 
 def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
-    """Gaussians of every size, direction and opacity in and around the view of a tilted camera whose principal point
-    is off the middle; some behind it, some at its near plane, some fainter than 1/255, SH of degree 3."""
+    """Gaussians of every size, direction and opacity in and around the view of a tilted camera.
+
+    Its principal point is off the middle. Some Gaussians are behind it, some at its near plane, and some fainter than
+    1/255. The SH degree is 3.
+    """
     unit = 0.125
     z = evenly(seed, (count,), 1.5, 8.5)
     sides = evenly(seed + 1, (count, 2), -0.75, 0.75)
@@ -83,8 +88,10 @@ def cloud(name: str, count: int, width: int, height: int, seed: int) -> Frozen:
 
 
 def wall() -> Frozen:
-    """Nearly opaque layers, two and two at the same depth: alpha is at its cap, pixels end after a few of them, and the
-    order of equals is that of their indices."""
+    """Nearly opaque layers, two at each depth.
+
+    Alpha is at its cap, pixels end after a few layers, and Gaussians of equal depth are ordered by index.
+    """
     count, width, height = 64, 40, 36
     depths = 1.5 + 0.0625 * (np.arange(count) // 2)
     sides = evenly(11, (count, 2), -0.5, 0.5)
@@ -100,7 +107,7 @@ def wall() -> Frozen:
 
 
 def scenes(*, quick: bool) -> list[Frozen]:
-    """The frozen scenes that the stages are run on."""
+    """The frozen scenes that the stages run on."""
     few = [cloud("cloud", 240, 70, 45, 1), wall()]
     return few if quick else [*few, cloud("crowd", 1500, 120, 75, 41)]
 

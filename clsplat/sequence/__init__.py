@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many frames as a job: tasks, workers, what is there already, clusters."""
+"""Rendering of many frames as a job: tasks, workers, finished frames, clusters."""

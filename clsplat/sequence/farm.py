@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames on a Dask cluster: one that is there, or one of processes of this machine. Needs `distributed`.
+"""Frames on a Dask cluster: an existing one, or one of processes on this machine. Needs `distributed`.
 
-A frame is a task. Every worker loads the model once and keeps it; the files have to be under the same paths for all.
+A frame is a Dask task. Every worker loads the model once and keeps it. Files must have the same paths on all workers.
 """
 
 from __future__ import annotations
@@ -18,31 +18,36 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import clsplat
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import ClsplatError, InputError, warn
 from clsplat.images.video import VideoWriter
-from clsplat.sequence.cast import load_cast
-from clsplat.sequence.existing import is_complete, remove_temporaries, stamp
+from clsplat.sequence.finished_frames import is_complete, remove_temporaries, stamp
 from clsplat.sequence.frame_renderer import FrameRenderer, open_frame_renderer
+from clsplat.sequence.job_models import load_cast
 from clsplat.sequence.mattes import mattes_of, names_of
 from clsplat.sequence.task import Record, RenderOptions, Task
-from clsplat.sequence.workers import HOST_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
+from clsplat.sequence.workers import WRITE_QUEUE_BYTES, Result, encode_frame, encoded, frame_bytes, record_of
+from clsplat.version import package_version
 
-THREADS = 2
+LOCAL_WORKER_THREADS = 2
 """Threads of a local worker: one frame is encoded while the next is rendered."""
-HELD = 3
-"""Frames that a worker holds at once, whatever threads it has."""
-PATIENCE = 20
-"""Seconds in which a scheduler has to answer."""
-REMINDER = 10.0
-"""Seconds from one line to the next while a scheduler has no workers."""
+MAX_FRAMES_PER_WORKER = 3
+"""Frames that a worker holds at once, regardless of its number of threads."""
+SCHEDULER_TIMEOUT_SECONDS = 20
+"""Seconds within which a scheduler has to answer."""
+NO_WORKERS_WARNING_SECONDS = 10.0
+"""Seconds between warnings while a scheduler has no workers."""
 
 
 @dataclass(frozen=True)
 class WorkerJob:
-    """Everything that a worker has to load. model: an absolute path, with the SHA-256 of its content (`Cast.digest`),
-    of a shot's too, whose placements come with the tasks; version: of clsplat."""
+    """Everything that a worker has to load.
+
+    model: absolute path of the model, or of the shot file.
+    digest: SHA-256 of its content (`Cast.digest`).
+    placed: the tasks contain placements of the models.
+    version: of clsplat.
+    """
 
     model: str
     digest: str
@@ -51,28 +56,28 @@ class WorkerJob:
     device: str | None = None
     memory_limit: int | None = None
     placed: bool = False
-    version: str = clsplat.__version__
+    version: str = package_version()
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A worker's trouble; exceptions of ours do not all survive being sent."""
+    """An error in a worker. Not all of clsplat's exceptions can be sent between processes."""
 
     message: str
     wrong_input: bool
 
 
 class _Held:
-    """The renderer that this process has open, of one job, and the right to render with it."""
+    """The renderer that this process holds open, for one job, and the locks that limit its use."""
 
     def __init__(self) -> None:
-        self.turn, self.room = threading.Lock(), threading.Semaphore(HELD)
+        self.turn, self.room = threading.Lock(), threading.Semaphore(MAX_FRAMES_PER_WORKER)
         self.key: str | None = None
         self.renderer: FrameRenderer | None = None
 
     def renderer_for(self, job: WorkerJob) -> FrameRenderer:
         if self.renderer is None or repr(job) != self.key:
-            self.key = self.renderer = None  # its memory is free before the next takes some
+            self.key = self.renderer = None  # frees its memory before the next one allocates
             cast = load_cast(Path(job.model))
             if cast.digest != job.digest:
                 raise InputError(f"{job.model}: has SHA-256 {cast.digest[:12]} on a worker, expected {job.digest[:12]}")
@@ -80,26 +85,34 @@ class _Held:
             mattes = mattes_of(cast, job.options.channels, job.options.ids_from)
             if names_of(mattes) != job.options.mattes:
                 raise InputError(f"{job.model}: has other mattes on a worker than it had when the job began")
-            how: dict[str, Any] = {"mattes": mattes, "device": job.device, "memory_limit": job.memory_limit}
-            self.renderer = open_frame_renderer(model, job.options, job.rasterizer, **how)
+            self.renderer = open_frame_renderer(
+                model,
+                job.options,
+                job.rasterizer,
+                device=job.device,
+                memory_limit=job.memory_limit,
+                mattes=mattes,
+            )
             self.key = repr(job)
         return self.renderer
 
 
-_HELD = _Held()
+_WORKER_RENDERER = _Held()
 
 
 def render_frame(task: Task, job: WorkerJob) -> Result | Failure:
-    """Render a frame in a worker and write its file, unless a worker that was lost since has finished it; a frame of a
-    video is returned, for the process that encodes it."""
+    """Render a frame in a worker and write its file, unless a worker that was lost since has finished it.
+
+    A frame of a video is returned to the process that encodes the video.
+    """
     try:
-        if job.version != clsplat.__version__:
-            raise InputError(f"a worker has clsplat {clsplat.__version__}, expected {job.version}")
-        with _HELD.room:
-            with _HELD.turn:
+        if job.version != package_version():
+            raise InputError(f"a worker has clsplat {package_version()}, expected {job.version}")
+        with _WORKER_RENDERER.room:
+            with _WORKER_RENDERER.turn:
                 if not task.is_video and stamp(task.path) != task.before and is_complete(task, job.options):
                     return record_of(task, job.options), None
-                frame = _HELD.renderer_for(job)(task)
+                frame = _WORKER_RENDERER.renderer_for(job)(task)
             return encode_frame(task, frame, job.options)
     except (ClsplatError, OSError, MemoryError) as error:
         message = " ".join(str(error).split()) or type(error).__name__
@@ -115,12 +128,13 @@ def render_on_farm(
     workers: int | None = None,
     video: VideoWriter | None = None,
 ) -> None:
-    """Render the frames on the cluster of the scheduler at that address, or on a new one of `workers` processes here.
-    Those of a video are encoded here.
+    """Render the frames on the cluster of the scheduler at that address, or on a new local one with `workers`
+    processes.
 
-    on_done: as for `workers.run_tasks`. The frames of a worker that is lost are rendered again by others. Raises
-    InputError where there is no such cluster, and ClsplatError for a frame that cannot be rendered, or that has cost
-    more workers than Dask allows.
+    Frames of a video are encoded in this process.
+    on_done: as in `workers.run_tasks`.
+    Frames of a lost worker are rendered again by others. Raises InputError if there is no such cluster. Raises
+    ClsplatError for a frame that cannot be rendered, or that has cost more workers than Dask allows.
     """
     if not tasks:
         return
@@ -132,13 +146,16 @@ def render_on_farm(
         results = _results(client, placed, job, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.key]))
-    # A worker that was killed while it wrote has left a file; none writes any more.
+    # A worker killed while writing has left a temporary file; no worker writes any more.
     remove_temporaries(tasks)
 
 
 def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWriter | None = None) -> Iterator[Result]:
-    """Results of `render_frame` as the frames are done; a window of tasks is with the scheduler, and not a million. For
-    a video the window begins with the frame that is to be encoded next, as those that come early wait here."""
+    """Results of `render_frame`, in the order in which frames finish.
+
+    Only a window of tasks is submitted at a time, as a job may have a million. For a video the window begins with the
+    frame to encode next, since frames that finish early wait here.
+    """
     from distributed import CancelledError, KilledWorker, as_completed
 
     prefix, left = f"clsplat-{uuid.uuid4().hex[:12]}", iter(tasks)
@@ -152,7 +169,7 @@ def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWri
     threads = sum(client.nthreads().values())
     window = max(64, 4 * threads)
     if video is not None:
-        window = max(threads + 1, min(window, HOST_BYTES // frame_bytes(tasks[0], job.options)))
+        window = max(threads + 1, min(window, WRITE_QUEUE_BYTES // frame_bytes(tasks[0], job.options)))
     with client.as_current():
         pending = as_completed(submit(window))
     sent = window
@@ -177,8 +194,7 @@ def _results(client: Any, tasks: Sequence[Task], job: WorkerJob, video: VideoWri
 
 @contextmanager
 def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]:
-    """Inside, a warning says so at once and every REMINDER seconds while the scheduler has no workers. Nothing for a
-    cluster that is made here."""
+    """Warn at once, and then at intervals, while the scheduler has no workers. Does nothing for a local cluster."""
     if scheduler is None:
         yield
         return
@@ -189,17 +205,17 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
         while not stop.is_set():
             try:
                 there = bool(client.nthreads())
-            except (OSError, RuntimeError, TimeoutError):  # the loop over the frames tells of a scheduler that is lost
+            except (OSError, RuntimeError, TimeoutError):  # the loop over the frames reports a lost scheduler
                 return
             now = time.monotonic()
             since = None if there else since or now
             if since is not None and not stop.is_set():
                 waited = f", for {now - since:.0f} s now" if now - since >= 1 else ""
                 warn(
-                    f"--scheduler {scheduler}: has no workers{waited}; frames wait until one is there, started with "
+                    f"--scheduler {scheduler}: has no workers{waited}; frames wait until one is there; start one with: "
                     f"dask worker {scheduler}"
                 )
-            stop.wait(REMINDER)
+            stop.wait(NO_WORKERS_WARNING_SECONDS)
 
     watcher = threading.Thread(target=watch, name="clsplat-farm", daemon=True)
     watcher.start()
@@ -207,11 +223,11 @@ def _telling_of_no_workers(client: Any, scheduler: str | None) -> Iterator[None]
         yield
     finally:
         stop.set()
-        watcher.join(REMINDER)
+        watcher.join(NO_WORKERS_WARNING_SECONDS)
 
 
 def dask_setup(_: Any) -> None:
-    """Leave Ctrl-C, which a terminal sends to a local worker as well, to the job. Dask calls this in the worker."""
+    """Ignore Ctrl-C in a local worker, as the terminal also sends it to the job. Dask calls this in the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -225,12 +241,12 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         raise InputError(
             f"{flag}: needs the package distributed, install it with: pip install 'clsplat[farm]'"
         ) from None
-    # Dask logs every worker that it loses in many lines. What matters is raised.
+    # Dask logs every lost worker in many lines. Errors that matter are raised.
     for name in ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler is not None:
         try:
-            client = distributed.Client(scheduler, timeout=PATIENCE, set_as_default=False)
+            client = distributed.Client(scheduler, timeout=SCHEDULER_TIMEOUT_SECONDS, set_as_default=False)
         except (OSError, ValueError, RuntimeError) as error:
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise InputError(f"--scheduler {scheduler}: no scheduler answers there: {reason}") from None
@@ -241,9 +257,9 @@ def _client(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         dask.config.set({"distributed.worker.daemon": True, "distributed.worker.multiprocessing-method": "spawn"}),
         distributed.LocalCluster(
             n_workers=workers,
-            threads_per_worker=THREADS,
+            threads_per_worker=LOCAL_WORKER_THREADS,
             processes=True,
-            memory_limit=None,  # Dask's own would end workers whose model is large
+            memory_limit=None,  # Dask's own limit would end workers with a large model
             dashboard_address=None,
             preload=[__name__],
             silence_logs=logging.CRITICAL,

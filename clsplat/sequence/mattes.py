@@ -1,31 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mattes of a job: which objects there are, and of which each Gaussian is. Without a device."""
+"""Mattes of a job: its objects, and the object of each Gaussian. Needs no device."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config.channels import MATTES
+from clsplat.config.channels import CRYPTOMATTE_CHANNELS
 from clsplat.errors import InputError
-from clsplat.frame.objects import Matte
+from clsplat.frame.mattes import Matte
 from clsplat.models.formats import unpacked
 from clsplat.models.formats.ply import read_whole_numbers
-from clsplat.sequence.cast import Cast
+from clsplat.sequence.job_models import JobModels
 from clsplat.sequence.task import MatteNames
 
-MOST_OBJECTS = 256
-"""Objects of a matte: each is a plane of floats while a frame is made."""
+MAX_MATTE_OBJECTS = 256
+"""Limit of objects in a matte. Each takes a plane of floats while a frame is rendered."""
 
 
-def mattes_of(cast: Cast, channels: Collection[str], ids_from: str = "") -> dict[str, Matte]:
-    """The mattes among the channels, by their names; ids_from: the property of the models' files that semantic ids
-    are of. Raises InputError."""
+def mattes_of(cast: JobModels, channels: Collection[str], ids_from: str = "") -> dict[str, Matte]:
+    """Mattes among the channels, by name.
+
+    ids_from: property of the model files that holds semantic ids.
+    Raises InputError.
+    """
     made = {}
-    if cast.changing and (asked := [name for name in MATTES if name in channels]):
+    if cast.changing and (asked := [name for name in CRYPTOMATTE_CHANNELS if name in channels]):
         raise InputError(
             f"--channels {asked[0]}: {cast.path} changes over time, expected models whose Gaussians stay the same"
         )
@@ -34,34 +37,36 @@ def mattes_of(cast: Cast, channels: Collection[str], ids_from: str = "") -> dict
     if "semantic" in channels:
         made["semantic"] = _semantic(cast, ids_from)
     for name, matte in made.items():
-        if len(matte.names) > MOST_OBJECTS:
-            raise InputError(f"--channels {name}: has {len(matte.names):,} objects, expected at most {MOST_OBJECTS}")
+        if len(matte.names) > MAX_MATTE_OBJECTS:
+            raise InputError(
+                f"--channels {name}: has {len(matte.names):,} objects, expected at most {MAX_MATTE_OBJECTS}"
+            )
     return made
 
 
-def names_of(mattes: dict[str, Matte]) -> tuple[MatteNames, ...]:
-    """The mattes as the options of a job tell of them."""
+def names_of(mattes: Mapping[str, Matte]) -> tuple[MatteNames, ...]:
+    """Names and digests of the mattes, for the options of a job."""
     return tuple(
         MatteNames(name, mattes[name].names, hashlib.sha256(mattes[name].owners.tobytes()).hexdigest()[:32])
-        for name in MATTES
+        for name in CRYPTOMATTE_CHANNELS
         if name in mattes
     )
 
 
-def _objects(cast: Cast) -> Matte:
-    """An object for each model, and one for each of its volumes, which go before it."""
+def _objects(cast: JobModels) -> Matte:
+    """A matte with one object per model, and one per volume of a model, which takes precedence over the model's."""
     names, owners = list(cast.names), []
     for index, model in enumerate(cast.still):
         own = np.full(len(model), index, np.int32)
-        for volume in reversed(cast.volumes[index] if cast.volumes else ()):  # the first counts
+        for volume in reversed(cast.volumes[index] if cast.volumes else ()):  # the first volume wins
             own[volume.holds(model)] = len(names)
             names.append(volume.name)
         owners.append(own)
     return Matte(tuple(names), np.concatenate(owners))
 
 
-def _semantic(cast: Cast, ids_from: str) -> Matte:
-    """An object for each number that the property has."""
+def _semantic(cast: JobModels, ids_from: str) -> Matte:
+    """A matte with one object for each value of the property."""
     if not cast.files:
         raise InputError(f"--ids-from {ids_from}: {cast.path} is a stage, expected PLY files that have the property")
     columns: list[NDArray[np.int64]] = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a shot as tasks: where they go, and the options that all of a job share."""
+"""Frames of a shot as render tasks, and the options that all tasks of a job share."""
 
 from __future__ import annotations
 
@@ -16,50 +16,71 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.camera import NEAR, Camera
-from clsplat.config.channels import WRITTEN
+from clsplat.camera import DEFAULT_NEAR_PLANE, Camera
+from clsplat.config.channels import WRITABLE_CHANNELS
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import InputError, reason_of
-from clsplat.files import digest, is_file
+from clsplat.files.documents import digest, is_file
 from clsplat.frame.lens import ByLens, ByMap, Places, Warp
-from clsplat.frame.times import sample_moments
+from clsplat.frame.shutter_times import sample_moments
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
-from clsplat.images.colour import CHROMATICITIES, INTEROP, SRGB
+from clsplat.images.colour import CHROMATICITIES, COLOR_INTEROP_IDS, SRGB
 from clsplat.images.cryptomatte import header_of
-from clsplat.images.frame_files import VIDEOS, Header, camera_matrices, is_whole_panorama
-from clsplat.images.records import SETTINGS
+from clsplat.images.frame_files import VIDEO_SUFFIXES, FrameFileHeader, camera_matrices, is_whole_panorama
+from clsplat.images.provenance import SETTINGS_DIGEST_ATTRIBUTE
 from clsplat.images.stmap import read_stmap
-from clsplat.models.placed import State
-from clsplat.scenes.data_set import Lens
+from clsplat.models.instances import State
+from clsplat.scenes.dataset import Lens
 from clsplat.shots import Shot
 from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
 from clsplat.shots.motion import Moments, moments
 from clsplat.shots.optics import Optics, headers, settled
 
-LATLONG: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
-"""OpenImageIO's words for EXR's envmap; and that no smaller versions follow, for which it would keep the file open."""
-_ENCODED = {
+LATLONG_ATTRIBUTES: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
+"""OpenImageIO's attributes for EXR's envmap. The level mode says that no mipmap levels follow, for which OpenImageIO
+would keep the file open."""
+_ENCODING_FIELDS_BY_SUFFIX = {
     ".exr": ("depth", "parts", "compression"),
     **dict.fromkeys((".png", ".tif", ".tiff", ".dpx"), ("bits",)),
     **dict.fromkeys((".jpg", ".jpeg"), ("quality",)),
     ".mov": ("prores",),
 }
-"""Settings of the encoding that a file of that extension depends on."""
+"""Encoding settings that affect files of each extension."""
 
 
 def key_of(number: int, eye: str) -> str:
-    """Name of a frame among those of a job."""
+    """Key of a frame within its job."""
     return f"{number} {eye}" if eye else str(number)
 
 
 @dataclass(frozen=True)
+class Measured:
+    """Values that are measured while a frame is rendered.
+
+    blank: True if nothing of the model is visible, None if this was not checked.
+    kernel_ms, transfer_ms: times on the device, None unless it was profiled.
+    """
+
+    blank: bool | None = None
+    kernel_ms: float | None = None
+    transfer_ms: float | None = None
+
+
+NOT_MEASURED = Measured()
+
+
+@dataclass(frozen=True)
 class Record:
-    """Record of a frame that is done. seconds: of rendering and writing it, without waiting; skipped: it was there;
-    eye: of a stereo pair in two files; blank: nothing of the model is in it, None where that was not looked at;
-    kernel_ms, transfer_ms: the device's, where that was asked for."""
+    """Record of a finished frame.
+
+    seconds: time for rendering and writing, without waiting.
+    skipped: the file was there already.
+    eye: of a stereo pair in two files.
+    blank, kernel_ms, transfer_ms: as in `Measured`.
+    """
 
     name: str
     frame: int
@@ -75,25 +96,35 @@ class Record:
 
     @property
     def key(self) -> str:
-        """That of its task."""
+        """Key of the frame's task."""
         return key_of(self.frame, self.eye or "")
 
     def document(self) -> dict[str, Any]:
-        """The record for JSON, without what was not measured."""
+        """The record for JSON, without values that were not measured."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A frame to be rendered. number, name: as `shots.Frame`; camera: of the whole frame, in its final size; after: the
-    camera that motion goes to, of the same size, where motion is asked for; earlier: that of backward motion likewise;
-    stretch: where the camera is while the shutter is open, None where it stands still; path: of the file; before: see
-    `existing.stamp`; sampling: shutter and lens, None for those of all; optics: what a stage has of them; eye: left or
-    right of a stereo pair; right: the frame of the right eye, where one file has both; lens: of the photograph that the
-    picture is bent as; holdout: an absolute path, None where nothing is held out; placed: of the models, by the time in
-    frames from the frame, at all `model_times` of it; None for one that stands as it is; nears: the models' near plane
-    at these times, none where the camera has its own; ends: numbers of the first and the last frame of its shot, None
-    for a shot of one; files: absolute paths, of models that have a file a frame.
+    """A frame to be rendered.
+
+    number, name: as in `shots.Frame`.
+    camera: of the whole frame, in its final size.
+    path: of the file.
+    after, earlier: cameras that motion and backward motion lead to, of the same size; None unless requested.
+    stretch: cameras while the shutter is open, None for a static camera.
+    before: state of the file when the job began (`finished_frames.stamp`).
+    sampling: shutter and lens of this frame, None for the job's.
+    optics: shutter and lens that a stage sets.
+    eye: left or right of a stereo pair.
+    right: task of the right eye, if one file holds both.
+    lens: the photograph's lens by which the picture is warped.
+    holdout: absolute path, None without a holdout.
+    placed: placements of the models at each of the `model_times`, in frames from the frame; None for a single model
+      used as it is.
+    nears: the models' near plane at these times, empty if the camera has its own.
+    ends: numbers of the first and the last frame of the shot, None for a shot of one frame.
+    files: absolute paths of the files of models that have one file per frame.
     """
 
     number: int
@@ -117,16 +148,16 @@ class Task:
 
     @property
     def key(self) -> str:
-        """Name of the frame among those of its job."""
+        """Key of the frame within its job."""
         return key_of(self.number, "" if self.right else self.eye)
 
     @property
     def views(self) -> tuple[Task, ...]:
-        """The frames that its file holds: itself, and that of the right eye where one file has both."""
+        """The frames that the file holds: this one, and the right eye's if one file has both."""
         return (self,) if self.right is None else (self, self.right)
 
     def at(self, time: float) -> Camera:
-        """The camera of the whole frame at a time in frames from the frame, as the models want it."""
+        """Camera of the whole frame at a time in frames from the frame, with the models' near plane and ray setting."""
         near = self.nears.get(time)
         if time == 0 or self.stretch is None:
             return self.camera if near in (None, self.camera.near) else replace(self.camera, near=near)
@@ -134,19 +165,22 @@ class Task:
         return camera if near is None else camera.before(near)
 
     def seen_by(self, gaussians: Gaussians, nears: Mapping[float, float]) -> Task:
-        """The frame of a model, with its near plane, and drawn as it wants it. nears: near planes by the time."""
+        """The task with cameras that have the model's near plane, and are drawn along rays if the model needs it.
+
+        nears: near planes by time.
+        """
 
         def seen(camera: Camera) -> Camera:
             return camera.before(gaussians.near).along_rays(gaussians.by_rays)
 
         after, earlier = (other and seen(other) for other in (self.after, self.earlier))
-        nears = nears if self.camera.near == NEAR else {}
+        nears = nears if self.camera.near == DEFAULT_NEAR_PLANE else {}
         return replace(self, camera=seen(self.camera), after=after, earlier=earlier, nears=nears)
 
     @property
     def is_video(self) -> bool:
         """True if the file holds other frames too."""
-        return self.path.suffix.lower() in VIDEOS
+        return self.path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def make_tasks(
@@ -157,13 +191,16 @@ def make_tasks(
     channels: Sequence[str],
     sampling: SamplingConfig | None = None,
 ) -> list[Task]:
-    """The frames of `chosen`, which are of the shot `whole`. Raises InputError for files that would be one, unless it
-    is a video, and for cameras that these channels, or the lens, are not defined for."""
+    """Tasks for the frames of `chosen`, which are part of the shot `whole`.
+
+    Raises InputError if two frames share a file that is not a video, and if the channels or the lens are not defined
+    for a camera.
+    """
     sampling = sampling or SamplingConfig()
     motion, backward = "motion" in channels, "backward" in channels
     whole.check(channels)
     indices = {frame.number: index for index, frame in enumerate(whole.frames)}
-    if Path(pattern).suffix.lower() in VIDEOS:
+    if Path(pattern).suffix.lower() in VIDEO_SUFFIXES:
         paths = [Path(pattern)] * len(chosen.frames)
     else:
         paths = output_paths(pattern, [(frame.number, frame.name) for frame in chosen.frames])
@@ -177,7 +214,7 @@ def make_tasks(
         camera = resize(frame.camera)
         own = settled(sampling, frame.optics, camera)
         own.check()
-        if own.has_lens and camera.projection != "perspective":
+        if own.has_lens and not camera.is_pinhole:
             raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
         index, after, earlier = indices[frame.number], None, None
         looked_at: Shot | Moments | None = stretch(frame.number)
@@ -198,8 +235,10 @@ def make_tasks(
 
 
 def _beside_middle(shot: Shot, resize: Callable[[Camera], Camera], number: int, middle: float, way: int) -> Camera:
-    """The camera a frame after the middle of the shutter (way 1) or before it (-1); beyond the shot's ends, where its
-    source says no more, it goes on as it did."""
+    """Camera one frame after the middle of the shutter (way 1) or before it (-1).
+
+    Outside the shot, where its source has no values, the camera is extrapolated.
+    """
     assert shot.moment is not None
     time, first, last = number + middle, float(shot.frames[0].number), float(shot.frames[-1].number)
     if shot.reach is not None:
@@ -216,7 +255,7 @@ def sampling_of(task: Task, options: RenderOptions) -> SamplingConfig:
 
 @dataclass(frozen=True)
 class MatteNames:
-    """A matte among the channels: its objects' names, and a digest of which Gaussians are of which."""
+    """A matte channel: names of its objects, and a digest of the object of each Gaussian."""
 
     channel: str
     names: tuple[str, ...]
@@ -225,11 +264,19 @@ class MatteNames:
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options that all frames of a job share. channels: of the table, `config.channels`; attributes: of the file's
-    header; pictures: windows, samples and colours of a frame; recorded: the model's colour space; deep: slices of a
-    deep picture, or None; drawn: digest of the rasterizer's settings; gains: of the model's colours, three, or nine of
-    a matrix, none where they are taken as they are; holdout: how hold-outs are read, None where there are none;
-    mattes: those among the channels; ids_from: the property of the models' files that semantic ids are of."""
+    """Options that all frames of a job share.
+
+    channels: names from the table in `config.channels`.
+    attributes: of the file's header.
+    pictures: windows, samples and colours of a frame.
+    recorded: the model's colour space.
+    deep: settings of deep pictures, None for flat ones.
+    drawn: digest of the rasterizer's settings.
+    gains: three factors of the model's colours, or nine entries of a matrix; empty for unchanged colours.
+    holdout: how holdouts are read, None if there are none.
+    mattes: those among the channels.
+    ids_from: property of the model files that holds semantic ids.
+    """
 
     channels: tuple[str, ...] = ("rgb",)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -246,10 +293,10 @@ class RenderOptions:
 
 
 def picture_camera(task: Task, options: RenderOptions) -> Camera:
-    """The camera of the picture that is written: its size, its window, the middle of the shutter. Of a bent picture it
-    says size and window alone.
+    """Camera of the written picture: its size, its window, and the middle of the shutter. For a warped picture only
+    size and window count.
 
-    Raises InputError for a region that is not in the frame.
+    Raises InputError for a region outside the frame.
     """
     warp = warp_of(task, options)
     shown = task.at(sampling_of(task, options).middle) if warp is None else warp.shown
@@ -257,44 +304,44 @@ def picture_camera(task: Task, options: RenderOptions) -> Camera:
 
 
 def lens_of(task: Task, options: RenderOptions) -> Places | None:
-    """The lens or the map that bends the picture, None where nothing does. Raises InputError for a map that cannot be
-    read."""
+    """The lens or STMap that warps the picture, None if nothing does. Raises InputError for an unreadable map."""
     if stmap := options.pictures.warp.stmap:
         return ByMap(read_stmap(Path(stmap)))
     return ByLens(task.lens) if task.lens is not None else None
 
 
 def warp_of(task: Task, options: RenderOptions) -> Warp | None:
-    """How the picture is bent."""
+    """The warp of the picture, None for a straight one."""
     lens = lens_of(task, options)
     return None if lens is None else Warp(lens, task.at(sampling_of(task, options).middle))
 
 
 def straight_camera(task: Task, options: RenderOptions) -> Camera:
-    """The camera of the picture that is drawn: `picture_camera`, or what a bent one looks at."""
+    """Camera of the rendered picture: `picture_camera`, or for a warped picture the straight window that it is sampled
+    from."""
     camera, warp = picture_camera(task, options), warp_of(task, options)
     return camera if warp is None else warp.of_window(camera)[1] or camera
 
 
 def camera_after(task: Task, options: RenderOptions) -> Camera | None:
-    """The camera of the whole frame that motion goes to: a frame later than the middle of the shutter."""
+    """Camera of the whole frame that motion leads to: one frame after the middle of the shutter."""
     middle = sampling_of(task, options).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
 
 
 def camera_before(task: Task, options: RenderOptions) -> Camera | None:
-    """The camera of the whole frame that backward motion goes to: a frame before the middle of the shutter."""
+    """Camera of the whole frame that backward motion leads to: one frame before the middle of the shutter."""
     middle = sampling_of(task, options).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)
 
 
 def end_before(task: Task, time: float, options: RenderOptions) -> float | None:
-    """The time, in frames from the frame, from which on the camera goes on as it did at another time; None where it is
-    as its source says, and for a shot of one frame.
+    """The time from which the camera at another time is extrapolated, both in frames from the frame.
 
-    A stage says where its camera is as long as the shutter is open; motion goes on from the middle of that.
+    None if the shot's source defines the camera at that time, and for a shot of one frame. A stage defines its camera
+    while the shutter is open; motion is extrapolated from the shutter's middle.
     """
     if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:
         return None
@@ -305,8 +352,8 @@ def end_before(task: Task, time: float, options: RenderOptions) -> float | None:
 
 
 def model_times(task: Task, options: RenderOptions) -> list[float]:
-    """The times at which the models of a frame are looked at, in frames from it: the middle of its shutter, its
-    samples, and where motion goes to."""
+    """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and the
+    targets of motion."""
     sampling = sampling_of(task, options)
     times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
     times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in options.channels]
@@ -314,8 +361,11 @@ def model_times(task: Task, options: RenderOptions) -> list[float]:
 
 
 def plain(value: Any) -> Any:
-    """A value in the form of JSON. A dataclass becomes its differences from the defaults, so that a setting that is
-    added later changes nothing. Floats have 12 digits, as processors differ in the last ones."""
+    """Convert a value to JSON types.
+
+    A dataclass becomes its differences from the defaults, so that adding a setting later does not change digests.
+    Floats have 12 digits, as processors differ in the last ones.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         changes = {}
         for setting in fields(value):
@@ -325,7 +375,7 @@ def plain(value: Any) -> Any:
                 changes[setting.name] = plain(given)
         return changes
     if isinstance(value, float | np.floating):
-        return f"{value + 0.0:.12g}"  # + 0.0: no -0
+        return f"{value + 0.0:.12g}"  # + 0.0 turns -0 into 0
     if isinstance(value, np.ndarray):
         return [plain(float(item)) for item in value.ravel()]
     if isinstance(value, tuple | list):
@@ -334,15 +384,20 @@ def plain(value: Any) -> Any:
 
 
 def digest_of(*parts: Any) -> str:
-    """128 bits of SHA-256, in hexadecimal, of values that `plain` takes."""
+    """128 bits of SHA-256, in hexadecimal, of values that `plain` accepts."""
     return hashlib.sha256(json.dumps(plain(parts), sort_keys=True).encode()).hexdigest()[:32]
 
 
 def settings_digest(task: Task, options: RenderOptions) -> str:
-    """Digest of all that a frame of the models depends on: cameras, channels, encoding, pictures, rasterizer, the
-    content of its hold-out, and where the models are."""
+    """Digest of everything but the model files that a frame depends on.
+
+    Includes cameras, channels, encoding, pictures, rasterizer, the content of its holdout, and the models' placements.
+    For models with one file per frame, it includes the content of these files.
+    """
     pictures, sampling = options.pictures, sampling_of(task, options)
-    encoding = {name: getattr(options.encoding, name) for name in _ENCODED.get(task.path.suffix.lower(), ())}
+    encoding = {
+        name: getattr(options.encoding, name) for name in _ENCODING_FIELDS_BY_SUFFIX.get(task.path.suffix.lower(), ())
+    }
     cameras: list[Camera | Moments] = [picture_camera(task, options)]
     if "motion" in options.channels and (after := camera_after(task, options)) is not None:
         cameras.append(after)
@@ -356,7 +411,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     used = sampling if sampling.on else None
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
-    made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera show what is beyond it
+    made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera were not clipped at the far plane
     if task.holdout is not None:
         made += ("holdout", _digest_at(str(task.holdout), _changed(task.holdout)), options.holdout)
     made += (options.mattes,) if options.mattes else ()
@@ -373,7 +428,7 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
 
 
 def _content(source: str) -> str:
-    """SHA-256 of a file of OpenColorIO's, and of the tables that it names; the name of another configuration."""
+    """SHA-256 of an OpenColorIO file and of the tables that it names; for any other configuration, its name."""
     if not source or not is_file(Path(source)):
         return source
     patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
@@ -382,7 +437,7 @@ def _content(source: str) -> str:
 
 
 def _changed(path: Path) -> int:
-    """When a file was last written, in nanoseconds. Raises InputError."""
+    """Modification time of a file, in nanoseconds. Raises InputError."""
     try:
         return path.stat().st_mtime_ns
     except OSError as error:
@@ -390,14 +445,16 @@ def _changed(path: Path) -> int:
 
 
 @lru_cache(maxsize=4096)
-def _digest_at(path: str, changed: int) -> str:  # noqa: ARG001  # asked anew where the file has changed
+def _digest_at(path: str, changed: int) -> str:  # noqa: ARG001  # a cache key: a changed file is read again
     return digest(path)
 
 
 @lru_cache(maxsize=8)
-def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # likewise
-    """Patterns of the paths of the files that a configuration's FileTransforms name, in the folders of its search_path;
-    its variables, which are set elsewhere, stand for anything."""
+def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # a cache key
+    """Glob patterns of the files that a configuration's FileTransforms name, in the folders of its search_path.
+
+    Its variables, which are set elsewhere, match anything.
+    """
     text = Path(source).read_text("utf-8", "replace")
     listed = re.search(r"^search_path:([^\n]*(?:\n[ \t]*- [^\n]*)*)", text, re.MULTILINE)
     places = re.split(r"[\n\[\],:;]|\s-\s", listed[1]) if listed else []
@@ -410,23 +467,33 @@ def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG0
     return tuple(sorted({str(home / folder / file) for folder in folders | {""} for file in files}))
 
 
-def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Header:
-    """Frame, model, version, settings and colour space; the matrices of a camera that has them; in EXR the window, and
-    that a panorama is one. whole: the task of the file, where that has other views too."""
+def header(task: Task, options: RenderOptions, whole: Task | None = None) -> FrameFileHeader:
+    """Header of a frame's file: frame, model, version, settings, colour space, and the matrices of a camera that has
+    them.
+
+    An EXR file also gets its window, and an attribute that marks a whole panorama.
+    whole: the file's task, if the file has other views too.
+    """
     camera = picture_camera(task, options)
     matrices = camera_matrices(camera)
     if warp_of(task, options) is not None:
-        matrices.pop("worldToNDC", None)  # no matrix bends
-    attributes = {**options.attributes, "clsplat:frame": task.number, SETTINGS: settings_digest(whole or task, options)}
+        matrices.pop("worldToNDC", None)  # no matrix describes a warp
+    attributes = {
+        **options.attributes,
+        "clsplat:frame": task.number,
+        SETTINGS_DIGEST_ATTRIBUTE: settings_digest(whole or task, options),
+    }
     space = str(attributes.get("clsplat:colorspace", SRGB))
     if task.path.suffix.lower() != ".exr":
-        return Header(attributes, matrices, is_srgb=space == SRGB)
+        return FrameFileHeader(attributes, matrices, is_srgb=space == SRGB)
     for matte in options.mattes:
-        attributes |= header_of(WRITTEN[matte.channel].part, matte.names)
-    if "clsplat:colorspace" in attributes and (name := INTEROP.get(space)):
+        attributes |= header_of(WRITABLE_CHANNELS[matte.channel].part, matte.names)
+    if "clsplat:colorspace" in attributes and (name := COLOR_INTEROP_IDS.get(space)):
         attributes["colorInteropID"] = name
     if is_whole_panorama(camera):
-        attributes |= LATLONG
+        attributes |= LATLONG_ATTRIBUTES
     sampling = sampling_of(task, options)
     typed = headers(task.at(sampling.middle), task.number, task.optics, sampling)
-    return Header(attributes, matrices, camera.window, CHROMATICITIES.get(space, ()), view=task.eye, typed=typed)
+    return FrameFileHeader(
+        attributes, matrices, camera.window, CHROMATICITIES.get(space, ()), view=task.eye, typed=typed
+    )

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop of a job: threads that render, encode and write its frames. No OpenCL here.
 
-Each device has a thread that renders; a few threads encode and write meanwhile. A frame is written to a temporary name
-and renamed, so a file that is there is complete, whenever the job was killed. The frames of a video are prepared by
-these threads and encoded in their order by the thread that waits for them.
+Each device has one thread that renders; a few more threads encode and write. A frame is written under a temporary name
+and then renamed, so that a file is complete even if the job is killed. Frames of a video are prepared by these threads
+and encoded in order by the thread that waits for them.
 """
 
 from __future__ import annotations
@@ -18,28 +18,41 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-from clsplat.config.channels import DEEP, WRITTEN
-from clsplat.config.pictures import DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig, WarpConfig
-from clsplat.device.child import abandon
+from clsplat.config.channels import DEEP_CHANNELS, WRITABLE_CHANNELS
+from clsplat.config.pictures import DEEP_MERGE_FLOATS, DEEP_STRIP_FLOATS, STRIP_PIXELS, VideoConfig, WarpConfig
+from clsplat.device.drivers.worker_process import abandon
 from clsplat.images import frame_files
-from clsplat.images.records import record_text
+from clsplat.images.provenance import record_text
 from clsplat.images.video import VideoPlanes, VideoWriter, planes_of, video_writer
-from clsplat.sequence.existing import MOST_WRITERS, made_of
+from clsplat.layouts.columns import DEEP_PICTURES
+from clsplat.sequence.finished_frames import MAX_FILE_THREADS, made_of
+from clsplat.sequence.frame_claims import FrameQueue, Sharing
 from clsplat.sequence.frame_renderer import RenderedFrame, RenderFrame
-from clsplat.sequence.sharing import FrameQueue, Sharing
-from clsplat.sequence.task import Record, RenderOptions, Task, header, picture_camera, sampling_of
+from clsplat.sequence.task import (
+    NOT_MEASURED,
+    Measured,
+    Record,
+    RenderOptions,
+    Task,
+    header,
+    picture_camera,
+    sampling_of,
+)
 
 Result = tuple[Record, VideoPlanes | None]
-"""Record of a frame; with the planes that a video takes of it, if it is one's."""
-HOST_BYTES = 1 << 30
-"""Main memory for frames that wait to be written, as a guide: three are held in any case."""
-COPIES = 3
-"""Copies of a frame, while it is encoded: as it was rendered, put together, converted."""
+"""Record of a frame, and for a frame of a video the planes to encode."""
+WRITE_QUEUE_BYTES = 1 << 30
+"""Target for the main memory of frames that wait to be written. Three frames are held in any case."""
+ENCODING_COPIES = 3
+"""Copies of a frame in memory while it is encoded: rendered, assembled, converted."""
 
 
 def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Result:
-    """Encode the frame and write it, atomically, unless that is done; of a video the planes are returned instead.
-    Raises ClsplatError."""
+    """Encode a frame and write it atomically, unless it was written in strips already. For a video, return the planes
+    instead.
+
+    Raises ClsplatError.
+    """
     start, yuv = time.monotonic(), None
     if task.is_video:
         assert frame.planes is not None, "frames of a video are not written one by one"
@@ -54,36 +67,56 @@ def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Re
         else:
             frame_files.write_views(task.path, made, options.encoding)
     seconds = frame.seconds + time.monotonic() - start
-    return record_of(task, options, seconds=seconds, **frame.measured), yuv
+    return record_of(task, options, seconds, frame.measured), yuv
 
 
-def record_of(task: Task, options: RenderOptions, **values: Any) -> Record:
-    """The frame's record with these values beside those of the task."""
+def record_of(
+    task: Task,
+    options: RenderOptions,
+    seconds: float = 0.0,
+    measured: Measured = NOT_MEASURED,
+    *,
+    skipped: bool = False,
+) -> Record:
+    """The record of a task's frame."""
     camera = picture_camera(task, options)
-    whose = {"eye": task.eye} if task.eye and task.right is None else {}
-    what = {"seconds": 0.0, **whose, **values}
-    return Record(task.name, task.number, str(task.path), camera.width, camera.height, **what)
+    return Record(
+        task.name,
+        task.number,
+        str(task.path),
+        camera.width,
+        camera.height,
+        seconds,
+        eye=task.eye if task.eye and task.right is None else None,
+        skipped=skipped,
+        blank=measured.blank,
+        kernel_ms=measured.kernel_ms,
+        transfer_ms=measured.transfer_ms,
+    )
 
 
 def frame_bytes(task: Task, options: RenderOptions) -> int:
-    """Main memory that a frame takes until it is written; of one in strips what a strip takes."""
+    """Main memory that a frame takes until it is written. A frame in strips takes the memory of one strip."""
     camera, framing = picture_camera(task, options), options.pictures.framing
     pixels, finer = camera.width * camera.height * len(task.views), framing.supersample**2
     if not task.is_video:
         pixels = min(pixels, STRIP_PIXELS // finer)
+    sampling = sampling_of(task, options)
     if options.deep is not None:
-        return COPIES * 4 * min(len(DEEP) * options.deep.bins * pixels, DEEP_STRIP_FLOATS)
-    floats = sum(len(WRITTEN[name].names) for name in options.channels)
-    light = 4 if sampling_of(task, options).on or finer > 1 else 0
+        floats = len(DEEP_CHANNELS) * options.deep.bins * pixels
+        merged = min(floats * min(sampling.pictures, DEEP_PICTURES), DEEP_MERGE_FLOATS) if sampling.on else 0
+        return 4 * (ENCODING_COPIES * min(floats, DEEP_STRIP_FLOATS) + merged)
+    floats = sum(len(WRITABLE_CHANNELS[name].names) for name in options.channels)
+    light = 4 if sampling.on or finer > 1 else 0
     floats += floats if options.pictures.warp != WarpConfig() else 0
-    return 4 * pixels * (COPIES * floats + light * (finer if finer > 1 else 2))
+    return 4 * pixels * (ENCODING_COPIES * floats + light * (finer if finer > 1 else 2))
 
 
 def frames_ahead(tasks: Sequence[Task], options: RenderOptions, devices: int) -> tuple[int, int]:
-    """(threads that write, frames that are held at once) so that main memory is bounded."""
+    """Number of threads that write, and of frames held at once, so that main memory is bounded."""
     largest = max((frame_bytes(task, options) for task in tasks), default=1)
-    writers = max(1, min(MOST_WRITERS, os.cpu_count() or 1))
-    held = max(devices + 2, min(HOST_BYTES // max(largest, 1), devices + writers + 1))
+    writers = max(1, min(MAX_FILE_THREADS, os.cpu_count() or 1))
+    held = max(devices + 2, min(WRITE_QUEUE_BYTES // max(largest, 1), devices + writers + 1))
     return max(1, min(writers, held - devices)), held
 
 
@@ -95,14 +128,13 @@ def run_tasks(
     video: VideoWriter | None = None,
     sharing: Sharing | None = None,
 ) -> None:
-    """Render the frames and write them meanwhile, or add them to the video. Each renderer has a thread, which takes the
-    next frame that is free.
+    """Render the frames and write them meanwhile, or add them to the video.
 
-    sharing: other jobs may make some of these frames meanwhile; theirs are waited for at the end.
-
-    on_done: called in this thread for each frame when its file is complete, not always in the frames' order; for a
-    video in order, when the frame has been encoded. The first error of any thread is raised here, after all of them
-    have ended.
+    Each renderer has a thread, which takes the next free frame.
+    sharing: other jobs may render some of these frames meanwhile; their frames are awaited at the end.
+    on_done: called in this thread for each frame when its file is complete, not always in order; for a video in order,
+      when the frame has been encoded.
+    The first error of any thread is raised here, after all threads have ended.
     """
     if not tasks:
         return
@@ -113,7 +145,7 @@ def run_tasks(
     devices = ThreadPoolExecutor(len(renderers), "clsplat-render")
 
     def render(renderer: RenderFrame) -> None:
-        while True:  # until there are no more frames
+        while True:  # until no frames are left
             room.acquire()
             if (task := frames.take(lambda task: finished.put(_skipped(task, options)))) is None:
                 return
@@ -151,14 +183,15 @@ def run_tasks(
 
 
 def _skipped(task: Task, options: RenderOptions) -> Future[Result]:
-    """The outcome of a frame that is there already."""
+    """The result of a frame that is there already."""
     outcome: Future[Result] = Future()
     outcome.set_result((record_of(task, options, skipped=True), None))
     return outcome
 
 
 def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter | None) -> Iterator[Record]:
-    """Records when their files are complete; of a video in the order of the tasks, when the frame is in."""
+    """Records of frames as their files are completed; for a video in the order of the tasks, as the frames are
+    added."""
     if video is None:
         for record, _ in results:
             yield record
@@ -178,8 +211,10 @@ def encoded(tasks: Sequence[Task], results: Iterator[Result], video: VideoWriter
 def open_video(
     tasks: Sequence[Task], config: VideoConfig, options: RenderOptions
 ) -> AbstractContextManager[VideoWriter | None]:
-    """The video that the tasks are frames of, None where they have files of their own. It takes its name at the end of
-    the block, if that ends well."""
+    """The video that the tasks' frames belong to, None if they have files of their own.
+
+    The file gets its final name at the end of the block, unless an error is raised.
+    """
     if not (tasks and tasks[0].is_video):
         return nullcontext()
     return video_writer(tasks[0].path, config, record_text(made_of(tasks, options, config)))

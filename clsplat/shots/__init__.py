@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras in: files of cameras and generated paths, as one `Shot`. The world is never re-oriented."""
+"""Camera input: camera files and generated paths, read as one `Shot`. The world is never reoriented."""
 
 from clsplat.shots.read import check_around, choose_shot, read_shot, shot_around
 from clsplat.shots.shot import Frame, Shot

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the frames that are rendered (`--frames`), and the file of each (`-o`)."""
+"""Selection of the frames to render (`--frames`), and names of their files (`-o`)."""
 
 from __future__ import annotations
 
@@ -9,47 +9,50 @@ from glob import escape, glob
 from pathlib import Path, PurePosixPath
 
 from clsplat.errors import InputError
-from clsplat.files import identity, name_trouble
+from clsplat.files.names import identity, name_trouble
 
-MOST_FRAMES = 10_000_000
-RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?:[:x](\d+))?)?")
-FIELD = re.compile(
+MAX_LISTED_FRAMES = 10_000_000
+"""Limit of the frames that one list may name."""
+FRAME_RANGE_PATTERN = re.compile(r"(-?\d+)(?:-(-?\d+)(?:[:x](\d+))?)?")
+FRAME_FIELD_PATTERN = re.compile(
     r"(?P<digits>#+|@{2,})|%(?P<printed>0\d+)?d|\{(?P<word>\w*)(?::(?P<padded>0\d+)d?)?\}"
     r"|\$F(?P<houdini>\d+)?(?!\w)|<F(?P<angled>\d+)?>",
     re.ASCII,
 )
-"""A frame's number or name in a file's, as render programs and compositors write it."""
+"""A field for a frame's number or name in a file name, in the notations of renderers and compositors."""
 
-KNOWN = "{name}, {frame}, ####, @@@@, %04d, $F4 or <F4>"
-ODD = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?|\$F\w*|<\w*>")
-"""Text that is meant as a field, and is none."""
+KNOWN_FRAME_FIELDS = "{name}, {frame}, ####, @@@@, %04d, $F4 or <F4>"
+UNKNOWN_FIELD_PATTERN = re.compile(r"%[-+ ]?\d*\.?\d*[diouxXeEfgGcsV]|[{}][^{}]*\}?|\$F\w*|<\w*>")
+"""Text that looks like a field but is not a known one."""
 
 
 def parse_frames(text: str) -> list[int]:
-    """The frames of a list such as 1-100, 1-100:2, 1-100x2, 10-1 or 7,12,30-40, each once, in rising order.
+    """Frame numbers of a list such as 1-100, 1-100:2, 1-100x2, 10-1 or 7,12,30-40, without duplicates, in rising order.
 
-    A step counts from a range's begin and must be at least 1. Negative numbers are frames like any other: -5--1 is five
-    of them. Raises InputError for anything else.
+    A step counts from the start of its range and must be at least 1. Negative numbers are allowed: -5--1 is five
+    frames. Raises InputError for any other text.
     """
     frames: set[int] = set()
     for word in text.split(","):
-        match = RANGE.fullmatch(word.strip())
+        match = FRAME_RANGE_PATTERN.fullmatch(word.strip())
         if match is None:
             raise InputError(
-                f"--frames {text}: {word.strip()!r} is no frame or range, expected such as 1-100:2 or 7,12"
+                f"--frames {text}: {word.strip()!r} is no frame or range, expected for example 1-100:2 or 7,12"
             )
         first = int(match[1])
         last, step = int(match[2] or first), int(match[3] or 1)
         if step < 1:
             raise InputError(f"--frames {text}: {word.strip()!r} has the step {step}, expected at least 1")
-        if abs(last - first) // step + len(frames) >= MOST_FRAMES:
-            raise InputError(f"--frames {text}: lists more than {MOST_FRAMES:,} frames; is a digit too many in it?")
+        if abs(last - first) // step + len(frames) >= MAX_LISTED_FRAMES:
+            raise InputError(
+                f"--frames {text}: lists more than {MAX_LISTED_FRAMES:,} frames; is there a digit too many?"
+            )
         frames.update(range(first, last + 1, step) if first <= last else range(first, last - 1, -step))
     return sorted(frames)
 
 
 def ranges(frames: Sequence[int]) -> str:
-    """Rising frames in short, such as 1-3,7; the first ones where there are many gaps."""
+    """Short text for rising frame numbers, such as 1-3,7. Only the first eight ranges are listed."""
     runs: list[list[int]] = []
     for frame in frames:
         if runs and frame == runs[-1][1] + 1:
@@ -63,8 +66,9 @@ def ranges(frames: Sequence[int]) -> str:
 def path_of(pattern: str, frame: int, name: str) -> Path:
     """The file of a frame. Raises InputError for a name that leads out of the output folder.
 
-    `####`, `@@@@`, `%04d`, `{frame:04}`, `$F4` and `<F4>` are the frame's number in at least four digits, `%d`,
-    `{frame}`, `$F` and `<F>` in as few as it has; `{name}` is its name without extension, with its folders.
+    `####`, `@@@@`, `%04d`, `{frame:04}`, `$F4` and `<F4>` become the frame's number, padded to four digits. `%d`,
+    `{frame}`, `$F` and `<F>` become the number without padding. `{name}` becomes the frame's name without extension,
+    including its folders.
     """
 
     def fill(match: re.Match[str]) -> str:
@@ -73,8 +77,8 @@ def path_of(pattern: str, frame: int, name: str) -> Path:
         width = match["printed"] or match["padded"] or match["houdini"] or match["angled"]
         return f"{frame:0{int(width or len(match['digits'] or ''))}d}"
 
-    # one pass: a name may have # or % in it
-    return Path(FIELD.sub(fill, pattern))
+    # a single pass, as a name may contain # or %
+    return Path(FRAME_FIELD_PATTERN.sub(fill, pattern))
 
 
 def _stem(name: str) -> str:
@@ -88,15 +92,18 @@ def _stem(name: str) -> str:
 
 
 def has_number(pattern: str) -> bool:
-    """True if a path has a field for a frame's number in it."""
-    return any(match["word"] in (None, "frame") for match in FIELD.finditer(pattern))
+    """True if a path has a field for a frame's number."""
+    return any(match["word"] in (None, "frame") for match in FRAME_FIELD_PATTERN.finditer(pattern))
 
 
 def numbered_files(pattern: str) -> dict[int, Path]:
-    """The files that there are of a pattern such as `model.####.ply`, by the frame's number, in rising order. Several
-    fields, as of a folder a frame, are of one number. Raises InputError for a field that is not known."""
+    """Existing files that match a pattern such as `model.####.ply`, by frame number, in rising order.
+
+    Several fields, such as one in the folder and one in the file name, stand for the same number. Raises InputError for
+    an unknown field.
+    """
     check_pattern(pattern)
-    pieces = FIELD.sub("\0", pattern).split("\0")
+    pieces = FRAME_FIELD_PATTERN.sub("\0", pattern).split("\0")
     number = re.compile(r"(-?\d+)".join(map(re.escape, pieces)))
     found = {}
     for text in glob("*".join(map(escape, pieces))):  # noqa: PTH207
@@ -106,19 +113,21 @@ def numbered_files(pattern: str) -> dict[int, Path]:
 
 
 def check_pattern(pattern: str) -> None:
-    """Raise InputError for a field in the names of files that is not known."""
-    for match in FIELD.finditer(pattern):
+    """Raise InputError for an unknown field in a file pattern."""
+    for match in FRAME_FIELD_PATTERN.finditer(pattern):
         if match["word"] not in (None, "frame") and not (match["word"] == "name" and match["padded"] is None):
-            raise InputError(f"{pattern}: {match[0]} is not known, expected {KNOWN}")
-    if odd := ODD.search(FIELD.sub("", Path(pattern).name)):
-        raise InputError(f"{pattern}: {odd[0]} is not known, expected {KNOWN}")
+            raise InputError(f"{pattern}: {match[0]} is not known, expected {KNOWN_FRAME_FIELDS}")
+    if odd := UNKNOWN_FIELD_PATTERN.search(FRAME_FIELD_PATTERN.sub("", Path(pattern).name)):
+        raise InputError(f"{pattern}: {odd[0]} is not known, expected {KNOWN_FRAME_FIELDS}")
 
 
 def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
-    """The file of every frame (number, name). Raises InputError where two would be one, or one would leave the
-    folder, or the pattern is none."""
+    """The file of each frame, given as (number, name).
+
+    Raises InputError if two frames share a file, a file would leave the folder, or the pattern is invalid.
+    """
     check_pattern(pattern)
-    if len(frames) > 1 and not FIELD.search(pattern):
+    if len(frames) > 1 and not FRAME_FIELD_PATTERN.search(pattern):
         raise InputError(
             f"{pattern}: has no {{name}} in it, expected one to tell {len(frames)} cameras apart, or a frame number "
             "such as ####"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera paths made from a scene's own cameras, of any number of frames."""
+"""Camera paths of any number of frames, generated from a scene's own cameras."""
 
 from __future__ import annotations
 
@@ -11,15 +11,22 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
-from clsplat.shots.keys import Key, interpolate
-from clsplat.shots.viewpoints import WIDEST_GAP, covered_arc, focus_point, look_at, up_axis
+from clsplat.shots.keyframes import Key, interpolate
+from clsplat.shots.viewpoints import MAX_AZIMUTH_GAP_RADIANS, covered_arc, focus_point, look_at, up_axis
 
 
 @dataclass(frozen=True, eq=False)
 class _Ring:
-    """The cameras about the point that they look at. first: of the cameras; up, east (towards the first), north and
-    focus (3,); offsets (N, 3) from the focus, of which heights (N,) along up and radii (N,) from its axis; azimuths
-    (N,), radians."""
+    """Cameras in cylindrical coordinates about the point that they look at.
+
+    first: the first camera.
+    up, east, north: unit axes (3,); east points towards the first camera.
+    focus: (3,), the point that the cameras look at.
+    offsets: (N, 3), camera positions relative to the focus.
+    heights: (N,), offsets along up.
+    radii: (N,), distances from the axis through the focus.
+    azimuths: (N,), radians.
+    """
 
     first: Camera
     up: Float64
@@ -32,11 +39,11 @@ class _Ring:
     azimuths: Float64
 
     def outwards(self, angle: float) -> Float64:
-        """The level direction from the axis at an azimuth, (3,)."""
+        """Horizontal unit vector (3,) that points away from the axis at an azimuth."""
         return np.asarray(np.cos(angle) * self.east + np.sin(angle) * self.north)
 
     def facing(self, positions: Iterable[Float64]) -> list[Camera]:
-        """The first camera at each of the positions (3,), turned to the focus."""
+        """Copies of the first camera at the given positions, each (3,), turned to the focus."""
         poses = [look_at(position, self.focus, self.up) for position in positions]
         return [replace(self.first, rotation=rotation, translation=translation) for rotation, translation in poses]
 
@@ -60,11 +67,11 @@ def _ring(cameras: Sequence[Camera]) -> _Ring:
 
 
 def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A closed camera path around what the cameras look at, `frames` views with the first camera's intrinsics.
+    """A closed path of `frames` cameras around the scene cameras' focus point, with the first camera's intrinsics.
 
-    It keeps the cameras' median distance and height. Where they stand all around it goes round once. Where they leave a
-    wide gap it swings to and fro over the arc that they cover, as no camera has seen the rest. It begins near the first
-    camera. Raises ValueError for no cameras or no frames.
+    The path keeps the cameras' median distance and height, and begins near the first camera. If the cameras surround
+    the focus point, the path makes one full turn. If they leave a wide gap, it swings to and fro over the arc that they
+    cover, since no camera has seen the rest. Raises ValueError for no cameras or no frames.
     """
     _check("turntable", cameras, frames)
     ring = _ring(cameras)
@@ -72,10 +79,10 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
     time = np.arange(frames) / frames
     begin, width = covered_arc(ring.azimuths)
-    if 2 * np.pi - width <= WIDEST_GAP:
+    if 2 * np.pi - width <= MAX_AZIMUTH_GAP_RADIANS:
         angles = 2 * np.pi * time
     else:
-        # phase chosen so that the first frame is at azimuth 0, the first camera's
+        # the phase puts the first frame at azimuth 0, the first camera's
         middle, half = begin + width / 2, width / 2
         off = (-middle + np.pi) % (2 * np.pi) - np.pi
         phase = np.arcsin(np.clip(off / half, -1, 1)) if half > 1e-6 else 0.0
@@ -84,29 +91,34 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 SPIRAL_TURNS = 2
-STEEPEST = np.deg2rad(85.0)
-"""Elevations that a spiral keeps below: straight up and down, a level camera does not know where its right is."""
-REACH = 3
-"""Neighbours on each side that a camera is smoothed with, for what a hand does between two photographs."""
+"""Full turns of a spiral around the focus point."""
+MAX_SPIRAL_ELEVATION_RADIANS = np.deg2rad(85.0)
+"""Limit of a spiral's elevation, in radians. A level camera that looks straight up or down has no defined right
+axis."""
+SMOOTHING_NEIGHBOURS = 3
+"""Neighbours on each side that are used to smooth a camera, to remove the hand's jitter from photograph to
+photograph."""
 
 
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A closed path, two turns, that rises and sinks over the heights of the cameras, facing what they face.
+    """A closed path of two turns that rises and sinks over the cameras' range of heights, facing their focus point.
 
-    In spherical coordinates about `focus_point`: at the cameras' median distance, the elevation from their 10th to
-    their 90th percentile and back. Where they leave a wide gap, the azimuth swings over the arc that they cover, once a
-    turn, a quarter of a turn behind the elevation. That is an ellipse before the scene; on it the distance goes from
-    its 10th to its 90th percentile and back. Intrinsics are the first camera's. Raises ValueError for no cameras or
-    frames.
+    Coordinates are spherical about `focus_point`. At the cameras' median distance, the elevation goes from its 10th to
+    its 90th percentile and back. If the cameras leave a wide gap, the azimuth swings over the arc that they cover, once
+    per turn, a quarter turn behind the elevation. This gives an ellipse in front of the scene, on which the distance
+    also goes from its 10th to its 90th percentile and back. Intrinsics are the first camera's. Raises ValueError for no
+    cameras or no frames.
     """
     _check("spiral", cameras, frames)
     ring = _ring(cameras)
-    elevations = np.clip(np.arctan2(ring.heights, ring.radii), -STEEPEST, STEEPEST)
+    elevations = np.clip(
+        np.arctan2(ring.heights, ring.radii), -MAX_SPIRAL_ELEVATION_RADIANS, MAX_SPIRAL_ELEVATION_RADIANS
+    )
     distances = np.linalg.norm(ring.offsets, axis=1)
 
     turn = 2 * np.pi * np.arange(frames) / frames
     begin, width = covered_arc(ring.azimuths)
-    if 2 * np.pi - width <= WIDEST_GAP:
+    if 2 * np.pi - width <= MAX_AZIMUTH_GAP_RADIANS:
         azimuth = SPIRAL_TURNS * turn
         elevation = _between(elevations, -np.cos(turn))
         distance = np.full(frames, np.median(distances))
@@ -121,19 +133,19 @@ def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _between(values: Float64, wave: Float64) -> Float64:
-    """Values from the 10th percentile of `values` (n,), where the wave is -1, to their 90th, where it is 1."""
+    """Map a wave from -1 to 1 onto the range from the 10th to the 90th percentile of `values` (n,)."""
     low, high = np.percentile(values, [10, 90])
     return np.asarray(0.5 * (low + high) + 0.5 * (high - low) * wave)
 
 
 def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A path from the first camera to the last in their order, smoothed, at an even speed, with the first one's
+    """A smoothed path from the first camera to the last, in their order, at constant speed, with the first camera's
     intrinsics.
 
-    Positions and rotations are those of a parabola fitted to a camera and three neighbours on each side, which keeps an
-    arc where it is. Towards the ends there are fewer neighbours, so that the ends stay. A spline goes through these.
-    Speed counts distances and angles, each in steps of the median camera, so a camera that only turns takes its time as
-    well. Raises ValueError for no cameras or no frames.
+    Positions and rotations come from a parabola fitted to each camera and three neighbours on each side, which
+    preserves arcs. Near the ends fewer neighbours are used, so that the ends stay in place. A spline interpolates the
+    results. Speed combines distance and angle, each relative to its median step, so that a camera that only turns also
+    takes time. Raises ValueError for no cameras or no frames.
     """
     _check("through", cameras, frames)
     smooth = _smoothed(cameras)
@@ -144,13 +156,13 @@ def through(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     steps = np.hypot(_in_medians(moves, 1e-12 * np.abs(positions).max()), _in_medians(turns, 1e-9))
     keys = [Key(0.0, smooth[0])]
     for camera, step in zip(smooth[1:], steps, strict=True):
-        if step > 1e-6:  # a camera that stands where the one before it does
+        if step > 1e-6:  # skips a camera that has not moved
             keys.append(Key(keys[-1].frame + float(step), camera))
     return interpolate(keys, list(np.linspace(0.0, keys[-1].frame, frames)))
 
 
 def _in_medians(lengths: Float64, rounding: float) -> Float64:
-    """lengths (n,) over the median of those that are more than rounding."""
+    """Lengths (n,) divided by the median of the lengths above the rounding error."""
     clear = lengths[lengths > rounding]
     return lengths / np.median(clear) if len(clear) else np.zeros_like(lengths)
 
@@ -160,7 +172,7 @@ def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
     rotations = Rotation.from_matrix(np.stack([camera.rotation.T for camera in cameras]))
     smooth = []
     for index in range(len(cameras)):
-        reach = min(REACH, index, len(cameras) - 1 - index)
+        reach = min(SMOOTHING_NEIGHBOURS, index, len(cameras) - 1 - index)
         near, weights = slice(index - reach, index + reach + 1), parabola_weights(reach)
         turns = (rotations[index].inv() * rotations[near]).as_rotvec()
         rotation = (rotations[index] * Rotation.from_rotvec(weights @ turns)).inv().as_matrix()
@@ -169,11 +181,11 @@ def _smoothed(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def parabola_weights(reach: int) -> Float64:
-    """Weights (2 reach + 1,) of evenly spaced values in the middle of the parabola nearest to them (Savitzky and Golay
-    1964)."""
+    """Weights (2 reach + 1,) of evenly spaced values that give the centre value of their least-squares parabola
+    (Savitzky and Golay 1964)."""
     offsets = np.arange(-reach, reach + 1)
     scale = 3 / ((2 * reach + 3) * (2 * reach + 1) * (2 * reach - 1))
     return np.asarray(scale * (3 * reach * reach + 3 * reach - 1 - 5 * offsets**2))
 
 
-PATHS = {"turntable": turntable, "spiral": spiral, "through": through}
+PATH_GENERATORS = {"turntable": turntable, "spiral": spiral, "through": through}

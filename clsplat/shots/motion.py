@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a shot around a frame's own: the next frame's, and those of the shutter's time."""
+"""Cameras of a shot near a frame in time: the next and the previous frame's, and those while the shutter is open."""
 
 from __future__ import annotations
 
@@ -8,28 +8,26 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
-from typing import Any
 
 import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.shots import Frame, Shot
+from clsplat.shots.shot import Frame, Shot
 
-AROUND = 2
-"""Frames on each side of a time that say where the camera is then: a segment's end, and what its tangent looks at."""
-
-
-_SCALARS = ("fx", "fy", "cx", "cy", "near", "far")
+NEIGHBOUR_FRAMES = 2
+"""Frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets its
+tangent."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Cameras of a frame, each at a time when it is looked at, taken from the source: for processes without it.
+    """Cameras of one frame at several times, evaluated in advance for processes that do not have the shot's source.
 
-    first: the camera at the first time; times (T,): in frames from the frame, rising; values (T, 18): what differs from
-    time to time, `_SCALARS`, rotation and translation.
+    first: the camera at the first time.
+    times: (T,), rising, in frames from the frame.
+    values: (T, 18), the quantities that change over time: fx, fy, cx, cy, near, far, rotation (9) and translation (3).
     """
 
     first: Camera
@@ -38,7 +36,7 @@ class Moments:
 
     @classmethod
     def of(cls, moment: Callable[[float], Camera], times: Iterable[float]) -> Moments:
-        """The camera at each of the times. Raises InputError where they are of several projections."""
+        """Evaluate the camera at each of the times. Raises InputError if they differ in projection."""
         rising = np.unique(np.array(list(times), np.float64))
         cameras = [moment(float(time)) for time in rising]
         for time, camera in zip(rising, cameras, strict=True):
@@ -54,19 +52,25 @@ class Moments:
         return {float(time): row for row, time in enumerate(self.times)}
 
     def at(self, time: float) -> Camera:
-        """The camera at one of the times. Raises KeyError for another."""
+        """The camera at one of the times. Raises KeyError for any other time."""
         values = self.values[self._rows[time]]
-        scalars: dict[str, Any] = dict(zip(_SCALARS, values[:6].tolist(), strict=True))
-        return replace(self.first, **scalars, rotation=values[6:15].reshape(3, 3), translation=values[15:])
+        fx, fy, cx, cy, near, far = values[:6].tolist()
+        rotation, translation = values[6:15].reshape(3, 3), values[15:]
+        return replace(
+            self.first, fx=fx, fy=fy, cx=cx, cy=cy, near=near, far=far, rotation=rotation, translation=translation
+        )
 
 
 def _values(camera: Camera) -> Float64:
-    return np.concatenate([[getattr(camera, name) for name in _SCALARS], camera.rotation.ravel(), camera.translation])
+    scalars = [camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.far]
+    return np.concatenate([scalars, camera.rotation.ravel(), camera.translation])
 
 
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: Iterable[float]) -> Moments:
-    """The cameras of a shot that has one for each moment, at those times in frames from the frame of that number, and
-    at the times between the first and the last of them that the source has values for."""
+    """Cameras of a shot that has `moment`, evaluated around the frame `number`.
+
+    times: in frames from that frame. Times between the first and the last at which the source has values are added.
+    """
     assert shot.moment is not None
     moment, wanted = shot.moment, list(times)
     begin = bisect_left(shot.authored, number + min(wanted))
@@ -76,10 +80,10 @@ def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: 
 
 
 def camera_after(shot: Shot, index: int) -> Camera:
-    """The shot's camera one frame number after its frame of this index.
+    """The shot's camera one frame number after the frame at this index.
 
-    After the last it goes on as it did from the one before: the same rigid motion once more, so that a turntable turns
-    on. A single frame stays where it is.
+    After the last frame, the last rigid motion is repeated, so that a turntable keeps turning. A single frame stays in
+    place.
     """
     frame = shot.frames[index]
     if index + 1 < len(shot.frames):
@@ -91,9 +95,9 @@ def camera_after(shot: Shot, index: int) -> Camera:
 
 
 def camera_before(shot: Shot, index: int) -> Camera:
-    """The shot's camera one frame number before its frame of this index.
+    """The shot's camera one frame number before the frame at this index.
 
-    Before the first it goes back as it goes on after it: the same rigid motion the other way, as `camera_after`.
+    Before the first frame, the first rigid motion is repeated backwards, as `camera_after` does at the end.
     """
     frame = shot.frames[index]
     if index > 0:
@@ -103,7 +107,7 @@ def camera_before(shot: Shot, index: int) -> Camera:
 
 
 def continued(earlier: Camera, now: Camera) -> Camera:
-    """The rigid motion from one to the other once more."""
+    """The camera after the rigid motion from `earlier` to `now` is applied once more."""
     turn = now.rotation @ earlier.rotation.T
     shift = now.translation - turn @ earlier.translation
     return replace(now, rotation=turn @ now.rotation, translation=turn @ now.translation + shift)
@@ -118,12 +122,13 @@ def stretches(
     motion: bool = False,
     backward: bool = False,
 ) -> Callable[[int], Shot | None]:
-    """The part of the shot that a frame's shutter looks at, by the frame's number, from which its own numbers count;
-    None where nothing can move. opens, closes: frames from the frame; motion, backward: with the middle of the shutter
-    of the next frame, and of the frame before.
+    """A function from a frame's number to the part of the shot that its shutter covers, None if nothing can move.
 
-    Before its first frame and after its last the shot goes on as it does there, as for motion. Raises InputError where
-    the frames' pictures have several sizes or projections, which is no camera that moves.
+    opens, closes: times of the shutter, in frames from the frame.
+    motion, backward: also cover the middle of the next frame's shutter, or of the previous frame's.
+    The part's frame numbers count from the given frame. Before its first and after its last frame, the shot is
+    extrapolated, as for motion. Raises InputError if the frames' pictures differ in size or projection, as one moving
+    camera cannot make them.
     """
     middle = 0.5 * (opens + closes)
     opens = min(opens, middle - 1) if backward else opens
@@ -138,18 +143,18 @@ def stretches(
                 f"an open shutter: frame {earlier} is {kinds[0]} and frame {number} {kinds[1]}, expected one camera"
             )
     first, second = frames[0][1], resize(camera_after(shot, 0))
-    for _ in range(ceil(max(-opens, 0)) + AROUND):
+    for _ in range(ceil(max(-opens, 0)) + NEIGHBOUR_FRAMES):
         first, second = continued(second, first), first
         frames.insert(0, (frames[0][0] - 1, first))
     last, following = frames[-1][1], resize(camera_after(shot, len(shot.frames) - 1))
-    for _ in range(ceil(max(closes, 0)) + AROUND):
+    for _ in range(ceil(max(closes, 0)) + NEIGHBOUR_FRAMES):
         frames.append((frames[-1][0] + 1, following))
         last, following = following, continued(last, following)
     numbers = [number for number, _ in frames]
 
     def stretch(number: int) -> Shot:
-        begin = max(bisect_right(numbers, number + min(opens, 0)) - AROUND, 0)
-        end = bisect_left(numbers, number + max(closes, 0)) + AROUND
+        begin = max(bisect_right(numbers, number + min(opens, 0)) - NEIGHBOUR_FRAMES, 0)
+        end = bisect_left(numbers, number + max(closes, 0)) + NEIGHBOUR_FRAMES
         return Shot(tuple(Frame(at - number, camera, f"{at:04d}") for at, camera in frames[begin:end]))
 
     return stretch

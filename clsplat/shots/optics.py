@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shutter and lens that a stage has for a frame, beside the flags, which go before them."""
+"""Shutter and lens settings that a USD stage gives for a frame. Flags override them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,21 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import SamplingConfig
 from clsplat.images.video import rate_of
 
-MOST_FRAMES_OF_A_SECOND = 30
-"""An SMPTE time code has no number for more."""
+MAX_TIME_CODE_FPS = 30
+"""Highest frame rate that SMPTE time codes can count."""
 
 
 @dataclass(frozen=True)
 class Optics:
-    """Shutter and lens at a frame. shutter: opening and closing in frames from the frame; f_stop: 0 for a pinhole;
-    focus: depth in focus, 0 for none, and focal_length, both in the world's units; metres: of such a unit; fps: frames
-    a second, 0 where that is not known."""
+    """Shutter and lens at a frame.
+
+    shutter: opening and closing time, in frames from the frame.
+    f_stop: f-number, 0 for a pinhole.
+    focus: focus distance in world units, 0 if it is not set.
+    focal_length: in world units.
+    metres: length of a world unit in metres.
+    fps: frames per second, 0 if unknown.
+    """
 
     shutter: tuple[float, float] = (0.0, 0.0)
     f_stop: float = 0.0
@@ -30,16 +36,16 @@ class Optics:
     fps: float = 0.0
 
     def radius(self, f_stop: float) -> float:
-        """The radius of the lens with that f-number, in the world's units."""
+        """Radius of the lens aperture at the given f-number, in world units."""
         return self.focal_length / (2 * f_stop)
 
     @property
     def still(self) -> Optics:
-        """The same without a shutter that is open and a lens."""
+        """The same settings with an instantaneous shutter and a pinhole."""
         return replace(self, shutter=(0.0, 0.0), f_stop=0.0)
 
     def named(self) -> Iterator[str]:
-        """USD's names, with the values, of those that would change a picture."""
+        """USD names, with values, of the settings that would change a picture."""
         if self.f_stop:
             yield f"fStop ({self.f_stop:g})"
             if self.focus:
@@ -50,33 +56,37 @@ class Optics:
 
 
 def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
-    """Shutter and lens of a frame: the flags', and what these leave open the stage's. The lens's size becomes a radius
-    unless flags say what the sensor and a unit are."""
+    """Shutter and lens of a frame: the flags, with settings that they leave open taken from the stage.
+
+    The lens size becomes an aperture radius, unless flags give the sensor width or the metres per unit.
+    """
     if optics is None:
         return flags
-    changes: dict[str, Any] = {}
+    settings = flags
     if flags.shutter_angle is None and flags.shutter_open is None and any(optics.shutter):
-        changes |= dict(zip(("shutter_open", "shutter_close"), optics.shutter, strict=True))
+        opens, closes = optics.shutter
+        settings = replace(settings, shutter_open=opens, shutter_close=closes)
     focus = flags.focus if flags.focus is not None else optics.focus or None
     asked = flags.aperture is not None or flags.f_stop is not None
     f_stop = flags.f_stop if asked else optics.f_stop
-    if f_stop and camera.projection == "perspective" and (asked or focus is not None):
+    applies = camera.is_pinhole and (asked or focus is not None)
+    if f_stop and applies:
         if flags.sensor_width is None and flags.metres is None:
-            changes |= {"aperture": optics.radius(f_stop), "f_stop": None}
+            settings = replace(settings, aperture=optics.radius(f_stop), f_stop=None)
         else:
             metres = flags.metres or optics.metres
             sensor = optics.focal_length * camera.width / camera.fx * 1000 * metres
-            changes |= {"f_stop": f_stop, "sensor_width": flags.sensor_width or sensor, "metres": metres}
-    if asked or changes.keys() & {"aperture", "f_stop"}:
-        changes["focus"] = focus
-    return replace(flags, **changes)
+            sensor_width = flags.sensor_width or sensor
+            settings = replace(settings, f_stop=f_stop, sensor_width=sensor_width, metres=metres)
+    return replace(settings, focus=focus) if asked or (f_stop and applies) else settings
 
 
 def headers(camera: Camera, number: int, optics: Optics | None, sampling: SamplingConfig) -> dict[str, tuple[str, Any]]:
-    """OpenEXR's standard attributes of a frame of a stage, by name: type and value. Of other frames none.
+    """OpenEXR standard attributes for a frame of a stage, by name, as (type, value). Empty for other frames.
 
-    camera: of the whole frame. Lens and sensor are those of a perspective camera, in millimetres; the sensor is as much
-    of it as the picture shows.
+    camera: camera of the whole frame.
+    Lens and sensor attributes are written for perspective cameras only: lengths in millimetres, focus distance in
+    metres. The sensor size is the part of the sensor that the picture shows.
     """
     if optics is None:
         return {}
@@ -89,7 +99,7 @@ def headers(camera: Camera, number: int, optics: Optics | None, sampling: Sampli
         if sampling.moves:
             opens, closes = sampling.shutter
             found["expTime"] = "float", (closes - opens) / optics.fps
-    if camera.projection != "perspective":
+    if not camera.is_pinhole:
         return found
     millimetres = 1000 * optics.metres
     focal = optics.focal_length * millimetres
@@ -105,15 +115,17 @@ def headers(camera: Camera, number: int, optics: Optics | None, sampling: Sampli
 
 
 def time_code(number: int, rate: Fraction) -> int | None:
-    """The bits of the SMPTE time code of a frame, counted from 0 at 00:00:00:00, no frames dropped; None where it has
-    none: before 0, at a rate that is not near a whole number, and above 30 frames a second."""
+    """SMPTE time code of a frame as packed bits, non-drop-frame, with frame 0 at 00:00:00:00.
+
+    None before frame 0, above 30 frames per second, and at a rate that is not close to a whole number.
+    """
     whole = round(rate)
-    if number < 0 or not 1 <= whole <= MOST_FRAMES_OF_A_SECOND or abs(float(rate) - whole) > whole / 500:
+    if number < 0 or not 1 <= whole <= MAX_TIME_CODE_FPS or abs(float(rate) - whole) > whole / 500:
         return None
     seconds, frame = divmod(number, whole)
     minutes, second = divmod(seconds, 60)
     hours, minute = divmod(minutes, 60)
     code = 0
-    for value in (hours % 24, minute, second, frame):  # each in two decimal digits of four bits
+    for value in (hours % 24, minute, second, frame):  # two binary-coded decimal digits each
         code = code << 8 | value // 10 << 4 | value % 10
     return code

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of a shot: the frames that `clsplat render`'s arguments ask for."""
+"""Selection of the shot that the arguments of `clsplat render` ask for."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from typing import Any
 from clsplat.camera import Camera
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError, examples
-from clsplat.files import is_file, parse_json, read_document
+from clsplat.files.documents import is_file, parse_json, read_document
 from clsplat.gaussians import Gaussians
-from clsplat.scenes import colmap, transforms
+from clsplat.models.formats.usd import USD_SUFFIXES
 from clsplat.scenes.camera_checks import cameras_of
-from clsplat.scenes.colmap import find_model, read_cameras
-from clsplat.scenes.data_set import PANORAMA, PosedImage
-from clsplat.scenes.strays import FACTOR, stray_cameras
-from clsplat.scenes.transforms import read_poses
-from clsplat.shots.around import among, cameras_around, parse_up
-from clsplat.shots.cameras_json import NAME, read_cameras_json
-from clsplat.shots.clsplat_json import VERSION_KEY, read_keyed
-from clsplat.shots.generated import PATHS
-from clsplat.shots.nerfstudio import read_camera_path
-from clsplat.shots.shot import MOST_FRAMES, Frame, Shot, named, numbered, photographs
-from clsplat.shots.usd import read_usd
-from clsplat.shots.usd_settings import window_named
+from clsplat.scenes.dataset import PosedImage
+from clsplat.scenes.outliers import OUTLIER_DISTANCE_RATIO, stray_cameras
+from clsplat.scenes.readers import colmap, transforms
+from clsplat.scenes.readers.colmap import find_model, read_cameras
+from clsplat.scenes.readers.transforms import read_poses
+from clsplat.shots.default_orbit import among, cameras_around, parse_up
+from clsplat.shots.generated import PATH_GENERATORS
+from clsplat.shots.readers.cameras_json import CAMERAS_JSON_NAME, read_cameras_json
+from clsplat.shots.readers.clsplat_json import CAMERAS_VERSION_KEY, read_keyed
+from clsplat.shots.readers.nerfstudio import read_camera_path
+from clsplat.shots.readers.usd import read_usd
+from clsplat.shots.readers.usd_settings import window_named
+from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot, named, numbered, photographs
 from clsplat.shots.viewpoints import COLMAP_UP
 
-COUNT = 120
-"""Frames of a generated path: five seconds at 24 a second."""
-USD = (".usd", ".usda", ".usdc", ".usdz")
-EXPECTED = (
+DEFAULT_PATH_FRAMES = 120
+"""Frames of a generated path: five seconds at 24 fps."""
+EXPECTED_CAMERA_SOURCES = (
     "a COLMAP model's folder, a transforms.json, a nerfstudio camera_path.json, a cameras.json of a 3DGS training, a "
     "clsplat camera file (.json) or a USD stage"
 )
@@ -45,25 +45,27 @@ def read_shot(
     usd_camera: str | None = None,
     lenses: Lenses = "undistort",
 ) -> Shot:
-    """The frames of any camera file, found out from what is in it; docs/cameras.md describes each.
+    """Read the frames of any camera file, whose format is recognised from its content. docs/cameras.md describes the
+    formats.
 
-    size: the width and height that will be asked for, for formats that have none of their own (USD; transforms.json
-    without its pictures). usd_camera: which camera of a USD stage. lenses: of photographs, as of `load_scene`. Raises
-    InputError, naming the file, for one that is missing, of no known kind, damaged or without frames.
+    size: requested width and height, for formats without their own (USD; transforms.json without its pictures).
+    usd_camera: which camera of a USD stage to use.
+    lenses: how lenses of photographs are treated, as in `load_scene`.
+    Raises InputError, naming the file, if it is missing, of an unknown kind, damaged or without frames.
     """
     path = Path(path)
     if not path.exists():
-        raise InputError(f"{path}: no such folder or file, expected {EXPECTED}")
-    is_usd = path.suffix.lower() in USD
+        raise InputError(f"{path}: no such folder or file, expected {EXPECTED_CAMERA_SOURCES}")
+    is_usd = path.suffix.lower() in USD_SUFFIXES
     if usd_camera is not None and not is_usd:
-        raise InputError(f"--usd-camera {usd_camera}: {path} is no USD stage, expected it with one only")
+        raise InputError(f"--usd-camera {usd_camera}: {path} is no USD stage, expected this flag with a stage only")
     if path.is_dir():
         return _read_folder(path, size, lenses)
     if is_usd:
         return read_usd(path, size, usd_camera)
     if path.suffix.lower() == ".json":
         return _read_json(path, size, lenses)
-    raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {EXPECTED}")
+    raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {EXPECTED_CAMERA_SOURCES}")
 
 
 def choose_shot(
@@ -79,21 +81,23 @@ def choose_shot(
 ) -> Shot:
     """The shot that --cameras, --path and --count ask for together.
 
-    path: turntable, spiral or through: `count` frames of that path, made from the cameras; else the cameras themselves.
-    applied: names of what the call applies of a stage beside, of which it is not warned. distort: the
-    cameras are those of photographs as they were taken, their lenses with them. Raises InputError.
+    path: turntable, spiral or through, for `count` frames of a path generated from the cameras; None for the cameras
+      themselves.
+    applied: names of the stage's settings that the call applies elsewhere, so that they need no warning.
+    distort: use the photographs' cameras as they were taken, including their lenses.
+    Raises InputError.
     """
     if count is not None and path is None:
-        raise InputError(f"--count {count}: expected --path with it, the files of cameras have their own frames")
+        raise InputError(f"--count {count}: expected --path with it, as camera files have their own frames")
     _check_count(count)
     if distort and path is not None:
-        raise InputError(f"--distort: is of the photographs' own cameras, expected it without --path {path}")
+        raise InputError(f"--distort: applies to the photographs' own cameras, expected it without --path {path}")
     if distort:
         shot = Shot(photographs(photographed(cameras, size)))
     else:
         shot = read_shot(cameras, size=size, usd_camera=usd_camera, lenses=lenses)
     if path is not None:
-        if not (first := shot.frames[0].camera).kind.flat:
+        if not (first := shot.frames[0].camera).model.flat:
             raise InputError(
                 f"{cameras}: its cameras are {first.projection}, --path needs perspective or orthographic ones"
             )
@@ -107,19 +111,22 @@ def choose_shot(
 
 
 def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera], tuple[str, ...]]:
-    """The cameras of frames but for strays, and the warning that names these."""
+    """Cameras of the frames without strays, and a warning that names the strays."""
     far = stray_cameras([frame.camera for frame in frames])
     near = [frame.camera for frame, stray in zip(frames, far, strict=True) if not stray]
     if not far.any():
         return near, ()
     names = examples(frame.name for frame, stray in zip(frames, far, strict=True) if stray)
-    text = f"{source}: the cameras of {names} stand over {FACTOR:g} times as far off as the others"
+    text = f"{source}: the cameras of {names} stand over {OUTLIER_DISTANCE_RATIO:g} times as far off as the others"
     return near, (f"{text}, and the path is made of the others",)
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
-    """The photographs' own cameras, with their lenses, of a COLMAP model or a transforms.json. Raises InputError for
-    another source of cameras, for panoramas, which no pinhole shows, and as `read_shot`."""
+    """The photographs' own cameras, with their lenses, from a COLMAP model or a transforms.json.
+
+    Raises InputError for another source of cameras, for panoramas, which no pinhole shows, and in the cases of
+    `read_shot`.
+    """
     images: list[PosedImage] | None = None
     if path.is_dir():
         listed = sorted(file.name for file in path.glob("transforms*.json"))
@@ -132,9 +139,9 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
         images = transforms.read_images(path, _both(size))
     if images is None:
         raise InputError(f"{path}: has no lenses of photographs, expected a COLMAP model's folder or a transforms.json")
-    if wrong := [image.name for image in images if image.lens.model == PANORAMA]:
-        raise InputError(f"{path}: {examples(wrong)} are panoramas, which no straight picture is bent to")
-    cameras_of(images)  # warns of those that cannot be right
+    if wrong := [image.name for image in images if image.lens.is_panorama]:
+        raise InputError(f"{path}: {examples(wrong)} are panoramas, which cannot be warped from a pinhole picture")
+    cameras_of(images)  # warns about implausible cameras
     return images
 
 
@@ -152,8 +159,11 @@ def shot_around(
     up: str | None = None,
     own: Sequence[Camera] = (),
 ) -> Shot:
-    """The shot that --path, --count and --up ask for without --cameras: among the photographs' own cameras where these
-    are known and no direction is given that is up, else around the model, as `cameras_around`. Raises InputError."""
+    """The shot that --path, --count and --up ask for without --cameras.
+
+    The path goes among the photographs' own cameras if these are known and `up` is None. Otherwise it goes around the
+    model, as in `cameras_around`. Raises InputError.
+    """
     among_own = bool(own) and up is None
     path = check_around(path, among_own=among_own)
     _check_count(count)
@@ -164,8 +174,10 @@ def shot_around(
 
 
 def check_around(path: str | None, *, among_own: bool = False) -> str:
-    """The path, which goes around a model, or among the photographs' own cameras. Raises InputError for one that needs
-    cameras, and for none."""
+    """The name of a path around a model, or among the photographs' own cameras, after a check.
+
+    Raises InputError for None, and for a path that needs --cameras.
+    """
     if path is None:
         raise InputError(
             "--cameras is missing, expected cameras to render from; or --path turntable or spiral alone, for a path "
@@ -177,25 +189,25 @@ def check_around(path: str | None, *, among_own: bool = False) -> str:
 
 
 def _check_count(count: int | None) -> None:
-    if count is not None and not 1 <= count <= MOST_FRAMES:
-        raise InputError(f"--count {count}: expected 1 to {MOST_FRAMES:,} frames")
+    if count is not None and not 1 <= count <= MAX_SHOT_FRAMES:
+        raise InputError(f"--count {count}: expected 1 to {MAX_SHOT_FRAMES:,} frames")
 
 
 def _path(path: str, cameras: Sequence[Camera], count: int | None) -> tuple[Frame, ...]:
-    return numbered(PATHS[path](cameras, COUNT if count is None else count))
+    return numbered(PATH_GENERATORS[path](cameras, DEFAULT_PATH_FRAMES if count is None else count))
 
 
 def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses) -> Shot:
     listed = sorted(file.name for file in path.glob("transforms*.json"))
     if listed:
-        # a model below colmap/ beside a transforms.json is nerfstudio's, in a world that is not the file's
+        # next to a transforms.json, a model below colmap/ is nerfstudio's, and its world differs from the file's
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:
                 raise InputError(f"{path}: holds {examples(listed)}, expected one of them to be named by --cameras")
             return _read_json(path / listed[0], size, lenses)
-    if is_file(path / NAME) and find_model(path) is None:
-        return _read_json(path / NAME, size, lenses)
+    if is_file(path / CAMERAS_JSON_NAME) and find_model(path) is None:
+        return _read_json(path / CAMERAS_JSON_NAME, size, lenses)
     cameras = read_cameras(path, lenses)
     if not cameras:
         raise InputError(f"{path}: has no images, expected at least one")
@@ -206,13 +218,13 @@ def _read_json(path: Path, size: tuple[int | None, int | None], lenses: Lenses) 
     document = _parsed(path)
     if isinstance(document, list):
         return read_cameras_json(path, document, size)
-    if VERSION_KEY in document:
+    if CAMERAS_VERSION_KEY in document:
         return read_keyed(path, document)
     if "camera_path" in document or "keyframes" in document:
         return read_camera_path(path, document)
     if "frames" not in document:
         raise InputError(
-            f"{path}: has neither '{VERSION_KEY}' (a clsplat camera file) nor 'camera_path' (nerfstudio's) nor "
+            f"{path}: has neither '{CAMERAS_VERSION_KEY}' (a clsplat camera file) nor 'camera_path' (nerfstudio's) nor "
             "'frames' (a transforms.json), expected one of them"
         )
     return Shot(named(read_poses(path, _both(size), lenses)))
@@ -225,6 +237,6 @@ def _parsed(path: Path) -> dict[str, Any] | list[Any]:
     except ValueError as error:
         raise InputError(f"{path}: is not JSON: {error}; expected a file of cameras") from None
     if not isinstance(document, dict | list):
-        keys = f"'frames', 'camera_path' or '{VERSION_KEY}'"
+        keys = f"'frames', 'camera_path' or '{CAMERAS_VERSION_KEY}'"
         raise InputError(f"{path}: holds no JSON object, expected one with {keys}, or a list of cameras")
     return document

@@ -10,21 +10,26 @@ from math import ceil, floor, isfinite
 
 from clsplat.camera import Camera
 from clsplat.errors import InputError
-from clsplat.scenes.data_set import Lens, PosedImage
+from clsplat.scenes.dataset import Lens, PosedImage
 from clsplat.shots.frame_numbers import parse_frames, ranges
-from clsplat.shots.keys import Key, interpolate
+from clsplat.shots.keyframes import Key, interpolate
 from clsplat.shots.optics import Optics
 
-MOST_FRAMES = 100_000
-"""Most frames of a shot: over an hour at 24 a second. More are a slip of the keyboard, and would be
-gigabytes of cameras from a file of few lines."""
+MAX_SHOT_FRAMES = 100_000
+"""Limit of frames per shot: over an hour at 24 fps. A larger number is probably a typo, and would turn a short file
+into gigabytes of cameras."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """number: what `--frames` and `####` mean; name: what `{name}` means, a picture's path or the number in four
-    digits; time: seconds from the first frame, where the source has any; optics: of a stage, shutter and lens; lens: of
-    the photograph that the frame is to be bent as."""
+    """A frame of a shot.
+
+    number: the number that `--frames` and `####` refer to.
+    name: the value of `{name}`: a picture's path, or the number in four digits.
+    time: seconds from the first frame, if the source gives times.
+    optics: shutter and lens from a USD stage.
+    lens: the photograph's lens, if the frame is to get its distortion.
+    """
 
     number: int
     camera: Camera
@@ -36,11 +41,17 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """frames: numbers rise; warnings: a line each, for the user; fps: frames a second, where the source says it;
-    unapplied: what the source has and no frame shows; moment: the camera at a time in frames, where the source has one
-    for each; authored: the times, rising, that it has values for; reach: the first and the last of those that say where
-    the camera is; window: part of the frame that it wants, as
-    `usd_settings.Settings`."""
+    """The frames to render, and settings of their source.
+
+    frames: in rising order of their numbers.
+    warnings: one line each, for the user.
+    fps: frames per second, if the source gives it.
+    unapplied: settings of the source that no frame shows.
+    moment: the camera at a time in frames, if the source defines one for every time.
+    authored: rising times at which the source has values.
+    reach: first and last time at which the source has values for the camera's transform.
+    window: part of the frame that the source asks for, as in `usd_settings.Settings`.
+    """
 
     frames: tuple[Frame, ...]
     warnings: tuple[str, ...] = ()
@@ -57,7 +68,8 @@ class Shot:
         return [frame.camera for frame in self.frames]
 
     def standing(self, numbers: Sequence[int]) -> Shot:
-        """Of one frame, the same camera in the frames of these numbers; other shots as they are."""
+        """The camera of a single-frame shot, repeated at the frames of these numbers. Other shots are returned
+        unchanged."""
         if len(self.frames) != 1 or not numbers:
             return self
         return replace(
@@ -65,9 +77,9 @@ class Shot:
         )
 
     def only(self, text: str) -> Shot:
-        """The frames that `text`, such as 1-100:2, lists and the shot has; a warning where it lists others too.
+        """The frames of the shot that `text`, such as 1-100:2, lists. Adds a warning if it lists other frames too.
 
-        Raises InputError for a text that `parse_frames` refuses, and where the shot has none of its frames.
+        Raises InputError for a text that `parse_frames` refuses, and if the shot has none of the listed frames.
         """
         wanted = parse_frames(text)
         numbers = {frame.number for frame in self.frames}
@@ -82,20 +94,22 @@ class Shot:
         return replace(self, frames=tuple(frame for frame in self.frames if frame.number in asked), warnings=warnings)
 
     def without_optics(self) -> Shot:
-        """The frames without the stage's shutter and lens, which are among what is not applied."""
+        """The shot without the stage's shutter and lens, whose settings are added to `unapplied`."""
         named = [name for frame in self.frames if frame.optics for name in frame.optics.named()]
-        found = {name.partition(" ")[0]: name for name in reversed(named)}  # of each the first value
+        found = {name.partition(" ")[0]: name for name in reversed(named)}  # the first value of each
         frames = tuple(replace(frame, optics=frame.optics.still) if frame.optics else frame for frame in self.frames)
         return replace(self, frames=frames, unapplied=(*self.unapplied, *reversed(found.values())))
 
     def told(self, source: object, *more: str) -> tuple[str, ...]:
-        """The warnings, a line each: the last names all that the source has and is not applied. more: of it that this
-        call does not apply."""
+        """The warnings, one line each. The last line names all settings of the source that are not applied.
+
+        more: settings of the source that this call does not apply.
+        """
         unapplied = (*self.unapplied, *more)
         return (*self.warnings, f"{source}: not applied: {', '.join(unapplied)}") if unapplied else self.warnings
 
     def check(self, channels: Iterable[str] = ()) -> None:
-        """Raises InputError where these channels are not defined: motion from one projection to another."""
+        """Raise InputError if motion channels are requested between frames of different projections."""
         if not (moving := [name for name in channels if name in ("motion", "backward")]):
             return
         for before, frame in pairwise(self.frames):
@@ -107,14 +121,17 @@ class Shot:
                 )
 
     def at(self, frame: float) -> Camera:
-        """The camera at a frame that need not be whole, such as within a shutter's time: interpolated as keys are."""
+        """The camera at a frame number that need not be whole, such as a time while the shutter is open.
+
+        The camera is interpolated as between key frames.
+        """
         return interpolate([Key(key.number, key.camera) for key in self.frames], [frame])[0]
 
 
 def whole_frames(where: str, what: str, begin: float, end: float) -> list[int]:
-    """The whole numbers from `begin` to `end`. Raises InputError for none of them, and for too many."""
-    if not (isfinite(end - begin) and end - begin < MOST_FRAMES):
-        raise InputError(f"{where}: has the {what}s {begin:g} to {end:g}, expected at most {MOST_FRAMES:,}")
+    """The whole numbers from `begin` to `end`. Raises InputError if there are none or too many."""
+    if not (isfinite(end - begin) and end - begin < MAX_SHOT_FRAMES):
+        raise InputError(f"{where}: has the {what}s {begin:g} to {end:g}, expected at most {MAX_SHOT_FRAMES:,}")
     frames = list(range(ceil(begin), floor(end) + 1))
     if not frames:
         raise InputError(f"{where}: has no whole {what} from {begin:g} to {end:g}, expected at least one")
@@ -122,7 +139,7 @@ def whole_frames(where: str, what: str, begin: float, end: float) -> list[int]:
 
 
 def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None) -> tuple[Frame, ...]:
-    """Frames from the number `first` on, named after their numbers."""
+    """Frames numbered upwards from `first` and named after their numbers."""
     return tuple(
         Frame(first + index, camera, f"{first + index:04d}", None if fps is None else index / fps)
         for index, camera in enumerate(cameras)
@@ -130,7 +147,8 @@ def numbered(cameras: Iterable[Camera], first: int = 1, fps: float | None = None
 
 
 def photographs(images: Iterable[PosedImage]) -> tuple[Frame, ...]:
-    """Frames of pictures as they were taken, by name, from 1 on: pinhole cameras, with the lens where it bends."""
+    """Frames of the photographs, numbered from 1 and named after their files: pinhole cameras, with the lens if it
+    distorts."""
     frames = []
     for index, image in enumerate(images, 1):
         lens = None if image.lens.is_pinhole else image.lens
@@ -139,5 +157,5 @@ def photographs(images: Iterable[PosedImage]) -> tuple[Frame, ...]:
 
 
 def named(cameras: dict[str, Camera]) -> tuple[Frame, ...]:
-    """Frames of pictures, from 1 on in their order."""
+    """Frames of named cameras, numbered from 1 in their order."""
     return tuple(Frame(index, camera, name) for index, (name, camera) in enumerate(cameras.items(), 1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo pairs: the cameras of the eyes beside a shot's own, and those that a USD stage has."""
+"""Stereo pairs: the two eyes' cameras, offset from a shot's own cameras or read from a USD stage."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from clsplat.errors import InputError, examples
 from clsplat.models.formats.usd import open_stage, readable, survive
 from clsplat.shots.shot import Shot
 
-FIELD = re.compile(r"\{eye\}|%V|%v")
-"""An eye's name in a file's: {eye} or %V for all of it, %v for its first letter, as Nuke writes them."""
+EYE_FIELD_PATTERN = re.compile(r"\{eye\}|%V|%v")
+"""A field for an eye's name in a file name: {eye} or %V for the name, %v for its first letter, as in Nuke."""
 
 
 def for_eye(pattern: str, eye: str) -> str:
-    """The pattern of files with the eye's name in it; the same for none."""
-    return FIELD.sub(lambda match: eye[:1] if match[0] == "%v" else eye, pattern) if eye else pattern
+    """The file pattern with the eye's name filled in; unchanged if `eye` is empty."""
+    return EYE_FIELD_PATTERN.sub(lambda match: eye[:1] if match[0] == "%v" else eye, pattern) if eye else pattern
 
 
 def seen_by(camera: Camera, eye: Eye, distance: float, convergence: float = math.inf) -> Camera:
-    """The camera of an eye of a pair that is `distance` world units apart, about a camera of a whole frame.
+    """The camera of one eye of a pair, `distance` world units apart and centred on `camera`, which shows a whole frame.
 
-    It looks in the same direction. Its principal point is shifted, so that what is at the depth `convergence` is in the
-    same place for both. Raises InputError for another camera than a perspective one.
+    Both eyes look in the camera's direction. The principal point is shifted so that points at the depth `convergence`
+    fall on the same pixel in both. Raises InputError if the camera is not perspective.
     """
-    if camera.projection != "perspective":
+    if not camera.is_pinhole:
         raise InputError(f"--stereo: a frame is {camera.projection}, expected perspective cameras")
     aside = (-0.5 if eye == "left" else 0.5) * distance
     moved = camera.translation - np.array([aside, 0.0, 0.0])
@@ -40,7 +40,7 @@ def seen_by(camera: Camera, eye: Eye, distance: float, convergence: float = math
 
 
 def shot_of(shot: Shot, eye: Eye, distance: float, convergence: float = math.inf) -> Shot:
-    """The shot as the eye sees it. Raises InputError as `seen_by`."""
+    """The shot as the eye sees it. Raises InputError in the cases of `seen_by`."""
 
     def seen(camera: Camera) -> Camera:
         return seen_by(camera, eye, distance, convergence)
@@ -51,20 +51,20 @@ def shot_of(shot: Shot, eye: Eye, distance: float, convergence: float = math.inf
 
 
 def pair_of_stage(path: Path, prim: str | None = None) -> tuple[str, str]:
-    """Paths of the cameras of a USD stage whose stereoRole is left and right, and that are children of one prim.
+    """Paths of a USD stage's left and right camera (stereoRole), which are children of the same prim.
 
-    prim: path or name of that, or of one of the cameras, where the stage has several pairs. Raises InputError where
-    there is no such pair, or are several, and as `usd.read_usd`.
+    prim: path or name of that prim or of one of the cameras, to choose one of several pairs.
+    Raises InputError if there is no such pair or more than one, and in the cases of `usd.read_usd`.
     """
     survive(path, "clsplat.shots.stereo:pair_here", prim=prim)
     return pair_here(path, prim)
 
 
 def pair_here(path: Path, prim: str | None = None) -> tuple[str, str]:
-    """`pair_of_stage` of a file that is known not to end the process."""
+    """`pair_of_stage` for a file that is known not to crash USD's library."""
     from pxr import UsdGeom, UsdUtils
 
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # captures the messages that USD would print
     stage = open_stage(path, path)
     rigs: dict[str, dict[str, list[Any]]] = {}
     with readable(path):
@@ -91,7 +91,7 @@ def pair_here(path: Path, prim: str | None = None) -> tuple[str, str]:
                 "children, expected such a pair; or give --stereo DISTANCE"
             )
         flag = "" if prim is None else f"--usd-camera {prim}: "
-        problem = "is of no pair" if prim is not None and not asked else f"has {len(asked)} pairs"
+        problem = "belongs to no pair" if prim is not None and not asked else f"has {len(asked)} pairs"
         raise InputError(f"{path}: {flag}{problem}, expected --usd-camera with one of {examples(sorted(pairs))}")
     left, right = next(iter(asked.values()))
     return str(left.GetPath()), str(right.GetPath())

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera paths made from a scene's own cameras. The world stays as it is; only what is up in it is estimated."""
+"""Geometry of a scene's cameras: up axis, focus point, covered arc. The world is not changed; only its up direction is
+estimated."""
 
 from __future__ import annotations
 
@@ -13,15 +14,15 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 COLMAP_UP = (0.0, -1.0, 0.0)
-"""Up in the world of a photograph that was taken level: COLMAP's y is down."""
-WIDEST_GAP = np.deg2rad(100.0)
-"""Widest gap of the cameras around the middle, in radians, that a turntable still goes across; beyond it swings."""
+"""Up direction in the world of a level photograph: COLMAP's y axis points down."""
+MAX_AZIMUTH_GAP_RADIANS = np.deg2rad(100.0)
+"""Widest azimuth gap between cameras, in radians, that a turntable crosses. At wider gaps it swings to and fro."""
 
 
 def look_at(position: Float64, target: Float64, up: Float64) -> tuple[Float64, Float64]:
-    """`cam_from_world` rotation (3, 3) and translation (3,) of a level camera at position that faces target.
+    """Rotation (3, 3) and translation (3,), `cam_from_world`, of a level camera at `position` that faces `target`.
 
-    up (3,) need not be at right angles to the view, but not along it.
+    up: (3,), at any angle to the view direction but not parallel to it.
     """
     forward = target - position
     forward = forward / np.linalg.norm(forward)
@@ -32,10 +33,10 @@ def look_at(position: Float64, target: Float64, up: Float64) -> tuple[Float64, F
 
 
 def up_axis(cameras: Sequence[Camera]) -> Float64:
-    """The world's up as the photographers held their cameras, a unit vector (3,).
+    """Estimate the world's up direction, a unit vector (3,), from how the photographers held their cameras.
 
-    People hold cameras level, tilted up or down: up is the direction most nearly at right angles to every image's
-    x axis. Where these axes do not span a plane (all photos from one side), up is the mean of the images' up.
+    People hold cameras level, tilted up or down, so up is the direction most nearly at right angles to every camera's x
+    axis. If these axes do not span a plane (all photographs from one side), up is the mean of the cameras' up axes.
     """
     right = np.stack([camera.rotation[0] for camera in cameras])
     mean_up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
@@ -48,9 +49,10 @@ def up_axis(cameras: Sequence[Camera]) -> Float64:
 
 
 def focus_point(cameras: Sequence[Camera]) -> Float64:
-    """The point (3,) that the cameras look at: nearest to all optical axes in the least squares sense.
+    """The point (3,) that the cameras look at: the least-squares nearest point to all optical axes.
 
-    Where the axes are nearly parallel and meet nowhere, a point ahead of the cameras, as far as they are spread.
+    If the axes are nearly parallel, or most cameras have the point behind them, it is a point ahead of the cameras
+    instead, as far away as they are spread.
     """
     positions = np.stack([camera.position for camera in cameras])
     forward = np.stack([camera.rotation[2] for camera in cameras])
@@ -67,7 +69,8 @@ def focus_point(cameras: Sequence[Camera]) -> Float64:
 
 
 def covered_arc(azimuths: Float64) -> tuple[float, float]:
-    """Begin and width in radians of the shortest arc that holds all azimuths (n,), in the direction of growth."""
+    """Start and width, in radians, of the shortest arc that holds all azimuths (n,), in the direction of rising
+    angles."""
     ordered = np.sort(np.mod(azimuths, 2 * np.pi))
     gaps = np.diff(ordered, append=ordered[0] + 2 * np.pi)
     widest = int(np.argmax(gaps))
@@ -75,7 +78,8 @@ def covered_arc(azimuths: Float64) -> tuple[float, float]:
 
 
 def extent_of(points: NDArray[Any], inside: float = 0.96) -> tuple[Float64, Float64]:
-    """Two corners (3,) of the box that holds this part of the points along each axis: strays are many in models."""
+    """Two corners (3,) of the box that holds this fraction of the points along each axis, since models have many
+    strays."""
     if not len(points):
         return -np.ones(3), np.ones(3)
     some = points[:: max(1, len(points) // 100_000)]

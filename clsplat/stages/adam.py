@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches adam.cl on every parameter group. A step of one view has Adam in `stages.project.project_step`."""
+"""Launches adam.cl for every parameter group. A step of one view has Adam in `stages.project.project_step`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
-from clsplat.device.layout import READBACK
 from clsplat.device.profile import stage
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import READBACK
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 
@@ -23,12 +23,13 @@ def updates_sh_rest(config: OptimiserConfig, step: int) -> bool:
 
 
 def corrected(config: OptimiserConfig, step: int, group: str, rate: float) -> tuple[float, float]:
-    """rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) of a group's t-th update, in step number `step` (from 1)."""
+    """Return rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) of a group's t-th update, in step number `step` (from
+    1)."""
     updates = step // config.sh_rest_every if group == "sh_rest" else step
     return rate / (1.0 - config.beta1**updates), (1.0 - config.beta2**updates) ** -0.5
 
 
-@stage("adam")
+@stage("adam", adam=4)
 def adam(
     device: Device,
     step: int,
@@ -43,14 +44,14 @@ def adam(
 ) -> None:
     """Step number `step` (from 1) with the constants of `config` and a rate per group; leaves the gradients zero.
 
-    tile_counts (n,) uint32: 0 where the view does not show a Gaussian, for `config.sparse`; readback (READBACK_SIZE,)
-    uint32: its last four count the elements that got no step, by the reason (`layout.REFUSED`).
+    tile_counts: (n,) uint32, 0 where the view does not show a Gaussian, for `config.sparse`.
+    readback: (READBACK_SIZE,) uint32; its last four count the elements that got no step, by reason (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
-    counts = readback.buffer  # no array that a step goes through: it is touched where something is wrong
+    counts = readback.buffer  # a raw buffer, not an array that each step processes: it is touched only on a fault
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes
-    for group, about in GROUPS.items():
+    for group, about in PARAMETER_GROUPS.items():
         if group == "sh_rest" and not updates_sh_rest(config, step):
             continue
         rate, root = corrected(config, step, group, rates[group])
@@ -64,11 +65,11 @@ def adam(
             launch_items(device, kernel, -(-rows // lanes), rows, *constants, tile_counts, *arrays)
         else:
             kernel = device.kernels("adam").adam
-            # Of SH more than 32 bits count, from 95 million Gaussians on.
+            # SH coefficients need an index of more than 32 bits from 95 million Gaussians.
             launch_items(device, kernel, -(-size // lanes), np.uint64(size), *constants, *arrays)
 
 
-@stage("adam")
+@stage("adam", add_view=1, join_view=1)
 def add_view(
     device: Device,
     tile_counts: DeviceArray,
@@ -78,10 +79,14 @@ def add_view(
     *,
     sh_rest: bool = True,
 ) -> None:
-    """Add the rows of `gradients` that a view shows, by its tile_counts (n,) uint32, to those of the views before it;
-    sh_rest: the higher bands of SH too; shown (n,) uint32, if given: not 0 where any of the views shows a Gaussian."""
+    """Add the rows of `gradients` that a view shows to the sums over the earlier views.
+
+    tile_counts: (n,) uint32, of the view.
+    shown: (n,) uint32, if given; becomes nonzero where any of the views shows a Gaussian.
+    sh_rest: also add the higher SH bands.
+    """
     rows = tile_counts.shape[0]
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         size = sums[group].size
         if size and (sh_rest or group != "sh_rest"):
             kernel = device.kernels("adam", WIDTH=size // rows).add_view

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches appearance.cl: the gains of a photograph, their gradient and Adam's step."""
+"""Launches appearance.cl: a photograph's gains, their gradient and Adam's step."""
 
 from __future__ import annotations
 
@@ -12,20 +12,26 @@ from scipy.sparse import csr_array
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid, launch_items
-from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import TILE
 
-PIXEL_BYTES = 2
-"""Bytes of each pixel with its padding: its share of the partial sums."""
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+GAINS_PIXEL_BYTES = 2
+"""Bytes of the partial sums, per pixel with padding."""
+APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Gains of all photographs, (photographs, entries) float32 each: logs to base 2, and mixes where there are more
-    than three entries, where they started, Adam's moments, 2^logs; moved: scratch. begins (photographs + 1,), others,
-    weights (n,): rows of a matrix, as a `csr_array` has. Times the distances from where the gains started, it is added
-    to the gradient."""
+    """Gains of all photographs, (photographs, entries) float32 each.
+
+    logs: logs to base 2; mixes after the first three entries, if there are more.
+    start: their initial values.
+    first, second: Adam's moments.
+    gains: 2^logs.
+    moved: scratch.
+    begins (photographs + 1,), others, weights (n,): rows of a matrix, stored like a `csr_array`. The matrix times the
+    distances of the gains from their start is added to the gradient.
+    """
 
     logs: DeviceArray
     start: DeviceArray
@@ -39,7 +45,7 @@ class Gains:
 
     @classmethod
     def on(cls, device: Device, logs: NDArray[np.float32], pull: csr_array | None = None) -> Gains:
-        """Gains that start with these logs, and moments of zero. pull: the matrix; of zeros if not given."""
+        """Gains that start with these logs, and zero moments. pull: the matrix; zero if not given."""
         zeros = np.zeros_like(logs)
         gains = np.exp2(logs.astype(np.float64)).astype(np.float32)
         held, start, first, second, factors = (upload(device, value) for value in (logs, logs, zeros, zeros, gains))
@@ -48,9 +54,9 @@ class Gains:
 
 
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
-    """begins, others and weights of a matrix; None: of zeros."""
+    """The begins, others and weights of a matrix; None gives a zero matrix."""
     matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
-    spare = np.zeros(1)  # an array has an element at least
+    spare = np.zeros(1)  # an array has at least one element
     parts = {
         "begins": matrix.indptr.astype(np.int32),
         "others": np.append(matrix.indices, spare).astype(np.int32),
@@ -59,9 +65,9 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
     return {name: upload(device, part) for name, part in parts.items()}
 
 
-@stage("appearance")
+@stage("appearance", remove_gains=1)
 def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
-    """Expose planes (3 or more, rows, stride) of the photograph, of which three are colours, as the model is."""
+    """Divide the photograph's gains out of planes (3 or more, rows, stride), the first three of them colours."""
     _, rows, stride = target.shape
     kernel = device.kernels("appearance", LANES=1).remove_gains
     launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
@@ -76,8 +82,10 @@ def gain_gradient(
     height: int,
     place: int = 0,
 ) -> DeviceArray:
-    """Sums (3, stride) of the image times the gradient by it, those of each `place` in a batch in an array of their
-    own: ln 2 times their sum over x is the gradient by the photograph's logs."""
+    """Column sums (3, stride) of the image times the loss's gradient by it.
+
+    ln 2 times their sum over x is the gradient by the photograph's logs. Each `place` in a batch has its own array.
+    """
     _, rows, stride = image.shape
     down = rows // TILE
     partials, columns = (
@@ -105,11 +113,22 @@ def step_gains(
     slow: float = 1.0,
     centred: bool = True,
 ) -> None:
-    """Adam's step number `step` (from 1), and the mean of each entry made 0 if `centred`. A step by capacity that has
-    stopped changes nothing. at: the entries' first row of `columns`; slow: part of the rate that mixes have."""
+    """Adam's step number `step` (from 1); then subtract the mean of each entry if `centred`.
+
+    at: first row of the entries in `columns`.
+    slow: fraction of the rate for mixes.
+    A step by capacity that has stopped changes nothing.
+    """
     kernels, (photographs, entries) = device.kernels("appearance", LANES=1), gains.logs.shape
     count = photographs * entries
-    constants = (rate / (1 - BETA1**step), slow, (1 - BETA2**step) ** -0.5, BETA1, BETA2, EPSILON)
+    constants = (
+        rate / (1 - APPEARANCE_BETA1**step),
+        slow,
+        (1 - APPEARANCE_BETA2**step) ** -0.5,
+        APPEARANCE_BETA1,
+        APPEARANCE_BETA2,
+        APPEARANCE_EPSILON,
+    )
     sizes, matrix = (count, entries, photograph, columns.shape[1], at), (gains.begins, gains.others, gains.weights)
     read = (readback, columns, gains.start, *matrix, gains.logs)
     launch_items(device, kernels.move_gains, count, *sizes, *constants, *read, gains.moved, gains.first, gains.second)

@@ -13,26 +13,43 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
-from clsplat.device.layout import PLAIN_SLOTS, TILE, SlotFields
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import PLAIN_SLOTS, TILE, SlotFields
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
 
-PIXEL_BYTES = 20
-"""Bytes of each pixel with its padding: image, transmittance, stop."""
+BLEND_PIXEL_BYTES = 20
+"""Bytes per pixel with padding: image, transmittance, stop."""
 
 
 def gradient_pair_bytes(fields: SlotFields) -> int:
-    """Bytes of each pair that its gradient needs: cells and a slot."""
+    """Bytes per pair for the gradient: cells and a slot."""
     return 4 + 4 * fields.floats
+
+
+@dataclass(frozen=True, eq=False)
+class ImageInputs:
+    """Input of an image's stages in addition to the tile lists.
+
+    splats: (n, SPLAT), of `Projected`.
+    background: (3,).
+    width, height: pixels.
+    camera_array: the packed camera, for pixels that are rays.
+    """
+
+    splats: DeviceArray
+    background: DeviceArray
+    width: int
+    height: int
+    camera_array: DeviceArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Blended:
     """Planes padded to whole tiles: image (3, rows, stride), transmittance (rows, stride), stops (rows, stride).
 
-    cells_from_sorted (pairs) uint32: the cells in which each pair's Gaussian contributes, as bits; or None; nearness
-    (rows, stride): the sum of weight over depth, where it was asked for.
+    cells_from_sorted: (pairs) uint32, the cells in which each pair's Gaussian contributes, as bits; or None.
+    nearness: (rows, stride), the sum of weight over depth, if requested.
     """
 
     image: DeviceArray
@@ -43,7 +60,7 @@ class Blended:
 
 
 def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Image, transmittance and stops of a frame, in the workspace. kept: as the last call left them."""
+    """Image, transmittance and stops of a frame, in the workspace. kept: keep their contents from the last call."""
     rows, stride = padded_size(width, height)
     return (
         work.array("image", (3, rows, stride), kept=kept),
@@ -52,15 +69,15 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
     )
 
 
-_FEWEST = 8
-"""Work-items that share a tile at least, where there is more than one: a row of a block (kernels/shared/blocks.h)."""
+_MIN_TILE_ITEMS = 8
+"""The fewest work-items that share a tile, if more than one: a row of a block (kernels/shared/blocks.h)."""
 
 
 def tile_items(device: Device) -> int:
-    """Work-items that share a tile, no more than it has pixels; one where vectors have several pixels."""
+    """Work-items that share a tile, at most its number of pixels; one if vectors have several pixels."""
     if device.shape.lanes > 1 or device.shape.items == 1:
         return 1
-    return min(max(device.shape.items, _FEWEST), TILE * TILE)
+    return min(max(device.shape.items, _MIN_TILE_ITEMS), TILE * TILE)
 
 
 def launch_tiles(
@@ -72,8 +89,12 @@ def launch_tiles(
     *arguments: Any,
     kernel: str = "",
 ) -> None:
-    """Launch the kernel that is named like its file, or another one in it, with a group for each of the lists' tiles.
-    Its arguments are the first tile, the tiles in a row of the image, and `arguments`."""
+    """Launch a kernel of `stem`.cl, with one group per tile of the lists.
+
+    kernel: its name, if different from the file's.
+
+    The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
+    """
     items = tile_items(device)
     built = getattr(device.kernels(stem, ITEMS=items, **defines), kernel or stem)
     launch_groups(device, built, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
@@ -84,29 +105,27 @@ def blend(
     device: Device,
     work: Workspace,
     lists: TileLists,
-    splats: DeviceArray,
-    background: DeviceArray,
-    width: int,
-    height: int,
+    inputs: ImageInputs,
     *,
     record: bool = True,
-    camera_array: DeviceArray | None = None,
     nearness: bool = False,
 ) -> Blended:
-    """Blend the Gaussians of each of the lists' tiles front to back over the background (3,). Pixels of other tiles are
-    left as they are.
+    """Blend the Gaussians of each tile in the lists front to back over the background.
 
-    record: keep the cells that the gradient has to go through, where the kernels' shape has them; camera_array: for
-    pixels that are rays; nearness: add up one over the depth too.
+    Pixels of other tiles are left unchanged.
+
+    record: keep the cells that the gradient has to visit, if the kernel shape supports it.
+    nearness: also sum one over the depth.
     """
+    width, height = inputs.width, inputs.height
     planes, near = _planes(work, width, height, kept=lists.band.first > 0), None
     if nearness:
         near = work.array("nearness", padded_size(width, height), kept=lists.band.first > 0)
     cells, rays = None, device.switched("RAYS")
     if record and not rays and tile_items(device) == 1 and device.shape.lanes >= 8:
         cells = work.array("cells_from_sorted", lists.gaussian_from_sorted.shape, np.uint32)
-    extra = ([near] if near else []) + ([cells] if cells else []) + ([camera_array] if rays else [])
-    arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, *extra)
+    extra = ([near] if near else []) + ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
+    arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, inputs.background, *planes, *extra)
     defines = {name: True for name, on in (("NEARNESS", near), ("RECORD_CELLS", cells)) if on}
     launch_tiles(device, "blend", defines, lists, -(-width // TILE), width, height, *arrays)
     return Blended(*planes, cells, near)
@@ -120,12 +139,12 @@ def count_pairs(
     background: DeviceArray,
     camera: Camera,
 ) -> tuple[int, int]:
-    """(contributing, evaluated) pairs of a Gaussian and a pixel, by a build of blend.cl that counts them.
+    """Count pairs of a Gaussian and a pixel, by a build of blend.cl that counts them: (contributing, evaluated).
 
-    Contributing: added to the pixel's colour. Evaluated: alpha was worked out, in a lane of a vector that was visited.
+    Contributing: added to the pixel's colour. Evaluated: alpha was computed, in a lane of a visited vector.
     """
     width, height = camera.width, camera.height
-    planes = _planes(work, width, height, kept=True)  # those of `blend`: it writes the same values again
+    planes = _planes(work, width, height, kept=True)  # the planes of `blend`: this writes the same values again
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)
@@ -138,17 +157,17 @@ def blend_grad(
     device: Device,
     work: Workspace,
     lists: TileLists,
-    splats: DeviceArray,
-    background: DeviceArray,
+    inputs: ImageInputs,
     blended: Blended,
     image_gradient: DeviceArray,
     *,
     fields: SlotFields = PLAIN_SLOTS,
-    camera_array: DeviceArray | None = None,
 ) -> DeviceArray:
-    """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats), from image_gradient (3, rows,
-    stride), with the loss's gradient by the transmittance (4, ...), and if the fields have it that by nearness behind;
-    camera_array: for pixels that are rays."""
+    """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats).
+
+    image_gradient: (3, rows, stride). A fourth plane is the loss's gradient by the transmittance. A last plane is the
+    gradient by nearness, if the fields include it.
+    """
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]
     slots = work.array("slots", (pairs, fields.floats))
@@ -162,7 +181,7 @@ def blend_grad(
         defines["ALPHA_GRADIENT"] = True
     listed = (lists.ranges, lists.gaussian_from_sorted, lists.slot_from_sorted)
     planes = (image_gradient, blended.transmittance, blended.stops)
-    extra = ([cells] if cells else []) + ([camera_array] if rays else [])
-    arrays = (*listed, splats, background, *planes, slots, *extra)
+    extra = ([cells] if cells else []) + ([inputs.camera_array] if rays else [])
+    arrays = (*listed, inputs.splats, inputs.background, *planes, slots, *extra)
     launch_tiles(device, "blend_grad", defines, lists, stride // TILE, rows, *arrays)
     return slots

@@ -7,13 +7,13 @@ import numpy as np
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.layout import DEEP, DEEP_LEVELS, TILE
 from clsplat.device.profile import stage
-from clsplat.stages.blend import Blended, launch_tiles
+from clsplat.layouts.columns import DEEP_LEVELS, DEEP_SLICE, TILE
+from clsplat.stages.blend import Blended, ImageInputs, launch_tiles
 from clsplat.stages.ranges import TileLists
 
-DEEP_FLOATS = len(DEEP)
-"""Floats of a pixel and slice."""
+DEEP_FLOATS = len(DEEP_SLICE)
+"""Floats per pixel and slice."""
 
 
 @stage("deep")
@@ -22,17 +22,17 @@ def deep(
     work: Workspace,
     bins: int,
     lists: TileLists,
-    splats: DeviceArray,
+    inputs: ImageInputs,
     blended: Blended,
-    height: int,
-    camera_array: DeviceArray | None = None,
 ) -> DeviceArray:
-    """(bins, DEEP_FLOATS, rows, stride) of the lists' tiles, which `blended` is of too. bins: the most slices that a
-    pixel has; camera_array: for pixels that are rays."""
+    """Slices (bins, DEEP_FLOATS, rows, stride) of the lists' tiles; `blended` must be of the same tiles.
+
+    bins: the most slices of a pixel.
+    """
     plane_rows, stride = blended.stops.shape
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride), kept=lists.band.first > 0)
     share = np.float32(1 / (DEEP_LEVELS * bins))
-    arrays = (lists.ranges, lists.gaussian_from_sorted, splats, blended.transmittance, blended.stops, planes)
-    rays = (camera_array,) if device.switched("RAYS") else ()
-    launch_tiles(device, "deep", {}, lists, stride // TILE, height, bins, share, *arrays, *rays)
+    arrays = (lists.ranges, lists.gaussian_from_sorted, inputs.splats, blended.transmittance, blended.stops, planes)
+    rays = (inputs.camera_array,) if device.switched("RAYS") else ()
+    launch_tiles(device, "deep", {}, lists, stride // TILE, inputs.height, bins, share, *arrays, *rays)
     return planes

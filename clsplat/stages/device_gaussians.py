@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters, gradients and moments on the device, or on the host in parts."""
+"""Parameters, gradients and moments on the device, or on the host and streamed in parts."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from typing_extensions import Self
 
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.gaussians import GROUPS, Gaussians, floats_of, group_shapes
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shapes
 
 
 @dataclass(frozen=True, eq=False)
 class ShStorage:
-    """Form of the SH in a model that is only rendered.
+    """Storage of the SH coefficients in a model that is only rendered.
 
-    coefficients: of each channel; degrees (n,) uint8: the highest of each Gaussian that is looked at, None for all;
-    half: the bands above 0 as float16.
+    coefficients: per channel.
+    degrees: (n,) uint8, the highest degree evaluated for each Gaussian; None evaluates all.
+    half: store the bands above 0 as float16.
     """
 
     coefficients: int
@@ -30,7 +31,7 @@ class ShStorage:
 
     @property
     def floats(self) -> int:
-        """Floats of one Gaussian's parameters and what is kept beside them, rounded up."""
+        """Floats per Gaussian, including its degree, rounded up."""
         rest = 3 * (self.coefficients - 1)
         kept = -(-rest // 2) if self.half else rest
         return floats_of(self.coefficients) - rest + kept + (self.degrees is not None)
@@ -41,7 +42,7 @@ A = TypeVar("A")
 
 @dataclass(frozen=True, eq=False)
 class _ByGroup(Generic[A]):
-    """Parameters, or their gradients or moments: arrays by group name, the first axis of each being `count`."""
+    """Parameters, gradients or moments: arrays by group name, with a first axis of length `count`."""
 
     count: int
     coefficients: int
@@ -51,19 +52,21 @@ class _ByGroup(Generic[A]):
         return self.arrays[group]
 
     def only(self, *groups: str) -> Self:
-        """The same with these arrays alone."""
+        """The same with only these arrays."""
         return replace(self, arrays={group: self.arrays[group] for group in groups})
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceGaussians(_ByGroup[DeviceArray]):
-    """Gaussians on the device. Of a model that is held to be rendered (`ShStorage`) sh_rest may be float16, and there
-    may be sh_degrees (count) uint8."""
+    """Gaussians on the device.
+
+    In a model that is only rendered (`ShStorage`), sh_rest may be float16, and sh_degrees (count) uint8 may be present.
+    """
 
 
 @dataclass(frozen=True, eq=False)
 class HostArray:
-    """An array on the host that is used as a DeviceArray is."""
+    """A host array with the interface of a DeviceArray."""
 
     values: NDArray[Any]
 
@@ -72,7 +75,7 @@ class HostArray:
         return self.values.shape
 
     def get(self) -> NDArray[Any]:
-        """A copy."""
+        """A copy of the array."""
         return self.values.copy()
 
     def set(self, values: NDArray[Any]) -> None:
@@ -80,11 +83,11 @@ class HostArray:
         self.values[...] = values
 
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
-        """A copy of the rows from start to before stop."""
+        """A copy of the rows [start, stop)."""
         return self.values[start:stop].copy()
 
     def set_rows(self, start: int, values: NDArray[Any]) -> None:
-        """Copy from another array to the rows from start on."""
+        """Copy another array to the rows that begin at `start`."""
         self.values[start : start + len(values)] = values
 
     def fill(self, value: float) -> None:
@@ -94,7 +97,7 @@ class HostArray:
 
 @dataclass(frozen=True, eq=False)
 class HostGaussians(_ByGroup[HostArray]):
-    """Gaussians on the host: for use they go to the device `rows` at a time (`parts`)."""
+    """Gaussians on the host, uploaded `rows` at a time for use (`parts`)."""
 
     rows: int
 
@@ -105,9 +108,11 @@ AnyGaussians = DeviceGaussians | HostGaussians
 def parts(
     work: Workspace, *models: AnyGaussians, keep: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
-    """(start, stop, the models' rows from start to before stop on the device), all at once if they are there.
+    """Yield (start, stop, the models' rows [start, stop) on the device), all at once if they are on the device.
 
-    Of host models the part is valid until the next one is asked for; keep: what was done to it then goes back.
+    A part of a host model is valid until the next one is requested.
+
+    keep: copy the part's changes back to the host.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
     if len(on_device) == len(models):
@@ -133,7 +138,7 @@ def parts(
 
 
 def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: bool = False) -> DeviceGaussians:
-    """Arrays for `count` Gaussians."""
+    """Allocate arrays for `count` Gaussians."""
     arrays = {name: allocate(device, shape, np.float32) for name, shape in group_shapes(count, coefficients).items()}
     if zero:
         for array in arrays.values():
@@ -142,7 +147,7 @@ def allocate_gaussians(device: Device, count: int, coefficients: int, *, zero: b
 
 
 def _grouped(gaussians: Gaussians, sh: ShStorage) -> dict[str, NDArray[Any]]:
-    host = {name: getattr(gaussians, group.field) for name, group in GROUPS.items()}
+    host = {name: getattr(gaussians, group.field) for name, group in PARAMETER_GROUPS.items()}
     host |= {"sh_dc": gaussians.sh[:, 0], "sh_rest": gaussians.sh[:, 1 : sh.coefficients]}
     kinds = {"sh_rest": np.float16 if sh.half else np.float32}
     arrays = {name: np.ascontiguousarray(values, kinds.get(name, np.float32)) for name, values in host.items()}
@@ -150,16 +155,18 @@ def _grouped(gaussians: Gaussians, sh: ShStorage) -> dict[str, NDArray[Any]]:
 
 
 def upload_gaussians(device: Device, gaussians: Gaussians, sh: ShStorage | None = None) -> DeviceGaussians:
-    """A copy on the device; sh: to be rendered alone."""
+    """Upload Gaussians. sh: the SH storage, for a model that is only rendered."""
     sh = sh or ShStorage(gaussians.sh.shape[1])
     arrays = {name: upload(device, values) for name, values in _grouped(gaussians, sh).items()}
     return DeviceGaussians(len(gaussians), sh.coefficients, arrays)
 
 
 def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None) -> HostGaussians:
-    """On the host, to go through the device `rows` at a time. Not a copy: to read, unless the caller may write.
+    """Gaussians on the host, to be streamed through the device `rows` at a time.
 
-    sh: to be rendered alone.
+    The arrays are not copied: they are read-only unless the caller may write them.
+
+    sh: the SH storage, for a model that is only rendered.
     """
     sh = sh or ShStorage(gaussians.sh.shape[1])
     arrays = {name: HostArray(values) for name, values in _grouped(gaussians, sh).items()}
@@ -167,10 +174,11 @@ def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None)
 
 
 def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
-    """Those of the arrays that are called `kind`/means and so on. Raises ValueError where they are no Gaussians."""
-    if missing := [group for group in GROUPS if f"{kind}/{group}" not in arrays]:
+    """Gaussians from the arrays named `kind`/means and so on. Raises ValueError if names, shapes or dtypes are
+    wrong."""
+    if missing := [group for group in PARAMETER_GROUPS if f"{kind}/{group}" not in arrays]:
         raise ValueError(f"has no {kind}/{missing[0]}")
-    host = {group: HostArray(arrays[f"{kind}/{group}"]) for group in GROUPS}
+    host = {group: HostArray(arrays[f"{kind}/{group}"]) for group in PARAMETER_GROUPS}
     count, coefficients = len(host["means"].values), host["sh_rest"].shape[1] + 1
     for group, shape in group_shapes(count, coefficients).items():
         values = host[group].values
@@ -180,14 +188,14 @@ def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
 
 
 def host_zeros(count: int, coefficients: int, rows: int) -> HostGaussians:
-    """Zeros, as moments begin."""
+    """Zero arrays, the initial moments."""
     shapes = group_shapes(count, coefficients)
     arrays = {name: HostArray(np.zeros(shape, np.float32)) for name, shape in shapes.items()}
     return HostGaussians(count, coefficients, arrays, rows)
 
 
 def to_host(gaussians: AnyGaussians) -> HostGaussians:
-    """A copy of what is on the device, or what is on the host already."""
+    """A host copy of Gaussians on the device; host Gaussians are returned unchanged."""
     if isinstance(gaussians, HostGaussians):
         return gaussians
     arrays = {name: HostArray(array.get()) for name, array in gaussians.arrays.items()}
@@ -195,13 +203,13 @@ def to_host(gaussians: AnyGaussians) -> HostGaussians:
 
 
 def to_device(device: Device, gaussians: HostGaussians) -> DeviceGaussians:
-    """A copy of what is on the host."""
+    """A device copy of host Gaussians."""
     arrays = {name: upload(device, array.values) for name, array in gaussians.arrays.items()}
     return DeviceGaussians(gaussians.count, gaussians.coefficients, arrays)
 
 
 def download_gaussians(gaussians: AnyGaussians) -> Gaussians:
-    """A copy on the host."""
-    host = {name: gaussians[name].get() for name in GROUPS}
+    """A host copy as `Gaussians`."""
+    host = {name: gaussians[name].get() for name in PARAMETER_GROUPS}
     sh = np.concatenate([host["sh_dc"][:, None], host["sh_rest"]], axis=1)
     return Gaussians(host["means"], host["quaternions"], host["log_scales"], host["opacity_logits"], sh)

@@ -13,33 +13,34 @@ from numpy.typing import NDArray
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, launch_items
-from clsplat.device.layout import COUNTED, READBACK, REFUSED, TILE
 from clsplat.device.profile import stage
 from clsplat.errors import CapacityError, amount
+from clsplat.layouts.columns import COUNTED, READBACK, REFUSED, TILE
 from clsplat.stages.project import Projected
 from clsplat.stages.scan import Elements, chunking, scan
-from clsplat.stages.sort import SORT_BYTES, sort
+from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
-MAX_PAIRS = 2**31 - 1024
-"""Most pairs in one band: what `stops` count is signed, and read a little ahead of."""
+MAX_PAIRS_PER_BAND = 2**31 - 1024
+"""The most pairs in one band: `stops` count in signed integers, and kernels read slightly ahead of them."""
 
 
-GAUSSIAN_BYTES = 3 * 4 + SORT_BYTES + 3 * 4
-"""Bytes of each Gaussian: first slots, the visible with their keys; these sorted, with counts and offsets."""
-BAND_BYTES = 4
-"""Bytes of each Gaussian more where there are several bands: its tiles in one of them."""
-TILE_BYTES = 4
-"""Bytes of each tile where there are several bands: its pairs."""
+DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
+"""Bytes per Gaussian: first slots, the visible Gaussians with their keys, and the same sorted, with counts and
+offsets."""
+BAND_GAUSSIAN_BYTES = 4
+"""Additional bytes per Gaussian if there are several bands: its number of tiles in one of them."""
+BAND_TILE_BYTES = 4
+"""Bytes per tile if there are several bands: its number of pairs."""
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Bytes of each pair: tile, slot, Gaussian; and these with the depth by slot, sorted, where pairs are sorted."""
-    return 12 + (12 + SORT_BYTES if sorts_pairs else 0)
+    """Bytes per pair: tile, slot, Gaussian; if pairs are sorted, also these and the depth by slot, and the sort."""
+    return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 
 
 @dataclass(frozen=True)
 class Band:
-    """The tiles [first, end) of an image in row-major order: what is listed and blended together."""
+    """The tiles [first, end) of an image in row-major order, listed and blended together."""
 
     first: int
     end: int
@@ -52,12 +53,19 @@ class Band:
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """tile_counts, first_slots (n): a Gaussian's tiles, and their scan; gaussian_from_visible, depth_keys (visible):
-    in order of Gaussians; visible and pairs: the totals, pairs capped at 2^32 - 1; least_key and key_bits: what every
-    depth key has at least, and how many low bits of the rest can be set; refused: what `adam` had counted.
+    """The visible Gaussians and the number of their pairs.
 
-    Of a pass by capacity visible and pairs are the most that there can be; on_device: the READBACK in which its kernels
-    find the totals; arriving: a function that waits for a copy of that, and returns it.
+    tile_counts, first_slots: (n), a Gaussian's number of tiles, and the prefix sums.
+    gaussian_from_visible, depth_keys: (visible), in order of the Gaussians.
+    visible, pairs: the totals; pairs are capped at 2^32 - 1.
+    least_key: a lower bound of the depth keys.
+    key_bits: the number of low bits that can be set in a key less least_key.
+    refused: the counts of `adam`.
+
+    In a pass by capacity, visible and pairs are upper bounds:
+
+    on_device: the READBACK in which its kernels find the totals.
+    arriving: a function that waits for a copy of that, and returns it.
     """
 
     tile_counts: DeviceArray
@@ -73,14 +81,18 @@ class Counted:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The number `name` of READBACK, as kernels take it; most: it, or what it is at most."""
+        """The count called `name` in READBACK, as kernels take it. most: the count itself, or an upper bound."""
         return Elements(most, self.on_device, READBACK.index(name))
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """tile_keys (pairs), pair_ids (pairs, 2): slot and Gaussian, both by depth, ties by index of the Gaussian;
-    elements: the pairs that there are of these."""
+    """Pairs in order of depth, ties by index of the Gaussian.
+
+    tile_keys: (pairs).
+    pair_ids: (pairs, 2), slot and Gaussian.
+    elements: the number of pairs that these arrays hold.
+    """
 
     tile_keys: DeviceArray
     pair_ids: DeviceArray
@@ -96,10 +108,12 @@ def count(
     all_bits: bool = False,
     readback: DeviceArray | None = None,
 ) -> Counted:
-    """Find the visible Gaussians, the number of their pairs, and the bits by which their depths differ, or with
-    `all_bits` 32; waits for the device.
+    """Find the visible Gaussians, the number of their pairs, and the bits in which their depths differ.
 
-    readback (READBACK_SIZE,) uint32: the array that is read, if what `adam` has counted there is to be read with it.
+    Waits for the device.
+
+    all_bits: assume 32 bits.
+    readback: (READBACK_SIZE,) uint32, the array that is read; give it to read the counts of `adam` in the same copy.
     """
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
     first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)
@@ -127,10 +141,12 @@ def count_by_capacity(
     capacity: int,
     host: NDArray[np.uint32],
 ) -> Counted:
-    """`count` without waiting, for at most `capacity` pairs; a pass that has more of them stops (kernels/duplicate.cl).
+    """Like `count` without waiting, for at most `capacity` pairs; a pass with more pairs stops (kernels/duplicate.cl).
 
-    readback (READBACK_SIZE,) uint32: as `project_step` gets it; host: memory for its copy. Depths are sorted by 32
-    bits, which is as many passes of a GPU as of the bits in which those of a scene differ.
+    readback: (READBACK_SIZE,) uint32, the array that `project_step` gets.
+    host: memory for its copy.
+
+    Depths are sorted by 32 bits. On a GPU that takes as many passes as the bits in which a scene's depths differ.
     """
     (n,) = projected.tile_counts.shape
     arrays = (projected.tile_counts, *_compact(device, work, projected, readback, capacity))
@@ -140,7 +156,7 @@ def count_by_capacity(
 def _compact(
     device: Device, work: Workspace, projected: Projected, readback: DeviceArray, capacity: int | None = None
 ) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-    """Fill readback, and the first slots (n), the visible Gaussians (n) and their depth keys (n), which it returns."""
+    """Fill readback; return the first slots (n), the visible Gaussians (n) and their depth keys (n)."""
     tile_counts = projected.tile_counts
     (n,) = tile_counts.shape
     shown = projected.shown or tile_counts
@@ -169,7 +185,7 @@ def count_band(
     *,
     all_bits: bool = False,
 ) -> Counted:
-    """`count` of the band's tiles alone. It replaces what an earlier count has left in the workspace."""
+    """Like `count`, for the band's tiles only. It overwrites the results of an earlier count in the workspace."""
     n = projected.tile_counts.shape[0]
     band_counts = work.array("band_counts", (n,), np.uint32)
     kernel, arrays = device.kernels("duplicate").band_counts, (projected.tile_counts, projected.splats, band_counts)
@@ -181,7 +197,7 @@ def count_band(
 def plan_bands(
     device: Device, work: Workspace, projected: Projected, counted: Counted, tiles: tuple[int, int], capacity: int
 ) -> tuple[Band, ...]:
-    """The fewest bands of at most `capacity` pairs each. Raises CapacityError where one tile has more."""
+    """The fewest bands of at most `capacity` pairs each. Raises CapacityError if one tile has more."""
     if counted.pairs <= capacity:
         return (Band(0, tiles[0] * tiles[1]),)
     n = projected.tile_counts.shape[0]
@@ -231,8 +247,10 @@ def duplicate(
 def duplicate_and_sort(
     device: Device, work: Workspace, splats: DeviceArray, counted: Counted, tiles: tuple[int, int], band: Band
 ) -> Pairs:
-    """The pairs of `duplicate`, by sorting all pairs by depth, as in the code of Kerbl et al.: with the sort by tile
-    that follows, the lower half of one by keys of 64 bits."""
+    """The pairs of `duplicate`, by sorting all pairs by depth, as in the code of Kerbl et al.
+
+    With the sort by tile that follows, it is the lower half of one sort by 64-bit keys.
+    """
     visible, pairs = counted.visible, counted.pairs
     kernels = device.kernels("duplicate")
     tile_from_slot = work.array("tile_from_slot", (pairs,), np.uint32)

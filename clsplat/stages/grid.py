@@ -13,16 +13,16 @@ from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid, launch_items
 from clsplat.device.profile import stage
-from clsplat.stages.appearance import BETA1, BETA2, EPSILON
+from clsplat.stages.appearance import APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON
 
-SHAPE = (8, 16, 16, 3, 4)
-"""Levels, rows and columns of a grid, and its colour maps."""
-FLOATS = int(np.prod(SHAPE))
+GRID_SHAPE = (8, 16, 16, 3, 4)
+"""Levels, rows and columns of a grid, and the shape of its colour transforms."""
+GRID_FLOATS = int(np.prod(GRID_SHAPE))
 
 
 @dataclass(frozen=True, eq=False)
 class Grids:
-    """Grids of all photographs, (photographs, *SHAPE) float32, and Adam's moments of these."""
+    """Grids of all photographs, (photographs, *GRID_SHAPE) float32, and their Adam moments."""
 
     grids: DeviceArray
     first: DeviceArray
@@ -30,21 +30,23 @@ class Grids:
 
     @classmethod
     def on(cls, device: Device, grids: NDArray[np.float32]) -> Grids:
-        """These grids, and moments of zero."""
+        """These grids, and zero moments."""
         zeros = np.zeros_like(grids)
         return cls(upload(device, grids), upload(device, zeros), upload(device, zeros))
 
 
 def _spans(width: int, height: int) -> tuple[float, float]:
-    """Columns of the grid a pixel, and rows."""
-    return (SHAPE[2] - 1) / width, (SHAPE[1] - 1) / height
+    """Grid columns and rows per pixel."""
+    return (GRID_SHAPE[2] - 1) / width, (GRID_SHAPE[1] - 1) / height
 
 
 def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
-    """Bytes of each pixel with its padding: the planes of what is seen, and a share of the grids with their moments and
-    of the sums of lines in the largest of these sizes, (width, height)."""
-    lines = max((height for _, height in sizes), default=0) * SHAPE[2] * 12 * SHAPE[0]
-    held = 4 * (3 * FLOATS * photographs + FLOATS + lines)
+    """Bytes per pixel with padding: the planes of the transformed image, and a share of fixed arrays.
+
+    Those are the grids with their moments, and the line sums in the largest of these sizes, (width, height).
+    """
+    lines = max((height for _, height in sizes), default=0) * GRID_SHAPE[2] * 12 * GRID_SHAPE[0]
+    held = 4 * (3 * GRID_FLOATS * photographs + GRID_FLOATS + lines)
     return 12 + -(-held // max((width * height for width, height in sizes), default=1))
 
 
@@ -52,7 +54,7 @@ def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
 def apply_grid(
     device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, width: int, height: int
 ) -> DeviceArray:
-    """Planes (3, rows, stride) of the image of width x height pixels, with the photograph's colours."""
+    """The image, width x height pixels, with the photograph's colours: planes (3, rows, stride)."""
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     sizes = (photograph, stride, rows * stride, *_spans(width, height))
@@ -74,17 +76,20 @@ def grid_gradient(
     weight: float,
     place: int = 0,
 ) -> DeviceArray:
-    """Make the gradient by what was seen that by the image, in its place. Returns that by the photograph's grid, with
-    `weight` times its variation's, for each `place` in a batch in an array of its own."""
+    """Convert the gradient by the transformed image to the gradient by the image, in place.
+
+    Returns the gradient by the photograph's grid, plus `weight` times the gradient of its variation. Each `place` in a
+    batch has its own array.
+    """
     _, rows, stride = image.shape
     plane, (across, down) = rows * stride, _spans(width, height)
-    lines = work.array("appearance_lines", (height, SHAPE[2], 12, SHAPE[0]))
-    by_grid = work.array(f"appearance_by_grid_{place}", SHAPE)
+    lines = work.array("appearance_lines", (height, GRID_SHAPE[2], 12, GRID_SHAPE[0]))
+    by_grid = work.array(f"appearance_by_grid_{place}", GRID_SHAPE)
     kernels = device.kernels("grid", LANES=1)
     sizes, sources = (width, stride, plane, across), (image, gradient)
-    launch_grid(device, kernels.line_sums, (SHAPE[2], height, 3), *sizes, *sources, lines)
+    launch_grid(device, kernels.line_sums, (GRID_SHAPE[2], height, 3), *sizes, *sources, lines)
     launch_items(
-        device, kernels.grid_sums, FLOATS, photograph, height, down, float(weight), grids.grids, lines, by_grid
+        device, kernels.grid_sums, GRID_FLOATS, photograph, height, down, float(weight), grids.grids, lines, by_grid
     )
     pixel = (photograph, stride, plane, across, down, grids.grids, *sources)
     launch_grid(device, kernels.slice_gradient, (width, height), *pixel)
@@ -101,16 +106,24 @@ def step_grid(
     rate: float,
     readback: DeviceArray,
 ) -> None:
-    """Adam's step for the photograph's grid, at its visit number `visit` (from 1). A step by capacity that has stopped
-    changes nothing."""
+    """Adam's step for the photograph's grid, at its visit number `visit` (from 1).
+
+    A step by capacity that has stopped changes nothing.
+    """
     kernel = device.kernels("grid", LANES=1).move_grid
-    constants = (rate / (1 - BETA1**visit), (1 - BETA2**visit) ** -0.5, BETA1, BETA2, EPSILON)
+    constants = (
+        rate / (1 - APPEARANCE_BETA1**visit),
+        (1 - APPEARANCE_BETA2**visit) ** -0.5,
+        APPEARANCE_BETA1,
+        APPEARANCE_BETA2,
+        APPEARANCE_EPSILON,
+    )
     state = (grids.grids, grids.first, grids.second)
-    launch_items(device, kernel, FLOATS, photograph, *constants, readback, by_grid, *state)
+    launch_items(device, kernel, GRID_FLOATS, photograph, *constants, readback, by_grid, *state)
 
 
 @stage("appearance")
 def centre_grids(device: Device, grids: Grids, readback: DeviceArray) -> None:
     """Make the mean of all grids the identity. A step by capacity that has stopped changes nothing."""
     kernel = device.kernels("grid", LANES=1).centre_grids
-    launch_items(device, kernel, FLOATS, grids.grids.shape[0], readback, grids.grids)
+    launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.grids)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches harmonics.cl and harmonics_grad.cl: colours from spherical harmonics, in given directions or as a camera
-sees them, and the gradient back."""
+"""Launches harmonics.cl and harmonics_grad.cl: colours from spherical harmonics, and the gradient back.
+
+The directions are given, or point from a camera to the means.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +18,20 @@ from clsplat.device.profile import stage
 from clsplat.errors import InputError
 from clsplat.stages.sums import padded, row_sums
 
-HIGHEST = 4
-"""The degree up to which there is a basis."""
+MAX_SH_BASIS_DEGREE = 4
+"""The highest supported degree."""
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """n colours to be. directions (n, 3), of any length; sh (n, K, 3), K at least (degree + 1)^2, of which the rest is
-    not looked at; mask (n,) or (n, 2), int32: what is not over 0 is left out. centre (6,): of a camera, by
-    `centre_array`; with it the directions are means, and colours have 0.5 more and a floor of 0."""
+    """Input for n colours.
+
+    directions: (n, 3), of any length.
+    sh: (n, K, 3), K at least (degree + 1)^2; the rest is ignored.
+    mask: (n,) or (n, 2), int32; rows that are not positive are skipped.
+    centre: (6,), a camera's `centre_array`. With it the directions are means, and colours are offset by 0.5 and clamped
+    at 0.
+    """
 
     directions: DeviceArray
     sh: DeviceArray
@@ -39,10 +46,10 @@ class Harmonics:
 
     @property
     def used(self) -> int:
-        """Coefficients that are looked at. Raises InputError for a degree that there is not."""
+        """Number of coefficients used. Raises InputError for an unsupported degree."""
         used = (self.degree + 1) ** 2
-        if not 0 <= self.degree <= HIGHEST:
-            raise InputError(f"sh_degree is {self.degree}: expected 0 to {HIGHEST}")
+        if not 0 <= self.degree <= MAX_SH_BASIS_DEGREE:
+            raise InputError(f"sh_degree is {self.degree}: expected 0 to {MAX_SH_BASIS_DEGREE}")
         if used > self.sh.shape[1]:
             raise InputError(f"sh_degree is {self.degree}: expected {used} coefficients, got {self.sh.shape[1]}")
         return used
@@ -53,27 +60,35 @@ class Harmonics:
         wanted = {
             "CAMERA": self.centre is not None,
             "MASKED": self.mask is not None,
-            "DEGREE_4": self.degree == HIGHEST,
+            "DEGREE_4": self.degree == MAX_SH_BASIS_DEGREE,
         }
         return {name: True for name, on in wanted.items() if on}
 
     @property
     def arguments(self) -> tuple[object, ...]:
-        """Arguments of both kernels from the number of coefficients on."""
+        """Arguments of both kernels that follow the count."""
         centre = () if self.centre is None else (self.centre,)
         mask = () if self.mask is None else (self.mask.size // max(self.count, 1), self.mask)
         return (self.sh.shape[1], self.used, *centre, self.directions, self.sh, *mask)
 
 
+@dataclass(frozen=True, eq=False)
+class HarmonicsGradients:
+    """Gradients by the arrays of `Harmonics`: sh (n, K, 3) and, if requested, directions (n, 3)."""
+
+    sh: DeviceArray
+    directions: DeviceArray | None = None
+
+
 def centre_array(device: Device, position: Float64) -> DeviceArray:
-    """A camera's centre (3,) in the world, on the device in two floats."""
+    """A camera's centre (3,) in the world, on the device, each coordinate in two floats."""
     high = np.asarray(position, np.float32)
     return from_host(device, np.concatenate([high, (np.asarray(position, np.float64) - high).astype(np.float32)]))
 
 
 @stage("harmonics")
 def harmonics(device: Device, given: Harmonics, colours: DeviceArray) -> None:
-    """Fill colours (n, 3), with 0 where the mask is. Equation (167) of docs/gradients.md."""
+    """Fill colours (n, 3), with 0 for masked rows. Equation (167) of docs/gradients.md."""
     n = given.count
     kernel = device.kernels("harmonics", **given.defines).harmonics
     launch_items(device, kernel, -(-n // device.shape.lanes), n, *given.arguments, colours)
@@ -86,20 +101,22 @@ def harmonics_grad(
     given: Harmonics,
     colours: DeviceArray,
     d_colours: DeviceArray,
-    d_sh: DeviceArray,
-    d_directions: DeviceArray | None = None,
+    gradients: HarmonicsGradients,
     *,
     add: bool = False,
     add_directions: bool = False,
     by_centre: bool = False,
 ) -> DeviceArray | None:
-    """Fill d_sh (n, K, 3), and where asked for d_directions (n, 3), from d_colours (n, 3) and what `harmonics` wrote.
+    """Fill `gradients` from d_colours (n, 3) and the colours of `harmonics`.
 
-    add, add_directions: to what is there, as of the cameras before this, or of the means' other gradient; by_centre:
-    the result is the gradient (3,) by the camera's centre. Equations (38) to (40) and (168).
+    add, add_directions: add to existing gradients, of earlier cameras, or of the means.
+    by_centre: return the gradient (3,) by the camera's centre.
+
+    Equations (38) to (40) and (168).
     """
     n = given.count
     parts = work.array("harmonics_by_centre", (3, padded(n))) if by_centre else None
+    d_directions = gradients.directions
     wanted = {
         "ADDED": add,
         "BY_DIRECTION": d_directions is not None or by_centre,
@@ -119,7 +136,7 @@ def harmonics_grad(
         *given.arguments,
         d_colours,
         *([] if given.centre is None else [colours]),
-        d_sh,
+        gradients.sh,
         *([] if d_directions is None else [d_directions]),
         *([] if parts is None else [parts]),
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches holdout.cl: a frame behind the surfaces of other elements (docs/pictures.md)."""
+"""Launches holdout.cl: a frame behind the surfaces of CG elements (docs/pictures.md)."""
 
 from __future__ import annotations
 
@@ -7,24 +7,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clsplat.config.holdout import HELD
+from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
 from clsplat.images.holdouts import Surfaces
-from clsplat.stages.blend import Blended, launch_tiles
+from clsplat.layouts.columns import TILE
+from clsplat.stages.blend import Blended, ImageInputs, launch_tiles
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.ranges import TileLists
 
-HELD_BYTES = 4 + 4 * len(HELD)
-"""Bytes of each pixel with one surface."""
+HELD_PIXEL_BYTES = 4 + 4 * len(HOLDOUT_SURFACE_FIELDS)
+"""Bytes per pixel with one surface."""
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Surfaces on the device: starts (rows * stride + 1) uint32 of each pixel of a padded plane, the end behind it;
-    surfaces (S, 4) float32."""
+    """Holdout surfaces on the device.
+
+    starts: (rows * stride + 1) uint32, the first surface of each pixel of a padded plane, and the end.
+    surfaces: (S, 4) float32.
+    """
 
     starts: DeviceArray
     surfaces: DeviceArray
@@ -36,12 +39,12 @@ class Held:
 
 
 def held_bytes(surfaces: Surfaces | None) -> int:
-    """Bytes of each pixel of a picture for its surfaces."""
-    return 0 if surfaces is None else 4 + 4 * len(HELD) * surfaces.dense
+    """Bytes per pixel of an image for its surfaces."""
+    return 0 if surfaces is None else 4 + 4 * len(HOLDOUT_SURFACE_FIELDS) * surfaces.dense
 
 
 def upload_held(device: Device, surfaces: Surfaces) -> Held:
-    """The surfaces of a picture, which has one at least, on the device."""
+    """Upload the surfaces of an image, which has at least one."""
     height, width = surfaces.counts.shape
     counts = np.zeros(padded_size(width, height), np.int64)
     counts[:height, :width] = surfaces.counts
@@ -50,19 +53,10 @@ def upload_held(device: Device, surfaces: Surfaces) -> Held:
 
 
 @stage("holdout")
-def holdout(
-    device: Device,
-    held: Held,
-    lists: TileLists,
-    splats: DeviceArray,
-    background: DeviceArray,
-    blended: Blended,
-    height: int,
-    camera_array: DeviceArray | None = None,
-) -> None:
-    """Write image and transmittance of `blended`, which is of the lists' tiles, anew, held out. camera_array: for
-    pixels that are rays."""
-    arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, blended.stops, blended.image)
-    rays = (camera_array,) if device.switched("RAYS") else ()
-    tiles_x = blended.stops.shape[1] // TILE
-    launch_tiles(device, "holdout", {}, lists, tiles_x, height, *arrays, blended.transmittance, *held.arguments, *rays)
+def holdout(device: Device, held: Held, lists: TileLists, inputs: ImageInputs, blended: Blended) -> None:
+    """Rewrite the image and transmittance of `blended`, held out; `blended` must be of the lists' tiles."""
+    tiles_x, listed = blended.stops.shape[1] // TILE, (lists.ranges, lists.gaussian_from_sorted)
+    planes = (blended.stops, blended.image, blended.transmittance)
+    arrays = (*listed, inputs.splats, inputs.background, *planes, *held.arguments)
+    rays = (inputs.camera_array,) if device.switched("RAYS") else ()
+    launch_tiles(device, "holdout", {}, lists, tiles_x, inputs.height, *arrays, *rays)

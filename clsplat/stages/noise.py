@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches noise.cl, which moves the means of Gaussians that are nearly transparent."""
+"""Launches noise.cl, which moves the means of nearly transparent Gaussians."""
 
 from __future__ import annotations
 
@@ -7,33 +7,35 @@ from math import inf, log
 
 import numpy as np
 
-from clsplat.config.exploring import Exploration
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.device_gaussians import DeviceGaussians
 
-REACH = 0.16
-"""Opacity over that of the dead from which on no noise is added: there it is less than 1.2e-7 of what the dead get."""
+NOISE_OPACITY_RANGE = 0.16
+"""Opacity above `dead` from which no noise is added: there it is less than 1.2e-7 of the noise of dead Gaussians."""
 
 
 def highest_logit(dead: float) -> float:
-    """Logit of the opacity from which on no noise is added."""
-    highest = dead + REACH
+    """Logit of the opacity from which no noise is added."""
+    highest = dead + NOISE_OPACITY_RANGE
     return log(highest / (1 - highest)) if highest < 1 else inf
 
 
-@stage("noise")
+@stage("noise", add_noise=1)
 def noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
-    """Add a step's noise to the means of these Gaussians, of which the first is `first_row` of the model; none after a
-    pass that has stopped, by `readback`."""
+    """Add a step's noise to the means of these Gaussians; none after a pass that has stopped, by `readback`.
+
+    first_row: row of their first in the model.
+    """
     if explore.amount == 0:
         return
-    highest, limit2 = min(highest_logit(explore.dead), 1e30), GROUPS["means"].limit ** 2
+    highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(
         device,
         device.kernels("noise", LANES=1).add_noise,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches pixels.cl: images between the planes of blending and arrays with a pixel's values side by side."""
+"""Launches pixels.cl: conversion between blending's planes and arrays with interleaved pixel values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clsplat.stages.device_camera import padded_size
 
 @stage("pixels")
 def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, alpha: DeviceArray) -> None:
-    """Fill the first three values, or as many as there are, of pixels (height, width, depth); alpha (height, width)."""
+    """Fill up to three leading values of pixels (height, width, depth), and alpha (height, width)."""
     height, width, depth = pixels.shape
     kernel, stride = device.kernels("pixels").pixels_from_planes, blended.transmittance.shape[1]
     planes = (blended.image, blended.transmittance)
@@ -24,8 +24,11 @@ def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, al
 def planes_from_pixels(
     device: Device, work: Workspace, d_pixels: DeviceArray, d_alpha: DeviceArray | None = None
 ) -> DeviceArray:
-    """The image gradient (3, rows, stride) of `blend_grad` from d_pixels (height, width, depth), depth 1 to 3; with
-    d_alpha (height, width) a fourth plane by the transmittance. The padding is not written."""
+    """The image gradient (3, rows, stride) of `blend_grad` from d_pixels (height, width, depth), depth 1 to 3.
+
+    d_alpha: (height, width), gives a fourth plane, the gradient by the transmittance.
+    The padding is not written.
+    """
     height, width, depth = d_pixels.shape
     rows, stride = padded_size(width, height)
     given = [] if d_alpha is None else [d_alpha]

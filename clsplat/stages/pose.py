@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches pose.cl: the gradient by the pose and the lens of the camera that a step's view has."""
+"""Launches pose.cl: the gradient by the pose and the lens of a training view's camera."""
 
 from __future__ import annotations
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
-from clsplat.device.layout import POSE_ROWS
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import POSE_ROWS
 from clsplat.stages.device_gaussians import DeviceGaussians
 
-POSE, LENS = 6, 4
-"""Numbers of a pose: a turn and a shift; and of a lens: logs of its focal lengths, and its principal point."""
+POSE_NUMBERS, LENS_NUMBERS = 6, 4
+"""Parameters of a pose: a rotation and a translation; and of a lens: logs of its focal lengths, and its principal
+point."""
 
 
-def sums_of(work: Workspace, count: int, numbers: int = POSE) -> DeviceArray:
-    """Room for the sums of `count` Gaussians by a pose or by a lens: `pose_rows` or `lens_rows` fills it, with one row
-    for each POSE_ROWS of them."""
+def sums_of(work: Workspace, count: int, numbers: int = POSE_NUMBERS) -> DeviceArray:
+    """Allocate the partial sums of `count` Gaussians by a pose or a lens, one row for each POSE_ROWS Gaussians.
+
+    `pose_rows` or `lens_rows` fills them.
+    """
     return work.array(f"rows_of_{numbers}", (-(-count // POSE_ROWS), numbers))
 
 
@@ -30,8 +33,11 @@ def pose_rows(
     sums: DeviceArray,
     first_row: int = 0,
 ) -> None:
-    """Add up what the gradients of these Gaussians say of the camera, in `sums` (ceil(n / POSE_ROWS), 6) of a model in
-    which `first_row` is their first, a multiple of POSE_ROWS. device: with the switches of the camera's projection."""
+    """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
+
+    device: with the switches of the camera's projection.
+    first_row: row of the first of them in the model, a multiple of POSE_ROWS.
+    """
     launch_items(
         device,
         device.kernels("pose", LANES=1).pose_rows,
@@ -51,7 +57,7 @@ def pose_rows(
 def lens_rows(
     device: Device, tile_counts: DeviceArray, by_lens: DeviceArray, sums: DeviceArray, first_row: int = 0
 ) -> None:
-    """The same of these Gaussians' own gradients (n, LENS) by the lens (`project_grad`), in `sums`."""
+    """Sum the lens gradients (n, LENS_NUMBERS) of these Gaussians (`project_grad`) into `sums`, like `pose_rows`."""
     (n,) = tile_counts.shape
     kernel = device.kernels("pose", LANES=1).lens_rows
     launch_items(device, kernel, -(-n // POSE_ROWS), n, first_row // POSE_ROWS, tile_counts, by_lens, sums)
@@ -59,8 +65,10 @@ def lens_rows(
 
 @stage("pose")
 def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
-    """The sum (1, numbers) of all sums (m, numbers): by the turn and the shift of `Camera.moved`, or by ln fx, ln fy,
-    cx and cy."""
+    """The total (1, numbers) of the partial sums (m, numbers).
+
+    It is by the rotation and translation of `Camera.moved`, or by ln fx, ln fy, cx and cy.
+    """
     kernel, numbers, level = device.kernels("pose", LANES=1).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:
         level += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches ppisp.cl: a photograph's gains and mixes of colours, its lens's vignette, and the gradient by them."""
+"""Launches ppisp.cl: a photograph's gains and colour mixes, its lens's vignette, and the gradient by them."""
 
 from __future__ import annotations
 
@@ -8,20 +8,24 @@ from dataclasses import dataclass
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
-from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import TILE
 from clsplat.stages.appearance import Gains
 
-COLOURS, VIGNETTE = 9, 3
-"""Entries of a photograph, three gains and six mixes; those of a lens."""
-PIXEL_BYTES = 8
-"""Bytes of each pixel with its padding: its share of the partial sums."""
+COLOUR_ENTRIES, VIGNETTE_ENTRIES = 9, 3
+"""Entries of a photograph, three gains and six mixes; entries of a lens."""
+PPISP_PIXEL_BYTES = 8
+"""Bytes of the partial sums, per pixel with padding."""
 
 
 @dataclass(frozen=True)
-class Taken:
-    """How a photograph was taken. photograph, lens: their rows; centre: the principal point, in parts of the picture's
-    width and height; flat: False for a panorama, which has no vignette."""
+class PhotoLens:
+    """How a photograph was taken.
+
+    photograph, lens: their rows.
+    centre: the principal point, as fractions of the image's width and height.
+    flat: False for a panorama, which has no vignette.
+    """
 
     photograph: int
     lens: int
@@ -29,17 +33,22 @@ class Taken:
     flat: bool = True
 
     def place(self, width: int, height: int) -> tuple[float, float, float]:
-        """The principal point in pixels, and one over the square of half the picture's diagonal, or 0."""
+        """The principal point in pixels, and one over the square of half the image's diagonal, or 0 for a panorama."""
         scale = 4 / (width**2 + height**2) if self.flat else 0.0
         return self.centre[0] * width, self.centre[1] * height, scale
 
 
-@stage("appearance")
+@stage("appearance", develop=1)
 def develop(
-    device: Device, colours: Gains, vignettes: Gains, taken: Taken, target: DeviceArray, width: int, height: int
+    device: Device, colours: Gains, vignettes: Gains, taken: PhotoLens, target: DeviceArray, width: int, height: int
 ) -> None:
-    """Take gains, mixes and vignette from planes (3 or more, rows, stride) of a photograph of width x height pixels, of
-    which three are colours. colours: (photographs, COLOURS); vignettes: (lenses, VIGNETTE)."""
+    """Remove gains, mixes and vignette from the planes (3 or more, rows, stride) of a photograph, width x height
+    pixels.
+
+    colours: (photographs, COLOUR_ENTRIES).
+    vignettes: (lenses, VIGNETTE_ENTRIES).
+    target: its first three planes are colours.
+    """
     _, rows, stride = target.shape
     kernel = device.kernels("ppisp").develop
     of_view = (taken.photograph, taken.lens, stride, rows * stride, *taken.place(width, height))
@@ -59,17 +68,20 @@ def develop(
 def camera_gradient(
     device: Device,
     work: Workspace,
-    taken: Taken,
+    taken: PhotoLens,
     image: DeviceArray,
     gradient: DeviceArray,
     width: int,
     height: int,
     place: int = 0,
 ) -> DeviceArray:
-    """Sums (COLOURS + VIGNETTE, stride), those of each `place` in a batch in an array of their own: their sums over x
-    are the gradients by the entries, over ln 2 but for the mixes."""
+    """Column sums (COLOUR_ENTRIES + VIGNETTE_ENTRIES, stride) of the gradient; each `place` in a batch has its own
+    array.
+
+    Their sums over x are the gradients by the entries, divided by ln 2 except for the mixes.
+    """
     _, rows, stride = image.shape
-    down, sums = rows // TILE, COLOURS + VIGNETTE
+    down, sums = rows // TILE, COLOUR_ENTRIES + VIGNETTE_ENTRIES
     partials = work.array("appearance_partials", (sums, down, stride))
     columns = work.array(f"appearance_columns_{place}", (sums, stride))
     sizes = (height, stride, rows * stride, down, *taken.place(width, height))

@@ -10,44 +10,48 @@ from typing import NamedTuple
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.exploring import Exploration
-from clsplat.config.thinning import Thinning
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.command_buffer import AnewWord, LaunchParameter
 from clsplat.device.context import Device
-from clsplat.device.launch import LOCAL, launch_groups, launch_items
-from clsplat.device.layout import PLAIN_SLOTS, SPLAT, SlotFields
+from clsplat.device.launch import DEFAULT_GROUP_ITEMS, launch_groups, launch_items
 from clsplat.device.profile import stage
-from clsplat.device.tape import Anew, AnewWord
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
+from clsplat.optimisation.dropout import Thinning
+from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.adam import corrected, updates_sh_rest
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
-ROWS = 128
-"""Gaussians of a group of `project_step` on a CPU: their gradients, 30 KiB, stay in its cache, and an array's part of
-them is long enough for a processor to fetch ahead. In groups of one vector of lanes a step takes 1.5 times as long."""
+CPU_STEP_ROWS = 128
+"""Gaussians of a `project_step` group on a CPU. Their gradients, 30 KiB, stay in its cache, and each array's part is
+long enough for the processor to prefetch. In groups of one vector of lanes a step takes 1.5 times as long."""
 
-SCREEN_BYTES = 8
-"""Bytes of each Gaussian's gradient on the image; 4 more where contributions are kept."""
+SCREEN_GRADIENT_BYTES = 8
+"""Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
 
 
 def gaussian_bytes(*, keeps_culled: bool) -> int:
-    """Bytes of each Gaussian: splat and count of tiles; where culling is switched off also `shown`."""
+    """Bytes per Gaussian: splat and tile count; `shown` too if culling is switched off."""
     return 4 * (len(SPLAT) + 1 + keeps_culled)
 
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """splats (n, SPLAT), tile_counts (n): 0 where culled; shown (n): 0 where there is no splat, if that is another
-    thing because culling is switched off."""
+    """Projected Gaussians.
+
+    splats: (n, SPLAT).
+    tile_counts: (n), 0 where culled.
+    shown: (n), 0 where there is no splat; given only if culling is switched off, as it then differs from tile_counts.
+    """
 
     splats: DeviceArray
     tile_counts: DeviceArray
     shown: DeviceArray | None = None
 
     def rows(self, start: int, stop: int) -> Projected:
-        """The projected Gaussians from start to before stop."""
+        """The projected Gaussians [start, stop)."""
         if (start, stop) == (0, self.tile_counts.shape[0]):
             return self
         shown = None if self.shown is None else self.shown.rows(start, stop)
@@ -55,10 +59,10 @@ class Projected:
 
 
 def thinning_numbers(thinning: Thinning | None) -> tuple[float, ...]:
-    """Numbers of `project` that are of the step."""
+    """Arguments of `project` that change with the step."""
     if thinning is None:
         return ()
-    return (*map(AnewWord, (*thinning.key, thinning.threshold)), Anew(thinning.factor))
+    return (*map(AnewWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
 
 
 @stage("project")
@@ -70,13 +74,15 @@ def project(
     camera_array: DeviceArray,
     thinning: Thinning | None = None,
 ) -> Projected:
-    """Project all Gaussians (Kerbl et al. 2023, section 4) but those that thinning leaves out, and count the tiles that
-    each reaches."""
+    """Project all Gaussians (Kerbl et al. 2023, section 4), except the ones that thinning drops.
+
+    It also counts the tiles that each Gaussian reaches.
+    """
     n = gaussians.count
     splats = work.array("splats", (n, len(SPLAT)))
     tile_counts = work.array("tile_counts", (n,), np.uint32)
     rays = device.switched("RAYS")
-    keeps_culled = not rays and device.switched("NO_FRUSTUM_CULL", "NO_OPACITY_CULL")
+    keeps_culled = not rays and device.switched("NO_FRUSTUM_CULL")
     projected = Projected(splats, tile_counts, work.array("shown", (n,), np.uint32) if keeps_culled else None)
     for start, stop, (part,) in parts(work, gaussians):
         out = projected.rows(start, stop)
@@ -99,7 +105,7 @@ def project(
             part.coefficients,
             *((camera.width, camera.height) if rays else tiles_of(camera)),
             camera_array,
-            *(part[group] for group in GROUPS),
+            *(part[group] for group in PARAMETER_GROUPS),
             out.splats,
             out.tile_counts,
             *(() if out.shown is None else (out.shown,)),
@@ -111,14 +117,17 @@ def project(
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """values (pairs, SlotFields.floats), where those of Gaussian i begin at first_slots[i]; without first_slots they
-    are added up already: (n, SlotFields.floats)."""
+    """Partial gradients of the pairs.
+
+    values: (pairs, SlotFields.floats), or (n, SlotFields.floats) if already summed by Gaussian.
+    first_slots: (n), where each Gaussian's slots begin; None if already summed.
+    """
 
     values: DeviceArray
     first_slots: DeviceArray | None = None
 
     def rows(self, start: int, stop: int) -> Slots:
-        """The slots of the Gaussians from start to before stop."""
+        """The slots of the Gaussians [start, stop)."""
         if self.first_slots is None:
             return Slots(self.values.rows(start, stop))
         return Slots(self.values, self.first_slots.rows(start, stop))
@@ -126,14 +135,17 @@ class Slots:
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """Results on the image of one view, in rows of the visible: gradients (n, 2) of the means on the image, in pixels;
-    contributions (n,), the sums of blending weights over the image's pixels, or None."""
+    """Screen-space results of one view; only rows of visible Gaussians are written.
+
+    gradients: (n, 2), by the means on the image, in pixels.
+    contributions: (n,), sums of the blending weights over the image's pixels, or None.
+    """
 
     gradients: DeviceArray
     contributions: DeviceArray | None = None
 
 
-@stage("project_grad")
+@stage("project_grad", add_slots=1)
 def add_slots(
     device: Device,
     work: Workspace,
@@ -143,7 +155,8 @@ def add_slots(
     *,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
-    """Add one band's slots to the sums by Gaussian (n, floats), which begin as None; bands have to come in order."""
+    """Add one band's slots to the sums by Gaussian (n, floats). Bands must come in order; `sums` is None for the
+    first."""
     (n,) = tile_counts.shape
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
@@ -168,9 +181,13 @@ def project_grad(
     explore: Exploration | None = None,
     by_lens: DeviceArray | None = None,
 ) -> None:
-    """Fill the visible Gaussians' rows of `gradients` (of sh_rest if asked for) and `screen` from the pairs' slots,
-    which have `fields`; explore: its penalties are added; by_lens (n, 4): gets what each says of the lens of a flat
-    camera."""
+    """Fill the visible Gaussians' rows of `gradients` and `screen` from the pairs' slots.
+
+    fields: the fields of the slots.
+    sh_rest: also compute the higher SH bands.
+    explore: its penalties are added.
+    by_lens: (n, 4), receives each Gaussian's gradient by the lens of a flat camera.
+    """
     weights, build = penalty_weights(explore), _build(device)
     defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **build.defines}
     defines |= {"PENALTIES": True} if weights else {}
@@ -181,7 +198,7 @@ def project_grad(
         device.kernels("project_grad", **defines).project_grad,
         -(-n // build.lanes) if slots.values.shape[0] else 0,
         *_inputs(gaussians, camera_array, projected, slots),
-        *(model[group] for model in (gaussians, gradients) for group in GROUPS),
+        *(model[group] for model in (gaussians, gradients) for group in PARAMETER_GROUPS),
         screen.gradients,
         *([screen.contributions] if fields.contributions else []),
         *([] if by_lens is None else [by_lens]),
@@ -192,19 +209,19 @@ def project_grad(
 def step_numbers(
     config: OptimiserConfig, step: int, rates: Mapping[str, float], explore: Exploration | None
 ) -> tuple[float, ...]:
-    """Numbers of `project_step` that are of the step: weights of penalties, two roots of Adam's, and the rate of each
-    group."""
+    """Arguments of `project_step` that change with the step: penalty weights, two roots of Adam, and each group's
+    rate."""
     by_group = {
         group: (0.0, 0.0)
         if group == "sh_rest" and not updates_sh_rest(config, step)
         else corrected(config, step, group, rates[group])
-        for group in GROUPS
+        for group in PARAMETER_GROUPS
     }
     roots = by_group["means"][1], by_group["sh_rest"][1]
     return (*penalty_weights(explore), *roots, *(rate for rate, _ in by_group.values()))
 
 
-@stage("project_grad")
+@stage("project_grad", project_step=18)
 def project_step(
     device: Device,
     step: int,
@@ -220,14 +237,16 @@ def project_step(
     fields: SlotFields = PLAIN_SLOTS,
     explore: Exploration | None = None,
 ) -> None:
-    """`project_grad` and with it `stages.adam.adam`, of the model (parameters, first and second moments), and no
-    gradients in memory. Arguments are those of the two."""
+    """`project_grad` and `stages.adam.adam` in one kernel, without gradients in memory.
+
+    model: parameters, first and second moments. The two functions document the other arguments.
+    """
     parameters = model[0]
     sh_rest = updates_sh_rest(config, step)
     defines = {**_defines(parameters, slots, fields, sh_rest=sh_rest), "ADAM": True}
     if config.sparse:
         defines["SPARSE"] = True
-    numbers = [Anew(number) for number in step_numbers(config, step, rates, explore)]
+    numbers = [LaunchParameter(number) for number in step_numbers(config, step, rates, explore)]
     weights = len(penalty_weights(explore))
     if weights:
         defines["PENALTIES"] = True
@@ -238,34 +257,34 @@ def project_step(
         *numbers[:weights],
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
-        *(GROUPS["means"].limit ** 2, GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # no array that a step goes through: it is touched where something is wrong
-        *(arrays[group] for arrays in model for group in GROUPS),
+        *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
+        readback.buffer,  # a raw buffer, not an array that each step processes: it is touched only on a fault
+        *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
     )
     build = _build(device)
     defines |= build.defines
     if build.lanes > 1:
-        kernel = device.kernels("project_grad", ROWS=ROWS, **defines).project_step
-        launch_groups(device, kernel, -(-parameters.count // ROWS), 1, *arguments)
+        kernel = device.kernels("project_grad", ROWS=CPU_STEP_ROWS, **defines).project_step
+        launch_groups(device, kernel, -(-parameters.count // CPU_STEP_ROWS), 1, *arguments)
     else:
-        kernel = device.kernels("project_grad", ROWS=LOCAL, **defines).project_step
+        kernel = device.kernels("project_grad", ROWS=DEFAULT_GROUP_ITEMS, **defines).project_step
         launch_items(device, kernel, parameters.count, *arguments)
 
 
 def penalty_weights(explore: Exploration | None) -> tuple[float, ...]:
-    """Weights of the penalties on opacity and scale, none where there are none."""
+    """Weights of the penalties on opacity and scale; empty without penalties."""
     return (explore.opacity, explore.scale) if explore is not None and explore.penalised else ()
 
 
 class _Build(NamedTuple):
-    """Gaussians of a work-item of the gradient, and defines where these are not the shape's."""
+    """Gaussians per work-item of the gradient, and defines if this differs from the kernel shape."""
 
     lanes: int
     defines: dict[str, object]
 
 
 def _build(device: Device) -> _Build:
-    """Of rays one, as of their projection."""
+    """The build of the gradient: one Gaussian per work-item for rays, as in their projection."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 
@@ -278,6 +297,6 @@ def _inputs(
     gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
 ) -> tuple[object, ...]:
     """The first arguments of both kernels."""
-    first_slots = slots.first_slots or projected.tile_counts  # not looked at where they are added up
+    first_slots = slots.first_slots or projected.tile_counts  # unused if the slots are already summed
     counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
     return (gaussians.count, gaussians.coefficients, camera_array, *counts)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches ranges.cl: pairs sorted by tile, and where each tile's begin and end."""
+"""Launches ranges.cl: pairs sorted by tile, and the begin and end of each tile's pairs."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
 from clsplat.stages.duplicate import Band, Pairs
-from clsplat.stages.sort import SORT_BYTES, sort
+from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
-PAIR_BYTES = SORT_BYTES + 8
-"""Bytes of each pair: its sort by tile, and the two lists."""
-TILE_BYTES = 8
-"""Bytes of each tile: where its list begins and ends."""
+TILE_SORT_PAIR_BYTES = SORT_KEY_BYTES + 8
+"""Bytes per pair: its sort by tile, and the two lists."""
+RANGE_TILE_BYTES = 8
+"""Bytes per tile: the begin and end of its list."""
 
 
 @dataclass(frozen=True, eq=False)
 class TileLists:
-    """The lists of a band's tiles: ranges (tiles, 2), begin and end in gaussian_from_sorted and slot_from_sorted
-    (pairs)."""
+    """The lists of a band's tiles.
+
+    ranges: (tiles, 2), begin and end in gaussian_from_sorted and slot_from_sorted (pairs).
+    """
 
     band: Band
     ranges: DeviceArray
@@ -33,8 +35,10 @@ class TileLists:
 
 @stage("ranges")
 def tile_lists(device: Device, work: Workspace, pairs: Pairs, band: Band, *, all_bits: bool = False) -> TileLists:
-    """A stable sort by tile of pairs that are in order of depth: each tile's Gaussians front to back. By as many bits
-    as the tiles need, or with `all_bits` by 32."""
+    """Sort depth-ordered pairs by tile, stably, so that each tile's Gaussians are front to back.
+
+    The sort is by as many bits as the tiles need, or with `all_bits` by 32.
+    """
     count, elements = pairs.tile_keys.shape[0], pairs.elements
     bits = 32 if all_bits else max(band.tiles - 1, 1).bit_length()
     keys, pair_from_sorted = sort(device, work, "tile", pairs.tile_keys, bits, elements=elements)

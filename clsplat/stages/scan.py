@@ -12,19 +12,21 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 
-PER_ITEM = 16
-"""Elements of a chunk for each item of a group, or a multiple of it."""
-LEAST_CHUNK, MOST_ALONE = 1024, 1 << 14
-"""Elements of a chunk at least, where a group is one item, and up to how many are one chunk: they are done sooner than
-another launch begins."""
-MOST_GROUPS = 2048
-"""Groups of more than one item that share a scan or sort: each reads what all before it have counted."""
+CHUNK_ELEMENTS_PER_ITEM = 16
+"""Elements of a chunk per item of a group, or a multiple of it."""
+MIN_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS = 1024, 1 << 14
+"""For groups of one item: the fewest elements of a chunk, and the number up to which one chunk takes all. One chunk of
+that size is done sooner than another launch begins."""
+MAX_SCAN_GROUPS = 2048
+"""The most groups of more than one item that share a scan or sort: each reads the counts of all earlier groups."""
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """The number of elements that a kernel is for (kernels/shared/count.h): `most`, or with `counts` the number at
-    `place` there, which is not larger; a launch is for `most`."""
+    """The number of elements that a kernel processes (kernels/shared/count.h).
+
+    It is `most`, or with `counts` the number at `place` there, which must not be larger. Launches are sized for `most`.
+    """
 
     most: int
     counts: DeviceArray | None = None
@@ -32,7 +34,7 @@ class Elements:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """The kernel's arguments for it."""
+        """The kernel arguments for the number."""
         return (self.most,) if self.counts is None else (self.counts.buffer, self.place)
 
     @property
@@ -42,14 +44,16 @@ class Elements:
 
 
 def chunking(device: Device, n: int, items: int = 0) -> tuple[int, int]:
-    """(groups, chunk): how many groups share n elements, and how many each has. items: those of a group, if not the
-    shape's."""
+    """(groups, chunk): the number of groups that share n elements, and the elements of each.
+
+    items: work-items of a group, if different from the kernel shape.
+    """
     items = items or device.shape.items
     if items == 1:
-        chunk = max(-(-n // device.shape.chunks), LEAST_CHUNK) if n > MOST_ALONE else max(n, 1)
+        chunk = max(-(-n // device.shape.chunks), MIN_CHUNK_ELEMENTS) if n > MAX_SINGLE_CHUNK_ELEMENTS else max(n, 1)
     else:
-        tile = items * PER_ITEM
-        chunk = tile * max(-(-n // (tile * MOST_GROUPS)), 1)
+        tile = items * CHUNK_ELEMENTS_PER_ITEM
+        chunk = tile * max(-(-n // (tile * MAX_SCAN_GROUPS)), 1)
     return max(-(-n // chunk), 1), chunk
 
 
@@ -61,8 +65,10 @@ def scan(
     total: DeviceArray,
     elements: Elements | None = None,
 ) -> None:
-    """out[i] = sum of values[:i], total[0] = sum of all; one launch where one group is enough, else two. elements: the
-    values that count, if not all do."""
+    """Compute out[i] = sum of values[:i] and total[0] = sum of all, in one launch if one group is enough, else two.
+
+    elements: the number of values that count, if not all do.
+    """
     elements = elements or Elements(values.shape[0])
     groups, chunk = chunking(device, elements.most)
     sums = work.array("scan_sums", (groups,), np.uint32)

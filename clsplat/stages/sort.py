@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys that also give where each key came from."""
+"""Launches sort_radix.cl and sort_bitonic.cl: stable sorts of uint32 keys that also return each key's origin."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.stages.scan import Elements, chunking
 
-BITONIC_MAX = 2048
-"""Number of keys that, with their positions, fill 16 KiB of local memory: half of what every device has."""
+MAX_BITONIC_KEYS = 2048
+"""Number of keys that, with their positions, fill 16 KiB of local memory: half of every device's minimum."""
 
-BITONIC_WINS = {"cpu": 512, "gpu": 1024, "other": 1024}
-"""Up to this many keys bitonic sort beats the radix sort's launches."""
+BITONIC_KEYS_BY_KIND = {"cpu": 512, "gpu": 1024, "other": 1024}
+"""Number of keys up to which bitonic sort is faster than the launches of radix sort."""
 
 
-_SORTED = ("keys", "positions")
-SORT_BYTES = 16
-"""Bytes of each key that is sorted: keys and positions, each in two arrays that take turns."""
+_SORTED_ARRAYS = ("keys", "positions")
+SORT_KEY_BYTES = 16
+"""Bytes per sorted key: keys and positions, each in two alternating arrays."""
 
-WIDE_DIGIT, WIDE_FROM = 13, 1 << 17
-"""Bits of a wide digit, and the number of keys from which it is used, where a group is one item. Its counters fill the
-32 KiB of local memory, and fewer passes save more than the larger histograms cost. An item that sorts alone has one
+WIDE_DIGIT_BITS, MIN_WIDE_DIGIT_KEYS = 13, 1 << 17
+"""Bits of a wide digit, and the number of keys from which it is used, for groups of one item. Its counters fill the 32
+KiB of local memory, and fewer passes save more than the larger histograms cost. An item that sorts alone has one
 histogram, and always uses it."""
 
 
 def _widest_digit(device: Device, n: int) -> int:
-    return WIDE_DIGIT if device.shape.items == 1 and n >= WIDE_FROM else device.shape.digit_bits
+    return WIDE_DIGIT_BITS if device.shape.items == 1 and n >= MIN_WIDE_DIGIT_KEYS else device.shape.digit_bits
 
 
 def scratch_bytes(device: Device, n: int) -> int:
-    """Upper bound of the bytes that sorts and scans of up to `n` elements need, beside the arrays under their names."""
+    """Upper bound of the scratch bytes for sorts and scans of up to `n` elements, except for the named arrays."""
     groups = max(chunking(device, n, device.shape.sort_items)[0], device.shape.chunks)
     return 4 * (1 << _widest_digit(device, n)) * (groups + 1) + 8 * groups  # histograms, totals; sums of scans
 
@@ -47,22 +47,25 @@ def radix_sort(
     base: int = 0,
     elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the lowest `bits` of the keys less `base`; (sorted keys, positions), in workspace arrays under `name`.
-    elements: the keys that count, if not all do.
+    """Sort by the lowest `bits` of the keys less `base`; return (sorted keys, positions) in workspace arrays under
+    `name`.
 
-    As few passes as the widest digit allows, and their digits of even width.
+    elements: the number of keys that count, if not all do.
+
+    It uses as few passes as the widest digit allows, with digits of equal width.
     """
     n, items = keys.shape[0], device.shape.sort_items
     elements = elements or Elements(n)
     groups, chunk = chunking(device, n, items)
     kernels = device.kernels("sort_radix", ITEMS=items, **elements.defines)
     alone = groups == items == 1
-    passes = max(-(-bits // (WIDE_DIGIT if alone else _widest_digit(device, n))), 1)
+    passes = max(-(-bits // (WIDE_DIGIT_BITS if alone else _widest_digit(device, n))), 1)
     digit_bits = -(-bits // passes) or 1
     digits = 1 << digit_bits
     counters = cl.LocalMemory(4 * digits)
     turns = [
-        [work.array(f"{name}_{kind}{turn}", (n,), np.uint32) for kind in _SORTED] for turn in range(min(passes, 2))
+        [work.array(f"{name}_{kind}{turn}", (n,), np.uint32) for kind in _SORTED_ARRAYS]
+        for turn in range(min(passes, 2))
     ]
     if alone:
         numbers = (*elements.arguments, base, digit_bits, passes)
@@ -88,11 +91,13 @@ def radix_sort(
 def bitonic_sort(
     device: Device, work: Workspace, name: str, keys: DeviceArray, elements: Elements | None = None
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort at most BITONIC_MAX keys in one launch; (sorted keys, positions). elements: the keys that count, if not all
-    do."""
+    """Sort at most MAX_BITONIC_KEYS keys in one launch; return (sorted keys, positions).
+
+    elements: the number of keys that count, if not all do.
+    """
     n = keys.shape[0]
-    if n > BITONIC_MAX:
-        raise ValueError(f"{n} keys: bitonic_sort takes at most {BITONIC_MAX}")
+    if n > MAX_BITONIC_KEYS:
+        raise ValueError(f"{n} keys: bitonic_sort takes at most {MAX_BITONIC_KEYS}")
     elements = elements or Elements(n)
     padded = 1 << max(n - 1, 0).bit_length()
     keys_out = work.array(f"{name}_keys0", (n,), np.uint32)
@@ -113,8 +118,12 @@ def sort(
     base: int = 0,
     elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the quicker of the two for this number of keys; `bits`: number of low bits of the keys less `base` that
-    can be set; `base`: no larger than any key; elements: the keys that count, if not all do."""
-    if keys.shape[0] <= BITONIC_WINS[device.kind]:
+    """Sort by the faster of the two sorts for this number of keys.
+
+    bits: number of low bits that can be set in a key less `base`.
+    base: not larger than any key.
+    elements: the number of keys that count, if not all do.
+    """
+    if keys.shape[0] <= BITONIC_KEYS_BY_KIND[device.kind]:
         return bitonic_sort(device, work, name, keys, elements)
     return radix_sort(device, work, name, keys, bits, base, elements)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches splats.cl and splats_grad.cl: projected Gaussians that come as arrays, and the gradient back to them."""
+"""Launches splats.cl and splats_grad.cl: projected Gaussians given as arrays, and the gradient back to them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,27 @@ import numpy as np
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
-from clsplat.device.layout import PLAIN_SLOTS, SLOT, SPLAT, TILE, SlotFields
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import PLAIN_SLOTS, SLOT, SPLAT, TILE, SlotFields
 from clsplat.stages.project import Projected, Slots
 
-COLOURS = 3
-"""Values that a splat has, and blend.cl blends."""
-MOMENTS = SLOT.index("RED")
+SPLAT_VALUES = 3
+"""Values in a splat, which blend.cl blends."""
+SLOT_MOMENT_FIELDS = SLOT.index("RED")
 """Fields of a slot before the gradients by values."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScreenGaussians:
-    """Projected Gaussians as arrays: radii (n, 2) int32 in pixels, one of which is 0 where a Gaussian is culled;
-    means2d (n, 2) in pixels; conics (n, 3), the inverse covariance's a, b and c; opacities (n,) in [0, 1]; depths (n,);
-    values (n, width), of which the first three are the splat's colour."""
+    """Projected Gaussians as arrays.
+
+    radii: (n, 2) int32 in pixels; one of them is 0 if a Gaussian is culled.
+    means2d: (n, 2) in pixels.
+    conics: (n, 3), a, b and c of the inverse covariance.
+    opacities: (n,) in [0, 1].
+    depths: (n,).
+    values: (n, width); the first three are the splat's colour.
+    """
 
     radii: DeviceArray
     means2d: DeviceArray
@@ -40,14 +46,16 @@ class ScreenGaussians:
 
     @property
     def width(self) -> int:
-        """Values of a Gaussian."""
+        """Values per Gaussian."""
         return self.values.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
 class ScreenGradients:
-    """Gradients by the arrays of `ScreenGaussians`: means2d (n, 2), conics (n, 3), opacities (n,), values (n, width);
-    absolute (n, 2) of means2d, or None where it is not wanted."""
+    """Gradients by the arrays of `ScreenGaussians`: means2d (n, 2), conics (n, 3), opacities (n,), values (n, width).
+
+    absolute: (n, 2), the absolute gradients by means2d, or None if not requested.
+    """
 
     means2d: DeviceArray
     conics: DeviceArray
@@ -60,8 +68,10 @@ class ScreenGradients:
 def splats(
     device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int, *, listed: bool = False
 ) -> Projected:
-    """Splats, and the tiles that each reaches, of an image of width x height pixels; listed: of all Gaussians, as
-    their lists are given, and may have any."""
+    """Compute splats and tile counts for an image of width x height pixels.
+
+    listed: make a splat for every Gaussian, as the caller's tile lists may name any.
+    """
     n = gaussians.count
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))
     launch_items(
@@ -91,11 +101,14 @@ def splats_grad(
     slots: Slots,
     gradients: ScreenGradients,
     *,
-    kept: int = COLOURS,
+    kept: int = SPLAT_VALUES,
     fields: SlotFields = PLAIN_SLOTS,
 ) -> None:
-    """Fill every row of the gradients from the pairs' slots, those by the first values of `kept`, which the slots
-    have. fields: of the slots, which may have absolute gradients."""
+    """Fill every row of the gradients from the pairs' slots.
+
+    kept: number of leading values whose gradients the slots hold.
+    fields: fields of the slots, which may include absolute gradients.
+    """
     assert slots.first_slots is not None, "there are no bands here"
     n, width = gradients.values.shape
     defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **fields.defines}
@@ -122,7 +135,7 @@ def splats_grad(
 def add_values(
     device: Device, projected: Projected, slots: Slots, d_values: DeviceArray, first: int, count: int
 ) -> None:
-    """Fill `count` columns of d_values (n, width) from `first` on with the sums of slots (pairs, count)."""
+    """Fill `count` columns of d_values (n, width), beginning at `first`, with the sums of slots (pairs, count)."""
     n, width = d_values.shape
     kernel = device.kernels("splats_grad", LANES=1, VALUES=count).add_values
     counts = (projected.tile_counts, slots.first_slots)

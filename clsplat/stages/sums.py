@@ -6,21 +6,20 @@ from __future__ import annotations
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
-from clsplat.device.layout import SUM_ROWS
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import SUM_ROWS
 
 
 def padded(count: int) -> int:
-    """Columns of an array that `row_sums` adds up: those of `count` numbers, in whole blocks. The rest has to be
-    zero."""
+    """Columns that `row_sums` needs for `count` numbers: whole blocks, padded with zeros."""
     return -(-count // SUM_ROWS) * SUM_ROWS
 
 
 @stage("sums")
 def row_sums(device: Device, work: Workspace, name: str, parts: DeviceArray) -> DeviceArray:
-    """The sum of each row of `parts` (rows, columns), float32, as (rows,), in arrays of the workspace under `name`.
+    """The sum of each row of `parts` (rows, columns), float32, as (rows,), in workspace arrays under `name`.
 
-    columns: `padded` of a number; the sums of no columns are 0.
+    columns: a result of `padded`; the sums of no columns are 0.
     """
     rows, columns = parts.shape
     kernel, level = device.kernels("sums").row_sums, 0

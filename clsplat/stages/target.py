@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches target.cl: a photograph into the blend's layout."""
+"""Launches target.cl: a photograph in the layout of blending."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
-from clsplat.device.layout import TILE
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import TILE
 from clsplat.stages.blend import Blended
 from clsplat.stages.device_camera import padded_size
 
-SOURCE_BYTES = 16
-"""Bytes of each pixel of a photograph: at most RGBA in floats."""
-MASK_BYTES = 4
-"""Bytes of each pixel of a photograph's mask, at most."""
-PIXEL_BYTES = 12 + SOURCE_BYTES
-"""Bytes of each pixel with its padding: three planes, and the photograph."""
+SOURCE_PIXEL_BYTES = 16
+"""Bytes per pixel of a photograph: at most RGBA in floats."""
+MASK_PIXEL_BYTES = 4
+"""The most bytes per pixel of a photograph's mask."""
+TARGET_PIXEL_BYTES = 12 + SOURCE_PIXEL_BYTES
+"""Bytes per pixel with padding: three planes, and the photograph."""
 
 
 @stage("target")
@@ -34,12 +34,14 @@ def target(
     *,
     alpha: bool = False,
 ) -> DeviceArray:
-    """image (H, W, 3 to 5), uint8 or float32, straight alpha -> planes (3, rows, stride) over the background, with
-    `alpha` a fourth of the alpha.
+    """Convert image (H, W, 3 to 5), uint8 or float32 with straight alpha, to planes (3, rows, stride) over the
+    background.
 
-    A fifth channel is a mask, 0 where a pixel does not count. Such pixels are zero in the planes, and in the blended
-    image, and the gradient of blending passes them: the render is changed.
-    An image on the host goes up without waiting: it must not change before the device is waited for.
+    alpha: add a fourth plane, the alpha.
+
+    A fifth channel is a mask, 0 where a pixel does not count. Such pixels become zero in the planes and also in the
+    blended image, and the gradient of blending skips them: this changes the render. An image on the host is uploaded
+    without waiting: it must not change until the host has waited for the device.
     """
     if isinstance(image, DeviceArray):
         device.under_way.append(image.buffer)  # it may be the host's memory

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches values.cl and values_grad.cl: any number of values a Gaussian, blended with the weights of an image."""
+"""Launches values.cl and values_grad.cl: any number of values per Gaussian, blended with the weights of an image."""
 
 from __future__ import annotations
 
@@ -8,43 +8,42 @@ from dataclasses import dataclass
 
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
-from clsplat.device.layout import PLAIN_SLOTS, TILE, SlotFields
 from clsplat.device.profile import stage
+from clsplat.layouts.columns import PLAIN_SLOTS, TILE, SlotFields
 from clsplat.stages.blend import Blended, launch_tiles, tile_items
 from clsplat.stages.project import Projected, Slots
 from clsplat.stages.ranges import TileLists
-from clsplat.stages.splats import COLOURS, MOMENTS, ScreenGradients, add_values, splats_grad
+from clsplat.stages.splats import SLOT_MOMENT_FIELDS, SPLAT_VALUES, ScreenGradients, add_values, splats_grad
 
-MOST = 32
-"""Values of a pass. Where a work-item is a lane they are registers, and of fewer."""
-_REGISTERS = 64
-"""Sums that an item of a group has at most in the forward pass: of its pixels' values."""
-_LOCAL = 2048
-"""Values of a pass times items of a group in the gradient: what their sums take of local memory."""
+MAX_VALUES_PER_PASS = 32
+"""Values per pass if a work-item is a lane. Otherwise they are in registers, and there are fewer."""
+_MAX_REGISTER_SUMS = 64
+"""The most sums of a work-item in a group's forward pass: the values of its pixels."""
+_MAX_LOCAL_SUMS = 2048
+"""Values per pass times items per group in the gradient, limited by the local memory of their sums."""
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:
-    """(first, count) of each pass over the values from `first` to before `depth`."""
+    """(first, count) of each pass over the values [first, depth)."""
     for begin in range(first, depth, most):
         yield begin, min(most, depth - begin)
 
 
 def most_values(device: Device) -> int:
-    """Values of a forward pass."""
+    """Values per forward pass."""
     items = tile_items(device)
-    return MOST if items == 1 else min(max(_REGISTERS * items // (TILE * TILE), 2), 16)
+    return MAX_VALUES_PER_PASS if items == 1 else min(max(_MAX_REGISTER_SUMS * items // (TILE * TILE), 2), 16)
 
 
 def most_gradients(device: Device) -> int:
-    """Values of a pass of the gradient."""
+    """Values per pass of the gradient."""
     items = tile_items(device)
-    return MOST if items == 1 else min(_LOCAL // items, 16)
+    return MAX_VALUES_PER_PASS if items == 1 else min(_MAX_LOCAL_SUMS // items, 16)
 
 
 @dataclass(frozen=True, eq=False)
 class ValuePass:
-    """Values (n, depth) of Gaussians in an image: its lists, splats and blending, of all Gaussians; and what is behind,
-    background (depth,)."""
+    """Values (n, depth) of all Gaussians in an image, its lists, splats and blending, and the background (depth,)."""
 
     lists: TileLists
     projected: Projected
@@ -54,9 +53,11 @@ class ValuePass:
 
 
 @stage("values")
-def values(device: Device, of: ValuePass, pixels: DeviceArray, *, first: int = COLOURS) -> None:
-    """Blend the values from `first` on over the background, with the weights of the image, into pixels (height, width,
-    depth)."""
+def values(device: Device, of: ValuePass, pixels: DeviceArray, *, first: int = SPLAT_VALUES) -> None:
+    """Blend the values from index `first` over the background, with the weights of the image.
+
+    pixels: (height, width, depth), receives them.
+    """
     height, width, depth = pixels.shape
     lists, cells = of.lists, of.blended.cells_from_sorted
     rows = (of.projected.splats, of.values, of.background, of.blended.stops, pixels)
@@ -80,8 +81,8 @@ def values_grad(
 ) -> None:
     """Fill every row of the gradients from d_pixels (height, width, depth) and d_alpha (height, width).
 
-    first_slots (n,): where each Gaussian's pairs begin; fields: with absolute gradients, if `gradients` has room for
-    them.
+    first_slots: (n,), where each Gaussian's pairs begin.
+    fields: includes absolute gradients if `gradients` has room for them.
     """
     height, width, depth = d_pixels.shape
     lists, cells, most = of.lists, of.blended.cells_from_sorted, most_gradients(device)
@@ -92,7 +93,7 @@ def values_grad(
     for first, count in passes(0, depth, most):
         geometry = first == 0
         own = {"GEOMETRY": True, **fields.defines} if geometry else {}
-        slots = work.array("slots", (pairs, count + (MOMENTS + 2 * fields.absolute if geometry else 0)))
+        slots = work.array("slots", (pairs, count + (SLOT_MOMENT_FIELDS + 2 * fields.absolute if geometry else 0)))
         defines = {"VALUES": count, **({"RECORD_CELLS": True} if cells else {}), **own}
         arrays = (*listed, *planes, slots, *([cells] if cells else []))
         if pairs:
@@ -106,7 +107,7 @@ def values_grad(
 def _gradient_by_cell(
     device: Device, work: Workspace, of: ValuePass, d_pixels: DeviceArray, d_alpha: DeviceArray | None
 ) -> DeviceArray:
-    """The image's gradient (tiles, depth + 1, pixels of a tile) in the order in which `values_grad` reads it."""
+    """The image's gradient (tiles, depth + 1, pixels of a tile), in the order in which `values_grad` reads it."""
     height, width, depth = d_pixels.shape
     by_cell = work.array("gradient_by_cell", (of.lists.band.tiles, depth + 1, TILE * TILE))
     given = [] if d_alpha is None else [d_alpha]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's calls for PyTorch, on any OpenCL device: `from clsplat.torch import rasterization` in place of gsplat's."""
+"""gsplat's calls for PyTorch, on any OpenCL device: use `from clsplat.torch import ...` for gsplat's import."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("clsplat.torch needs PyTorch: pip install 'clsplat[torch]'", name="torch") from error
 
-from clsplat.torch.absent import NEED_CUDA, what_is_absent
 from clsplat.torch.covariances import quat_scale_to_covar_preci
+from clsplat.torch.gsplat.absent_names import CUDA_ONLY_NAMES, what_is_absent
+from clsplat.torch.gsplat.shim import install_as_gsplat, strategy
 from clsplat.torch.harmonics import spherical_harmonics
 from clsplat.torch.pixels import rasterize_to_pixels
 from clsplat.torch.projection import fully_fused_projection
 from clsplat.torch.relocation import compute_relocation
 from clsplat.torch.rendering import RollingShutterType, rasterization
 from clsplat.torch.selective_adam import SelectiveAdam
-from clsplat.torch.stand_in import install_as_gsplat, strategy
 from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 
 __all__ = [
@@ -36,14 +36,14 @@ __all__ = [
     "rasterize_to_pixels",
     "spherical_harmonics",
 ]
-STRATEGIES = ("DefaultStrategy", "MCMCStrategy")
-"""gsplat's own classes, which are imported when they are first used."""
+GSPLAT_STRATEGIES = ("DefaultStrategy", "MCMCStrategy")
+"""gsplat's own classes, imported on first use."""
 
 
 def __getattr__(name: str) -> Any:
-    if name in NEED_CUDA:
+    if name in CUDA_ONLY_NAMES:
         raise AttributeError(what_is_absent(name))
-    if name not in STRATEGIES:
+    if name not in GSPLAT_STRATEGIES:
         raise AttributeError(f"module 'clsplat.torch' has no attribute {name!r}")
     globals()[name] = value = strategy(name)
     return value

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tensors that are given, checked by name; and the way from a tensor to an array and back."""
+"""Checks of tensor arguments, and conversions between tensors and arrays."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from clsplat.arrays import Float32
 from clsplat.errors import InputError, warn
 from clsplat.library.checks import plain, whole
 
-_SAID: set[str] = set()
-"""Kinds of tensors that have been warned of."""
+_CONVERSIONS_REPORTED: set[str] = set()
+"""Kinds of tensors whose conversion has been warned about."""
 
 
 def refuse(name: str, found: object, expected: str) -> InputError:
-    """The error of an argument: its name, its value, and a value that would do."""
+    """The error for an argument: its name, its value, and the expected value."""
     return InputError(f"{name} is {found}, expected {expected}")
 
 
 @contextmanager
 def renamed(**names: str) -> Iterator[None]:
-    """Errors of the library within, with the names that arguments have here: `theirs="ours"`."""
+    """Rename arguments in errors that the library raises inside: `theirs="ours"`."""
     try:
         yield
     except InputError as error:
@@ -41,15 +41,18 @@ def renamed(**names: str) -> Iterator[None]:
 
 
 def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Raise InputError, which names the argument, unless it is a dense tensor of real numbers of one of `shapes`, in
-    which a word stands for any size; and for a tensor of torch.func, whose numbers kernels cannot read."""
+    """Raise InputError unless the argument is a dense tensor of real numbers with one of `shapes`.
+
+    A string in a shape stands for any size. Tensors of torch.func are refused too, since kernels cannot read their
+    numbers.
+    """
     if isinstance(value, Tensor) and (is_gradtrackingtensor(value) or is_batchedtensor(value)):
         raise refuse(name, "a tensor of torch.func", "a plain one: clsplat.torch has the gradients of torch.autograd")
     _check_shape(name, value, *shapes)
 
 
 def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Check as `check_shape` does, for functions in PyTorch alone, which torch.func may call."""
+    """Check like `check_shape`, but accept tensors of torch.func. For functions in pure PyTorch."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -61,9 +64,9 @@ def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 
 
 def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Raise InputError, which names the argument, where `check_shape` does, and for NaN."""
+    """Raise InputError like `check_shape`, and for NaN. Tensors of torch.func are accepted."""
     _check_shape(name, value, *shapes)
-    # a sum is NaN where a number is, and is made in one pass without another array
+    # the sum is NaN if any number is; it takes one pass and no further array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
         first = tuple(broken.nonzero()[0].tolist())
         raise InputError(f"{name} has {int(broken.sum())} NaN, the first at {first}; expected numbers")
@@ -78,13 +81,13 @@ def _named(shape: Sequence[int | str]) -> str:
 
 
 def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
-    """Raise InputError unless an argument is one of `choices`."""
+    """Raise InputError unless the argument is one of `choices`."""
     if value not in choices:
         raise refuse(name, repr(value), f"one of {', '.join(choices)}")
 
 
 def check_size(name: str, value: object) -> int:
-    """A number of pixels, which may be a real number or a tensor of one. Raises InputError where it is none."""
+    """A number of pixels, from an integer, a float or a tensor of one element. Raises InputError."""
     size = whole(value)
     if size is None or size < 1:
         raise refuse(name, repr(value), "a whole number of pixels, 1 or more")
@@ -92,7 +95,7 @@ def check_size(name: str, value: object) -> int:
 
 
 def check_number(name: str, value: object, least: float = -math.inf, most: float = math.inf) -> float:
-    """A number in a range, which may be a tensor of one. Raises InputError where it is none."""
+    """A number in a range, also from a tensor of one element. Raises InputError."""
     number = plain(value)
     if isinstance(number, bool) or not isinstance(number, int | float) or not least <= number <= most:
         limits = [f"{least} or more"] * (least > -math.inf) + [f"{most} or less"] * (most < math.inf)
@@ -101,14 +104,14 @@ def check_number(name: str, value: object, least: float = -math.inf, most: float
 
 
 def as_array(value: Tensor) -> Float32:
-    """The numbers of a tensor: float32, C order. Over the same memory where the tensor is float32 on the CPU and dense.
+    """A tensor's numbers as a C-contiguous float32 array.
 
-    Others are copied, and a warning says so once for each kind.
+    It shares the memory of a dense float32 tensor on the CPU. Other tensors are copied, with one warning for each kind.
     """
     if value.dtype != torch.float32 or value.device.type != "cpu":
         kind = f"{str(value.dtype).removeprefix('torch.')} on {value.device.type}"
-        if kind not in _SAID:
-            _SAID.add(kind)
+        if kind not in _CONVERSIONS_REPORTED:
+            _CONVERSIONS_REPORTED.add(kind)
             warn(f"tensors of {kind} are copied to float32 on the CPU, in which clsplat takes them, and results back")
         value = value.detach().to("cpu", torch.float32)
     array: Float32 = value.detach().contiguous().numpy()
@@ -116,7 +119,7 @@ def as_array(value: Tensor) -> Float32:
 
 
 def as_tensor(array: NDArray[Any], like: Tensor) -> Tensor:
-    """A tensor over an array's memory; on the device of another tensor, and of its kind where the numbers are real."""
+    """A tensor over an array's memory, on the device of `like`, and of its dtype if the numbers are real."""
     if not array.flags.writeable or not array.flags.c_contiguous:
         array = array.copy()
     tensor = torch.from_numpy(array)

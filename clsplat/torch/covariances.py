@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from clsplat.torch.arguments import check
-from clsplat.torch.graphs import differentiable_once
+from clsplat.torch.compile_guards import differentiable_once
 
-UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+UPPER_TRIANGLE_INDICES = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of the upper triangle of a 3x3 matrix, in the order of the flattened form."""
 
 
@@ -22,13 +22,32 @@ def quat_scale_to_covar_preci(
     compute_preci: bool = True,
     triu: bool = False,
 ) -> tuple[Tensor | None, Tensor | None]:
-    """Covariance R S S^T R^T and precision R S^-1 S^-T R^T of each Gaussian, as gsplat 1.5.3's function of this name.
+    """Compute covariance R S S^T R^T and precision R S^-1 S^-T R^T of each Gaussian, like gsplat 1.5.3's function.
 
-    quats: (..., 4), w x y z, of any length over 0. scales: (..., 3), standard deviations along the axes, in units of
-    the scene; over 0 where a precision is wanted. Returns both as (..., 3, 3), or as (..., 6), the upper triangle row
-    by row, with `triu`; None for one that is not asked for. Both can be differentiated as often as one likes.
+    Parameters
+    ----------
+    quats : (..., 4) Tensor
+        w, x, y, z, of any length over 0.
+    scales : (..., 3) Tensor
+        Standard deviations along the axes, in units of the scene. Over 0 if precisions are wanted.
+    compute_covar, compute_preci : bool
+        The results to compute.
+    triu : bool
+        Return the upper triangles, row by row.
 
-    Raises InputError, which names the argument, for other shapes and for NaN.
+    Returns
+    -------
+    covariances, precisions : (..., 3, 3) or (..., 6) Tensor, or None
+        (..., 6) with `triu`; None if not asked for. Both can be differentiated any number of times.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong or there is a NaN; it names the argument.
+
+    Notes
+    -----
+    Kerbl et al. 2023, eq. (6); gsplat 1.5.3's function of this name.
     """
     check("quats", quats, (*_leading(quats), 4))
     check("scales", scales, (*quats.shape[:-1], 3))
@@ -52,8 +71,10 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def sparse_upper(covars: Tensor) -> Tensor:
-    """The upper triangles (N, 6) of matrices (N, 3, 3), by which a gradient may be a COO tensor of rows: that by the
-    matrices is one too then."""
+    """The upper triangles (N, 6) of matrices (N, 3, 3).
+
+    Their gradient may be a COO tensor of rows. The gradient of the matrices is then one too.
+    """
     upper: Tensor = _SparseUpper.apply(covars)
     return upper
 
@@ -61,14 +82,14 @@ def sparse_upper(covars: Tensor) -> Tensor:
 class _SparseUpper(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
     @staticmethod
     def forward(_: Any, covars: Tensor) -> Tensor:
-        return covars[..., UPPER[0], UPPER[1]]
+        return covars[..., UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]]
 
     @staticmethod
     @differentiable_once
     def backward(_: Any, gradient: Tensor) -> Tensor:
         rows = gradient.coalesce().values() if gradient.is_sparse else gradient
         matrices = rows.new_zeros(len(rows), 3, 3)
-        matrices[:, UPPER[0], UPPER[1]] = rows
+        matrices[:, UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]] = rows
         if not gradient.is_sparse:
             return matrices
         return torch.sparse_coo_tensor(
@@ -85,4 +106,8 @@ def _leading(value: object) -> tuple[int | str, ...]:
 
 
 def _form(matrices: Tensor | None, triu: bool) -> Tensor | None:
-    return matrices[..., UPPER[0], UPPER[1]] if matrices is not None and triu else matrices
+    return (
+        matrices[..., UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]]
+        if matrices is not None and triu
+        else matrices
+    )

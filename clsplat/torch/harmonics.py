@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`spherical_harmonics`: colours from coefficients in directions, by gsplat's call, with their gradient."""
+"""gsplat's `spherical_harmonics`: colours from coefficients and directions, with their gradient."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.device.context import Device
 from clsplat.library.harmonics import HarmonicColors
 from clsplat.library.harmonics import spherical_harmonics as library_harmonics
 from clsplat.torch.arguments import as_array, as_tensor, check_shape, refuse, renamed
-from clsplat.torch.graphs import differentiable_once, outside_graphs
+from clsplat.torch.compile_guards import differentiable_once, outside_graphs
 
 
 @outside_graphs
@@ -24,14 +24,34 @@ def spherical_harmonics(
     *,
     device: Device | str | None = None,
 ) -> Tensor:
-    """Sums of real spherical harmonics in directions, (..., 3), as gsplat 1.5.3's function of this name; without the
-    0.5 and the floor that `rasterization` adds.
+    """Evaluate real spherical harmonics in given directions, like gsplat 1.5.3's function of this name.
 
-    degrees_to_use: the highest degree, 0 to 4. dirs: (..., 3), of any length. coeffs: (..., K, 3), K at least
-    (degrees_to_use + 1)^2, in the order and with the signs of 3DGS files. masks: (...), of bool; where false the sum
-    and its gradient are 0. device: an OpenCL device, open or as `clsplat devices` lists it.
+    Parameters
+    ----------
+    degrees_to_use : int
+        Highest degree, 0 to 4.
+    dirs : (..., 3) Tensor
+        Directions of any length.
+    coeffs : (..., K, 3) Tensor
+        K is at least (degrees_to_use + 1)^2; order and signs as in 3DGS files.
+    masks : (...) Tensor of bool, optional
+        Where it is False the sum and its gradient are 0.
+    device : Device or str, optional
+        An open OpenCL device, or a name as `clsplat devices` lists them.
 
-    Raises InputError, which names the argument, for other shapes and degrees and for numbers that are not finite.
+    Returns
+    -------
+    (..., 3) Tensor
+        The sums, without the 0.5 and the floor at 0 that `rasterization` adds.
+
+    Raises
+    ------
+    InputError
+        If a shape or degree is wrong, or numbers are not finite; it names the argument.
+
+    Notes
+    -----
+    Signs and order of the basis are in docs/conventions.md.
     """
     check_shape("dirs", dirs, (*dirs.shape[:-1], 3) if isinstance(dirs, Tensor) and dirs.dim() else ("...", 3))
     check_shape("coeffs", coeffs, (*dirs.shape[:-1], "K", 3))

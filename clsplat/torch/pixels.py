@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rasterize_to_pixels`: images of splats from lists of tiles, by gsplat's call, with their gradient."""
+"""gsplat's `rasterize_to_pixels`: images of splats from tile lists, with their gradient."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from clsplat.device.context import Device
-from clsplat.library.listed import RasterizedPixels
-from clsplat.library.listed import rasterize_to_pixels as library_pixels
+from clsplat.library.tile_list_pixels import RasterizedPixels
+from clsplat.library.tile_list_pixels import rasterize_to_pixels as library_pixels
 from clsplat.torch.arguments import as_array, as_tensor, check_shape, check_size, refuse
-from clsplat.torch.graphs import differentiable_once, outside_graphs
+from clsplat.torch.compile_guards import differentiable_once, outside_graphs
 
-INPUTS = ("means2d", "conics", "colors", "opacities", "backgrounds")
+PIXEL_INPUTS = ("means2d", "conics", "colors", "opacities", "backgrounds")
 
 
 @outside_graphs
@@ -36,26 +36,57 @@ def rasterize_to_pixels(
     alpha_max: float = 0.999,
     device: Device | str | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Images (..., H, W, D) and alphas (..., H, W, 1) of splats, as gsplat 1.5.3's function of this name.
+    """Blend splats in tile lists to images, like gsplat 1.5.3's function of this name.
 
-    means2d: (..., N, 2), pixels, the first pixel's centre at 0.5. conics: (..., N, 3), the inverse covariance's xx, xy,
-    yy. colors: (..., N, D), D of at least 1. opacities: (..., N), in [0, 1]. Or all of them `packed`, (nnz, ...).
-    image_width, image_height: pixels. tile_size: 16, the one that clsplat has. isect_offsets: (..., tile_height,
-    tile_width) and flatten_ids: (n_isects,), of `isect_offset_encode` and `isect_tiles`: each tile's splats, front to
-    back. backgrounds: (..., D), black if None. masks: (..., tile_height, tile_width) of bool; a tile where it is false
-    has the background alone. absgrad: after the backward pass `means2d.absgrad` has sums over pixels of absolute
-    gradients. alpha_max: the largest alpha. device: an OpenCL device, open or as `clsplat devices` lists it.
+    Parameters
+    ----------
+    means2d : (..., N, 2) Tensor
+        Pixels; the first pixel's centre is at 0.5. With `packed` (nnz, 2), as all tensors below without the axis N.
+    conics : (..., N, 3) Tensor
+        xx, xy, yy of the inverse covariance, 1 / px^2.
+    colors : (..., N, D) Tensor
+        D at least 1.
+    opacities : (..., N) Tensor
+        0 to 1.
+    image_width, image_height : int
+        Pixels.
+    tile_size : int
+        16, the only size that clsplat has.
+    isect_offsets : (..., tile_height, tile_width) Tensor of int
+        Start of each tile's list in flatten_ids, from `isect_offset_encode`.
+    flatten_ids : (n_isects,) Tensor of int
+        Splats of the lists, front to back, from `isect_tiles`.
+    backgrounds : (..., D) Tensor, optional
+        Black if None.
+    masks : (..., tile_height, tile_width) Tensor of bool, optional
+        Tiles that are False show only the background.
+    packed : bool
+        The splats of all images are in one axis.
+    absgrad : bool
+        Let the backward pass set `means2d.absgrad` to the sums over pixels of absolute gradients.
+    alpha_max : float
+        The cap of alpha.
+    device : Device or str, optional
+        An open OpenCL device, or a name as `clsplat devices` lists them.
 
-    Raises InputError, which names the argument, for other shapes, sizes of tiles and numbers that are not finite.
+    Returns
+    -------
+    images : (..., H, W, D) Tensor
+        Colours over the background.
+    alphas : (..., H, W, 1) Tensor
+        0 to 1.
+
+    Raises
+    ------
+    InputError
+        If a shape or the tile size is wrong, or numbers are not finite; it names the argument.
+
+    Notes
+    -----
+    Kerbl et al. 2023; gsplat 1.5.3's function of this name.
     """
     image_width, image_height = check_size("image_width", image_width), check_size("image_height", image_height)
-    leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
-    if packed and len(leading) != 1:
-        raise refuse("means2d", tuple(means2d.shape), "(nnz, 2) where packed is True")
-    check_shape("means2d", means2d, (*leading, 2))
-    check_shape("conics", conics, (*leading, 3))
-    check_shape("colors", colors, (*leading, "D"))
-    check_shape("opacities", opacities, leading)
+    _check_splats(means2d, conics, colors, opacities, packed=packed)
     for name, value in (("isect_offsets", isect_offsets), ("flatten_ids", flatten_ids)):
         if not isinstance(value, Tensor):
             raise refuse(name, f"a {type(value).__name__}", "a tensor of integers")
@@ -80,6 +111,17 @@ def rasterize_to_pixels(
     return images, alphas
 
 
+def _check_splats(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *, packed: bool) -> None:
+    """Raise InputError unless the shapes fit."""
+    leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
+    if packed and len(leading) != 1:
+        raise refuse("means2d", tuple(means2d.shape), "(nnz, 2) where packed is True")
+    check_shape("means2d", means2d, (*leading, 2))
+    check_shape("conics", conics, (*leading, 3))
+    check_shape("colors", colors, (*leading, "D"))
+    check_shape("opacities", opacities, leading)
+
+
 class _Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
     @staticmethod
     def forward(
@@ -94,7 +136,7 @@ class _Pixels(torch.autograd.Function):  # type: ignore[misc]  # torch has no ty
     @staticmethod
     @differentiable_once
     def backward(ctx: Any, d_images: Tensor | None, d_alphas: Tensor | None) -> tuple[Any, ...]:
-        inputs = dict(zip(INPUTS, ctx.saved_tensors, strict=True))
+        inputs = dict(zip(PIXEL_INPUTS, ctx.saved_tensors, strict=True))
         if d_images is None and d_alphas is None:
             return (None,) * (2 + len(inputs))
         given = [None if each is None else as_array(each) for each in (d_images, d_alphas)]

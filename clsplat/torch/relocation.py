@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians that share the place of one: plain PyTorch, on the tensors' own device."""
+"""Relocation of Gaussians to the place of another one: plain PyTorch, on the tensors' own device."""
 
 from __future__ import annotations
 
@@ -12,14 +12,38 @@ from clsplat.torch.arguments import check, refuse
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *, min_opacity: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Opacities and scales of n Gaussians in the place of one that look like that one, as gsplat 1.5.3's function.
+    """Compute opacities and scales of n Gaussians at one place that together look like one, like gsplat 1.5.3's
+    function.
 
-    opacities: (N,), in [0, 1]. scales: (N, 3). ratios: (N,), how many share each one's place, any kind of number; taken
-    as at least 1 and at most n_max. binoms: (n_max, n_max), binoms[n, k] = n over k. min_opacity: the least new
-    opacity, gsplat 1.6's. Returns the new opacities (N,) and scales (N, 3). Eq. (9) of Kheradmand et al. 2024,
-    "3D Gaussian Splatting as Markov Chain Monte Carlo", whose sum of alternating terms is made in float64.
+    Parameters
+    ----------
+    opacities : (N,) Tensor
+        0 to 1.
+    scales : (N, 3) Tensor
+        Standard deviations.
+    ratios : (N,) Tensor
+        Number n of Gaussians that share each place, of any dtype; clamped to 1 to n_max.
+    binoms : (n_max, n_max) Tensor
+        binoms[n, k] = n over k.
+    min_opacity : float
+        Smallest new opacity, an argument of gsplat 1.6.
 
-    Raises InputError, which names the argument, for other shapes and for NaN.
+    Returns
+    -------
+    opacities : (N,) Tensor
+        New opacities.
+    scales : (N, 3) Tensor
+        New standard deviations.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong or there is a NaN; it names the argument.
+
+    Notes
+    -----
+    Eq. (9) of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Its alternating sum is
+    computed in float64.
     """
     check("opacities", opacities, ("N",))
     count = len(opacities)
@@ -37,7 +61,7 @@ def compute_relocation(
         new = (1 - (1 - old) ** (1 / shares)).clamp(min=min_opacity)
         powers = torch.arange(1, most + 1, device=old.device)
         signs = 1 - 2 * ((powers - 1) % 2)
-        # binoms[i - 1, k] summed over i = 1 .. n
+        # sums[:, k] = sum of binoms[i - 1, k] over i = 1 .. n
         sums = table.cumsum(0)[shares - 1]
         denominators = (sums * signs / powers.sqrt() * new[:, None] ** powers).sum(-1)
         new_scales = (old / denominators)[:, None] * scales

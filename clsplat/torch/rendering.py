@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`rasterization`: images of Gaussians, by gsplat's call, with their gradient."""
+"""gsplat's `rasterization`: images of Gaussians, with their gradient."""
 
 from __future__ import annotations
 
@@ -10,31 +10,28 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from clsplat.device.context import Device
-from clsplat.library.checks import degree, whole
-from clsplat.library.rasterize import rasterize
-from clsplat.stages.harmonics import HIGHEST
-from clsplat.torch.arguments import check, check_choice, check_number, check_shape, check_size, refuse, renamed
-from clsplat.torch.autograd import SPLATS, Batches, Call, Pixels, Projection
-from clsplat.torch.covariances import UPPER, sparse_upper
-from clsplat.torch.graphs import outside_graphs
-from clsplat.torch.meta import Meta
+from clsplat.library.checks import whole
+from clsplat.library.rasterize import RASTERIZE_FILTER_MODES, RASTERIZE_RENDER_MODES
+from clsplat.stages.ewa import EWA_CAMERA_MODELS
+from clsplat.torch.arguments import check_choice, check_number, check_size, refuse, renamed
+from clsplat.torch.autograd import PROJECTED_SPLAT_NAMES, BatchResults, PixelsFunction, ProjectionFunction
+from clsplat.torch.compile_guards import outside_graphs
+from clsplat.torch.covariances import UPPER_TRIANGLE_INDICES, sparse_upper
+from clsplat.torch.inputs import GivenTensors, RasterizationSettings
+from clsplat.torch.lazy_info import Meta
 from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-HIT_DISTANCES = ("d", "Ed", "RGB-d", "RGB-Ed")
-"""Modes of gsplat 1.6, which has them with `with_eval3d` alone."""
-RASTERIZE_MODES = ("classic", "antialiased")
-CAMERA_MODELS = ("pinhole", "ortho", "fisheye")
-TILE_SIZE = 16
-IDS = ("batch_ids", "camera_ids", "gaussian_ids")
-"""Names of a splat's own in `meta`."""
+HIT_DISTANCE_RENDER_MODES = ("d", "Ed", "RGB-d", "RGB-Ed")
+"""Modes of gsplat 1.6, which it supports only with `with_eval3d`."""
+GSPLAT_TILE_SIZE_PX = 16
+PACKED_ID_NAMES = ("batch_ids", "camera_ids", "gaussian_ids")
+"""Names of a splat's indices in `meta`."""
 
 
 class RollingShutterType(Enum):
-    """gsplat's names of shutters. clsplat has the last."""
+    """gsplat's names of shutters. clsplat supports GLOBAL."""
 
     ROLLING_TOP_TO_BOTTOM = 0
     ROLLING_LEFT_TO_RIGHT = 1
@@ -60,7 +57,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int | None = TILE_SIZE,
+    tile_size: int | None = GSPLAT_TILE_SIZE_PX,
     backgrounds: Tensor | None = None,
     render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
     sparse_grad: bool = False,
@@ -92,44 +89,98 @@ def rasterization(
     alpha_max: float = 0.999,
     device: Device | str | None = None,
 ) -> tuple[Tensor, Tensor, Meta]:
-    """Images, alphas and `meta` of N Gaussians in C cameras: gsplat 1.5.3's function, argument by argument, and those
-    of gsplat 1.6 by name.
+    """Render N Gaussians to images of C cameras: gsplat 1.5.3's function, with gsplat 1.6's further arguments by name.
 
-    Leading sizes `...` are those of batches, and may be none. Tensors of float32 on the CPU share their memory with a
-    CPU's OpenCL device; others are copied there and back, which a warning says once. Everything has a gradient, `Ks`
-    too.
+    The leading sizes `...` are batches, and may be absent. Every tensor has a gradient, `Ks` too.
 
-    means: (..., N, 3), in units of the scene. quats: (..., N, 4), w x y z, of any length. scales: (..., N, 3), standard
-    deviations, over 0. opacities: (..., N), in [0, 1]. colors: (..., N, D) or (..., C, N, D) with any D; with
-    `sh_degree` coefficients (..., N, K, 3) or (..., C, N, K, 3), K >= (sh_degree + 1)^2, in the order and with the
-    signs of 3DGS files; None where depth alone is drawn. viewmats: (..., C, 4, 4), camera from world, x right, y down,
-    z forward. Ks: (..., C, 3, 3), in pixels, the centre of the first pixel at 0.5; skew is ignored. width, height:
-    pixels. near_plane, far_plane: depths between which a Gaussian is drawn. radius_clip: pixels; a splat of no larger
-    radius is not drawn. eps2d: pixels^2, added to the variance of each splat. sh_degree: the degree to use, 0 to 4;
-    None for colours. packed: `meta` has the splats in view alone. tile_size: pixels, of the tile lists in `meta` alone;
-    None for 16. backgrounds: (..., C, D). render_mode: colour, depth along z (D), expected depth (ED), or colour and
-    depth, in the last channel. sparse_grad: with `packed`, without batches: the gradients of means, quats and scales
-    (or covars) are COO tensors of the rows in view. absgrad: after the backward pass `meta["means2d"].absgrad` has sums
-    over pixels of absolute gradients. rasterize_mode: "antialiased" scales opacities by what eps2d added
-    (Mip-Splatting). camera_model: pinhole, ortho or fisheye (equidistant). covars: (..., N, 3, 3) in the place of quats
-    and scales, which may be None. alpha_max: the largest alpha, under 1; gsplat's 0.999, where `clsplat train` and
-    `render` have 0.99. device: an OpenCL device, open or as `clsplat devices` lists it; None for the first.
-    channel_chunk, segmented and ut_params change no result, and are ignored. Sizes and numbers may be tensors of one
-    number; sizes may be 40.0.
+    Parameters
+    ----------
+    means : (..., N, 3) Tensor
+        In units of the scene.
+    quats : (..., N, 4) Tensor
+        w, x, y, z, of any length over 0.
+    scales : (..., N, 3) Tensor
+        Standard deviations over 0, in units of the scene.
+    opacities : (..., N) Tensor
+        0 to 1.
+    colors : (..., N, D) or (..., C, N, D) Tensor, or None
+        Any D. With `sh_degree`, coefficients (..., N, K, 3) or (..., C, N, K, 3), K at least (sh_degree + 1)^2; order
+        and signs as in 3DGS files. May be None if only depth is rendered.
+    viewmats : (..., C, 4, 4) Tensor
+        Camera from world; x right, y down, z forward.
+    Ks : (..., C, 3, 3) Tensor
+        Intrinsics, pixels; the first pixel's centre is at 0.5. Skew is ignored.
+    width, height : int
+        Pixels. Sizes and numbers may be tensors of one element, and sizes may be floats such as 40.0.
+    near_plane, far_plane : float
+        Depths between which a Gaussian is drawn, in units of the scene.
+    radius_clip : float
+        Splats whose radii are not larger are not drawn, pixels.
+    eps2d : float
+        Added to the variance of each splat, px^2.
+    sh_degree : int, optional
+        Degree to use, 0 to 4. None if colors are colours.
+    packed : bool
+        Let `meta` list only the splats in view.
+    tile_size : int or None
+        Pixels, for the tile lists in `meta` only. None means 16.
+    backgrounds : (..., C, D) Tensor, optional
+        Black if None.
+    render_mode : str
+        "RGB", "D" (depth along z), "ED" (expected depth), "RGB+D" or "RGB+ED". The depth is the last channel.
+    sparse_grad : bool
+        With `packed` and without batches: the gradients of means, quats and scales (or covars) are COO tensors of the
+        rows in view.
+    absgrad : bool
+        Let the backward pass set `meta["means2d"].absgrad` to the sums over pixels of absolute gradients.
+    rasterize_mode : str
+        "classic", or "antialiased": scale opacities to compensate for eps2d (Mip-Splatting, Yu et al. 2024).
+    camera_model : str
+        "pinhole", "ortho" or "fisheye" (equidistant).
+    covars : (..., N, 3, 3) Tensor, optional
+        Covariances instead of quats and scales, which may be None.
+    channel_chunk, segmented, ut_params
+        Ignored; they change no result.
+    alpha_max : float
+        The cap of alpha, under 1. gsplat's default is 0.999; `clsplat train` and `render` use 0.99.
+    device : Device or str, optional
+        An open OpenCL device, or a name as `clsplat devices` lists them. None means the default device
+        (docs/drivers.md).
+    distributed, with_ut, with_eval3d, return_normals, global_z_order
+        Only gsplat's defaults are supported.
+    radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, viewmats_rs
+        Only None is supported.
+    rays, lidar_coeffs, external_distortion_coeffs, extra_signals, extra_signals_sh_degree
+        Only None is supported.
+    rolling_shutter : RollingShutterType
+        Only GLOBAL is supported.
+    renderer_config
+        None or gsplat's `RendererConfig_MixedBatch`.
 
-    Returns images (..., C, height, width, X), X = D, 1 or D + 1 by the mode, alphas (..., C, height, width, 1), and
-    meta, a dictionary with gsplat's names: batch_ids, camera_ids, gaussian_ids (nnz,) int64, None unless packed; radii
-    (..., C, N, 2) or (nnz, 2) int32, pixels, 0 where not in view; means2d (.., 2), pixels; depths; conics (.., 3), the
-    inverse covariance's xx, xy, yy, 1 / pixels^2; opacities, with the compensation; tiles_per_gauss, isect_ids,
-    flatten_ids, isect_offsets, made when they are first looked at; tile_width, tile_height, width, height, tile_size,
-    n_batches, n_cameras.
+    Returns
+    -------
+    images : (..., C, height, width, X) Tensor
+        X is D, 1 or D + 1, by the render mode.
+    alphas : (..., C, height, width, 1) Tensor
+        0 to 1.
+    meta : dict
+        gsplat's names: "batch_ids", "camera_ids", "gaussian_ids" (nnz,) int64, None unless packed. "radii" (..., C, N,
+        2) or (nnz, 2) int32, pixels, 0 if not in view. "means2d" (..., 2), pixels. "depths". "conics" (..., 3): xx, xy,
+        yy of the inverse covariance, 1 / px^2. "opacities", after compensation. "tiles_per_gauss", "isect_ids",
+        "flatten_ids" and "isect_offsets" are computed on first access. Also "tile_width", "tile_height", "width",
+        "height", "tile_size", "n_batches" and "n_cameras".
 
-    Raises InputError, which names the argument: other shapes, NaN, settings out of range; and `distributed`, `with_ut`,
-    `with_eval3d`, what gsplat 1.6 has with these two alone (modes of hit distances, return_normals, another
-    global_z_order), the model ftheta, coefficients of lenses, shutters other than GLOBAL, rays, extra_signals, and
-    tensors of torch.func, which clsplat does not have.
+    Raises
+    ------
+    InputError
+        If a shape is wrong, there is a NaN, a setting is out of range, or an argument is not supported (above); it
+        names the argument. Also for gsplat 1.6's hit distance modes, the camera model ftheta, and tensors of
+        torch.func.
 
-    Source: gsplat 1.5.3, https://docs.gsplat.studio; Kerbl et al. 2023.
+    Notes
+    -----
+    Kerbl et al. 2023; gsplat 1.5.3, https://docs.gsplat.studio. float32 tensors on the CPU share their memory with a
+    CPU's OpenCL device. Others are copied there and back, with one warning.
     """
     _refuse_missing(
         distributed=distributed,
@@ -147,82 +198,83 @@ def rasterization(
         extra_signals=extra_signals,
         extra_signals_sh_degree=extra_signals_sh_degree,
     )
+    _refuse_settings(global_z_order, renderer_config, render_mode, rolling_shutter)
+    check_choice("camera_model", camera_model, EWA_CAMERA_MODELS)
+    check_choice("render_mode", render_mode, RASTERIZE_RENDER_MODES)
+    check_choice("rasterize_mode", rasterize_mode, RASTERIZE_FILTER_MODES)
+    width, height = check_size("width", width), check_size("height", height)
+    tile_size = GSPLAT_TILE_SIZE_PX if tile_size is None else check_size("tile_size", tile_size)
+    depth_alone = render_mode in {"D", "ED"}
+    if colors is None and depth_alone:
+        sh_degree, backgrounds = None, None
+        colors = torch.zeros(*opacities.shape, 1) if isinstance(opacities, Tensor) else colors
+    given = GivenTensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars)
+    batch = given.check(sh_degree)
+    if sparse_grad and (batch or not packed):
+        raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
+    settings = RasterizationSettings(
+        width=width,
+        height=height,
+        near_plane=check_number("near_plane", near_plane),
+        far_plane=check_number("far_plane", far_plane),
+        radius_clip=check_number("radius_clip", radius_clip, 0),
+        eps2d=check_number("eps2d", eps2d, 0),
+        alpha_max=check_number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6),
+        sh_degree=None if sh_degree is None else whole(sh_degree),
+        render_mode=render_mode,
+        rasterize_mode=rasterize_mode,
+        camera_model=camera_model,
+        absolute_gradients=absgrad,
+        device=device,
+    )
+    given = given.used(depth_alone=depth_alone)
+    differentiable = torch.is_grad_enabled() and given.require_grad
+    with renamed(quaternions="quats", intrinsics="Ks"):
+        results = given.rasterized(settings, batch, differentiable=differentiable)
+    expected = render_mode.endswith("ED")
+    call = BatchResults(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
+    if not differentiable and not given.have_tangents:  # for a dual tensor PyTorch then raises: no forward derivative
+        return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
+    splats, images, alphas = _with_gradient(call, given, settings.sh_degree, depth_alone=depth_alone)
+    return images, alphas, _meta(call, means, splats, width, height, tile_size)
+
+
+def _with_gradient(
+    call: BatchResults, given: GivenTensors, sh_degree: int | None, *, depth_alone: bool
+) -> tuple[list[Tensor], Tensor, Tensor]:
+    """PROJECTED_SPLAT_NAMES, images and alphas with their gradient."""
+    covars, colors = given.covars, given.colors
+    if covars is not None:
+        covars = (
+            sparse_upper(covars) if call.sparse else covars[..., UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]]
+        )
+    coefficients = None if sh_degree is None or depth_alone else colors
+    shapes = (given.quats, given.scales, covars)
+    *splats, colors2d = ProjectionFunction.apply(
+        call, given.means, *shapes, given.opacities, coefficients, given.viewmats, given.Ks
+    )
+    values = None if depth_alone else colors if sh_degree is None else colors2d
+    images, alphas = PixelsFunction.apply(call, *splats, values, given.backgrounds)
+    return splats, images, alphas
+
+
+def _refuse_settings(global_z_order: Any, renderer_config: Any, render_mode: str, rolling_shutter: Any) -> None:
+    """Raise InputError for settings that gsplat has only with `with_ut` or `with_eval3d`."""
     if global_z_order is not True:
         raise refuse(
             "global_z_order", global_z_order, "True: clsplat.torch has no with_ut, which gsplat has False with"
         )
     if type(renderer_config).__name__ not in {"NoneType", "RendererConfig_MixedBatch"}:
         raise refuse("renderer_config", f"a {type(renderer_config).__name__}", "None: clsplat.torch has no with_eval3d")
-    if render_mode in HIT_DISTANCES:
+    if render_mode in HIT_DISTANCE_RENDER_MODES:
         raise refuse(
             "render_mode",
             repr(render_mode),
-            f"one of {', '.join(RENDER_MODES)}: clsplat.torch has no with_eval3d, which gsplat has hit distances with",
+            f"one of {', '.join(RASTERIZE_RENDER_MODES)}: clsplat.torch has no with_eval3d, which gsplat has hit "
+            "distances with",
         )
     if getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL":
         raise refuse("rolling_shutter", rolling_shutter, "GLOBAL, the one that clsplat.torch has")
-    check_choice("camera_model", camera_model, CAMERA_MODELS)
-    check_choice("render_mode", render_mode, RENDER_MODES)
-    check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
-    width, height = check_size("width", width), check_size("height", height)
-    tile_size = TILE_SIZE if tile_size is None else check_size("tile_size", tile_size)
-    depth_alone = render_mode in {"D", "ED"}
-    if colors is None and depth_alone:
-        sh_degree, backgrounds = None, None
-        colors = torch.zeros(*opacities.shape, 1) if isinstance(opacities, Tensor) else colors
-    batch = _check_tensors(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, covars, sh_degree)
-    sh_degree = None if sh_degree is None else whole(sh_degree)
-    if sparse_grad and (batch or not packed):
-        raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
-    settings: dict[str, Any] = {
-        "width": width,
-        "height": height,
-        "near_plane": check_number("near_plane", near_plane),
-        "far_plane": check_number("far_plane", far_plane),
-        "radius_clip": check_number("radius_clip", radius_clip, 0),
-        "eps2d": check_number("eps2d", eps2d, 0),
-        "alpha_max": check_number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6),
-        "sh_degree": sh_degree,
-        "render_mode": render_mode,
-        "rasterize_mode": rasterize_mode,
-        "camera_model": camera_model,
-        "absolute_gradients": absgrad,
-        "differentiable": torch.is_grad_enabled(),
-        "device": device,
-    }
-    backgrounds = None if depth_alone else backgrounds
-    if covars is not None:
-        quats = scales = None
-    tensors = {
-        "means": means,
-        "quaternions": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-        "viewmats": viewmats,
-        "intrinsics": Ks,
-        "backgrounds": backgrounds,
-        "covars": covars,
-    }
-    settings["differentiable"] &= any(each is not None and each.requires_grad for each in tensors.values())
-    dual = any(each is not None and forward_ad.unpack_dual(each).tangent is not None for each in tensors.values())
-    arrays = {name: Batches(each, batch) for name, each in tensors.items()}
-    with renamed(quaternions="quats", intrinsics="Ks"):
-        results = [
-            rasterize(**{name: each[index] for name, each in arrays.items()}, **settings)
-            for index in range(math.prod(batch))
-        ]
-    expected = render_mode.endswith("ED")
-    call = Call(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
-    if not settings["differentiable"] and not dual:  # of a dual tensor PyTorch says that there is no derivative
-        return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
-    if covars is not None:
-        covars = sparse_upper(covars) if sparse_grad else covars[..., UPPER[0], UPPER[1]]
-    coefficients = None if sh_degree is None or depth_alone else colors
-    *splats, colors2d = Projection.apply(call, means, quats, scales, covars, opacities, coefficients, viewmats, Ks)
-    values = None if depth_alone else colors if sh_degree is None else colors2d
-    images, alphas = Pixels.apply(call, *splats, values, backgrounds)
-    return images, alphas, _meta(call, means, splats, width, height, tile_size)
 
 
 def _refuse_missing(**given: Any) -> None:
@@ -233,70 +285,28 @@ def _refuse_missing(**given: Any) -> None:
             raise refuse(name, found, f"{wanted}: clsplat.torch does not have it")
 
 
-def _check_tensors(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Any,
-    viewmats: Tensor,
-    Ks: Tensor,  # noqa: N803
-    backgrounds: Tensor | None,
-    covars: Tensor | None,
-    sh_degree: int | None,
-) -> tuple[int, ...]:
-    """The sizes of batches. Raises InputError for what is none of the shapes in `rasterization`, or has NaN."""
-    leading = means.shape[:-2] if isinstance(means, Tensor) and means.dim() >= 2 else ()
-    check_shape("means", means, (*leading, "N", 3))
-    batch, count = tuple(leading), means.shape[-2]
-    if covars is None:
-        check_shape("quats", quats, (*batch, count, 4))
-        check_shape("scales", scales, (*batch, count, 3))
-    else:
-        check_shape("covars", covars, (*batch, count, 3, 3))
-    check_shape("opacities", opacities, (*batch, count))
-    check_shape("viewmats", viewmats, (*batch, "C", 4, 4))
-    cameras = viewmats.shape[-3]
-    if cameras == 0 or 0 in batch:
-        raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "a camera or more in each batch")
-    check_shape("Ks", Ks, (*batch, cameras, 3, 3))
-    if sh_degree is None:
-        check_shape("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
-        if colors.shape[-1] == 0:
-            raise refuse("colors", "of 0 channels", "1 or more")
-    else:
-        sh_degree = degree("sh_degree", sh_degree, HIGHEST, ", or None for colours")
-        check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
-        if colors.shape[-2] < (sh_degree + 1) ** 2:
-            raise refuse(
-                "colors",
-                f"of {colors.shape[-2]} coefficients",
-                f"{(sh_degree + 1) ** 2} or more, for sh_degree {sh_degree}",
-            )
-    if backgrounds is not None:  # depths have none behind them, so that nothing else looks at its numbers then
-        shape = (*batch, cameras, colors.shape[-1])
-        check_shape("backgrounds", backgrounds, shape)
-        check("backgrounds", backgrounds, shape)
-    return batch
+def _meta(
+    call: BatchResults, like: Tensor, splats: Sequence[Tensor] | None, width: int, height: int, tile_size: int
+) -> Meta:
+    """gsplat's dictionary, in its order.
 
-
-def _meta(call: Call, like: Tensor, splats: Sequence[Tensor] | None, width: int, height: int, tile_size: int) -> Meta:
-    """gsplat's dictionary, in its order. like: a tensor of the device and kind of what is made later; splats: SPLATS
-    with their gradient, or None if there is none, to make them when they are looked at."""
+    like: a tensor with the device and dtype of tensors that are computed later.
+    splats: PROJECTED_SPLAT_NAMES with their gradient. If None, they have no gradient and are computed on first access.
+    """
     batches, cameras, _ = call.sizes
-    like = like.new_empty(0)  # the caller's own would live as long as the dictionary
+    like = like.new_empty(0)  # the dictionary would keep the caller's tensor alive
     columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
 
     def ids() -> dict[str, Any]:
-        return dict(zip(IDS, call.ids(like.device), strict=True))
+        return dict(zip(PACKED_ID_NAMES, call.ids(like.device), strict=True))
 
     def radii() -> dict[str, Any]:
         return {"radii": torch.from_numpy(call.radii()).to(like.device)}
 
     def all_splats() -> dict[str, Any]:
-        return dict(zip(SPLATS, call.splats(like) if splats is None else splats, strict=True))
+        return dict(zip(PROJECTED_SPLAT_NAMES, call.splats(like) if splats is None else splats, strict=True))
 
-    # none of these holds the dictionary: in a ring with it a call and its memory would wait for the collector
+    # None of these refers to the dictionary: a cycle would keep the call's memory until the garbage collector runs.
     def tiles() -> dict[str, Any]:
         batch_ids, camera_ids, gaussian_ids = (None, None, None) if call.in_view is None else call.ids(like.device)
         means2d, _, depths, _ = call.splats(like)
@@ -320,9 +330,9 @@ def _meta(call: Call, like: Tensor, splats: Sequence[Tensor] | None, width: int,
             "isect_offsets": offsets.reshape(*call.batch, cameras, rows, columns),
         }
 
-    meta = Meta(dict.fromkeys(IDS))
+    meta = Meta(dict.fromkeys(PACKED_ID_NAMES))
     if call.packed:
-        meta.later(IDS, ids)
+        meta.later(PACKED_ID_NAMES, ids)
     meta.later(("radii",), radii)
     meta.later(("means2d", "depths", "conics", "opacities"), all_splats)
     meta.update({"tile_width": columns, "tile_height": rows})

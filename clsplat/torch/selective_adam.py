@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam on the rows that are in view: plain PyTorch, on the tensors' own device."""
+"""Adam on the rows in view: plain PyTorch, on the tensors' own device."""
 
 from __future__ import annotations
 
@@ -13,20 +13,39 @@ from clsplat.torch.arguments import refuse
 
 
 class SelectiveAdam(torch.optim.Adam):  # type: ignore[misc]  # torch has no types here
-    """Adam without bias correction that leaves rows out of view as they are, their moments too; gsplat 1.5.3's class of
-    this name (Mallick et al. 2024, "Taming 3DGS").
+    """Adam that updates only rows in view, without bias correction: gsplat 1.5.3's class of this name.
 
-    params: as for `torch.optim.Adam`, one tensor a group, with Gaussians along the first axis. eps: added to the root
-    of the second moment. betas: the decay of the first and second moment.
+    Rows out of view keep their values and moments.
+
+    Parameters
+    ----------
+    params : iterable
+        Parameter groups, as for `torch.optim.Adam`, one tensor per group, with Gaussians along the first axis.
+    eps : float
+        Added to the root of the second moment.
+    betas : (float, float)
+        Decay of the first and the second moment.
+
+    Notes
+    -----
+    Mallick et al. 2024, "Taming 3DGS".
     """
 
     def __init__(self, params: Iterable[Any], eps: float, betas: tuple[float, float]) -> None:
         super().__init__(params=params, eps=eps, betas=betas)
 
     def step(self, visibility: Tensor) -> None:
-        """One step for the rows of which `visibility` (N,) is not 0.
+        """Take one step for the rows in view.
 
-        Raises InputError where a group has more than one tensor, or a tensor has another number of rows than N.
+        Parameters
+        ----------
+        visibility : (N,) Tensor
+            Rows where it is not 0 are updated.
+
+        Raises
+        ------
+        InputError
+            If a group has more than one tensor, or a tensor does not have N rows.
         """
         rows = visibility.flatten().bool()
         for group in self.param_groups:
@@ -41,7 +60,7 @@ class SelectiveAdam(torch.optim.Adam):  # type: ignore[misc]  # torch has no typ
                 self._update(parameter, rows, group)
 
     def _update(self, parameter: Tensor, rows: Tensor, group: dict[str, Any]) -> None:
-        """One tensor's rows, where `rows` (N,) is true."""
+        """Update the rows of one tensor for which `rows` (N,) is True."""
         state = self.state[parameter]
         if not state:
             state["step"] = torch.tensor(0.0)

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`isect_tiles` and `isect_offset_encode`: the tiles that splats reach, by gsplat's calls."""
+"""gsplat's `isect_tiles` and `isect_offset_encode`: the tiles that splats reach."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from clsplat.library import tiles
 from clsplat.torch.arguments import as_array, check_shape, refuse
-from clsplat.torch.graphs import outside_graphs
+from clsplat.torch.compile_guards import outside_graphs
 
 
 @outside_graphs
@@ -29,33 +32,60 @@ def isect_tiles(
     conics: Tensor | None = None,
     opacities: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of a tile and a splat whose box, its mean plus and minus the radii, overlaps it, as gsplat 1.5.3's
-    function.
+    """List the (tile, splat) pairs whose tile overlaps the splat's box, like gsplat 1.5.3's function of this name.
 
-    means2d: (..., N, 2), pixels. radii: (..., N, 2), pixels; where one is 0 there is no pair. depths: (..., N). With
-    `packed` (nnz, 2), (nnz, 2), (nnz,), image_ids (nnz,) of integers below n_images, and gaussian_ids (nnz,), which
-    change nothing. tile_size: pixels. tile_width, tile_height: tiles across and down. sort: by id. segmented changes
-    nothing. conics, opacities: None; gsplat 1.6 leaves tiles out by them.
+    The box is the mean plus and minus the radii. No result has a gradient.
 
-    Returns tiles_per_gauss (..., N) or (nnz,) int32; isect_ids (n_isects,) int64, the image's number, the tile's, row
-    by row, and the depth's 32 bits, from the high bits down; flatten_ids (n_isects,) int32, the splat's number among
-    those of all images. None has a gradient. Raises InputError, which names the argument.
+    Parameters
+    ----------
+    means2d : (..., N, 2) Tensor
+        Pixels. With `packed` (nnz, 2).
+    radii : (..., N, 2) Tensor
+        Pixels; a splat with a radius of 0 has no pairs. With `packed` (nnz, 2).
+    depths : (..., N) Tensor
+        With `packed` (nnz,).
+    tile_size : int
+        Side of a tile, pixels.
+    tile_width, tile_height : int
+        Number of tiles across and down.
+    sort : bool
+        Sort the pairs by id.
+    segmented : bool
+        Ignored; it changes no result.
+    packed : bool
+        The splats of all images are in one axis. image_ids, gaussian_ids and n_images are then required.
+    n_images : int, optional
+        Number of images, with `packed`.
+    image_ids : (nnz,) Tensor of int, optional
+        Image of each splat, below n_images.
+    gaussian_ids : (nnz,) Tensor of int, optional
+        Not used for any result.
+    conics, opacities : None
+        Arguments of gsplat 1.6, which skips tiles by them; not supported.
+
+    Returns
+    -------
+    tiles_per_gauss : (..., N) or (nnz,) Tensor of int32
+        Number of tiles of each splat.
+    isect_ids : (n_isects,) Tensor of int64
+        From the high bits down: the image, the tile in row-major order, the 32 bits of the depth.
+    flatten_ids : (n_isects,) Tensor of int32
+        Index of the splat, counted over all images.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, or an argument is not supported; it names the argument.
+
+    Notes
+    -----
+    Kerbl et al. 2023, section 6; gsplat 1.5.3's function of this name.
     """
     for name, value in (("conics", conics), ("opacities", opacities)):
         if value is not None:
             raise refuse(name, "given", "None: clsplat.torch has the tiles of a box alone")
-    leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
-    check_shape("means2d", means2d, (*leading, 2))
-    if not isinstance(radii, Tensor) or radii.shape != means2d.shape:
-        raise refuse("radii", tuple(getattr(radii, "shape", ())), f"a tensor {tuple(means2d.shape)}")
-    check_shape("depths", depths, leading)
-    images = None
-    if packed:
-        for name, value in (("n_images", n_images), ("image_ids", image_ids), ("gaussian_ids", gaussian_ids)):
-            if value is None:
-                raise refuse(name, None, "given where packed is True")
-        assert image_ids is not None
-        images = image_ids.cpu().numpy()
+    _check_splats(means2d, radii, depths)
+    images = _checked_ids(n_images, image_ids, gaussian_ids) if packed else None
     found = tiles.isect_tiles(
         as_array(means2d),
         radii.cpu().numpy(),
@@ -71,10 +101,49 @@ def isect_tiles(
     return first, second, third
 
 
+def _check_splats(means2d: Tensor, radii: Tensor, depths: Tensor) -> None:
+    """Raise InputError unless the shapes fit."""
+    leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
+    check_shape("means2d", means2d, (*leading, 2))
+    if not isinstance(radii, Tensor) or radii.shape != means2d.shape:
+        raise refuse("radii", tuple(getattr(radii, "shape", ())), f"a tensor {tuple(means2d.shape)}")
+    check_shape("depths", depths, leading)
+
+
+def _checked_ids(n_images: int | None, image_ids: Tensor | None, gaussian_ids: Tensor | None) -> NDArray[Any]:
+    """The image of each packed splat. Raises InputError if an argument is missing."""
+    for name, value in (("n_images", n_images), ("image_ids", image_ids), ("gaussian_ids", gaussian_ids)):
+        if value is None:
+            raise refuse(name, None, "given where packed is True")
+    assert image_ids is not None
+    images: NDArray[Any] = image_ids.cpu().numpy()
+    return images
+
+
 @outside_graphs
 def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
-    """The places (n_images, tile_height, tile_width) int32 at which each tile's pairs begin in sorted `isect_ids`
-    (n_isects,) int64 of `isect_tiles`, as gsplat 1.5.3's function. Raises InputError for other images or tiles."""
+    """Find the start of each tile's pairs in the sorted ids of `isect_tiles`, like gsplat 1.5.3's function of this
+    name.
+
+    Parameters
+    ----------
+    isect_ids : (n_isects,) Tensor of int64
+        Sorted ids of `isect_tiles`.
+    n_images : int
+        Number of images.
+    tile_width, tile_height : int
+        Number of tiles across and down.
+
+    Returns
+    -------
+    (n_images, tile_height, tile_width) Tensor of int32
+        Index of the first id of each tile.
+
+    Raises
+    ------
+    InputError
+        If an id belongs to another image or tile.
+    """
     if not isinstance(isect_ids, Tensor):
         raise refuse("isect_ids", f"a {type(isect_ids).__name__}", "a tensor (n_isects,) of int64")
     found = tiles.isect_offset_encode(isect_ids.cpu().numpy(), n_images, tile_width, tile_height)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of several views, on one device or several: gradients are added in the order of the views, then Adam.
+"""A step of several views, on one device or several: gradients are summed in the order of the views, then Adam.
 
-The first device has the model. The others have copies of its parameters, each with a thread, and hand back what their
-views found. So which is quicker changes no bit, nor does their number.
+The first device has the model. The others have copies of its parameters, each with a thread, and return their views'
+results. So neither their speed nor their number changes a bit.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, shared, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT
 from clsplat.errors import InputError
-from clsplat.gaussians import GROUPS, group_shapes
+from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
+from clsplat.layouts.columns import SPLAT
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.adam import adam, add_view, updates_sh_rest
@@ -37,30 +37,38 @@ from clsplat.stages.device_gaussians import (
 from clsplat.stages.loss import Loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Projected, Screen
-from clsplat.training.appearance import ViewAppearance
-from clsplat.training.photographs import Photographs
-from clsplat.training.step import GradientStep, Sample, StepProbe, StepRows, ViewRows, view_gradients
+from clsplat.training.step.gradient_step import GradientStep, StepProbe, view_gradients
+from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
+from clsplat.training.supervision.image_cache import ImageCache
 
-OWNER_MODELS, REPLICA_MODELS = 5, 2
-"""Arrays for each parameter on the first device, parameters, two moments, a view's gradients and their sum, and on the
-others, parameters and a view's gradients."""
+OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER = 5, 2
+"""Arrays on a device for each parameter.
+
+The first device has parameters, two moments, a view's gradients and their sum. The others have parameters and a view's
+gradients.
+"""
 
 
 def scaled(config: OptimiserConfig, batch: int) -> OptimiserConfig:
-    """Adam's constants for steps of `batch` views: as much of the moments is kept from view to view as with one (Zhao
-    et al. 2024, "On Scaling Up 3D Gaussian Splatting Training", section 4)."""
+    """Adam's constants for steps of `batch` views: moments decay as much per view as with one view per step.
+
+    Zhao et al. 2024, "On Scaling Up 3D Gaussian Splatting Training", section 4.
+    """
     every = max(config.sh_rest_every // batch, 1)
     return replace(config, beta1=config.beta1**batch, beta2=config.beta2**batch, sh_rest_every=every)
 
 
 def scaled_rates(rates: Mapping[str, float], batch: int) -> dict[str, float]:
-    """Learning rates for steps of `batch` views: gradients of different views are nearly independent, so that their sum
-    grows with the root of their number, by which Adam divides (the same)."""
+    """Learning rates for steps of `batch` views.
+
+    Gradients of different views are nearly independent, so their sum grows with the root of their number, by which Adam
+    divides (the same paper).
+    """
     return {group: rate * sqrt(batch) for group, rate in rates.items()}
 
 
 def shares(count: int, devices: int) -> list[range]:
-    """The views of a step that each device has, those of a device following each other."""
+    """Views of a step for each device; each device's views are consecutive."""
     size = -(-count // devices)
     return [range(min(k * size, count), min((k + 1) * size, count)) for k in range(devices)]
 
@@ -79,18 +87,21 @@ class Losses:
 
 @dataclass(frozen=True, eq=False)
 class _AddedView(GradientStep):
-    """A view whose gradients are added to the sums, which are second in the model that it is given. shown (n,): the
-    Gaussians that any view shows, where Adam wants to know; columns: gradients of appearances, by the views' places."""
+    """A view whose gradients are added to the sums, which are the second member of its model.
+
+    shown: (n,), Gaussians that any view shows, if Adam needs them.
+    own: gradients of the views' shares, by the views' places.
+    """
 
     shown: DeviceArray | None
-    columns: dict[int, DeviceArray]
+    own: dict[int, Sequence[DeviceArray | None]]
 
-    def learn(self, appearance: ViewAppearance, columns: DeviceArray) -> None:
-        """Keep the gradient: all views of the batch see the appearances as they were before it."""
-        self.columns[appearance.place] = columns
+    def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
+        """Keep the gradients, as all views of the batch use the components' state from before it."""
+        self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
-        """Add the rows' gradients; while kernels are only tried, try Adam's too."""
+        """Add the rows' gradients. If kernels are only tried, try Adam's too."""
         assert rows.gradients is not None, "the batch asks for them"
         parameters, sums = rows.model
         shown = None if self.shown is None else self.shown.rows(rows.start, rows.stop)
@@ -104,14 +115,18 @@ class _AddedView(GradientStep):
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """Results of a view on another device, on the host until the next step: by name the arrays of its rows, and its
-    gradients by group; the loss; the gradient of its appearance, if that is learnt."""
+class ViewOutcome:
+    """Results of a view on another device, on the host until the next step.
+
+    arrays: arrays of its rows, by name.
+    gradients: by group.
+    own: gradients of its shares.
+    """
 
     arrays: dict[str, NDArray[Any]]
     gradients: dict[str, NDArray[np.float32]]
     loss: Loss
-    columns: NDArray[Any] | None = None
+    own: Sequence[NDArray[Any] | None] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +135,11 @@ class _RemoteView(GradientStep):
 
     arrays: dict[str, NDArray[Any]]
     outcome: dict[str, NDArray[np.float32]]
-    columns: list[NDArray[Any]]
+    own: list[NDArray[Any] | None]
 
-    def learn(self, appearance: ViewAppearance, columns: DeviceArray) -> None:  # noqa: ARG002  # the owner does
-        """Copy the gradient to the host."""
-        self.columns.append(columns.get())
+    def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:  # noqa: ARG002  # the owner does
+        """Copy the gradients to the host."""
+        self.own.extend(None if gradient is None else gradient.get() for gradient in own)
 
     def update(self, rows: StepRows) -> None:
         """Copy the rows' results to the host."""
@@ -147,7 +162,7 @@ class _RemoteView(GradientStep):
 class Replica:
     """A further device of a training, with a copy of the parameters, and a thread."""
 
-    def __init__(self, device: Device, config: TrainConfig, photographs: Photographs) -> None:
+    def __init__(self, device: Device, config: TrainConfig, photographs: ImageCache) -> None:
         self.device, self.config, self.photographs = device, config, photographs.for_device(device)
         self.rasterizer = Rasterizer(device, config.rasterizer)
         self.rasterizer.antialias(on=config.antialiased)
@@ -157,7 +172,7 @@ class Replica:
         self._room: dict[tuple[int, str], NDArray[Any]] = {}
 
     def follow(self, plan: Plan) -> None:
-        """Work in as much of the device's memory as the plan has for it."""
+        """Use as much of the device's memory as the plan allows."""
         self.plan, self.parameters = plan, None
         self._room.clear()
         self.rasterizer.follow(plan)
@@ -179,20 +194,25 @@ class Replica:
     def view(
         self,
         place: int,
-        sample: Sample,
+        inputs: ViewInputs,
         factor: float,
         step: GradientStep,
-        gains: NDArray[np.float32] | None,
+        values: Sequence[NDArray[np.float32]],
         *,
         splats: bool,
-    ) -> Outcome:
-        """Forward, loss and backward of a view; place: its number among this device's; factor: of its resolution;
-        gains: of its photograph, where they are learnt; splats: True if density control goes by its gradients."""
-        parameters, photograph = self.parameters, self.photographs.bring(sample.view, factor)
+    ) -> ViewOutcome:
+        """Forward, loss and backward of a view.
+
+        place: its number among this device's views.
+        factor: divisor of the photographs' resolution.
+        values: values of its shares, for this device.
+        splats: True if density control uses its gradients.
+        """
+        parameters, photograph = self.parameters, self.photographs.bring(inputs.view, factor)
         assert parameters is not None, "taken before the view"
         n, sh_rest = parameters.count, updates_sh_rest(step.config.optimiser, step.step)
         shapes = group_shapes(n, parameters.coefficients)
-        gradients = {g: self._host(place, g, shapes[g]) for g in GROUPS if g != "sh_rest" or sh_rest}
+        gradients = {g: self._host(place, g, shapes[g]) for g in PARAMETER_GROUPS if g != "sh_rest" or sh_rest}
         arrays = {"tile_counts": self._host(place, "tile_counts", (n,), np.uint32)}
         if splats:
             arrays["splats"] = self._host(place, "splats", (n, len(SPLAT)))
@@ -201,12 +221,11 @@ class Replica:
             arrays["contributions"] = self._host(place, "contributions", (n,))
         settings = (self.device, self.rasterizer, step.config, step.step, step.rates, step.fields)
         room = view_gradients(self.rasterizer.work, parameters)
-        pixels = (photograph, sample.camera, sample.background)
-        appearance = step.appearance.on(self.device, gains) if step.appearance and gains is not None else None
-        columns: list[NDArray[Any]] = []
-        view = _RemoteView(*settings, arrays, gradients, columns, explore=step.explore, appearance=appearance)
-        result = view.run((parameters,), *pixels, StepProbe(), room, reads_loss=True, **sample.known)
-        return Outcome(arrays, gradients, result, next(iter(columns), None))
+        shares = tuple(part.on(self.device, each) for part, each in zip(inputs.parts, values, strict=True))
+        own: list[NDArray[Any] | None] = []
+        view = _RemoteView(*settings, arrays, gradients, own, explore=step.explore)
+        here = replace(inputs, photograph=photograph, parts=shares)
+        return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
         """Room on the host, the same from step to step: fresh pages would cost as much as the copy."""
@@ -219,12 +238,13 @@ class Replica:
 class Batch:
     """The gradients of several views, and Adam along their sum.
 
-    rasterizer, photographs: of the device that has the model; further: the other devices. Raises InputError for a
-    device that is there twice.
+    rasterizer, photographs: of the device that has the model.
+    further: the other devices.
+    Raises InputError if a device occurs twice.
     """
 
     def __init__(
-        self, rasterizer: Rasterizer, photographs: Photographs, config: TrainConfig, further: Sequence[Device]
+        self, rasterizer: Rasterizer, photographs: ImageCache, config: TrainConfig, further: Sequence[Device]
     ) -> None:
         devices = (rasterizer.device, *further)
         if len({device.queue.int_ptr for device in devices}) < len(devices):
@@ -239,7 +259,7 @@ class Batch:
         self._room: dict[str, NDArray[np.float32]] = {}
 
     def follow(self, plans: Sequence[Plan]) -> None:
-        """Work in as much of the further devices' memory as the plans have for it. What was planned before goes."""
+        """Use as much of the further devices' memory as the plans allow. Arrays of earlier plans are freed."""
         self._sums = self._sent = None
         self._room.clear()
         for replica, plan in zip(self.replicas, plans, strict=True):
@@ -258,48 +278,44 @@ class Batch:
         self,
         step: GradientStep,
         model: tuple[AnyGaussians, AnyGaussians, AnyGaussians],
-        samples: Sequence[Sample],
+        views: Sequence[ViewInputs],
         factor: float,
-        probes: Callable[[Sample, GradientStep], StepProbe],
-        appearances: Sequence[ViewAppearance] = (),
+        probes: Callable[[ViewInputs, GradientStep], StepProbe],
         *,
         statistics: bool,
     ) -> Losses:
-        """Update the model (parameters, first and second moments) by the samples.
+        """Update the model (parameters, first and second moments) by the views.
 
-        step: one of a single view, from which this one follows; its number counts views; factor: of the photographs'
-        resolution; probes: makes one for a view; appearances: of the samples, where they are learnt; statistics:
-        density control goes by the views' gradients.
+        step: the template of a single view's step; its number counts views.
+        factor: divisor of the photographs' resolution.
+        probes: makes a view's probe.
+        statistics: True if density control uses the views' gradients.
         """
         batch, work, device = self.config.batch, self.rasterizer.work, step.device
         optimiser, number = scaled(self.config.optimiser, batch), -(-step.step // batch)
         config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
         sums, shown = self._room_for(device, model[0])
         explore = step.explore
-        columns: dict[int, DeviceArray] = {}
-        settings = (device, self.rasterizer, config, number, rates, step.fields, shown, columns)
+        own: dict[int, Sequence[DeviceArray | None]] = {}
+        settings = (device, self.rasterizer, config, number, rates, step.fields, shown, own)
         step_of_view = _AddedView(*settings, explore=explore and explore.of_view())
-        steps = [replace(step_of_view, appearance=appearance) for appearance in appearances]
-        steps = steps or [step_of_view] * len(samples)
-        gains = [each.values() if self.replicas else None for each in appearances] or [None] * len(samples)
-        first, *others = shares(len(samples), 1 + len(self.replicas))
+        first, *others = shares(len(views), 1 + len(self.replicas))
         transfers = self._send(model[0])
-        pending: list[tuple[int, Future[Outcome]]] = []
+        pending: list[tuple[int, Future[ViewOutcome]]] = []
         try:
             for replica, share in zip(self.replicas, others, strict=True):
                 for place, index in enumerate(share):
-                    of_view = (samples[index], factor, steps[index], gains[index])
-                    view = partial(replica.view, place, *of_view, splats=statistics)
+                    values = [part.values() for part in views[index].parts]
+                    view = partial(replica.view, place, views[index], factor, step_of_view, values, splats=statistics)
                     pending.append((index, replica.thread.submit(view)))
-            losses = [self._view((model[0], sums), samples[index], factor, steps[index], probes) for index in first]
+            losses = [self._view((model[0], sums), views[index], factor, step_of_view, probes) for index in first]
             for transfer in transfers:
                 transfer.result()
             for index, future in pending:
                 outcome = future.result()
-                losses.append(self._take(sums, outcome, step_of_view, probes(samples[index], step_of_view)))
-                if outcome.columns is not None:
-                    columns[index] = upload(device, outcome.columns)
-        finally:  # what an error has ended goes on in no thread
+                losses.append(self._take(sums, outcome, step_of_view, probes(views[index], step_of_view)))
+                own[index] = [None if each is None else upload(device, each) for each in outcome.own]
+        finally:  # no thread may continue after an error
             under_way: list[Future[Any]] = [*transfers, *(future for _, future in pending)]
             wait([future for future in under_way if not future.cancel()])
         for start, stop, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
@@ -308,13 +324,14 @@ class Batch:
             adam(device, number, rates, optimiser, *models, counts, self.rasterizer.readback)
             if explore is not None:
                 noise(device, explore.scaled(sqrt(batch)), parameters, start, self.rasterizer.readback)
-        for appearance in appearances:
-            appearance.update(columns[appearance.place], self.rasterizer.readback)
+        for inputs in views:
+            for part, gradient in zip(inputs.parts, own[inputs.place], strict=True):
+                part.update(gradient, self.rasterizer.readback)
         self._sent = None if updates_sh_rest(optimiser, number) else model[0]
         return Losses(tuple(losses))
 
     def _room_for(self, device: Device, parameters: AnyGaussians) -> tuple[AnyGaussians, DeviceArray | None]:
-        """The sums, all zero, as `adam` leaves them, and where Adam wants to know the Gaussians shown, none yet."""
+        """Sums, all zero, as `adam` leaves them, and room for the Gaussians shown, cleared, if Adam needs them."""
         count, coefficients, sums = parameters.count, parameters.coefficients, self._sums
         if sums is None or (sums.count, sums.coefficients) != (count, coefficients):
             del sums
@@ -331,10 +348,10 @@ class Batch:
         return sums, shown
 
     def _send(self, parameters: AnyGaussians) -> list[Future[None]]:
-        """Send the parameters to the further devices, but for the higher bands of SH where these have them already."""
+        """Send the parameters to the further devices, except the higher SH bands if they are unchanged there."""
         if not self.replicas:
             return []
-        groups = [group for group in GROUPS if group != "sh_rest" or self._sent is not parameters]
+        groups = [group for group in PARAMETER_GROUPS if group != "sh_rest" or self._sent is not parameters]
         values = {group: self._on_host(group, parameters) for group in groups}
         return [replica.thread.submit(replica.take, values, parameters.coefficients) for replica in self.replicas]
 
@@ -351,18 +368,21 @@ class Batch:
     def _view(
         self,
         model: tuple[AnyGaussians, AnyGaussians],
-        sample: Sample,
+        inputs: ViewInputs,
         factor: float,
         step: _AddedView,
-        probes: Callable[[Sample, GradientStep], StepProbe],
+        probes: Callable[[ViewInputs, GradientStep], StepProbe],
     ) -> Loss:
-        """A view on the device that has the model, which here are its parameters and the sums."""
-        gradients = view_gradients(self.rasterizer.work, model[0])
-        pixels = (self.photographs.bring(sample.view, factor), sample.camera, sample.background)
-        return step.run(model, *pixels, probes(sample, step), gradients, reads_loss=True, **sample.known)
+        """Run a view on the device of the model.
 
-    def _take(self, sums: AnyGaussians, outcome: Outcome, step: _AddedView, probe: StepProbe) -> Loss:
-        """Add what a view has found on another device, in the memory of a view on this one."""
+        model: parameters and sums.
+        """
+        gradients = view_gradients(self.rasterizer.work, model[0])
+        inputs = replace(inputs, photograph=self.photographs.bring(inputs.view, factor))
+        return step.run(model, inputs, probes(inputs, step), gradients, reads_loss=True)
+
+    def _take(self, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe) -> Loss:
+        """Add a view's results from another device, in the memory of a view on this one."""
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)
         for start, stop, (part,) in parts(work, sums, keep=True):
@@ -380,7 +400,7 @@ class Batch:
 
 
 def _brought(work: Workspace, device: Device, name: str, values: NDArray[Any]) -> DeviceArray:
-    """An array of another device's, which is on the host until the next step."""
+    """Bring an array of another device to this one. It stays on the host until the next step."""
     if device.shares_memory and values.size:
         return shared(device, values)
     array = work.array(name, values.shape, values.dtype.type)

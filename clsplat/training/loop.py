@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training from start to end: the loop around the trainer's step, and what it leaves in a run's folder."""
+"""Training from start to end: the loop around the trainer's step, and its output in a run's folder."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from types import FrameType
 from typing import Any
 
@@ -18,12 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.camera import Camera
-from clsplat.config.training import TrainConfig
 from clsplat.device import cl
-from clsplat.device.child import TrialInterrupted
-from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
+from clsplat.device.drivers.worker_process import TrialInterrupted
+from clsplat.errors import CapacityError, ClsplatError, DriverError
 from clsplat.evaluation.depths import keep_depths
-from clsplat.evaluation.held_out import evaluate
+from clsplat.evaluation.held_out import EvaluatedModel, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.images.colour import photos_space
@@ -33,37 +31,38 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.runs import scene_record
 from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import unusable
-from clsplat.runs.run import Run, check_resumed
-from clsplat.scenes import doubts
-from clsplat.scenes.cloud import with_points
-from clsplat.scenes.depth import with_depths
-from clsplat.scenes.initialise import is_colourless, photographed
-from clsplat.scenes.scene import Scene
+from clsplat.runs.run import Run
+from clsplat.scenes.analysis import sanity_checks
 from clsplat.stages.loss import Loss
 from clsplat.training import telemetry
 from clsplat.training.batch import Losses
-from clsplat.training.cameras import aligned
-from clsplat.training.health import RETURNS, WINDOW
-from clsplat.training.judging import judge
-from clsplat.training.refined import doubt_poses, keep_cameras
-from clsplat.training.repro import write_bundle
+from clsplat.training.cameras.export import doubt_poses
+from clsplat.training.held_out_alignment import aligned
+from clsplat.training.preparation import late_settings
+from clsplat.training.repro_bundle import write_bundle
+from clsplat.training.stability.health import MAX_CHECKPOINT_RETURNS, TROUBLE_WINDOW_STEPS
 from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
-"""Steps between readings of the loss, for which the host waits; the device goes on with the rest of the step."""
-HELD = 0.97
-"""Part of --density.max-gaussians from which on growth is taken to have ended there: some are pruned since."""
+"""Steps between readings of the loss. The host waits for the loss while the device continues with the step."""
+GROWTH_LIMIT_FRACTION = 0.97
+"""Fraction of --density.max-gaussians from which growth counts as limited: some Gaussians are pruned after reaching
+it."""
 
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
-"""A function called before each step, with the trainer and a function that is True once Ctrl-C was pressed: then it
-should return."""
+"""A function called before each step, with the trainer and a predicate that is True after Ctrl-C, when it should
+return."""
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """step: number of steps done; loss and psnr of that step's view, or of all that its gradient is of; seconds of
-    training alone, so far."""
+    """Report of a step.
+
+    step: number of steps done.
+    loss, psnr: of that step's view, or of all views of its batch.
+    seconds: training time so far, without anything else.
+    """
 
     step: int
     loss: float
@@ -74,8 +73,11 @@ class StepReport:
 
 @contextmanager
 def _interruption() -> Iterator[Callable[[], int]]:
-    """Inside, the first Ctrl-C or other signal to end is noted, and the loop stops between two steps: the function
-    gives its number then, and 0 before. After it a Ctrl-C is Python's own, and the other signals do what they did."""
+    """Context in which the first Ctrl-C or other termination signal only stops the loop between two steps.
+
+    Its function returns the signal's number, or 0 without one. After the signal, a Ctrl-C is Python's own again, and
+    the other signals are restored.
+    """
     first = 0
 
     def ask(number: int, _frame: FrameType | None) -> None:
@@ -85,7 +87,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
     def asked() -> int:
         if not first:
-            for number in before:  # again, as compilers of kernels install handlers of their own
+            for number in before:  # again, as kernel compilers install handlers of their own
                 signal.signal(number, ask)
         return first
 
@@ -94,8 +96,8 @@ def _interruption() -> Iterator[Callable[[], int]]:
         yield asked
 
 
-class Session:
-    """One call of `clsplat.train`: a trainer, the run that it writes to, and the seconds that it has trained."""
+class TrainingSession:
+    """One call of `clsplat.train`: a trainer, its run, and its training time in seconds."""
 
     def __init__(
         self,
@@ -108,7 +110,6 @@ class Session:
         record = scene_record.read(run) if run is not None else None
         self.scene = scene_record.digest_of(record) if record is not None else None
         self.announced: Plan | None = None
-        self.renderer = Renderer(trainer.device, trainer.rasterizer)
         self.seconds = 0.0
         self.began = time.perf_counter()
         self.recorded, self.first_step = False, 0
@@ -116,7 +117,7 @@ class Session:
         self.troubles: Counter[str] = Counter()
 
     def resume(self) -> None:
-        """Go on from the latest checkpoint, if there is one."""
+        """Continue from the latest checkpoint, if there is one."""
         if self.run is not None and (checkpoint := self.run.load_latest_checkpoint()) is not None:
             self.trainer.restore(checkpoint)
             seconds = checkpoint.state.get("seconds")
@@ -126,7 +127,7 @@ class Session:
             self.saved = checkpoint.step
 
     def save(self) -> None:
-        """Write a checkpoint, unless this step has one, or the model is not one to go back to."""
+        """Write a checkpoint, unless this step has one or the model is too broken to return to."""
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
             if not self.trainer.watch.patience.lost:
@@ -135,8 +136,11 @@ class Session:
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """Write a checkpoint of the state that the step began with, if that is whole, after a trial that failed or was
-        interrupted. The end of a sentence that says so, or nothing."""
+        """Write a checkpoint of the state at the start of the step, if it is intact, after a failed or interrupted
+        trial.
+
+        Returns the end of a sentence that reports it, or "".
+        """
         if self.run is None or not self.trainer.step_back():
             return ""
         try:
@@ -149,8 +153,10 @@ class Session:
         return f"; the checkpoint of step {self.trainer.step} is written: {resume} goes on from it"
 
     def go_back(self) -> bool:
-        """Tell what trouble there was; after too much of it go back to the last checkpoint, with smaller steps, and
-        after too much of that raise ClsplatError. True if it went back."""
+        """Report trouble. After too much of it go back to the last checkpoint, with smaller learning rates.
+
+        After too many returns raise ClsplatError. Returns True if it went back.
+        """
         trainer, patience = self.trainer, self.trainer.watch.patience
         self.tell_trouble()
         if not patience.over:
@@ -167,15 +173,16 @@ class Session:
         if self.run is not None:
             self.run.truncate_metrics(trainer.step)
             self.saved = -1
-            self.save()  # how small the steps are now must outlast a crash
+            self.save()  # the smaller learning rates must survive a crash
         warnings.warn(
-            f"step {stopped}: {len(patience.troubled)} of the last {WINDOW} steps had trouble: back to step "
+            f"step {stopped}: {len(patience.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had trouble: back to "
+            "step "
             f"{trainer.step}, with learning rates of {trainer.watch.patience.rate_factor:g} of what they would be"
         )
         return True
 
     def tell_trouble(self) -> None:
-        """A warning for the first trouble of each stage; the rest is counted."""
+        """Warn of the first trouble of each stage, and count the rest."""
         for incident in self.trainer.watch.incidents:
             self.troubles[incident.stage] += 1
             if self.troubles[incident.stage] == 1:
@@ -190,24 +197,24 @@ class Session:
             warnings.warn(f"{untold} more steps had something that was not finite")
 
     def give_up(self) -> None:
-        """Raise ClsplatError, with what reproduces the trouble in the run's folder."""
+        """Write a bundle that reproduces the trouble into the run's folder, and raise ClsplatError."""
         incident = self.trainer.watch.latest
         assert incident is not None, "patience is over only after trouble"
-        trouble = f"{incident}, and {RETURNS} returns with smaller steps did not help"
+        trouble = f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns with smaller steps did not help"
         if self.run is None:
             raise ClsplatError(f"{trouble}: give a run, and what reproduces it is written there")
         path = write_bundle(self.run.path, self.trainer, incident)
-        raise ClsplatError(f"{trouble}: {path} reproduces it (python -m clsplat.training.repro)")
+        raise ClsplatError(f"{trouble}: {path} reproduces it (python -m clsplat.training.repro_bundle)")
 
     def tell_plan(self) -> None:
-        """Tell how the device's memory is used, at first and when more is done in pieces, or less."""
+        """Report the use of the device's memory, first and whenever more or less work is split into pieces."""
         plan, announced = self.trainer.plan, self.announced
         if self.on_plan is not None and (announced is None or plan.pieces != announced.pieces):
             self.on_plan(plan)
         self.announced = plan
 
     def report(self, result: Loss | Losses) -> StepReport | None:
-        """Read the loss of the step just made; None where it is not finite."""
+        """Read the loss of the latest step; None if it is not finite."""
         start = time.perf_counter()
         value, squared = result.read()
         self.seconds += time.perf_counter() - start
@@ -218,19 +225,20 @@ class Session:
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
 
     def draw(self, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Image and alpha of the model as it is, before the background of evaluations."""
-        trainer, background = self.trainer, background_colour(self.trainer.config.background)
-        trainer.settle()
-        result = self.renderer.render(trainer.parameters, trainer.local(camera), background)
+        """Image and alpha of the current model, before compositing over the background of evaluations."""
+        result = self.trainer.draw(camera)
         return result.image, result.alpha
 
     def render(self, model: Gaussians, camera: Camera) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Image over black and alpha of a model on the host."""
+        """Image over black, and alpha, of a model on the host."""
         result = Renderer(self.trainer.device, config=self.trainer.config.rasterizer).render(model, camera)
         return result.image, result.alpha
 
     def evaluate(self, *, keep: bool) -> dict[str, Any]:
-        """The held-out views; their renders are kept in the run's test/ if asked for."""
+        """Evaluate the held-out views.
+
+        keep: keep their renders in the run's test/.
+        """
         trainer = self.trainer
         trainer.settle()
         seen = held_out_looks(trainer.appearance.record())
@@ -239,9 +247,7 @@ class Session:
             trainer.cameras.lenses.of_views(trainer.scene.test_views),
             background_colour(trainer.config.background),
             self.run.test_path if keep and self.run is not None else None,
-            step=trainer.step,
-            gaussians=trainer.parameters.count,
-            seconds=self.seconds,
+            model=EvaluatedModel(trainer.step, trainer.parameters.count, self.seconds),
             corrected=trainer.config.appearance != "none",
             aligned=(lambda view: seen(view.name, self.draw(aligned(trainer, view, seen))[0]))
             if trainer.cameras.poses.on and keep
@@ -252,7 +258,7 @@ class Session:
     def record(
         self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, judged: bool = False
     ) -> None:
-        """Hand the report on, and write it down with what clsplat.report asks for."""
+        """Pass the report on, and record it with the data that clsplat.report needs."""
         if self.on_step is not None:
             self.on_step(report)
         record = asdict(report)
@@ -274,14 +280,13 @@ class Session:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """A warning if the renders show nothing; no look at them if the memory is too small for one."""
+        """Warn if the renders show nothing. It renders nothing if memory is too small."""
         with suppress(CapacityError):
-            if text := doubts.of_pictures(self.draw, self.trainer.views):
+            if text := sanity_checks.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
 
     def times_stages(self, steps: range) -> bool:
-        """True if each stage of these steps, which are made together, is to be timed: only where the times are written
-        down."""
+        """True if each stage of these steps, which run together, has to be timed; only if the times are recorded."""
         config = self.trainer.config
         if config.stages_every == 0:
             return False
@@ -297,7 +302,7 @@ class Session:
         return _reached(REPORT_EVERY, steps) or self.trainer.config.iterations in steps or asked
 
     def step(self) -> None:
-        """One step, or those of a batch, and what is due after it."""
+        """Run one step, or a batch of them, and the work that is due afterwards."""
         trainer, config = self.trainer, self.trainer.config
         start, stages = time.perf_counter(), None
         steps = range(trainer.step + 1, trainer.step + 1 + trainer.views_ahead)
@@ -312,8 +317,8 @@ class Session:
             trainer.mend(look=True)
         if self.go_back():
             return
-        judged = judge(trainer)
-        if doubts.LOOK_AT in steps and trainer.step < config.iterations:
+        judged = trainer.judge()
+        if sanity_checks.FIRST_RENDER_CHECK_STEP in steps and trainer.step < config.iterations:
             self.doubt()
         if reports:
             evaluating = self.evaluates(steps)
@@ -324,7 +329,7 @@ class Session:
             self.save()
 
     def train(self, between: Between | None) -> Gaussians:
-        """Make the steps that are left, and write down the model and its evaluation."""
+        """Run the remaining steps, and write the model and its evaluation."""
         trainer, run = self.trainer, self.run
         self.first_step = trainer.step
         _tell_idle_settings(trainer)
@@ -340,23 +345,21 @@ class Session:
         model = trainer.gaussians()
         if run is not None:
             run.save_model(model, photos_space(view.path for view in trainer.scene.views))
-            if (appearance := trainer.appearance.record()) is not None:
-                run.write_appearance(appearance, trainer.appearance.tables())
-            if trainer.config.refines:
-                keep_cameras(run, trainer)
+            for component in trainer.components:
+                component.write(run)
             if trainer.scene.test_views:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
                 doubt_poses(result["mean"], trainer.config.refine_gate)
                 ample = trainer.device.memory.limit is None and not any(trainer.plan.pieces)
                 if trainer.config.report and ample:
-                    with suppress(CapacityError, DriverError):  # a picture less is no failed training
+                    with suppress(CapacityError, DriverError):  # a missing picture does not fail the training
                         views = trainer.cameras.lenses.of_views(trainer.scene.test_views)
                         keep_depths(self.render, model, views, result["views"], run.depth_path)
         return model
 
     def make_steps(self, between: Between | None) -> None:
-        """All steps that are left, and what is due at their end. Raises Interrupted, after a checkpoint."""
+        """Run the remaining steps, and the work that is due at their end. Raises Interrupted, after a checkpoint."""
         trainer, last = self.trainer, self.trainer.config.iterations
         with _interruption() as interrupted:
             while True:
@@ -375,9 +378,9 @@ class Session:
 
 
 def _tell_of_limit(trainer: Trainer) -> None:
-    """Warn where a limit has held the paper's growth, which began under it."""
+    """Warn if the limit has stopped the paper's growth, which started below it."""
     density, scene = trainer.config.density, trainer.scene
-    most, began = HELD * density.max_gaussians, len(scene.points) or trainer.config.random_points
+    most, began = GROWTH_LIMIT_FRACTION * density.max_gaussians, len(scene.points) or trainer.config.random_points
     if density.growth == "paper" and began < most <= trainer.parameters.count:
         warnings.warn(
             f"--density.max-gaussians {density.max_gaussians:,} has held the growth: --density.growth mcmc, or budget "
@@ -390,87 +393,8 @@ def _reached(every: int, steps: range) -> bool:
     return steps[-1] // every > (steps[0] - 1) // every
 
 
-def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """The scene to train on, with colours, recorded in the run; a warning for each doubt in it. Raises InputError where
-    the run has been trained already, or on another scene."""
-    scene = with_depths(with_points(scene, config.start_points), config.depth_use)
-    if run is not None:
-        if not resume and (run.checkpoints() or run.read_metrics()):
-            raise InputError(
-                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
-                "starts again"
-            )
-        run.keep_config(config)
-        if resume:
-            scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
-        scene_record.keep(run, scene, resuming=resume)
-        if resume and run.checkpoints():
-            return scene
-    for text in doubts.of_scene(scene, config.background):
-        warnings.warn(text)
-    if is_colourless(scene):
-        warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
-        scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
-    return scene
-
-
-def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
-    """The settings. Raises InputError where the arguments of `clsplat.train` make no sense."""
-    for name, value, kind, meant in (
-        ("scene", scene, Scene, "clsplat.load_scene(...)"),
-        ("config", config, TrainConfig | None, "TrainConfig(...)"),
-        ("run", run, Run | None, "Run.create(...)"),
-    ):
-        if not isinstance(value, kind):
-            raise InputError(f"{name} is {value!r:.100}, expected {meant}")
-    if resume and run is None:
-        raise InputError("resume=True: expected run=..., the run to go on with")
-    if config is None:
-        config = run.config if run is not None else TrainConfig()
-    config.check()
-    if resume and run is not None:
-        check_resumed(run, config)
-        if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
-            raise InputError(f"iterations {config.iterations}: {run.path} is at step {done} already, expected more")
-    scene.require_training_views()
-    return config
-
-
-def late_settings(config: TrainConfig) -> Iterator[str]:
-    """A line for each setting that is not the default and comes after the last step, or begins before the first."""
-    last, expected = config.iterations, f"expected at most --iterations {config.iterations}"
-    ends = f"training ends at step {last}"
-    if steps := [step for step in config.density.prune_at if step > last]:
-        yield f"--density.prune-at {','.join(map(str, steps))}: nothing is pruned then, {ends}; {expected}"
-    density = config.density
-    if density.every and density.growth != "paper" and density.stop > last:
-        yield (
-            f"--density.growth {density.growth}: --density.max-gaussians {density.max_gaussians:,} is reached at "
-            f"--density.stop {density.stop}, {ends}; {expected}, such as {5 * last // 7}"
-        )
-    optimiser = config.optimiser
-    if optimiser.cooldown > last:
-        part = optimiser.cooldown_to ** (1 - last / optimiser.cooldown)
-        yield (
-            f"--optimiser.cooldown {optimiser.cooldown}: the learning rates begin at {part:.2g} of what they are, "
-            f"training has {last} steps; {expected}"
-        )
-    if config.frequency_steps > last:
-        rise = "the training resolution does not rise to the full size"
-        yield f"--frequency-steps {config.frequency_steps}: {rise}, {ends}; {expected}"
-    elif (
-        not config.frequency_steps
-        and tuple(config.warmup) != TrainConfig.warmup
-        and (steps := [step for step in config.warmup if step >= max(last, 2)])
-    ):
-        yield (
-            f"--warmup {','.join(map(str, steps))}: the training resolution does not double then, {ends} at "
-            f"1/{2 ** len(steps)} of the size; expected less than --iterations {last}"
-        )
-
-
 def _tell_idle_settings(trainer: Trainer) -> None:
-    """A warning for each setting that comes to nothing with this scene."""
+    """Warn of each setting that has no effect with this scene."""
     config, count = trainer.config, trainer.parameters.count
     for text in late_settings(config):
         warnings.warn(text)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Notes of a training in metrics.jsonl for its report: device and versions, time of each stage, contributions."""
+"""Records for a training's report in metrics.jsonl: device and versions, time of each stage, contributions."""
 
 from __future__ import annotations
 
@@ -15,30 +15,29 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-import clsplat
 from clsplat.device import cl
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 from clsplat.rendering.contributions import sums_of_weights
 from clsplat.stages.device_gaussians import HostGaussians
+from clsplat.version import package_version
 
 if TYPE_CHECKING:
     from clsplat.training.trainer import Trainer
 
 T = TypeVar("T")
 
-PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
-SECONDS = 1.0
-"""Seconds in which training views are looked at for contributions, beside the first."""
-EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
+REPORTED_PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
+CONTRIBUTION_SECONDS = 1.0
+"""Time limit for sampling training views for contributions, after the first view."""
+CONTRIBUTION_BIN_EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
 """Powers of ten of pixels, between the bins of contributions."""
 
 
 def session(device: Device, step: int) -> dict[str, Any]:
-    """Record of the machine that trains, from `step` on. No name of a user, host or folder: reports are sent to
-    others."""
-    versions = {"clsplat": clsplat.__version__, "Python": platform.python_version()}
-    for package in PACKAGES:
+    """Record of the machine that trains from `step`. Reports are shared, so it names no user, host or folder."""
+    versions = {"clsplat": package_version(), "Python": platform.python_version()}
+    for package in REPORTED_PACKAGES:
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
     return {
@@ -55,10 +54,10 @@ def session(device: Device, step: int) -> dict[str, Any]:
 
 
 def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
-    """The result, and milliseconds of each stage, "other" for what is in none and "all" for everything.
+    """Result of `work`, and milliseconds of each stage; "other" for time outside the stages, "all" for the total.
 
-    Wall time from an idle device to an idle device, so that launches are in it and no queue needs profiling. Only for
-    this once: waiting at every seam takes the overlap of host and device away.
+    It measures wall time from an idle device to an idle device. So launches are included and no queue needs profiling.
+    Use it rarely: waiting after every stage prevents host and device from overlapping.
     """
     with device.recorder.recording(wait=True) as stages:
         result, total = device.timed(work)
@@ -66,10 +65,13 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
     return result, {**times, "other": max(total - sum(times.values()), 0.0), "all": total}
 
 
-def contributions(trainer: Trainer, seconds: float = SECONDS) -> dict[str, Any] | None:
-    """A histogram of `largest_contributions`: `none` counts those that none shows, `counts` those between `edges`,
-    powers of ten of pixels; the first and last take what is beyond. None where memory is limited, as that was planned
-    for training alone."""
+def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> dict[str, Any] | None:
+    """Histogram of `largest_contributions`.
+
+    `none` counts Gaussians that no view shows, `counts` those between `edges`, which are powers of ten of pixels. The
+    first and last bin include everything beyond.
+    Returns None if memory is limited, as the plan covers training alone.
+    """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
         return None
     try:
@@ -77,21 +79,21 @@ def contributions(trainer: Trainer, seconds: float = SECONDS) -> dict[str, Any] 
     except (CapacityError, cl.MemoryError):
         return None
     seen = largest[np.isfinite(largest) & (largest > 0)]
-    powers = np.clip(np.log10(seen.astype(np.float64)), EDGES[0], EDGES[-1])
-    counts, _ = np.histogram(powers, EDGES)
+    powers = np.clip(np.log10(seen.astype(np.float64)), CONTRIBUTION_BIN_EDGES[0], CONTRIBUTION_BIN_EDGES[-1])
+    counts, _ = np.histogram(powers, CONTRIBUTION_BIN_EDGES)
     return {
         "views": looked,
         "of": len(trainer.views),
         "none": len(largest) - len(seen),
-        "edges": list(EDGES),
+        "edges": list(CONTRIBUTION_BIN_EDGES),
         "counts": counts.tolist(),
     }
 
 
-def largest_contributions(trainer: Trainer, seconds: float = SECONDS) -> tuple[NDArray[np.float32], int]:
-    """Largest contribution of each Gaussian (n,) to one of the views (`sums_of_weights`), and the number of views.
+def largest_contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> tuple[NDArray[np.float32], int]:
+    """Largest contribution of each Gaussian (n,) to a sampled view (`sums_of_weights`), and the number of views.
 
-    It looks at as many training views, spread evenly, as `seconds` allow. Changes nothing that training goes by. Raises
+    It samples as many training views, evenly spaced, as `seconds` allow. The training state does not change. Raises
     CapacityError.
     """
     rasterizer, views, looked = trainer.rasterizer, trainer.views, 0
@@ -102,14 +104,14 @@ def largest_contributions(trainer: Trainer, seconds: float = SECONDS) -> tuple[N
         np.maximum(largest, sums_of_weights(rasterizer, frame), out=largest)
         looked += 1
         if looked == 1:
-            start = time.perf_counter()  # kernels may have been built
+            start = time.perf_counter()  # the first view may have built kernels
         elif time.perf_counter() - start > seconds:
             break
     return largest, looked
 
 
 def _spread(count: int) -> list[int]:
-    """0 to count - 1, any first few of them far from each other: by the bits of the index reversed."""
+    """0 to count - 1 in bit-reversed order, so that any first few are far apart."""
     bits = max(count - 1, 1).bit_length()
     turned = (int(f"{index:0{bits}b}"[::-1], 2) for index in range(1 << bits))
     return [index for index in turned if index < count]

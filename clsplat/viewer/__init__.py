@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer: a page in the browser, whose picture the OpenCL device renders (docs/viewer.md).
+"""The viewer: a browser page that shows frames rendered by the OpenCL device (docs/viewer.md).
 
-`pose`, `refinement`, `appearance` and `path_recorder` are policy, without OpenCL and without viser; `scheduler` shares
-the work of one thread among all viewers; `models` has the models that are shown; `server` and `page` speak to the
-browser, by viser.
+`pose`, `refinement`, `appearance` and `path_recorder` are policy, without OpenCL and viser.
+`scheduler` divides one thread's work among all viewers. `models` holds the models that are shown.
+`server` and `page` talk to the browser through viser.
 """

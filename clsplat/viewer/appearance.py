@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearance of a model on a page: parts left out or changed, the channel, its colours. No OpenCL, no viser."""
+"""Appearance of a model on a page: edits of the Gaussians, display channel and colour map. No OpenCL, no viser."""
 
 from __future__ import annotations
 
@@ -17,26 +17,34 @@ from clsplat.models.edit import drop_sh, in_box, take
 
 Image = NDArray[np.uint8]
 Mode = Literal["colour", "depth", "alpha", "count"]
-MODES: tuple[Mode, ...] = get_args(Mode)
+VIEWER_MODES: tuple[Mode, ...] = get_args(Mode)
 Box = tuple[float, float, float, float, float, float]
-"""The least x, y, z in the world, and the largest."""
+"""Smallest x, y, z in the world, then largest x, y, z."""
 
-LARGEST_OPACITY = 0.999
-"""Upper limit of a raised opacity: the logit of 1 is not finite."""
-SIZES = (0.05, 2.0)
-OPACITIES = (0.0, 3.0)
-SCALE = np.array(
+MAX_EDITED_OPACITY = 0.999
+"""Upper limit of an opacity that was raised: the logit of 1 is infinite."""
+SIZE_FACTOR_RANGE = (0.05, 2.0)
+OPACITY_FACTOR_RANGE = (0.0, 3.0)
+VIRIDIS_RGB = np.array(
     [(68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141), (39, 173, 129), (92, 200, 99),
      (170, 220, 50), (253, 231, 37)],
     np.float64,
 )  # fmt: skip
-"""Dark to bright, 8-bit: every eighth part of viridis (Smith and van der Walt 2015, CC0,
-https://bids.github.io/colormap/)."""
+"""Colour map from dark to bright, 8-bit: every eighth entry of viridis.
+
+Smith and van der Walt 2015, CC0, https://bids.github.io/colormap/.
+"""
 
 
 @dataclass(frozen=True)
 class Look:
-    """mode: what is shown; degree: SH bands up to this one; size, opacity: factors; crop: nothing outside is shown."""
+    """Appearance settings of a page.
+
+    mode: the displayed channel.
+    degree: highest SH degree used.
+    size, opacity: factors.
+    crop: Gaussians outside are hidden.
+    """
 
     mode: Mode = "colour"
     degree: int = 3
@@ -45,24 +53,24 @@ class Look:
     crop: Box | None = None
 
     def changes(self, degree: int) -> Look | None:
-        """The part of the look that changes a model of this SH degree, whatever the mode; None for nothing."""
+        """The settings that edit a model of this SH degree, without the mode; None if they change nothing."""
         asked = replace(self, mode="colour", degree=min(self.degree, degree))
         return None if asked == Look(degree=degree) else asked
 
 
 def read_look(mode: Any, degree: Any, size: Any, opacity: Any, crop: Any = None) -> Look:
-    """The look that a page's controls ask for; numbers that no slider has are brought into its range."""
+    """Look from the values of a page's controls. Numbers outside a slider's range are clamped."""
     box = None
     if crop is not None:
         corners = np.asarray(crop, np.float64).reshape(2, 3)
         if np.isfinite(corners).all():
             box = tuple(float(value) for value in np.concatenate([corners.min(axis=0), corners.max(axis=0)]))
     return Look(
-        mode if mode in MODES else "colour",
+        mode if mode in VIEWER_MODES else "colour",
         int(_within(degree, 0, 3, 3)),
-        _within(size, *SIZES, 1.0),
-        _within(opacity, *OPACITIES, 1.0),
-        box,  # type: ignore[arg-type]  # six of them
+        _within(size, *SIZE_FACTOR_RANGE, 1.0),
+        _within(opacity, *OPACITY_FACTOR_RANGE, 1.0),
+        box,  # type: ignore[arg-type]  # six numbers
     )
 
 
@@ -72,13 +80,13 @@ def _within(value: Any, low: float, high: float, usual: float) -> float:
 
 
 def edited(gaussians: Gaussians, look: Look) -> Gaussians:
-    """The model as it is looked at. What does not change is shared with the one given."""
+    """The model edited by a look. Unchanged arrays are shared with the input."""
     model = drop_sh(gaussians, look.degree) if look.degree < gaussians.sh_degree else replace(gaussians)
     if look.size != 1:
         model.log_scales = gaussians.log_scales + np.float32(math.log(look.size))
     if look.opacity != 1:
         opacity = look.opacity / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
-        opacity = np.clip(opacity, 1e-6, LARGEST_OPACITY)
+        opacity = np.clip(opacity, 1e-6, MAX_EDITED_OPACITY)
         model.opacity_logits = np.log(opacity / (1 - opacity)).astype(np.float32)
     if look.crop is not None:
         model = take(model, in_box(gaussians, look.crop[:3], look.crop[3:]))
@@ -86,17 +94,17 @@ def edited(gaussians: Gaussians, look: Look) -> Gaussians:
 
 
 def colour_picture(image: Float32) -> Image:
-    """(H, W, 3) uint8 of a frame, with the bits that `clsplat render` writes to a PNG."""
+    """Convert a frame to (H, W, 3) uint8, with the bits that `clsplat render` writes to a PNG."""
     return steps_of([image], 8)
 
 
 def alpha_picture(alpha: Float32) -> Image:
-    """(H, W, 3) uint8: black where nothing is."""
+    """Alpha as a grey picture (H, W, 3) uint8: transparent pixels are black."""
     return colour_picture(np.broadcast_to(alpha[:, :, None], (*alpha.shape, 3)))
 
 
 def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
-    """(H, W, 3) uint8, near is bright, nothing is black; and between which depths, in words."""
+    """Depth as a picture (H, W, 3) uint8, and a text with its range. Near is bright, transparent is black."""
     seen = alpha > 0.5
     if not seen.any():
         return np.zeros((*depth.shape, 3), np.uint8), "nothing is seen"
@@ -106,16 +114,16 @@ def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
 
 
 def count_picture(count: NDArray[np.int32]) -> tuple[Image, str]:
-    """(H, W, 3) uint8, many are bright; and how many, in words."""
+    """Number of Gaussians a pixel as a picture (H, W, 3) uint8, bright for many, and a text with its range."""
     most = max(float(np.quantile(count, 0.995)), 1.0)
     return _shaded(count / most, None), f"0 to {most:,.0f} Gaussians a pixel (bright), {int(count.max()):,} at most"
 
 
 def _shaded(shade: NDArray[np.float64], alpha: Float32 | None) -> Image:
-    """0 to 1 in the colours of SCALE."""
+    """Map values from 0 to 1 to the colour map, scaled by alpha if given."""
     at = np.clip(np.nan_to_num(shade), 0, 1)
-    stops = np.linspace(0, 1, len(SCALE))
-    table = np.stack([np.interp(np.linspace(0, 1, 256), stops, column) for column in SCALE.T], axis=1)
+    stops = np.linspace(0, 1, len(VIRIDIS_RGB))
+    table = np.stack([np.interp(np.linspace(0, 1, 256), stops, column) for column in VIRIDIS_RGB.T], axis=1)
     colours = table[np.rint(255 * at).astype(np.intp)]
     if alpha is not None:
         colours = colours * np.clip(alpha, 0, 1)[:, :, None]

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that are shown: one that does not change, or one in training. Their pictures are made by
-`clsplat.rendering.rasterizer`.
+"""Models that the viewer shows: a fixed one, or one in training. `clsplat.rendering.rasterizer` renders them.
 
-Only the thread that made them may ask for pictures: a device has one queue.
+Only the thread that created a model may ask it for pictures, because a device has one queue.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from clsplat.camera import Camera
-from clsplat.config.presets import PRESETS
+from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError, InputError
@@ -23,17 +22,17 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training.trainer import Trainer
 from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture, count_picture, depth_picture, edited
-from clsplat.viewer.pose import MOST_PIXELS
+from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 
-HELD = 2
-"""Models on the device: the one of the file, and one that is looked at in another way."""
-FEATURES = 3
-"""Floats of a Gaussian, at least, that go into channels beside colour."""
+MAX_MODELS_ON_DEVICE = 2
+"""Models kept on the device: the file's, and one edited by a look."""
+CHANNEL_FLOATS_PER_GAUSSIAN = 3
+"""Floats per Gaussian that the channels need at least, in addition to colour."""
 
 
 def draft(config: RasterizerConfig) -> RasterizerConfig:
-    """Settings for pictures in motion: approximate where that is quick, of the same SH."""
-    fast = PRESETS["fast"]
+    """Rasterizer settings for pictures in motion: approximate where that is quick, with the same SH settings."""
+    fast = RASTERIZER_PRESETS["fast"]
     return replace(
         config,
         alpha_min=max(config.alpha_min, fast.alpha_min),
@@ -42,10 +41,10 @@ def draft(config: RasterizerConfig) -> RasterizerConfig:
 
 
 class HeldModel:
-    """A model from a file. The device holds it as it is, and with the changes of the last look."""
+    """Model from a file. The device holds it unchanged, and edited by the last look."""
 
     version = 0
-    """Counts the model's changes."""
+    """Version number of the model: it never changes."""
 
     def __init__(
         self,
@@ -62,25 +61,25 @@ class HeldModel:
 
     @property
     def pixels(self) -> int:
-        """The most that a picture on a page may have."""
-        return min(MOST_PIXELS, frame_pixels(self.device, FEATURES))
+        """Largest number of pixels of a picture on a page."""
+        return min(MAX_PAGE_PICTURE_PIXELS, frame_pixels(self.device, CHANNEL_FLOATS_PER_GAUSSIAN))
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """The picture (H, W, 3) uint8, and a remark on it. Raises CapacityError and InputError."""
+        """Render a picture (H, W, 3) uint8, with a remark on it. Raises CapacityError and InputError."""
         key = look.changes(self.gaussians.sh_degree)
         try:
             return self._picture(key, camera, look, exact=exact)
         except CapacityError:
-            self._held = {key: (self._held[key][0], {})}  # all other models make room
+            self._held = {key: (self._held[key][0], {})}  # drops all other models to free memory
             return self._picture(key, camera, look, exact=exact)
 
     def _picture(self, key: Look | None, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
         if key not in self._held:
             self._held[key] = (self.gaussians if key is None else edited(self.gaussians, key), {})
         gaussians, renderers = self._held.pop(key)
-        while len(self._held) >= HELD:
+        while len(self._held) >= MAX_MODELS_ON_DEVICE:
             del self._held[next(iter(self._held))]
-        self._held[key] = (gaussians, renderers)  # the latest is the last
+        self._held[key] = (gaussians, renderers)  # the most recently used comes last
         renderer = renderers.get(exact)
         if renderer is None:
             renderer = renderers[exact] = Renderer(self.device, self._rasterizers[exact])
@@ -88,8 +87,7 @@ class HeldModel:
 
 
 class LiveModel:
-    """A model in training, between two of its steps. It works in the trainer's memory, and leaves alone what a step
-    needs."""
+    """Model in training, shown between two steps. It uses the trainer's memory without disturbing a step's data."""
 
     def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
         self.trainer, self.background = trainer, background
@@ -100,16 +98,17 @@ class LiveModel:
 
     @property
     def version(self) -> int:
-        """The step."""
+        """The training step, as the model's version number."""
         return self.trainer.step
 
     @property
     def pixels(self) -> int:
-        """The most that training has memory for."""
+        """Largest number of pixels for which the training has memory."""
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """The picture, and a remark on it. Raises InputError where a limited training leaves too little memory."""
+        """Render a picture, with a remark on it. Raises InputError if a training with limited memory leaves too
+        little."""
         trainer = self.trainer
         trainer.settle()
         degree = round(trainer.parameters.coefficients**0.5) - 1
@@ -138,7 +137,7 @@ def render_picture(
     background: Sequence[float],
     space: str,
 ) -> tuple[Image, str]:
-    """The result of `picture`, for a model or the part of it that is on the device."""
+    """Render a picture and its remark, of a model on the host or on the device."""
     if isinstance(model, Gaussians) and not len(model):
         raise InputError("nothing of the model is left: the crop box holds no Gaussian")
     if look.mode in ("depth", "count"):

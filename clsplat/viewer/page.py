@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page of the viewer: its controls, and what they ask for. By viser; what they mean is in `appearance`."""
+"""One page of the viewer: its controls and their actions, by viser. `appearance` defines their meaning."""
 
 from __future__ import annotations
 
@@ -15,13 +15,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clsplat.arrays import Float64
+from clsplat.config.pictures import DEFAULT_VIDEO_FPS
 from clsplat.errors import ClsplatError, InputError, plain
 from clsplat.rotations import quaternion_of
-from clsplat.scenes.marked import masked
-from clsplat.shots.around import parse_up
-from clsplat.viewer.appearance import MODES, OPACITIES, SIZES, Image, Look, colour_picture, read_look
-from clsplat.viewer.path_recorder import FPS, add_key, path_document, save_path
-from clsplat.viewer.pose import LARGEST_SIDE, MOST_PIXELS, Pose, Start, leaning, wide_enough
+from clsplat.scenes.analysis.mask_overlay import masked
+from clsplat.shots.default_orbit import parse_up
+from clsplat.viewer.appearance import (
+    OPACITY_FACTOR_RANGE,
+    SIZE_FACTOR_RANGE,
+    VIEWER_MODES,
+    Image,
+    Look,
+    colour_picture,
+    read_look,
+)
+from clsplat.viewer.path_recorder import add_key, path_document, save_path
+from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS, MAX_PAGE_SIDE_PX, Pose, Start, leaning, wide_enough
 from clsplat.viewer.refinement import Level
 from clsplat.viewer.scheduler import Viewing
 
@@ -29,23 +38,27 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import View
     from clsplat.viewer.models import Model
 
-THUMBNAIL = 240
-"""Longest side of a photo on the page."""
-FRUSTUM = 0.05
-"""Size of a camera in relation to its distance from what is looked at."""
-UPS = ("as the scene", "y", "-y", "z", "-z", "x", "-x")
-"""Choices of what is up."""
-CAMERAS = ("hidden", "frames", "photos")
+PAGE_PHOTO_SIDE_PX = 240
+"""Longest side of a photograph on the page, in pixels."""
+FRUSTUM_SCALE = 0.05
+"""Size of a drawn camera, relative to the distance between the start position and its target."""
+UP_CHOICES = ("as the scene", "y", "-y", "z", "-z", "x", "-x")
+"""Choices for the up direction."""
+CAMERA_DISPLAY_CHOICES = ("hidden", "frames", "photos")
 """Ways to draw the scene's cameras."""
 CAMERA_COLOURS = {"train": (80, 160, 255), "test": (255, 160, 60), "key": (255, 60, 90)}
-SIZE = (1280, 720)
-"""Width and height of a path's pictures and of screenshots, unless another is asked for."""
+DEFAULT_PICTURE_SIZE_PX = (1280, 720)
+"""Default width and height of path pictures and screenshots."""
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Facts that the pages begin with. origin (3,): subtracted from the world for the browser, whose numbers are
-    float32; box: corners (3,) of what the crop's sliders reach; degree: of the model's SH."""
+    """Data that every page starts with.
+
+    origin: (3,), subtracted from world positions for the browser, which computes in float32.
+    box: two corners (3,), the range of the crop sliders.
+    degree: the model's SH degree.
+    """
 
     title: str
     start: Start
@@ -55,12 +68,12 @@ class World:
     views: Sequence[View] = ()
 
 
-COARSE = "coarse"
-"""Remark on a picture that is not the exact one, in motion or on the way to rest."""
+COARSE_PICTURE_REMARK = "coarse"
+"""Remark on a picture that is not exact: in motion, or during refinement."""
 
 
 class ViserPage:
-    """One viewer's page, with its controls. The methods that render are called by the device's thread."""
+    """One viewer's page with its controls. The device's thread calls the methods that render."""
 
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
@@ -71,22 +84,24 @@ class ViserPage:
         self.viewer = viewing.join(self)
 
     def show(self, image: Image, level: Level, text: str) -> None:
-        """Show a picture (H, W, 3), with a remark on it."""
+        """Show a picture (H, W, 3) with a remark."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
-        if self._shown == 2:  # controls keep a browser busy: they may not come before the first picture
+        if self._shown == 2:  # controls keep a browser busy, so the first picture comes before them
             self._build()
         height, width = image.shape[:2]
-        self._say(", ".join(filter(None, (f"{width} x {height}, exact" if level.exact else COARSE, text))))
+        self._say(
+            ", ".join(filter(None, (f"{width} x {height}, exact" if level.exact else COARSE_PICTURE_REMARK, text)))
+        )
 
     def tell(self, message: str) -> None:
-        """Show the reason that there is no picture."""
+        """Show a message, such as the reason why there is no picture."""
         self._build()
         self.client.add_notification("clsplat", plain(message), auto_close_seconds=10.0)
         self._say(plain(message))
 
     def _build(self) -> None:
-        """Make the controls, if they are not there yet."""
+        """Make the controls, unless they exist."""
         if self._status is not None:
             return
         gui, scene = self.client.gui, self.client.scene
@@ -103,10 +118,10 @@ class ViserPage:
             self._status.content = text
 
     def _add_view(self, gui: Any) -> None:
-        mode = gui.add_dropdown("Show", MODES, initial_value="colour")
+        mode = gui.add_dropdown("Show", VIEWER_MODES, initial_value="colour")
         degree = gui.add_slider("SH degree", 0, 3, 1, max(self.world.degree, 0))
-        size = gui.add_slider("Size", *SIZES, 0.05, 1.0)
-        opacity = gui.add_slider("Opacity", *OPACITIES, 0.05, 1.0)
+        size = gui.add_slider("Size", *SIZE_FACTOR_RANGE, 0.05, 1.0)
+        opacity = gui.add_slider("Opacity", *OPACITY_FACTOR_RANGE, 0.05, 1.0)
         low, high = self.world.box
         reach = np.maximum(high - low, 1e-6 * (float((high - low).max()) or 1.0))
         low, high = low - 0.5 * reach, high + 0.5 * reach
@@ -130,12 +145,14 @@ class ViserPage:
             self._add_cameras(gui)
 
     def _add_up(self, gui: Any) -> None:
-        up = gui.add_dropdown("Up", UPS, initial_value=UPS[0], hint="What is up while the camera goes around.")
+        up = gui.add_dropdown(
+            "Up", UP_CHOICES, initial_value=UP_CHOICES[0], hint="What is up while the camera goes around."
+        )
         roll = gui.add_slider("Roll", -180.0, 180.0, 1.0, 0.0, hint="Degrees clockwise, about where the camera looks.")
 
         async def changed(_: Any) -> None:
             camera = self.client.camera
-            axis = self.world.start.up if up.value == UPS[0] else np.array(parse_up(up.value))
+            axis = self.world.start.up if up.value == UP_CHOICES[0] else np.array(parse_up(up.value))
             if (leant := leaning(axis, camera.look_at - camera.position, roll.value)) is None:
                 self.client.add_notification("clsplat", "the camera looks straight up or down there")
             else:
@@ -154,31 +171,34 @@ class ViserPage:
 
     def _add_cameras(self, gui: Any) -> None:
         shown = gui.add_dropdown(
-            "Cameras", CAMERAS, initial_value=CAMERAS[0], hint="Blue: trained on; orange: held out. A click goes there."
+            "Cameras",
+            CAMERA_DISPLAY_CHOICES,
+            initial_value=CAMERA_DISPLAY_CHOICES[0],
+            hint="Blue: trained on; orange: held out. A click goes there.",
         )
 
-        def changed(_: Any) -> None:  # in a thread of viser's: photos take a while to read
+        def changed(_: Any) -> None:  # in one of viser's threads: reading photos takes a while
             self._drawing += 1
             mine = self._drawing
-            with self._drawn:  # the latest wish is the last to be drawn
+            with self._drawn:  # only the latest request is drawn to the end
                 if mine == self._drawing:
                     self._clear("/cameras")
                 for index, view in enumerate(self.world.views):
-                    if mine != self._drawing or shown.value == CAMERAS[0]:
+                    if mine != self._drawing or shown.value == CAMERA_DISPLAY_CHOICES[0]:
                         return
-                    self._add_camera(index, view, photo=shown.value == CAMERAS[2])
+                    self._add_camera(index, view, photo=shown.value == CAMERA_DISPLAY_CHOICES[2])
 
         shown.on_update(changed)
 
     def _clear(self, name: str) -> None:
-        """Remove the part of the scene under this name."""
+        """Remove everything below this name from the browser's scene."""
         with self.client.atomic():
             self.client.scene.remove_by_name(name)
             self.client.scene.add_frame(name, show_axes=False)
 
     def _add_camera(self, index: int, view: View, *, photo: bool) -> None:
         camera = view.camera
-        if camera.projection != "perspective":
+        if not camera.is_pinhole:
             return
         fov, aspect = (
             2 * math.atan2(0.5 * camera.height, camera.fy),
@@ -186,8 +206,9 @@ class ViserPage:
         )
         pose = Pose(camera.rotation.T, camera.position, fov, camera.width, camera.height)
         image = thumbnail(view) if photo else None
-        shadows = {"cast_shadow": False, "receive_shadow": False}
-        handle = self._add_frustum(f"/cameras/{index}", pose, view.split, image=image, **shadows)
+        handle = self._add_frustum(
+            f"/cameras/{index}", pose, view.split, image=image, cast_shadow=False, receive_shadow=False
+        )
 
         async def clicked(_: Any) -> None:
             viewpoint = self.client.camera
@@ -211,9 +232,9 @@ class ViserPage:
         def add() -> None:
             if (pose := self.viewer.pose) is not None:
                 add_key(self.keys, pose)
-                # thin lines: where the camera still stands, it would frame the page
-                lines = {"thickness": 2.0, "thickness_units": "screen"}
-                self._add_frustum(f"/keys/{len(self.keys) - 1}", pose, "key", **lines)
+                # thin lines: the camera still stands there, and its frustum would frame the page
+                name = f"/keys/{len(self.keys) - 1}"
+                self._add_frustum(name, pose, "key", thickness=2.0, thickness_units="screen")
 
         def remove() -> None:
             del self.keys[-1:]
@@ -235,7 +256,7 @@ class ViserPage:
         button("Clear keys", clear)
         count = gui.add_markdown("no keys")
         apart = gui.add_number("Seconds between keys", 2.0, min=0.05, max=3600.0, step=0.05)
-        fps = gui.add_number("Frames a second", FPS, min=1.0, max=240.0, step=1.0)
+        fps = gui.add_number("Frames a second", DEFAULT_VIDEO_FPS, min=1.0, max=240.0, step=1.0)
         loop = gui.add_checkbox("Closed loop", initial_value=False)
         width, height = self._add_size(gui)
         button("Download path", download)
@@ -243,13 +264,13 @@ class ViserPage:
             button("Save path", lambda: self.tell(f"saved as {save_path(folder, document()).name}"))
 
     def _add_frustum(self, name: str, pose: Pose, kind: str, **options: Any) -> Any:
-        """Draw a camera of a kind of CAMERA_COLOURS."""
+        """Draw a camera in the colour of its kind."""
         start = self.world.start
         return self.client.scene.add_camera_frustum(
             name,
             pose.fov,
             pose.width / pose.height,
-            scale=FRUSTUM * float(np.linalg.norm(start.position - start.target)),
+            scale=FRUSTUM_SCALE * float(np.linalg.norm(start.position - start.target)),
             color=CAMERA_COLOURS[kind],
             wxyz=quaternion_of(pose.rotation),
             position=pose.position - self.world.origin,
@@ -267,32 +288,40 @@ class ViserPage:
         take.on_click(taken)
 
     def _add_size(self, gui: Any) -> tuple[Any, Any]:
-        sides = {"min": 1, "max": LARGEST_SIDE, "step": 1}
-        return gui.add_number("Width", SIZE[0], **sides), gui.add_number("Height", SIZE[1], **sides)
+        def add_side(name: str, usual: int) -> Any:
+            return gui.add_number(name, usual, min=1, max=MAX_PAGE_SIDE_PX, step=1)
+
+        return add_side("Width", DEFAULT_PICTURE_SIZE_PX[0]), add_side("Height", DEFAULT_PICTURE_SIZE_PX[1])
 
     def screenshot(self, model: Model, size: tuple[int, int]) -> None:
-        """Send an exact picture of this size, as `clsplat render` would make it. Raises InputError."""
+        """Send an exact picture of this size, equal to `clsplat render`'s. Raises InputError."""
         pose = self.viewer.pose
         if pose is None:
             return
         width, height = size
-        if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and width * height <= 4 * MOST_PIXELS):
-            raise InputError(f"a screenshot of {width} x {height}: expected at most {4 * MOST_PIXELS:,} pixels")
+        if not (
+            1 <= width <= MAX_PAGE_SIDE_PX
+            and 1 <= height <= MAX_PAGE_SIDE_PX
+            and width * height <= 4 * MAX_PAGE_PICTURE_PIXELS
+        ):
+            raise InputError(
+                f"a screenshot of {width} x {height}: expected at most {4 * MAX_PAGE_PICTURE_PIXELS:,} pixels"
+            )
         image, _ = model.picture(pose.camera(width, height), self.viewer.look, exact=True)
         self.client.send_file_download("screenshot.png", png(image), save_immediately=True)
 
     def _attempt(self, action: Callable[[], None]) -> None:
-        """Do it, and tell of what is wrong with it."""
+        """Run an action and show its error as a message."""
         try:
             action()
         except ClsplatError as error:
             self.tell(str(error))
         except OSError as error:
-            self.tell(re.sub(r": '.*'$", "", str(error)))  # paths of this machine are not for a page
+            self.tell(re.sub(r": '.*'$", "", str(error)))  # without this machine's paths
 
 
 def png(image: Image) -> bytes:
-    """The file."""
+    """Encode an image as PNG."""
     import imageio.v3 as iio
 
     return iio.imwrite("<bytes>", image, extension=".png")
@@ -300,9 +329,9 @@ def png(image: Image) -> bytes:
 
 @cache
 def thumbnail(view: View) -> Image | None:
-    """(H, W, 3), small, red and blue where masks leave something out; None for a photo that cannot be read."""
+    """Small picture (H, W, 3) of a photograph, red and blue where its masks act; None if the file cannot be read."""
     camera = view.camera
-    scale = min(THUMBNAIL / max(camera.width, camera.height), 1.0)
+    scale = min(PAGE_PHOTO_SIDE_PX / max(camera.width, camera.height), 1.0)
     try:
         picture = masked(view, max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     except (ClsplatError, OSError):
@@ -311,7 +340,7 @@ def thumbnail(view: View) -> Image | None:
 
 
 def edges_of(low: Any, high: Any) -> Any:
-    """(12, 2, 3) float32: the edges of a box."""
+    """The twelve edges of a box, (12, 2, 3) float32."""
     corners = np.array([[(low, high)[bit][axis] for axis, bit in enumerate(bits)] for bits in np.ndindex(2, 2, 2)])
     pairs = [(a, b) for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1]
     return corners[np.array(pairs)].astype(np.float32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Key frames that are recorded in the viewer, as a file of cameras for `clsplat render` (docs/cameras.md)."""
+"""Recording of key frames in the viewer, and their camera file for `clsplat render` (docs/cameras.md)."""
 
 from __future__ import annotations
 
@@ -9,28 +9,38 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from clsplat.config.pictures import DEFAULT_VIDEO_FPS
 from clsplat.errors import InputError
-from clsplat.files import atomic_write
+from clsplat.files.atomic import atomic_write
 from clsplat.rotations import quaternion_of
 from clsplat.viewer.pose import Pose
 
-MOST_KEYS = 10_000
-MOST_FILES = 10_000
-FPS = 24.0
+MAX_KEY_FRAMES = 10_000
+MAX_PATH_FILES = 10_000
 
 
 def add_key(keys: list[Pose], pose: Pose) -> None:
-    """One more key frame at the end. Raises InputError when there are too many."""
-    if len(keys) >= MOST_KEYS:
-        raise InputError(f"there are {MOST_KEYS:,} key frames already")
+    """Append a key frame. Raises InputError if there are too many."""
+    if len(keys) >= MAX_KEY_FRAMES:
+        raise InputError(f"there are {MAX_KEY_FRAMES:,} key frames already")
     keys.append(pose)
 
 
 def path_document(
-    keys: Sequence[Pose], size: tuple[int, int], *, apart: float = 2.0, fps: float = FPS, loop: bool = False
+    keys: Sequence[Pose],
+    size: tuple[int, int],
+    *,
+    apart: float = 2.0,
+    fps: float = DEFAULT_VIDEO_FPS,
+    loop: bool = False,
 ) -> str:
-    """The file. size: width, height of its pictures; apart: seconds from key to key, brought to whole frames; loop:
-    after the last the first comes again. Raises InputError for no keys, and for numbers that make no path."""
+    """Camera file of the key frames.
+
+    size: width and height of its frames.
+    apart: seconds between keys, rounded to whole frames.
+    loop: return to the first key after the last.
+    Raises InputError without keys, and for numbers that make no path.
+    """
     width, height = size
     if not keys:
         raise InputError("no key frames are recorded yet")
@@ -55,11 +65,13 @@ def path_document(
 
 
 def save_path(folder: Path, document: str) -> Path:
-    """Write it as the first of path-001.json, path-002.json, ... that is free: a page has no say in the name. Raises
-    OSError, and InputError where none is free."""
-    for number in range(1, MOST_FILES):
+    """Write the document to the first free name of path-001.json, path-002.json, ...: a page cannot choose a name.
+
+    Raises OSError, and InputError if no name is free.
+    """
+    for number in range(1, MAX_PATH_FILES):
         path = folder / f"path-{number:03d}.json"
         if not path.exists() and not path.is_symlink():
             atomic_write(path, document.encode())
             return path
-    raise InputError(f"{folder}: has {MOST_FILES - 1:,} paths already")
+    raise InputError(f"{folder}: has {MAX_PATH_FILES - 1:,} paths already")

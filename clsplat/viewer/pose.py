@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of a page's camera, and the pose that it starts with."""
+"""Pose of a page's camera, and its start pose."""
 
 from __future__ import annotations
 
@@ -12,23 +12,30 @@ from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera, focal_length
+from clsplat.images.video import MAX_VIDEO_SIDE_PX
 from clsplat.rotations import quaternion_of, rotation_from_quaternion
-from clsplat.scenes.strays import stray_cameras
+from clsplat.scenes.outliers import stray_cameras
 from clsplat.shots.viewpoints import COLMAP_UP, extent_of, focus_point, look_at, up_axis
 
-MOST_PIXELS = 4096 * 2304
-"""Most pixels of a picture on a page, whatever size the browser asks for."""
-LARGEST_SIDE = 16384
-FIELD = math.radians(60)
-"""Vertical angle of view where no camera of a scene says another."""
-WIDEST = math.radians(120)
-"""Largest vertical angle that a narrow page begins with: beyond it little but what is above and below is added."""
+MAX_PAGE_PICTURE_PIXELS = 4096 * 2304
+"""Largest number of pixels of a picture on a page, whatever size the browser asks for."""
+MAX_PAGE_SIDE_PX = MAX_VIDEO_SIDE_PX
+"""Largest side in pixels of a page and its pictures: a video's, which a recorded path may become."""
+DEFAULT_FOV_Y_RADIANS = math.radians(60)
+"""Vertical field of view without a scene camera that defines one, in radians."""
+MAX_START_FOV_Y_RADIANS = math.radians(120)
+"""Largest vertical field of view in radians at the start of a narrow page. A larger one adds only top and bottom."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of a browser's camera. rotation (3, 3): world from camera (x right, y down, z forward); position (3,) in the
-    world; fov: vertical, radians; width, height of the page in pixels."""
+    """Pose of a browser's camera.
+
+    rotation: (3, 3), world from camera (x right, y down, z forward).
+    position: (3,), in the world.
+    fov: vertical, radians.
+    width, height: of the page, in pixels.
+    """
 
     rotation: Float64
     position: Float64
@@ -37,8 +44,10 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """The camera, of the page's size or another, with the `angle` of that. It is to the last bit the one that a
-        file of cameras holds (`path_document`), as a quaternion and degrees."""
+        """The camera for the page's size or another, with the field of view of `angle`.
+
+        It equals bit for bit the camera that a camera file stores (`path_document`), as a quaternion and degrees.
+        """
         across, down = width or self.width, height or self.height
         focal = focal_length(math.radians(math.degrees(self.angle(across, down))), down)
         quaternion = quaternion_of(self.rotation)
@@ -46,13 +55,16 @@ class Pose:
         return Camera(across, down, focal, focal, across / 2, down / 2, turn, -turn @ self.position)
 
     def angle(self, width: int, height: int) -> float:
-        """The vertical angle of a picture of this size: the page's. Of an upright page, which is higher than anything
-        that it shows, a wider picture keeps the angle across, and one wider than high has that angle down."""
+        """Vertical field of view in radians for a picture of this size: usually the page's.
+
+        On an upright page, a picture wider than the page keeps the horizontal field of view.
+        A picture wider than high has this angle as its vertical field of view.
+        """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)
 
     def same(self, other: Pose | None) -> bool:
-        """True if the other shows the same."""
+        """True if the other pose shows the same picture."""
         names = [item.name for item in fields(self)]
         return other is not None and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
@@ -64,9 +76,13 @@ def read_pose(
     size: tuple[int, int],
     origin: Float64,
 ) -> Pose | None:
-    """The pose that a browser sends: the rotation from its axes (COLMAP's) to the world's as a quaternion w x y z, the
-    position counted from `origin` (3,), the vertical angle in radians, width and height. None for values that no camera
-    has: a browser may send anything."""
+    """Check a pose that a browser sent. None for values that no camera can have: a browser may send anything.
+
+    wxyz: quaternion of the rotation from the camera's axes (COLMAP's) to the world's.
+    position: relative to `origin` (3,).
+    fov: vertical, radians.
+    size: width and height.
+    """
     try:
         turn, place = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
         angle, (width, height) = float(fov), (int(side) for side in size)
@@ -77,15 +93,17 @@ def read_pose(
     length = float(np.linalg.norm(turn))
     if not (0 < angle < math.pi and 1e-3 < length < 1e3 and np.abs(place).max() < 1e12):
         return None
-    if not (0 < width <= LARGEST_SIDE and 0 < height <= LARGEST_SIDE):
+    if not (0 < width <= MAX_PAGE_SIDE_PX and 0 < height <= MAX_PAGE_SIDE_PX):
         return None
     return Pose(rotation_from_quaternion(turn / length), place + origin, angle, width, height)
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Start of a page: a camera in the world, the point that it turns about, and the direction that is up there.
-    aspect: width by height of what is to be seen at the vertical angle `fov`."""
+    """Start of a page: camera position, orbit centre and up direction in the world.
+
+    aspect: width / height of the content to be seen at the vertical field of view `fov`.
+    """
 
     position: Float64
     target: Float64
@@ -94,21 +112,30 @@ class Start:
     aspect: float = 1.0
 
     def fov_on(self, width: int, height: int) -> float:
-        """The vertical angle on a page of this size: the start's, or as much more as a narrow page, such as a phone's
-        that is held upright, takes to show it from side to side."""
+        """Vertical field of view on a page of this size.
+
+        It is the start's, or larger on a narrow page, such as an upright phone's, to show the whole width.
+        """
         return wide_enough(self.fov, self.aspect, width, height)
 
 
 def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
-    """The vertical angle, radians, on a page of this size at which all of a picture is seen whose vertical angle is
-    `fov` and whose width by height is `aspect`; `WIDEST` at most, and not less than `fov`."""
+    """Vertical field of view in radians on a page of this size that shows a whole picture.
+
+    fov: vertical field of view of the picture.
+    aspect: its width / height.
+    The result is at least `fov`, and has an upper limit for narrow pages.
+    """
     more = aspect * height / max(width, 1)
-    return max(fov, min(2 * math.atan(math.tan(0.5 * fov) * more), WIDEST)) if more > 1 else fov
+    return max(fov, min(2 * math.atan(math.tan(0.5 * fov) * more), MAX_START_FOV_Y_RADIANS)) if more > 1 else fov
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
-    """The start at the first of the cameras that is no stray, about the point that the others look at. Without cameras:
-    before the points (N, 3) as a COLMAP scene would be seen, y down, looking along z. All vectors are in the world."""
+    """Start at the first camera that is no outlier, orbiting the cameras' common focus point.
+
+    Without cameras: in front of the points (N, 3), y down, looking along z as in a COLMAP scene.
+    All vectors are in world coordinates.
+    """
     if cameras:
         cameras = [camera for camera, far in zip(cameras, stray_cameras(cameras), strict=True) if not far]
         first, focus, up = cameras[0], focus_point(cameras), up_axis(cameras)
@@ -117,19 +144,21 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
         away = float(np.linalg.norm(focus - first.position))
         if not distance > 1e-6 * away:
             distance = away or 1.0
-        if first.projection != "perspective":
-            return Start(first.position, first.position + distance * ahead, up, FIELD)
+        if not first.is_pinhole:
+            return Start(first.position, first.position + distance * ahead, up, DEFAULT_FOV_Y_RADIANS)
         fov, aspect = 2 * math.atan2(0.5 * first.height, first.fy), (first.width / first.fx) / (first.height / first.fy)
         return Start(first.position, first.position + distance * ahead, up, fov, aspect)
     low, high = extent_of(points)
     middle = 0.5 * (low + high)
-    distance = 0.6 * float(np.linalg.norm(high - low)) / math.tan(FIELD / 2) or 1.0
-    return Start(middle - [0.0, 0.0, distance], middle, np.array(COLMAP_UP), FIELD)
+    distance = 0.6 * float(np.linalg.norm(high - low)) / math.tan(DEFAULT_FOV_Y_RADIANS / 2) or 1.0
+    return Start(middle - [0.0, 0.0, distance], middle, np.array(COLMAP_UP), DEFAULT_FOV_Y_RADIANS)
 
 
 def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
-    """The direction that is up for a camera that looks `ahead` and is rolled, clockwise as seen from behind it: `up`
-    turned about that axis, a unit vector (3,). None for a camera that looks along `up`."""
+    """Up direction (3,), of unit length, for a camera that looks `ahead` and is rolled clockwise as seen from behind.
+
+    It is `up` rotated about the viewing direction. None for a camera that looks along `up`.
+    """
     length = float(np.linalg.norm(ahead) * np.linalg.norm(up))
     if not float(np.linalg.norm(np.cross(ahead, up))) > 1e-3 * length:
         return None
@@ -138,12 +167,12 @@ def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
 
 
 def looking(start: Start, size: tuple[int, int]) -> Pose:
-    """The pose of the start on a page of this size."""
+    """Pose of the start on a page of this size."""
     rotation, _ = look_at(start.position, start.target, start.up)
     return Pose(rotation.T, start.position, start.fov_on(*size), *size)
 
 
-def fitted(width: int, height: int, scale: float, most: float = MOST_PIXELS) -> tuple[int, int]:
-    """Width and height of a picture at this scale of the page, and of `most` pixels at most."""
+def fitted(width: int, height: int, scale: float, most: float = MAX_PAGE_PICTURE_PIXELS) -> tuple[int, int]:
+    """Width and height of a picture at this scale of the page, with at most `most` pixels."""
     scale = min(scale, math.sqrt(most / (width * height)))
     return max(1, round(width * scale)), max(1, round(height * scale))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement of a viewer's pictures: coarse ones in motion, exact ones at rest, shares of a training.
+"""Refinement of a viewer's pictures: coarse in motion, exact at rest, within a fraction of a training's time.
 
-No OpenCL and no viser. Times are seconds of any clock that does not go back.
+No OpenCL, no viser. Times are seconds of any monotonic clock.
 """
 
 from __future__ import annotations
@@ -9,52 +9,58 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-SETTLE = (0.2, 1.0)
-"""Seconds without a change after which a picture is refined: at least; at most, where a slow browser's camera jumps."""
-START = 0.5
-"""The same for the first picture of all, which the browser has to get ready to show."""
-JUMPS = 3.0
-"""A camera is at rest when it has not changed for this many times its usual interval."""
-TARGET = 0.04
-"""Seconds that a picture in motion may take, with its encoding: what the browser needs comes on top."""
-PATIENCE = 0.6
-"""An exact picture that takes longer is led up to by pictures of growing size."""
-SMALLEST = 1 / 8
-"""Smallest scale of the page's size: a coarser picture would not be told apart from another."""
-QUALITIES = (60, 95)
-"""Qualities of JPEG, in motion and at rest."""
-SHARES = (0.2, 0.05)
-"""Shares of the time of a training: while a viewer moves, and while all are at rest."""
+SETTLE_SECONDS_RANGE = (0.2, 1.0)
+"""Seconds without a change before refinement: minimum, and maximum for a slow browser whose camera moves in jumps."""
+FIRST_SETTLE_SECONDS = 0.5
+"""Seconds before the first refinement, while the browser gets ready to show pictures."""
+REST_INTERVAL_RATIO = 3.0
+"""A camera is at rest if it has not changed for this many of its usual intervals between changes."""
+MOTION_PICTURE_SECONDS = 0.04
+"""Time budget in seconds of a picture in motion, encoding included. The browser's own time is not included."""
+MAX_UNPREPARED_EXACT_SECONDS = 0.6
+"""Longest time in seconds of an exact picture that is shown without intermediate pictures of growing size."""
+MIN_MOTION_SCALE = 1 / 8
+"""Smallest scale relative to the page. A coarser picture would be unrecognisable."""
+PAGE_JPEG_QUALITIES = (60, 95)
+"""JPEG quality in motion and at rest."""
+VIEWER_TIME_FRACTIONS = (0.2, 0.05)
+"""Fractions of a training's time for pictures: while a viewer moves, and while all are at rest."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """A picture that is due: its size in relation to the page's, and whether it is the last, which is exact."""
+    """The next picture to render.
+
+    scale: its size relative to the page.
+    exact: True for the last one, which is exact.
+    """
 
     scale: float
     exact: bool
 
     @property
     def quality(self) -> int:
-        """Quality of JPEG."""
-        return QUALITIES[self.exact]
+        """JPEG quality."""
+        return PAGE_JPEG_QUALITIES[self.exact]
 
 
 def next_scale(scale: float, seconds: float) -> float:
-    """The scale at which a picture in motion comes nearer to the time that it may take, after one of `scale` took
-    `seconds`. Part of that does not shrink with the pixels, so that the size is found step by step."""
-    factor = math.sqrt(TARGET / max(seconds, 1e-4))
-    return min(max(scale * min(max(factor, 0.6), 1.2), SMALLEST), 1.0)
+    """Next scale of pictures in motion, after a picture of `scale` took `seconds`.
+
+    It approaches the time budget step by step, because some of the time does not depend on the number of pixels.
+    """
+    factor = math.sqrt(MOTION_PICTURE_SECONDS / max(seconds, 1e-4))
+    return min(max(scale * min(max(factor, 0.6), 1.2), MIN_MOTION_SCALE), 1.0)
 
 
 class Refinement:
-    """The picture that a viewer sees, and the next one: coarse in motion, finer at rest, exact in the end."""
+    """State of one viewer's refinement: coarse in motion, finer at rest, exact in the end."""
 
     def __init__(self, now: float) -> None:
         self.scale = 0.25
         self.served = -math.inf
         self.changes, self._at = 1, now
-        self._settle = START
+        self._settle = FIRST_SETTLE_SECONDS
         self._shown = 0
         self._model = 0
         self._level = Level(0.0, exact=False)
@@ -62,30 +68,33 @@ class Refinement:
 
     @property
     def moving(self) -> bool:
-        """True if the picture shown is not the one asked for."""
+        """True if the picture shown is older than the last change."""
         return self._shown != self.changes
 
     def changed(self, now: float) -> None:
-        """The camera, or how the model is looked at."""
+        """Note a change of the camera or the look."""
         apart = now - self._at
-        usual = JUMPS * apart if self.changes > 1 and apart < SETTLE[1] else 0.0
+        usual = REST_INTERVAL_RATIO * apart if self.changes > 1 and apart < SETTLE_SECONDS_RANGE[1] else 0.0
         before = self._settle if self.changes > 1 else 0.0
-        self._settle = min(max(0.7 * before + 0.3 * usual, SETTLE[0]), SETTLE[1])
+        self._settle = min(max(0.7 * before + 0.3 * usual, SETTLE_SECONDS_RANGE[0]), SETTLE_SECONDS_RANGE[1])
         self.changes += 1
         self._at = now
 
     def due(self, now: float, model: int = 0) -> Level | None:
-        """The next picture, if its time has come; model: counts its changes, while it is trained."""
+        """The next picture, if its time has come.
+
+        model: version number of the model, which changes in training.
+        """
         if self.wait(now, model) != 0:
             return None
         if self.moving:
             return Level(self.scale, exact=False)
-        if self._level.exact or self._exact_takes <= PATIENCE or self._level.scale >= 0.5:
+        if self._level.exact or self._exact_takes <= MAX_UNPREPARED_EXACT_SECONDS or self._level.scale >= 0.5:
             return Level(1.0, exact=True)
         return Level(2 * self._level.scale, exact=False)
 
     def wait(self, now: float, model: int = 0) -> float | None:
-        """Seconds until something is due, None if nothing will be by itself."""
+        """Seconds until a picture is due; None if none will be due without a change."""
         if self.moving:
             return 0.0
         if self._level.exact and self._model == model:
@@ -93,7 +102,10 @@ class Refinement:
         return max(0.0, self._at + self._settle - now)
 
     def shown(self, begun: int, level: Level, seconds: float, now: float, model: int = 0) -> None:
-        """A picture has been sent that took so long; begun: the number of `changes` before it was made."""
+        """Note that a picture was sent after `seconds`.
+
+        begun: the number of `changes` when its rendering began.
+        """
         if level.exact:
             self._exact_takes = seconds
         elif self._shown != begun:
@@ -102,17 +114,17 @@ class Refinement:
 
 
 class Share:
-    """Keeps pictures to a share of a training's time."""
+    """Limiter that keeps pictures to a fraction of a training's time."""
 
-    def __init__(self, shares: tuple[float, float] = SHARES) -> None:
+    def __init__(self, shares: tuple[float, float] = VIEWER_TIME_FRACTIONS) -> None:
         self._moving, self._still = shares
         self._end, self._seconds = -math.inf, 0.0
 
     def ready(self, now: float, *, moving: bool) -> bool:
-        """True if another picture may be made."""
+        """True if another picture may be rendered."""
         share = self._moving if moving else self._still
         return now - self._end >= self._seconds * (1 - share) / share
 
     def spent(self, now: float, seconds: float) -> None:
-        """A picture took so long, and is done now."""
+        """Note that a picture took `seconds` and ended at `now`."""
         self._end, self._seconds = now, seconds

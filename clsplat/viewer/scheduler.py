@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scheduler of one thread's work for all viewers: whose picture is next, and their other requests. No OpenCL, no viser.
+"""Scheduler for all viewers on one thread: the order of pictures, and other requests. No OpenCL, no viser.
 
-Any thread may say what a viewer wants; `work` alone renders, in the thread that owns the device.
+Any thread may report a viewer's changes. Only `work` renders, on the thread that owns the device.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Page(Protocol):
-    """A place that shows a viewer's pictures, with a remark on each, and messages: `page.ViserPage`."""
+    """Display of a viewer's pictures, remarks and messages, such as `page.ViserPage`."""
 
     def show(self, image: Image, level: Level, text: str) -> None: ...
     def tell(self, message: str) -> None: ...
@@ -31,7 +31,10 @@ class Page(Protocol):
 
 @dataclass(eq=False)
 class Viewer:
-    """One viewer: page, refinement, look and pose; trouble: the message that the page has shown last."""
+    """One viewer: page, refinement, look and pose.
+
+    trouble: the error message that the page showed last, empty after a picture.
+    """
 
     page: Page
     refinement: Refinement
@@ -41,7 +44,10 @@ class Viewer:
 
 
 class Viewing:
-    """All viewers of a model. model: None until there is one."""
+    """All viewers of a model.
+
+    model: None until it exists.
+    """
 
     def __init__(self, model: Model | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
         self.model, self.clock = model, clock
@@ -54,19 +60,19 @@ class Viewing:
         return len(self._viewers)
 
     def join(self, page: Page) -> Viewer:
-        """Take in a viewer that has opened a page."""
+        """Add a viewer that has opened a page."""
         viewer = Viewer(page, Refinement(self.clock()))
         with self._news:
             self._viewers.append(viewer)
         return viewer
 
     def leave(self, viewer: Viewer) -> None:
-        """Drop a viewer whose page is closed."""
+        """Remove a viewer whose page is closed."""
         with self._news:
             self._viewers.remove(viewer)
 
     def moved(self, viewer: Viewer, pose: Pose) -> None:
-        """Take the viewer's pose, a new one or once more the same."""
+        """Set a viewer's pose; equal poses are no change."""
         with self._news:
             if not pose.same(viewer.pose):
                 if viewer.pose is not None:
@@ -75,7 +81,7 @@ class Viewing:
                 self.wake()
 
     def looks(self, viewer: Viewer, look: Look) -> None:
-        """Take the viewer's look at the model."""
+        """Set a viewer's look at the model."""
         with self._news:
             if look != viewer.look:
                 viewer.look = look
@@ -83,7 +89,7 @@ class Viewing:
                 self.wake()
 
     def ask(self, viewer: Viewer, job: Callable[[Model], None]) -> None:
-        """Have something done in the device's thread. The page tells of its ClsplatError or OSError."""
+        """Run a job on the device's thread. The page shows its ClsplatError or OSError."""
         with self._news:
             self._jobs.append((viewer, job))
             self.wake()
@@ -95,7 +101,7 @@ class Viewing:
             self._news.notify_all()
 
     def wait(self, most: float) -> None:
-        """Wait until there may be something to do, for at most `most` seconds."""
+        """Wait until there may be work, for at most `most` seconds."""
         with self._news:
             if self._is_news:
                 self._is_news = False
@@ -107,8 +113,10 @@ class Viewing:
             self._is_news = False
 
     def work(self, share: Share | None = None) -> bool:
-        """Do one thing, if there is one: a job, or the picture of the one whose turn it is. share: of a training, which
-        must not be exceeded. Whether something was done."""
+        """Do one job, or render one picture for the viewer whose turn it is. True if there was work.
+
+        share: limit on the fraction of a training's time, which must not be exceeded.
+        """
         if (model := self.model) is None or not (self._viewers or self._jobs):
             return False
         with self._news:
@@ -123,7 +131,7 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
-        """The viewer that has waited longest of those for which a picture is due, with the picture's level."""
+        """The viewer with a picture due that has waited longest, and the picture's level; None if none is due."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None
@@ -142,11 +150,11 @@ class Viewing:
             if viewer in self._viewers:
                 moved_on = (
                     level.exact and viewer.refinement.changes != begun
-                )  # since then: it is no longer what is seen
+                )  # the picture is outdated: the view changed meanwhile
                 viewer.page.show(image, Level(level.scale, exact=False) if moved_on else level, text)
             viewer.trouble = ""
         except ClsplatError as error:
-            if viewer.trouble != str(error):  # once is enough
+            if viewer.trouble != str(error):  # report an error only once
                 viewer.page.tell(str(error))
             viewer.trouble = str(error)
         now = self.clock()

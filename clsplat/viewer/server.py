@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's server, by viser (the extra `view`): viewers that come and go, and what all of them see.
+"""The viewer's server, by viser (the extra `view`): connections of viewers, and everything that they have in common.
 
-It serves viser's own page and the messages of its web socket; no path of this machine.
+It serves viser's own page and its web socket messages, and no path of this machine.
 """
 
 from __future__ import annotations
@@ -25,29 +25,34 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.config.verbs import HOST, PORT
+from clsplat.config.cli_defaults import VIEWER_HOST, VIEWER_PORT
 from clsplat.errors import InputError, plain
 from clsplat.viewer.page import ViserPage, World
 from clsplat.viewer.pose import read_pose
 from clsplat.viewer.scheduler import Viewer, Viewing
 
-LOCAL = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
-"""Names, as a pattern, by which a server for this machine alone may be asked."""
-FAR = 1000.0
-"""viser's own far plane, of what it draws itself: cameras and boxes."""
+LOCAL_HOST_PATTERN = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
+"""Pattern of host names that a server for this machine alone accepts."""
+VISER_FAR_PLANE = 1000.0
+"""viser's own far plane, for the cameras and boxes that it draws itself."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Address that the server listens at, and the folder for paths that are saved, None for none."""
+    """Address that the server listens at.
 
-    host: str = HOST
-    port: int = PORT
+    paths: folder for saved camera paths; None if saving is off.
+    """
+
+    host: str = VIEWER_HOST
+    port: int = VIEWER_PORT
     paths: Path | None = None
 
     def check(self) -> None:
-        """Raise InputError where viser is missing, the folder is, or nothing can listen there. viser itself would take
-        the next port that is free."""
+        """Raise InputError if viser or the folder is missing, or if nothing can listen at the address.
+
+        viser itself would silently take the next free port.
+        """
         try:
             import viser  # noqa: F401
         except ImportError:
@@ -60,7 +65,7 @@ class Address:
             addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
-                if os.name == "posix":  # as asyncio does; on Windows it would take the port of another server
+                if os.name == "posix":  # as asyncio does; on Windows it would take over the port of another server
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
@@ -73,7 +78,7 @@ class Address:
 
     @property
     def local(self) -> bool:
-        """True if only this machine can reach it."""
+        """True if only this machine can reach the server."""
         if self.host == "localhost":
             return True
         try:
@@ -83,9 +88,9 @@ class Address:
 
 
 class Server:
-    """Serves pages until it is closed. Raises InputError where it cannot listen.
+    """Server of the pages, until closed. Raises InputError if it cannot listen.
 
-    training: whether there is one to be paused.
+    training: add controls to pause a training.
     """
 
     def __init__(self, viewing: Viewing, world: World, address: Address, *, training: bool = False) -> None:
@@ -97,16 +102,16 @@ class Server:
         with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server
-        server.request_share_url = lambda *_, **__: None  # a page may not ask for a tunnel out of this machine
+        server.request_share_url = lambda *_, **__: None  # a page may not open a tunnel out of this machine
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
         server.scene.set_up_direction(world.start.up)
-        # nothing in the scene is lit: filtering a sky and drawing shadows would hold up a browser without a GPU
+        # the scene has nothing to light: a filtered sky and shadows would slow down a browser without a GPU
         server.scene.configure_environment_map(hdri=None)
         server.scene.configure_default_lights(cast_shadow=False)
         begin, start = server.initial_camera, world.start
         begin.position, begin.look_at = start.position - world.origin, start.target - world.origin
         begin.up, begin.fov = start.up, start.fov
-        begin.far = max(FAR, 20 * float(np.linalg.norm(start.position - start.target)))
+        begin.far = max(VISER_FAR_PLANE, 20 * float(np.linalg.norm(start.position - start.target)))
         self.paused = False
         self._status: Any = None
         if training:
@@ -121,7 +126,7 @@ class Server:
             async def moved(camera: Any) -> None:
                 nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
-                # the start's angle, on a page of another shape now, and not that of a camera which was gone to
+                # on a resized page, adapt the start's angle; a camera that the user clicked keeps its own
                 if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
                     fov = camera.fov = start.fov_on(*size)
                 before = size
@@ -141,18 +146,18 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Address for this machine's browser, or with the host's name where it listens elsewhere."""
+        """URL for a browser on this machine, or with the host's name if the server listens at another address."""
         host = self.address.host
         name = "localhost" if self.address.local else f"[{host}]" if ":" in host else host
         return f"http://{name}:{self._server.get_port()}"
 
     def tell(self, text: str) -> None:
-        """Show the state of a training on the pages."""
+        """Show a training's state on all pages."""
         if self._status is not None and self._status.content != text:
             self._status.content = text
 
     def close(self) -> None:
-        """All pages lose their server."""
+        """Disconnect all pages and stop."""
         with _quiet():
             self._server.stop()
 
@@ -172,19 +177,23 @@ class Server:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """viser prints to standard output, which belongs to --json."""
+    """Silence viser's prints: standard output belongs to --json."""
     with contextlib.redirect_stdout(io.StringIO() if sys.stdout is not None else None):
         yield
 
 
 @contextlib.contextmanager
 def _guarded(address: Address) -> Iterator[None]:
-    """Inside, a server refuses pages that are not its own, which a browser here may have open, and what makes no sense
-    ends its connection, with a line. viser has no setting for that, the library it listens with has."""
+    """Make servers that start inside the context refuse foreign pages, which a browser here may have open.
+
+    A nonsensical message ends its connection, with one line on standard error.
+    viser has no setting for either, but the library that it listens with has.
+    """
     from websockets.asyncio import server
 
     usual = server.serve
-    log = logging.getLogger("clsplat.viewer")  # of its own: the usual one prints tracebacks of requests that are none
+    # a logger of its own: the usual one prints tracebacks for malformed requests
+    log = logging.getLogger("clsplat.viewer")
     log.propagate = False
     log.addHandler(logging.NullHandler())
 
@@ -198,7 +207,7 @@ def _guarded(address: Address) -> Iterator[None]:
             asyncio.get_running_loop().set_exception_handler(_tell)
             try:
                 await handler(connection)
-            except Exception as error:  # noqa: BLE001  # whatever a message has led to
+            except Exception as error:  # noqa: BLE001  # any error that a message has caused
                 _tell(None, {"exception": error})
                 await connection.close(1007)
 
@@ -212,25 +221,26 @@ def _guarded(address: Address) -> Iterator[None]:
 
 
 def _tell(_: Any, context: dict[str, Any]) -> None:
-    """Print a line in place of a traceback; it takes what asyncio gives its handler for errors in tasks."""
+    """Print one line in place of a traceback. The arguments match asyncio's exception handler."""
     error = context.get("exception")
     words = f"{type(error).__name__}: {error}" if error is not None else str(context.get("message", ""))
     message = plain(" ".join(words.split()))[:200].rstrip(": ")
-    print(f"clsplat: warning: a page sent what makes no sense here: {message}", file=sys.stderr)
+    print(f"clsplat: warning: a page sent an invalid message: {message}", file=sys.stderr)
 
 
 def refused(headers: Any, *, local: bool) -> str:
-    """The reason that a request is not answered, '' if it is.
+    """Reason why a request is refused; '' if it is accepted.
 
-    Requests from a page that is not this server's are refused; so are, by a server for this machine alone, those for
-    another name, as when a foreign name has been led here. Ports count, but not which: a tunnel (ssh -L) may have led
-    another one here. A request without an origin is from no page.
+    A request from another server's page is refused.
+    A server for this machine alone also refuses other host names, as after DNS rebinding.
+    Host and origin must have equal ports, but any port is accepted: a tunnel (ssh -L) may have changed it.
+    A request without an origin does not come from a page.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:
         return "expected one Host, and at most one Origin"
-    if local and not re.fullmatch(LOCAL, hosts[0]):
-        return "this server is for its machine alone, as localhost"
+    if local and not re.fullmatch(LOCAL_HOST_PATTERN, hosts[0]):
+        return "this server only answers its own machine, as localhost"
     if origins and re.sub("^https?://", "", origins[0].lower()) != hosts[0].lower():
-        return "pages of other servers are not let in"
+        return "pages of other servers are refused"
     return ""

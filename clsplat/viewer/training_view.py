@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a training: pictures between its steps, within a share of its time."""
+"""Page of a training: renders pictures between training steps, within a fraction of the training's time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from clsplat.process import MAX_SIGNAL_WAIT_SECONDS
 from clsplat.viewer.models import LiveModel
 from clsplat.viewer.refinement import Share
 from clsplat.viewer.scheduler import Viewing
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
     from clsplat.training.trainer import Trainer
 
 
-LONGEST_WAIT = 0.5
-"""Seconds, so that a signal is seen to on systems where it does not end a wait."""
-TELL_EVERY = 0.5
-"""Seconds between words of a training on its page."""
+STATUS_INTERVAL_SECONDS = 0.5
+"""Seconds between updates of a training's state on its page."""
 
 
 class TrainingView:
-    """The viewer's part of `clsplat.api.train`, called between two steps: pictures for all viewers, within their
-    share."""
+    """Viewer hook of `clsplat.api.train`, called between two steps.
+
+    It renders for all viewers, within their fraction of the time.
+    """
 
     def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:
         self.viewing, self.server, self.background, self.last = viewing, server, background, last
@@ -32,7 +33,7 @@ class TrainingView:
         self._told_at = -math.inf
 
     def __call__(self, trainer: Trainer, interrupted: Callable[[], bool]) -> None:
-        """Show pictures; returns at once where there are no viewers."""
+        """Render a picture that is due, and wait while paused. Returns at once without viewers, unless paused."""
         viewing = self.viewing
         if viewing.model is None:
             viewing.model = LiveModel(trainer, self.background)
@@ -43,11 +44,11 @@ class TrainingView:
         while self.server.paused and not interrupted():
             self._tell(trainer, force=True)
             if not viewing.work():
-                viewing.wait(LONGEST_WAIT)
+                viewing.wait(MAX_SIGNAL_WAIT_SECONDS)
 
     def _tell(self, trainer: Trainer, *, force: bool = False) -> None:
         now = self.viewing.clock()
-        if force or now - self._told_at > TELL_EVERY:
+        if force or now - self._told_at > STATUS_INTERVAL_SECONDS:
             state = "paused" if self.server.paused else "training"
             self.server.tell(f"{state}: step {trainer.step:,} of {self.last:,}, {trainer.parameters.count:,} Gaussians")
             self._told_at = now

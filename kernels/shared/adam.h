@@ -1,15 +1,15 @@
-// Adam's step, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1): of an element, and of LANES elements that
-// follow each other.
+// Adam's step, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for LANES consecutive
+// elements.
 //
-// No parameter and no moment becomes NaN or infinite here. An element is left as it is where its new values would be,
-// or where its parameter's square would not be less than `limit2`. It is counted in the last four of `readback`, of
-// which compact_visible has the first four: by the parameter that it had, its gradient, its moments, or all of these
-// well and the step not. Moments that are broken begin again from zero. In the other cases the second moment becomes
-// infinite and the first 0, which refuses every step until the host has seen to the row
+// No parameter and no moment becomes NaN or infinite here. An element stays as it is if its new values would be, or if
+// the square of its new parameter would reach `limit2`. Such refusals are counted in the last four entries of
+// `readback` (the first four belong to compact_visible). They count by cause: the old parameter, the gradient, the
+// moments, or only the step itself. Broken moments restart from zero. In the other cases the second moment becomes
+// infinite and the first 0: every step is then refused until the host has repaired the row
 // (docs/decisions/0016-never-a-nan.md).
 
-// Constants of a step, and where refused elements are counted. rate: the learning rate / (1 - beta1^t); root:
-// 1 / sqrt(1 - beta2^t).
+// Constants of a step, and the counters of refused elements. rate: the learning rate / (1 - beta1^t); root: 1 / sqrt(1
+// - beta2^t).
 typedef struct {
   float rate, root, beta1, beta2, epsilon, limit2;
   __global uint *readback;
@@ -27,7 +27,7 @@ static inline floatL change(floatL g, Step s, floatL *m, floatL *v) {
   return s.rate * *m / fmaL(sqrt(*v), (floatL)(s.root), (floatL)(s.epsilon));
 }
 
-// Refuses the step of an element: p, g, m and v as they were before it.
+// Refuses the step of an element; p, g, m and v are its values before the step.
 static inline void refuse(size_t i, Step s, float p, float g, float m, float v, __global float *first,
                           __global float *second) {
   const int parameter = p * p < s.limit2, gradient = fabs(g) < INFINITY;
@@ -41,15 +41,15 @@ static inline void refuse(size_t i, Step s, float p, float g, float m, float v, 
                                        : READBACK_REFUSED_STEPS));
 }
 
-// With vectors an element has a step of its own where one is refused: rarely, and a compiler took half a minute to put
-// it everywhere.
+// With vectors, single elements are stepped only where one is refused. That is rare, and inlining it everywhere made
+// one compiler take half a minute.
 #if LANES > 1
 #define RARE __attribute__((noinline)) static
 #else
 #define RARE static inline
 #endif
 
-// The step of element i along its gradient g, by `change`.
+// The step of element i along its gradient g, as in `change`.
 RARE void step_element(size_t i, float g, Step s, Stepped model) {
   const float before = model.parameters[i], m_before = model.first[i], v_before = model.second[i];
   const float m = fma1(s.beta1, m_before, (1.0f - s.beta1) * g);
@@ -66,8 +66,8 @@ RARE void step_element(size_t i, float g, Step s, Stepped model) {
   model.parameters[i] = p;
 }
 
-// The step of those elements from i on that are `taken`. Returns 0, with nothing stored, where one is to be refused: a
-// second moment is a square as well, so that the sum is one test of both.
+// The step of the `taken` elements from i on. Returns 0 and stores nothing if one has to be refused. The second moment
+// is a square like p * p, so one test of their sum checks both.
 static inline int step_vector(size_t i, floatL g, intL taken, Step s, Stepped model) {
   const floatL before = LOADL(model.parameters + i), m_before = LOADL(model.first + i);
   const floatL v_before = LOADL(model.second + i);

@@ -1,14 +1,7 @@
-// The alpha of a Gaussian in a tile's pixels: blend and blend_grad must agree to the last bit, or the transmittance
-// that the gradient recovers by division is another one.
+// A Gaussian's alpha in a tile's pixels. blend and blend_grad must agree to the last bit, or the gradient recovers a
+// different transmittance by division.
 
-// True if a vector has a pixel that takes the Gaussian (RasterizerConfig.vector_skip).
-#ifdef NO_VECTOR_SKIP
-#define REACHES(mask) 1
-#else
-#define REACHES(mask) ANYL(mask)
-#endif
-
-// A Gaussian's nearness, one over its depth, which is blended like a colour (docs/gradients.md, (120)).
+// A Gaussian's nearness, 1 / depth, which is blended like a colour (docs/gradients.md, (120)).
 #ifdef NEARNESS
 #define NEAR_PARAMETER , float c_near
 #define NEAR_ARGUMENT , c_near
@@ -19,12 +12,12 @@
 #define NEAR_HERE(nearness)
 #endif
 
-// u of a pixel, from the mean's offset (dx, dy) to it.
+// u of a pixel; (dx, dy) is the mean minus the pixel.
 static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   return fmaL((floatL)(l12), dy, l11 * dx);
 }
 
-// Adds g and its moments in pixels to the first fields of a slot; by_u, by_v: to those of the first order.
+// Adds g and its moments to the first fields of a slot; by_u, by_v: the addends of the first-order moments.
 static inline void add_moments_by(floatS g, floatS u, floatS v, floatS by_u, floatS by_v, floatS *sums) {
   const floatS gu = g * u, gv = g * v;
   sums[SLOT_G] += g;
@@ -39,8 +32,9 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
   add_moments_by(g, u, v, g * u, g * v, sums);
 }
 
-// A Gaussian's values for a loop over cells, and log2 of its alpha before the cap in cell `cell`.
+// A Gaussian's values for a loop over cells, and log2 of its uncapped alpha in cell `cell`.
 #ifdef RAYS
+#include "shared/camera.h"
 #include "shared/rays.h"
 #define RAY_TABLES                                                                                                     \
   floatL ray_x[OWNED], ray_y[OWNED], ray_z[OWNED];                                                                     \
@@ -61,10 +55,10 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
   log2_alpha(whitened_u(l11, l12, mx - AT_X(cell), my - AT_Y(cell)), (l22) * (my - AT_Y(cell)), log2o)
 #endif
 
-// log2 of alpha before the cap, from the mean's offset in (u, v).
+// log2 of the uncapped alpha from the mean's offset in (u, v).
 static inline floatL log2_alpha(floatL u, floatL v, float log2o) { return fmaL(-u, u, fmaL(-v, v, (floatL)(log2o))); }
 
-// Alpha from its log2 before the cap, 0 in the lanes that do not take the Gaussian.
+// Alpha from its uncapped log2; 0 in the lanes that do not take the Gaussian.
 static inline floatL alpha_where(intL taken, floatL power) {
   floatL alpha = exp2L(power);
   alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);

@@ -1,7 +1,7 @@
-// cells.h for a group of ITEMS work-items that share a tile: one pixel a cell, which belongs to a block of 8 x 4
-// pixels. 32 items have a pixel of a block each, so that items which run together skip a block together; groups of
-// fewer items have lower blocks. Item i owns pixel i % 32 of the blocks i / 32, i / 32 + ITEMS / 32, ...: its cells 0,
-// 1, ... Splats come in batches through local memory, each with the blocks that its ellipse reaches.
+// cells.h for a group of ITEMS work-items that share a tile. A cell is one pixel of a block of 8 x 4 pixels. Each block
+// has 32 items, one per pixel, so that items that run together skip a block together; groups of fewer items have lower
+// blocks. Item i owns pixel i % 32 of the blocks i / 32, i / 32 + ITEMS / 32, ...: its cells 0, 1, ... Splats pass
+// through local memory in batches, each with the blocks that its ellipse reaches.
 #if LANES > 1
 #error "a group of work-items has one pixel a vector"
 #endif
@@ -30,31 +30,31 @@
 #define LOAD_CELL(type, p, stride) (*(p))
 #define STORE_CELL(type, x, p, stride) (*(p) = (x))
 
-#if TILE * TILE / ITEMS <= 8 // in registers then, as every index is a constant
+#if TILE * TILE / ITEMS <= 8 // few enough for registers, with constant indices
 #define UNROLLED _Pragma("unroll")
 #else
 #define UNROLLED
 #endif
 #define ALL_CELLS(cell) UNROLLED for (int cell = 0; cell < OWNED; ++cell)
 
-typedef int Open; // how many of the item's
+typedef int Open; // how many of the item's cells
 #define OPEN_CELL(open, cell) (++(open))
 #define CLOSE_CELL(open, cell) (--(open))
 
-// Blocks as bits, from the item's first one on.
+// Blocks as bits, starting at the item's first block.
 typedef uint Reach;
 #define ALL_BLOCKS (0xffffffffu >> (32 - BLOCK_COLUMNS * BLOCK_ROWS))
 #define FROM_OWN(blocks) ((blocks) >> (ITEM / BLOCK_ITEMS))
 #define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * (ITEMS / BLOCK_ITEMS)) & 1)
 
-// Every block: for kernels that take one splat after the other, where the test costs more than the pixels.
+// Every block: for kernels that take one splat at a time, where the test would cost more than the pixels.
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 
 #if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
 static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 #else
-// The right edge of an ellipse, from its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)), or a little
-// beyond: the root is of up to 0.2 % more.
+// The right edge of an ellipse, from its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). It may be
+// slightly too large, as the square root is up to 0.2 % too large.
 static inline float block_edge(float d0, float d1, float tangent, float half_w, float l12, float l22, float inverse_l11,
                                float budget) {
   const float dy = tangent < d0 ? d0 : d1, v = l22 * dy;
@@ -64,7 +64,7 @@ static inline float block_edge(float d0, float d1, float tangent, float half_w, 
   return tangent >= d0 && tangent <= d1 ? half_w : edge;
 }
 
-// The blocks that an ellipse reaches.
+// The blocks that an ellipse reaches, as bits.
 static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) {
   const float mx = (splat[SPLAT_PIXEL_X] - (float)tile_x) + splat[SPLAT_SUB_X];
   const float my = (splat[SPLAT_PIXEL_Y] - (float)tile_y) + splat[SPLAT_SUB_Y];
@@ -98,8 +98,8 @@ static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y
 }
 #endif
 
-// A batch: what the items of a group fetch together, and then all read. Every item fetches as many, the last splats
-// again where the list ends: a compiler that makes vectors of items may else read for those that have none.
+// A batch: splats that the group's items fetch together and all read. Every item fetches the same number, repeating the
+// last splat at the list's end: a compiler that vectorises across items may read for idle ones too.
 #define BATCH (ITEMS < 64 ? 64 : ITEMS)
 typedef struct {
   float mx, my, l11, l12; // mx, my: from the tile's first pixel to the mean
@@ -107,8 +107,8 @@ typedef struct {
   float blue;
   uint blocks, gaussian, slot;
 #ifdef NEARNESS
-  float near;     // one over the depth
-  uint unused[3]; // to the next multiple of 16 bytes: no copy has what nobody wrote
+  float near;     // 1 / depth
+  uint unused[3]; // padding to 16 bytes, set so that copies read no unwritten memory
 #endif
 } __attribute__((aligned(16))) Staged;
 
@@ -135,7 +135,7 @@ static inline void stage(__local Staged *place, uint gaussian, uint slot, __glob
   *place = s;
 }
 
-// A staged splat by the names that LOG2_ALPHA and the kernels have for one in global memory.
+// Gives a staged splat the names that LOG2_ALPHA and the kernels use for a splat in global memory.
 #define SPLAT_STAGED(place)                                                                                            \
   const Staged s = place;                                                                                              \
   __global const float *splat = splats + (size_t)SPLAT_SIZE * s.gaussian;                                              \

@@ -1,7 +1,6 @@
-// The pixels of a tile as cells, and which of them a Gaussian reaches. A group that shares a tile has those of
-// blocks.h. Else one work-item walks the tile: a vector has the pixels of a block of CELL_W x CELL_H, row by row, as an
-// ellipse's edge cuts fewer blocks than rows of as many pixels. Cell c is the one at column c % COLUMNS and row c /
-// COLUMNS.
+// The pixels of a tile as cells, and the cells that a Gaussian reaches. A group that shares a tile uses blocks.h.
+// Otherwise one work-item walks the tile, and a cell is a block of CELL_W x CELL_H pixels in a vector, row by row: an
+// ellipse's edge cuts fewer blocks than rows of as many pixels. Cell c is at column c % COLUMNS and row c / COLUMNS.
 #if ITEMS > 1
 #include "shared/blocks.h"
 #else
@@ -15,13 +14,13 @@
 #define CELL_X(cell) ((cell) % COLUMNS * CELL_W)
 #define CELL_Y(cell) ((cell) / COLUMNS * CELL_H)
 
-// Where a cell's first pixel is in a plane.
+// The place of a cell's first pixel in a plane.
 #define CELL_IN_PLANE(cell) (stride * (tile_y + CELL_Y(cell)) + tile_x + CELL_X(cell))
 
-// A lane's pixel, from its cell's first one on.
+// A lane's pixel, relative to its cell's first pixel.
 #define LANE_IN_PLANE(lane) (stride * ((lane) / CELL_W) + (lane) % CELL_W)
 
-// Coordinates of a cell's pixels in the tile, and the cell's part of a plane whose rows are `stride` apart.
+// The coordinates of a cell's pixels in the tile, and access to the cell in a plane whose rows are `stride` apart.
 #define PIXELS_X(cell) ((floatL)(CELL_X(cell)) + LANE_X)
 #define PIXELS_Y(cell) ((floatL)(CELL_Y(cell)) + LANE_Y)
 #if LANES == 1
@@ -56,10 +55,10 @@ typedef int4 int4U __attribute__((aligned(4)));
 #endif
 #endif
 
-// The cells that a Gaussian reaches: those that have a pixel in its ellipse, as bits, in a tile of at most 32; else
-// those that its box reaches.
+// The cells that a Gaussian reaches. In a tile of at most 32 cells they are bits, of the cells with a pixel in the
+// ellipse. Otherwise they are the cells that its box reaches.
 #if LANES >= 8
-#ifndef RAYS // there every cell of a tile is looked at
+#ifndef RAYS // with RAYS every cell of a tile is visited
 #define CELLS_BY_ELLIPSE
 #endif
 typedef uint Reach;
@@ -72,15 +71,16 @@ typedef uint Reach;
 #define LOWEST(bits) (31 - clz((bits) & -(bits)))
 #endif
 
-// sqrt(x) or up to 0.2 % more: Newton's step on the bits' estimate of 1 / sqrt(x). sqrt of a vector is a call in PoCL.
+// sqrt(x), up to 0.2 % too large: one Newton step from an estimate of 1 / sqrt(x) by its bits. A vector's sqrt is a
+// call in PoCL.
 static inline float8 over_sqrt(float8 x) {
   const float8 y = as_float8((int8)(0x5f375a86) - (as_int8(x) >> 1));
   const float8 root = x * y;
   return root * (1.502f - 0.5f * (root * y));
 }
 
-// In eight rows of pixels, the ellipse's chord from *low to *end, in pixels and not clamped:
-// |l11 (mx - x) + l12 (my - y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2; a point where rest < 0.
+// The ellipse's chord in eight rows of pixels, from *low to *end, in pixels and not clamped: |l11 (mx - x) + l12 (my -
+// y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2. It is a point where rest < 0.
 static inline float8 chord(float8 dy, float mx, float l12, float l22, float inverse_l11, float budget, float8 *low,
                            float8 *end) {
   const float8 v = l22 * dy, shift = l12 * dy;
@@ -91,7 +91,7 @@ static inline float8 chord(float8 dy, float mx, float l12, float l22, float inve
   return rest;
 }
 
-// Bits of the columns that the ellipse reaches in eight pairs of rows of pixels.
+// Bits of the columns that the ellipse reaches in eight pairs of pixel rows.
 static inline int8 reached_columns(float my, float mx, float l12, float l22, float inverse_l11, float budget) {
   const float8 dy = my - (float8)(0, 2, 4, 6, 8, 10, 12, 14);
   float8 low, end, low2, end2;
@@ -139,8 +139,9 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #endif
 }
 
-// Pixels' coordinates by table: conversions from integers in the inner loop made a chain through it in some compilers.
-// A cell is in the same place in every table and array: places are a good part of a loop's instructions.
+// Tables of the pixels' coordinates: in some compilers, integer conversions in the inner loop became a dependency chain
+// through it. A cell has the same index in every table and array, because address arithmetic is much of a loop's
+// instructions.
 #define PIXEL_TABLES                                                                                                   \
   floatL table_x[CELLS], table_y[CELLS];                                                                               \
   ALL_CELLS(cell) {                                                                                                    \
@@ -150,7 +151,7 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #define AT_X(cell) table_x[cell]
 #define AT_Y(cell) table_y[cell]
 
-// Cells that have a pixel left to fill.
+// Cells that have an open pixel.
 typedef uint Open;
 #define OPEN_CELL(open, cell) ((open) |= 1u << (cell))
 #define CLOSE_CELL(open, cell) ((open) &= ~(1u << (cell)))
@@ -162,19 +163,17 @@ typedef uint Open;
 
 #define FOR_CELLS(cell, reach) for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
 
-// Cells of the shape's vectors, which are what is recorded, as bits. RECORDED(mask) << FIRST_RECORDED(cell): those in
-// which the mask of a cell has a lane; CELLS_OF(recorded): the cells that they are in; PLACE_OF(each): where in an
-// array of cells, which is one of floatS too, it is.
+// Recorded cells are bits of cells in the shape's own vectors. RECORDED(mask) << FIRST_RECORDED(cell): those with a
+// lane set in a cell's mask. CELLS_OF(recorded): the cells that contain them. PLACE_OF(each): the index in an array of
+// cells, seen as an array of floatS.
 #if VECTORS == 1
 #define FIRST_RECORDED(cell) (cell)
 #define RECORDED(mask) ((uint)(ANYL(mask) != 0))
-#define ALL_RECORDED 1
 #define CELLS_OF(recorded) (recorded)
 #define PLACE_OF(each) (each)
-#else // one below the other
+#else // two vectors, one below the other
 #define FIRST_RECORDED(cell) ((cell) / COLUMNS * (2 * COLUMNS) + (cell) % COLUMNS)
 #define RECORDED(mask) recorded_of(mask)
-#define ALL_RECORDED (1 | 1 << COLUMNS)
 #define CELLS_OF(recorded) cells_of(recorded)
 #define PLACE_OF(each) place_of[each]
 __constant uchar place_of[2 * CELLS] = {0,  2,  4,  6,  1,  3,  5,  7,  8,  10, 12, 14, 9,  11, 13, 15,
@@ -189,11 +188,6 @@ static inline uint cells_of(uint recorded) {
   const uint pairs = (rows | rows >> 4) & 0x00ff00ff;
   return (pairs | pairs >> 8) & 0xffff;
 }
-#endif
-#ifdef NO_VECTOR_SKIP
-#define REACHED_CELLS(mask) ALL_RECORDED
-#else
-#define REACHED_CELLS(mask) RECORDED(mask)
 #endif
 #else
 typedef struct {

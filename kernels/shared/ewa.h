@@ -1,45 +1,43 @@
-// From LANES Gaussians to their ellipses on the image, with gsplat's conventions: what ewa.cl and its gradient both
-// need. Equation numbers are those of docs/gradients.md. The view matrix may have any rows, so that its gradient is
-// that of its numbers: (154) takes the cofactors of its rows in place of the rows. With ORTHOGRAPHIC or FISHEYE the
-// image is linear in x and y, or in the angle from the axis; with COVARIANCES these are given in place of quaternions
-// and scales.
+// From LANES Gaussians to their ellipses on the image, with gsplat's conventions; shared by ewa.cl and its gradient.
+// Equation numbers refer to docs/gradients.md. The view matrix may be any matrix, so that its gradient is by its twelve
+// numbers: (154) uses cofactors of the rows instead of the rows. With ORTHOGRAPHIC the image is linear in x and y, with
+// FISHEYE in the angle from the axis. With COVARIANCES these are given instead of quaternions and scales.
 #include "shared/place.h"
-#ifdef FISHEYE
-#include "shared/angles.h"
-#endif
+#define NEEDS_PROJECTION
+#include "shared/camera.h"
 
-// The least part of the determinant that is not the low-pass's of which a compensation has a gradient.
+// The smallest determinant without the low-pass at which a compensation has a gradient.
 #define LEAST_DETERMINANT 1e-30f
 
 typedef struct {
-  intL valid;        // not to be culled for its place, its size or a number that is none
+  intL valid;        // not culled for its depth, its size or a value that is not finite
   floatL x, y, z;    // mean in the camera's frame
-  floatL lx, ly, lz; // what rounding it to float32 left
+  floatL lx, ly, lz; // the mean's rounding remainders
 #ifdef FISHEYE
-  floatL away;         // theta / r, the distance on the image over that from the axis
-  floatL bend, bend2;  // (1/r d/dr) of it, once and twice
+  floatL away;         // theta / r: distance on the image over distance from the axis
+  floatL bend, bend2;  // (1/r d/dr) of `away`, once and twice
   floatL inverse;      // 1 / (x^2 + y^2 + z^2)
   floatL j1[3], j2[3]; // rows of the Jacobian
 #else
-  floatL rx, ry; // x/z and y/z as the Jacobian takes them, clamped; orthographic: 0
+  floatL rx, ry; // x/z and y/z as in the Jacobian, clamped; orthographic: 0
   floatL jx, jy; // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
 #endif
   floatL t1[3], t2[3]; // rows of the Jacobian times the view matrix
   floatL n[3];         // their cross product
 #ifdef COVARIANCES
   floatL v[6];   // xx, xy, xz, yy, yz, zz
-  floatL v2[3];  // that times t2
-  floatL adj[6]; // its adjugate, in the same order
+  floatL v2[3];  // V times t2
+  floatL adj[6]; // V's adjugate, in the same order
 #else
   floatL q[4];         // unit quaternion w x y z
-  floatL length;       // of the raw one
-  floatL r[9];         // its rotation
+  floatL length;       // of the raw quaternion
+  floatL r[9];         // rotation matrix
   floatL s[3];         // scales
   floatL b1[3], b2[3]; // t1 and t2 along the Gaussian's axes
-  floatL c[3];         // n along them
+  floatL c[3];         // n along the Gaussian's axes
 #endif
   floatL sxx, sxy, syy; // projected covariance with the low-pass
-  floatL det, det0;     // its determinant, and that without the low-pass
+  floatL det, det0;     // determinants with and without the low-pass
 } Ellipse2;
 
 #ifdef COVARIANCES
@@ -56,19 +54,19 @@ typedef struct {
 
 static inline floatL dotL(const floatL *a, const floatL *b) { return fmaL(a[0], b[0], fmaL(a[1], b[1], a[2] * b[2])); }
 
-// a times a row of three numbers of the camera.
+// The dot product of a with a row of three camera numbers.
 static inline floatL dot_row(const floatL *a, __constant float *row) {
   return fmaL(a[0], (floatL)(row[0]), fmaL(a[1], (floatL)(row[1]), a[2] * row[2]));
 }
 
-// a b - c d, good to its own last digits.
+// a b - c d, accurate to its own last digits.
 static inline floatL product_difference(floatL a, floatL b, floatL c, floatL d) {
   const floatL cd = c * d;
   return fmaL(a, b, -cd) + fmaL(-c, d, cd);
 }
 
 #ifdef COVARIANCES
-// A symmetric matrix, by its upper triangle, times a vector.
+// A symmetric matrix, given by its upper triangle, times a vector.
 static inline void symmetric_times(const floatL *v, const floatL *a, floatL *result) {
   result[0] = fmaL(v[0], a[0], fmaL(v[1], a[1], v[2] * a[2]));
   result[1] = fmaL(v[1], a[0], fmaL(v[3], a[1], v[4] * a[2]));
@@ -77,7 +75,7 @@ static inline void symmetric_times(const floatL *v, const floatL *a, floatL *res
 #endif
 
 #ifdef FISHEYE
-// atan(x) for x in [0, 1], as quarter_atan has it.
+// atan(x) for x in [0, 1], as in quarter_atan.
 static inline floatL atan_of_ratio(floatL x) {
   const floatL t = x * x;
   floatL p = fmaL(t, (floatL)(ATAN0), (floatL)(ATAN1));
@@ -90,7 +88,7 @@ static inline floatL atan_of_ratio(floatL x) {
   return fmaL(t * p, x, x);
 }
 
-// (157), (158): near the axis by their series, as there they are differences of what is nearly the same.
+// (157), (158): near the axis by series, because the closed forms are differences of nearly equal terms there.
 static inline void fisheye_of(Ellipse2 *p) {
   const floatL q = fmaL(p->x, p->x, p->y * p->y), d = fmaL(p->z, p->z, q);
   const floatL up = 1.0f / p->z, up2 = up * up, t = q * up2;
@@ -116,7 +114,7 @@ static inline void fisheye_of(Ellipse2 *p) {
   k = fmaL(t, -k, (floatL)(48.0f / 9.0f));
   k = fmaL(t, -k, (floatL)(24.0f / 7.0f));
   k = fmaL(t, -k, (floatL)(8.0f / 5.0f));
-  // elsewhere as they stand
+  // elsewhere by the closed forms
   const floatL r = sqrt(q), z = p->z < 0.0f ? -p->z : p->z;
   const intL steep = r > z;
   const floatL angle = atan_of_ratio(steep ? z / r : r / z);
@@ -130,7 +128,7 @@ static inline void fisheye_of(Ellipse2 *p) {
 }
 #endif
 
-// (153) to (155): the covariance with the low-pass, and its determinants as sums of squares or of what is positive.
+// (153) to (155): the covariance with the low-pass. The determinants are sums of squares or of positive terms.
 static inline void covariance2(float eps, Ellipse2 *p) {
   floatL xx, xy, yy;
 #ifdef COVARIANCES
@@ -168,29 +166,17 @@ static inline void covariance2(float eps, Ellipse2 *p) {
 }
 
 #if !defined(COVARIANCES) && !defined(FISHEYE)
-// The rest of x/z as the Jacobian takes it: of a limit where it is clamped.
-static inline floatL limited_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
-                                  float low_rest, float high, float high_rest) {
-#ifdef ORTHOGRAPHIC
-  return (floatL)(0.0f);
-#else
-  const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
-  const floatL above = ratio == low ? (floatL)(low_rest) : rest;
-  return ratio == high ? (floatL)(high_rest) : above;
-#endif
-}
-
 #define EWA_NUMBER2(name, index)                                                                                       \
   {(floatL)(camera[EWA_##name##0 + (index)]), (floatL)(camera[EWA_##name##0_LOW + (index)])}
 
-// (57): b1, b2 and c once more, in two floats up to where nothing cancels any more, for the lanes of `which`.
+// (57): recomputes b1, b2 and c in the lanes of `which`, in two floats until the last cancellation is done.
 static inline void refine2(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                            Ellipse2 *p) {
   Double r[9];
   const floatL length = rotation2_of(row, quaternions, p->length, r);
-  const Double rx = {p->rx, limited_rest(p->rx, p->x, p->lx, p->z, p->lz, camera[EWA_XMIN], camera[EWA_XMIN_LOW],
+  const Double rx = {p->rx, clamped_rest(p->rx, p->x, p->lx, p->z, p->lz, camera[EWA_XMIN], camera[EWA_XMIN_LOW],
                                          camera[EWA_XMAX], camera[EWA_XMAX_LOW])};
-  const Double ry = {p->ry, limited_rest(p->ry, p->y, p->ly, p->z, p->lz, camera[EWA_YMIN], camera[EWA_YMIN_LOW],
+  const Double ry = {p->ry, clamped_rest(p->ry, p->y, p->ly, p->z, p->lz, camera[EWA_YMIN], camera[EWA_YMIN_LOW],
                                          camera[EWA_YMAX], camera[EWA_YMAX_LOW])};
   const floatL along_x = p->jx / (length * length), along_y = p->jy / (length * length), area = p->jx * along_y;
   Double t1[3], t2[3], n[3];
@@ -213,8 +199,8 @@ static inline void refine2(const uint *row, __global const float *quaternions, _
 }
 #endif
 
-// Fills *p: (150) to (155). Conditions are positive, so that NaN culls. `row` as ROWS_OF_ITEM makes it. Returns 0 where
-// every one is culled.
+// Fills *p: (150) to (155). Conditions are positive, so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if
+// every lane is culled.
 static inline int project_ellipses(const uint *row, __global const float *means, EWA_SHAPES, __constant float *camera,
                                    Ellipse2 *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);
@@ -249,16 +235,8 @@ static inline int project_ellipses(const uint *row, __global const float *means,
                    fmaL(m[1], (floatL)(camera[EWA_N10 + i]), m[2] * camera[EWA_N20 + i]));
   }
 #else
-#ifdef ORTHOGRAPHIC
-  p->rx = p->ry = (floatL)(0.0f);
-  p->jx = (floatL)(camera[EWA_FX]);
-  p->jy = (floatL)(camera[EWA_FY]);
-#else
-  p->rx = clampL(p->x / p->z, camera[EWA_XMIN], camera[EWA_XMAX]);
-  p->ry = clampL(p->y / p->z, camera[EWA_YMIN], camera[EWA_YMAX]);
-  p->jx = camera[EWA_FX] / p->z;
-  p->jy = camera[EWA_FY] / p->z;
-#endif
+  jacobian_row(p->x, p->z, camera[EWA_FX], camera[EWA_XMIN], camera[EWA_XMAX], &p->rx, &p->jx);
+  jacobian_row(p->y, p->z, camera[EWA_FY], camera[EWA_YMIN], camera[EWA_YMAX], &p->ry, &p->jy);
   const floatL area = p->jx * p->jy;
   FOR_AXES(i) {
     p->t1[i] = p->jx * fmaL(-p->rx, (floatL)(camera[EWA_R20 + i]), (floatL)(camera[EWA_R00 + i]));
@@ -296,7 +274,7 @@ static inline int project_ellipses(const uint *row, __global const float *means,
     p->c[k] = fmaL(p->n[0], p->r[k], fmaL(p->n[1], p->r[3 + k], p->n[2] * p->r[6 + k]));
   }
   covariance2(camera[EWA_EPS], p);
-#ifndef FISHEYE // as in gaussian.h: a long axis must not move by more than a part of the short one
+#ifndef FISHEYE // as in gaussian.h: rounding must move a long axis by little against the short one
   floatL longest2 = p->s[0] * p->s[0];
   longest2 = p->s[1] * p->s[1] > longest2 ? p->s[1] * p->s[1] : longest2;
   longest2 = p->s[2] * p->s[2] > longest2 ? p->s[2] * p->s[2] : longest2;
@@ -317,5 +295,5 @@ static inline int project_ellipses(const uint *row, __global const float *means,
   return 1;
 }
 
-// (156): what opacity makes up for the low-pass.
+// (156): the factor by which opacity compensates for the low-pass.
 static inline floatL compensation2(const Ellipse2 *p) { return sqrt(p->det0 / p->det); }

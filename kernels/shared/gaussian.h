@@ -1,10 +1,10 @@
-// From LANES Gaussians' parameters to their ellipses on the image: what projection and its gradient both need.
-// Equation numbers are those of docs/gradients.md. With ORTHOGRAPHIC the image is linear in x and y, not in x/z and y/z
-// (docs/cameras.md, equations 15 to 17).
+// From LANES Gaussians' parameters to their ellipses on the image, shared by projection and its gradient. Equation
+// numbers refer to docs/gradients.md. With RAYS tangent.h has its own projection, which shares what is outside of
+// #ifndef RAYS here.
 
 #include "shared/place.h"
 
-// px^2 added to the projected covariance, and with ANTIALIASED the least that (83) makes of an opacity.
+// Variance added to the projected covariance, in px^2, and with ANTIALIASED the smallest factor of opacity in (83).
 #ifdef ANTIALIASED
 #define LOW_PASS 0.1f
 #define LEAST_COMPENSATION 0.005f
@@ -13,16 +13,16 @@
 #endif
 
 typedef struct {
-  intL valid;           // not to be culled
+  intL valid;           // not culled
   floatL x, y, z;       // mean in the camera's frame
-  floatL lx, ly, lz;    // what rounding it to float32 left
-  floatL rx, ry;        // x/z and y/z as the Jacobian takes them, clamped; orthographic: 0
+  floatL lx, ly, lz;    // the mean's rounding remainders
+  floatL rx, ry;        // x/z and y/z as in the Jacobian, clamped; orthographic: 0
   floatL jx, jy;        // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
   floatL q[4];          // unit quaternion w x y z
-  floatL length;        // of the raw one
-  floatL a2[3];         // the last row of the camera from Gaussian rotation A: its axes' depths
+  floatL length;        // of the raw quaternion
+  floatL a2[3];         // last row of A, camera from Gaussian: the axes' depths
   floatL b1[3], b2[3];  // the two rows of J A
-  floatL c[3];          // their minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for k, l, m in turn
+  floatL c[3];          // minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for cyclic k, l, m
   floatL s[3];          // scales
   floatL sxx, sxy, syy; // projected covariance with the low-pass
   floatL det;
@@ -31,29 +31,14 @@ typedef struct {
 #endif
 } Projection;
 
-// Row of cam_from_world times the mean (x, y, z). In float32 alone this would cost 1e-4 pixels, and a pixel at the edge
-// of an ellipse flips over that.
-#define CAMERA_ROW(index)                                                                                              \
-  camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                    \
-             camera[CAMERA_T##index##_LOW], x, y, z)
-
-// (2): focal * (x / z) + centre, as whole pixels from the window's first and the rest in [0, 1): the rest has the same
-// bits in every window.
-static inline void image_position(floatL x, floatL x_low, floatL z, floatL z_low, float focal, float focal_low,
-                                  float centre, float centre_low, float window, floatL *whole, floatL *rest) {
-  const floatL ratio = RATIO(x, z);
-  const Double c = {(floatL)(centre),
-                    fmaL((floatL)(focal), ratio_rest(ratio, x, x_low, z, z_low), (floatL)(centre_low))};
-  const Double at = multiply_add2(focal, focal_low, ratio, c);
-  const floatL in_frame = floorL(at.high);
-  *whole = in_frame - window;
-  *rest = (at.high - in_frame) + at.low;
-}
+#define NEEDS_PROJECTION
+#include "shared/camera.h"
 
 // From the camera's centre to the mean, along a world axis.
 #define FROM_CAMERA(means, axis, index)                                                                                \
   ((GATHER(means, 3, index) - camera[CAMERA_P##axis]) - camera[CAMERA_P##axis##_LOW])
 
+#ifndef RAYS
 // (5) to (7) from J A and S, with the determinant as a sum of squares (56).
 static inline void covariance(Projection *p) {
   floatL xx = (floatL)(0.0f), yy = xx, xy = xx, minors = (floatL)(LOW_PASS * LOW_PASS);
@@ -76,28 +61,19 @@ static inline void covariance(Projection *p) {
   p->sxy = xy;
   p->det = fmaL((floatL)(LOW_PASS), xx + yy, minors);
 }
+#endif
 
 #ifdef ANTIALIASED
-// (83): what the low-pass thickens, opacity makes up for. det0, det: the covariance's determinant without it and with.
+// (83): the factor by which opacity compensates for the low-pass. det0, det: the covariance's determinant without and
+// with it.
 static inline floatL compensation(floatL det0, floatL det) {
   const floatL part = det0 / det;
   return part > LEAST_COMPENSATION * LEAST_COMPENSATION ? sqrt(part) : (floatL)(LEAST_COMPENSATION);
 }
 #endif
 
-// The rest of x/z as the Jacobian takes it: of a limit where it is clamped.
-static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
-                                  float low_rest, float high, float high_rest) {
-#ifdef ORTHOGRAPHIC
-  return (floatL)(0.0f);
-#else
-  const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
-  const floatL above = ratio == low ? (floatL)(low_rest) : rest;
-  return ratio == high ? (floatL)(high_rest) : above;
-#endif
-}
-
-// (57): J A and its minors once more, in two floats up to where nothing cancels any more, for the lanes of `which`.
+#ifndef RAYS
+// (57): recomputes J A and its minors in the lanes of `which`, in two floats until the last cancellation is done.
 static inline void refine(const uint *row, __global const float *quaternions, __constant float *camera, intL which,
                           Projection *p) {
   Double r[9];
@@ -124,8 +100,8 @@ static inline void refine(const uint *row, __global const float *quaternions, __
   }
 }
 
-// Fills *p: (1), (3) to (7). Conditions are positive, so that NaN culls. `row` as ROWS_OF_ITEM makes it. Returns 0
-// where every one is culled.
+// Fills *p: (1), (3) to (7). Conditions are positive, so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if
+// every lane is culled.
 static inline int project_gaussians(const uint *row, __global const float *means, __global const float *quaternions,
                                     __global const float *log_scales, __constant float *camera, Projection *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);
@@ -158,16 +134,8 @@ static inline int project_gaussians(const uint *row, __global const float *means
   p->s[1] = expL(GATHER(log_scales, 3, 1));
   p->s[2] = expL(GATHER(log_scales, 3, 2));
 
-#ifdef ORTHOGRAPHIC
-  p->rx = p->ry = (floatL)(0.0f);
-  p->jx = (floatL)(camera[CAMERA_FX]);
-  p->jy = (floatL)(camera[CAMERA_FY]);
-#else
-  p->rx = clampL(p->x / p->z, camera[CAMERA_XMIN], camera[CAMERA_XMAX]);
-  p->ry = clampL(p->y / p->z, camera[CAMERA_YMIN], camera[CAMERA_YMAX]);
-  p->jx = camera[CAMERA_FX] / p->z;
-  p->jy = camera[CAMERA_FY] / p->z;
-#endif
+  jacobian_row(p->x, p->z, camera[CAMERA_FX], camera[CAMERA_XMIN], camera[CAMERA_XMAX], &p->rx, &p->jx);
+  jacobian_row(p->y, p->z, camera[CAMERA_FY], camera[CAMERA_YMIN], camera[CAMERA_YMAX], &p->ry, &p->jy);
   const floatL area = camera[CAMERA_HAND] * p->jx * p->jy;
   FOR_AXES(k) {
     p->a2[k] = a[6 + k];
@@ -177,9 +145,9 @@ static inline int project_gaussians(const uint *row, __global const float *means
   }
   covariance(p);
 
-  // Rounding the rotation moves a point at a long axis' end by that axis times 1e-7, which has to be little beside the
-  // ellipse's short axis: the square root of det / (sxx + syy), or up to 1.42 times that. The gradient wants to know an
-  // axis that points at the camera too.
+  // Rounding the rotation moves the end of a long axis by 1e-7 of its length. That has to be small against the
+  // ellipse's short axis, which is between 1 and 1.42 times sqrt(det / (sxx + syy)). The gradient also needs an axis
+  // that points at the camera accurately.
   floatL longest = p->s[0] > p->s[1] ? p->s[0] : p->s[1];
   longest = longest > p->s[2] ? longest : p->s[2];
   const floatL across2 = fmaL(p->jx, p->jx, p->jy * p->jy);
@@ -195,3 +163,4 @@ static inline int project_gaussians(const uint *row, __global const float *means
   p->valid &= (p->sxx < 1e30f) & (p->syy < 1e30f) & (p->det > 0.0f) & (p->det < 1e30f);
   return 1;
 }
+#endif

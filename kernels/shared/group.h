@@ -1,4 +1,4 @@
-// Tasks that a work-group does together. At ITEMS == 1 a group is one sequential work-item and nothing is left of this.
+// Operations of a whole work-group. With ITEMS == 1 a group is one sequential work-item, and they vanish.
 #ifndef ITEMS
 #error "ITEMS must be defined: work-items per group, 1 on CPUs"
 #endif
@@ -11,8 +11,8 @@
 #endif
 #define GROUP __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 
-// Raises `value`, an int that every item has, to the largest of the group's. In a kernel's own scope and once in it, as
-// it declares local memory.
+// Raises every item's int `value` to the group's maximum. Use it once, in the outermost scope of a kernel, because it
+// declares local memory.
 #if ITEMS == 1
 #define RAISE_TO_GROUP_MAX(value)
 #else
@@ -25,20 +25,20 @@
   value = group_max;
 #endif
 
-// A sum of 64 bits in 32, 0xffffffff where it does not fit. So a sum of many is the same in every order of addition.
+// A 64-bit sum in 32 bits, 0xffffffff where it does not fit. A saturated sum of many values is the same in every order
+// of addition.
 #define CAPPED(sum) ((sum) > 0xffffffff ? 0xffffffff : (uint)(sum))
 
-// Intel's runtime for CPUs unrolls five rounds, and one of its compiler's passes
-// (sycl-kernel-reduce-cross-barrier-values) reads memory that it has freed where a kernel with barriers has some 50
-// basic blocks.
+// Intel's CPU runtime unrolls five rounds. In kernels with barriers and some 50 basic blocks, one of its compiler's
+// passes (sycl-kernel-reduce-cross-barrier-values) then reads freed memory.
 #if ITEMS < 64
 #define ROUNDS _Pragma("unroll 1")
 #else
 #define ROUNDS
 #endif
 
-// The sum of the values of the items before this one; *total gets the sum of all. Sums stop at 0xffffffff. scratch
-// holds ITEMS elements.
+// The sum of the values of all lower-numbered items; *total gets the sum over all items. Sums saturate at 0xffffffff.
+// scratch holds ITEMS elements.
 static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint *total) {
 #if ITEMS == 1
   *total = value;
@@ -60,8 +60,8 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 #endif
 }
 
-// Where a group is, from a kernel's first_tile, tiles_x, height and ranges: the first pixel of its tile; its list, the
-// pairs from `begin` to before `end`; floats from a row of a plane to the next, and from plane to plane.
+// A group's tile, from the kernel's first_tile, tiles_x, height and ranges: its first pixel, its list of pairs [begin,
+// end), and the strides in floats between rows and between planes.
 #define TILE_OF_GROUP                                                                                                  \
   const int tile = first_tile + get_group_id(0);                                                                       \
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \
@@ -69,7 +69,7 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
   const size_t stride = (size_t)tiles_x * TILE;                                                                        \
   const size_t plane = stride * ((height + TILE - 1) / TILE * TILE);
 
-// The sum of values (count), for every item; it stops at 0xffffffff. scratch holds ITEMS elements.
+// The sum of values (count), for every item; it saturates at 0xffffffff. scratch holds ITEMS elements.
 static inline uint group_sum(__global const uint *values, uint count, __local uint *scratch) {
   ulong sum = 0;
   uint total;

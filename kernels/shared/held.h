@@ -1,10 +1,10 @@
-// A hold-out: surfaces of other elements in the pixels, which let a share of the light behind them through.
+// A holdout: surfaces of other elements in the pixels, which let a fraction of the light behind them through.
 //
-// held_starts (pixels of a plane + 1): the first surface of each pixel, the end behind it; held_surfaces (surfaces,
-// HELD_SIZE): depths at which one begins and ends, what it lets through, the binary logarithm of that over its length;
-// each pixel's from the nearest beginning on. Equations: docs/pictures.md, (75).
+// held_starts (pixels of a plane + 1): the first surface of each pixel, then the end. held_surfaces (surfaces,
+// HELD_SIZE): the depths of front and back, the transmitted fraction, and its binary logarithm over the thickness. Each
+// pixel's surfaces are sorted by the depth of their fronts. Equations: docs/pictures.md, (75).
 #ifdef HOLDOUT
-// Of a cell: what the surfaces let through that its pixels have behind them, and the beginning of the next ones.
+// A cell's state: the light that the surfaces already passed let through, and the front of the next surface.
 typedef struct {
   Lanes through, next;
   uint at[LANES], end[LANES];
@@ -22,10 +22,10 @@ static inline Held held_of(__global const uint *starts, __global const float *su
   return held;
 }
 
-// The share of the light that comes through to a depth, which is no less than that of the call before.
+// The fraction of the light that comes through to `depth`. Depths must not decrease from call to call.
 static inline floatL let_through(float depth, Held *held, __global const float *surfaces) {
   if (!ANYL(MASKL(held->next.all <= (floatL)(depth)))) return held->through.all;
-  Lanes within; // log2 of what those let through that the depth is in
+  Lanes within; // log2 of the light that the surfaces around this depth let through
   Lanes through;
   for (int lane = 0; lane < LANES; ++lane) {
     uint k = held->at[lane];

@@ -1,8 +1,8 @@
-// Sums over a group's items, of neighbours first, then of pairs, of fours and so on: one order, and the same bits,
-// whether items leave their addends in local memory or exchange them in sub-groups of SUBGROUP items.
+// Sums over a group's items: first neighbours, then pairs, fours and so on. The order and the bits are the same whether
+// items leave their addends in local memory or exchange them in sub-groups of SUBGROUP items.
 #define PARTS (ITEMS / SUBGROUP) // addends of a row in local memory
 
-// A row is padded so that rows begin in banks of their own.
+// A row is padded so that rows begin in different banks.
 #define ROW (PARTS < 4 ? PARTS : PARTS + 4)
 
 static inline float sum_of_1(__local const float *row) { return row[0]; }
@@ -36,13 +36,13 @@ static inline float row_sum(__local const float *row) {
 }
 
 #if SUBGROUP > 1
-// Adds up a pair's fields over a sub-group: in each step an item gives half of what it has to a neighbour, and gets the
-// neighbour's addends of the other half, until it has one field, or a few. These go to the sub-group's places of the
-// fields' rows, from `rows` on.
+// Adds up a pair's fields over a sub-group. In each step an item gives half of its fields to a neighbour and adds the
+// neighbour's part of the other half, until it holds one field, or a few. These go to the sub-group's places in the
+// fields' rows, which start at `rows`.
 static inline void leave_sums(const float *sums, __local float *rows) {
   const int item = get_local_id(0);
   float held[SLOT_STRIDE];
-  int n = SLOT_STRIDE, begin = 0, end = SLOT_STRIDE; // this item has the fields from begin to before end
+  int n = SLOT_STRIDE, begin = 0, end = SLOT_STRIDE; // this item has the fields [begin, end)
   _Pragma("unroll") for (int field = 0; field < SLOT_STRIDE; ++field) held[field] = sums[field];
   _Pragma("unroll") for (int step = 1; step < SUBGROUP; step *= 2) {
     const int upper = (item & step) != 0;

@@ -1,9 +1,9 @@
-// floatL: LANES pixels, one name for float, float8 and float16. MASKL(comparison) is an intL, all bits of a lane set or
-// none; the comparison operators alone give 0 and 1 at LANES == 1.
+// floatL: LANES pixels, one name for float, float4, float8 and float16. MASKL(comparison) is an intL in which all bits
+// of a lane are set or clear. At LANES == 1 the comparison operators themselves give 0 and 1.
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
-#ifndef VECTORS // of the shape in one: widened.h
+#ifndef VECTORS // shape vectors in one of these: widened.h
 #define VECTORS 1
 #endif
 #define CAT_(a, b) a##b
@@ -138,7 +138,7 @@ static inline float sumS(floatS x) {
 #else
 #define EIGHT(x) (x)
 #endif
-// The sums of eight vectors, each as sumS adds it up, in fewer steps than one after the other.
+// The sums of eight vectors, each in the order of sumS, in fewer steps than eight separate calls.
 static inline float8 sums8(floatS x0, floatS x1, floatS x2, floatS x3, floatS x4, floatS x5, floatS x6, floatS x7) {
   const float8 a = EIGHT(x0), b = EIGHT(x1), c = EIGHT(x2), d = EIGHT(x3);
   const float8 e = EIGHT(x4), f = EIGHT(x5), g = EIGHT(x6), h = EIGHT(x7);
@@ -152,9 +152,10 @@ static inline float8 sums8(floatS x0, floatS x1, floatS x2, floatS x3, floatS x4
 }
 #endif
 
-// 2^x for x in [-126, 1], relative error under 2.1e-7: round to the nearest integer with the magic number 1.5 * 2^23,
-// degree 5 minimax on [-1/2, 1/2] that is 1 at 0, exponent by integer addition. A lane under -126 is some number. The
-// polynomial is in Estrin's order: blending waits for what its longest chain of operations takes.
+// 2^x for x in [-126, 1], relative error under 2.1e-7. x is rounded to the nearest integer with the magic number 1.5 *
+// 2^23. The polynomial is minimax of degree 5 on [-1/2, 1/2] and is 1 at 0. The exponent is set by an integer addition.
+// A lane under -126 gets an arbitrary number. The polynomial is in Estrin's order, because blending's speed depends on
+// its longest dependency chain.
 static inline floatL exp2L(floatL x) {
   const floatL t = x + 12582912.0f;
   const floatL f = x + (12582912.0f - t);
@@ -181,7 +182,7 @@ static inline floatL exp2L(floatL x) {
             ROW4_(array, width, field, 12)))
 #endif
 
-// A short loop without a loop where a lane is an item: on a GPU an array that an index walks is memory, not registers.
+// Unrolls a short loop if a lane is an item: on a GPU an array with a variable index is in memory, not in registers.
 #if LANES == 1
 #define UNROLL _Pragma("unroll")
 #else
@@ -189,7 +190,7 @@ static inline floatL exp2L(floatL x) {
 #endif
 #define FOR_AXES(k) UNROLL for (int k = 0; k < 3; ++k)
 
-// The rows of a work-item that has LANES of n, the last one again where they end.
+// The rows of a work-item that owns LANES of n; the last row repeats past the end.
 #define ROWS_OF_ITEM(n)                                                                                                \
   const uint first_row = get_global_id(0) * LANES;                                                                     \
   if (first_row >= (n)) return;                                                                                        \
@@ -197,7 +198,7 @@ static inline floatL exp2L(floatL x) {
   for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < (n) ? first_row + lane : (n) - 1;           \
   const uint lanes_used = (n) - first_row < LANES ? (n) - first_row : LANES;
 
-// A vector to be had lane by lane.
+// A vector with access to its lanes.
 typedef union {
   floatL all;
   float lane[LANES];

@@ -1,10 +1,11 @@
-// Scalar arithmetic with the same bits on every driver: no contraction but where fma1 asks for it, and no
-// elementary function of the driver's. Every kernel includes this file first.
+// Scalar arithmetic with the same bits on every driver: contraction only where fma1 asks for it, and none of the
+// driver's elementary functions. Every kernel includes this file first.
 #pragma OPENCL FP_CONTRACT OFF
+#include "shared/layouts.h"
 
 #define LOG2E 1.44269504088896341f
 #define LN2 0.693147180559945f
-#ifndef ALPHA_MAX // the library sets another one, as its callers ask for it
+#ifndef ALPHA_MAX // the library can set another cap
 #define ALPHA_MAX 0.99f
 #endif
 #ifndef ALPHA_MIN // these two can be set by RasterizerConfig
@@ -15,8 +16,8 @@
 #define TRANSMITTANCE_MIN 1e-4f
 #endif
 
-// a*b + c with one rounding. FMA_BY_CONTRACTION is set where a probe found that the driver's compiler fuses this
-// expression; its fma() is then a slower way to the same bits (and aborts some drivers at 16 lanes).
+// a*b + c with one rounding. FMA_BY_CONTRACTION is set if a probe found that the driver's compiler fuses this
+// expression. Its fma() is then a slower way to the same bits, and aborts some drivers at 16 lanes.
 static inline float fma1(float a, float b, float c) {
 #ifdef FMA_BY_CONTRACTION
 #pragma OPENCL FP_CONTRACT ON
@@ -26,6 +27,6 @@ static inline float fma1(float a, float b, float c) {
 #endif
 }
 
-// sum + x, for a loop over neighbouring floats: Intel's CPU runtime adds these up in another order where there is
-// AVX-512, if it sees a sum.
+// sum + x, for a loop over neighbouring floats. With AVX-512, Intel's CPU runtime would recognise a sum and reorder its
+// additions.
 static inline float added(float sum, float x) { return fma(x, 1.0f, sum); }

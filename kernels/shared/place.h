@@ -1,14 +1,14 @@
-// Where LANES points and turned axes are in a camera: arithmetic in two floats, of several kernels. Equation numbers
-// are those of docs/gradients.md. With ORTHOGRAPHIC the image is linear in x and y, not in x/z and y/z.
+// The positions of LANES points and rotated axes in a camera, in two-float arithmetic, for several kernels. Equation
+// numbers refer to docs/gradients.md.
 
-// So that no sum of what they are factors of overflows: of distances in world units and of axes in pixels.
+// Limit of distances in world units and of axes in pixels, so that no sum of their products overflows.
 #define FARTHEST 1e18f
-// Where `refine` is called for: longest axis over the ellipse's short one, and an axis over what is seen of it. Up to
-// there float32 is good to 3e-5.
+// Thresholds for calling `refine`: longest axis over the ellipse's short axis, and an axis over its projected length.
+// Up to them float32 is accurate to 3e-5.
 #define REFINE_FROM 64.0f
 #define FORESHORTENED 256.0f
 
-// The rotation of a unit quaternion, row by row.
+// The rotation matrix of a unit quaternion, row by row.
 static inline void rotation_of(const floatL *q, floatL *r) {
   const floatL w = q[0], x = q[1], y = q[2], z = q[3];
   r[0] = 1.0f - 2.0f * (y * y + z * z);
@@ -22,9 +22,9 @@ static inline void rotation_of(const floatL *q, floatL *r) {
   r[8] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-// (57): the same in two floats, times the square of the length that is returned; `length`: the raw quaternion's.
+// (57): the same in two floats, times the square of the returned length. `length` is the raw quaternion's.
 static inline floatL rotation2_of(const uint *row, __global const float *quaternions, floatL length, Double *r) {
-  // By a power of two, which is exact: the rest of a product must not fall among denormals.
+  // Scales by a power of two, which is exact, to keep the low parts of products out of the denormals.
   const floatL size = AS_FLOATL(AS_INTL(length) & 0x7f800000);
   const floatL w = GATHER(quaternions, 4, 0) / size, x = GATHER(quaternions, 4, 1) / size;
   const floatL y = GATHER(quaternions, 4, 2) / size, z = GATHER(quaternions, 4, 3) / size;
@@ -44,7 +44,7 @@ static inline floatL rotation2_of(const uint *row, __global const float *quatern
   return length / size;
 }
 
-// A row of a camera's matrix times the mean (x, y, z), and its shift.
+// A row of the camera's matrix times the mean (x, y, z), plus the row's translation.
 static inline Double camera_row(__constant float *r, __constant float *r_low, float t, float t_low, floatL x, floatL y,
                                 floatL z) {
   Double sum = {(floatL)(t), (floatL)(t_low)};
@@ -53,18 +53,18 @@ static inline Double camera_row(__constant float *r, __constant float *r_low, fl
   return multiply_add2(r[2], r_low[2], z, sum);
 }
 
-// The quantity that a place on the image is linear in, x/z or x, in two floats: the value, and the rest of it.
-#ifdef ORTHOGRAPHIC
-#define RATIO(x, z) (x)
-static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) { return x_low; }
-#else
-#define RATIO(x, z) ((x) / (z))
-static inline floatL ratio_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) {
+// A row of cam_from_world times the mean (x, y, z), in two floats. Float32 alone would cost 1e-4 pixels, enough to flip
+// a pixel at the edge of an ellipse.
+#define CAMERA_ROW(index)                                                                                              \
+  camera_row(camera + CAMERA_R##index##0, camera + CAMERA_R##index##0_LOW, camera[CAMERA_T##index],                    \
+             camera[CAMERA_T##index##_LOW], x, y, z)
+
+// The low part of ratio = x / z in two floats.
+static inline floatL slope_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low) {
   return (fmaL(-ratio, z, x) + fmaL(-ratio, z_low, x_low)) / z;
 }
-#endif
 
-// x within [low, high], and NaN as it is.
+// x clamped to [low, high]; NaN stays NaN.
 static inline floatL clampL(floatL x, float low, float high) {
   const floatL above = x < low ? (floatL)(low) : x;
   return above > high ? (floatL)(high) : above;

@@ -1,16 +1,16 @@
 // The chain rule from the sums of LANES Gaussians' slots back to their parameters, and to the camera's lens. Equation
-// numbers are those of docs/gradients.md, with RAYS of docs/cameras.md. Needs splat.h, gaussian.h and sh.h, with RAYS
-// tangent.h; defines are those of project_grad.cl.
+// numbers refer to docs/gradients.md, with RAYS to docs/cameras.md. Needs splat.h, gaussian.h and sh.h, with RAYS
+// tangent.h; the defines are those of project_grad.cl.
 
-// Memory that the gradients of the higher SH bands are written to: all Gaussians', or a work-item's own. With one lane
-// project_step makes them of basis and colour.
+// Address space of the gradients of the higher SH bands: all Gaussians' in global memory, or a work-item's own. With
+// one lane project_step computes them from basis and colour instead.
 #if !defined(ADAM)
 #define SH_GRADIENT __global float
 #elif LANES > 1
 #define SH_GRADIENT float
 #endif
 
-// The SH coefficients after the first one, of so many that are used.
+// Loops over the SH coefficients after the first, up to `used`.
 #define SH_HIGHER 15
 #if LANES == 1
 #define FOR_HIGHER(k, used) UNROLL for (int k = 1; k <= SH_HIGHER; ++k) if (k < (used))
@@ -18,14 +18,15 @@
 #define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
 #endif
 
-// Gradients of LANES Gaussians by their parameters. That by an SH coefficient is the basis there times colour's; colour
-// is a row's red, green and blue, each zero where it is clamped.
+// Gradients of LANES Gaussians by their parameters. The gradient by an SH coefficient is its basis value times the one
+// by colour. `colour` is red, green and blue, each zero where clamped.
 typedef struct {
   Lanes mean[3], quaternion[4], scale[3], opacity, colour[3], basis[16];
 } Gradients;
 
-// Gradients of the visible ones of the rows from first_row on; returns 0 if none is visible. `shown` (LANES) is 1 where
-// one is. Fills screen and contributions, and of visible rows d_sh_rest, which is row first_row's.
+// Gradients of the visible rows among LANES rows from first_row on. Returns 0 if none is visible. Sets `shown` (LANES)
+// to 1 for visible rows, and fills screen, contributions and by_lens. d_sh_rest begins at row first_row; only visible
+// rows of it are written.
 static inline int gradients_of(const uint n, const uint first_row, const int coefficients, __constant float *camera,
                                __global const uint *tile_counts, __global const uint *first_slots,
                                __global const float *slots, __global const float *splats, __global const float *means,
@@ -51,7 +52,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   Lanes m[SLOT_STRIDE];
   int any = 0;
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
-  Lanes whitening[3]; // nobody has written the splats of Gaussians that are not visible
+  Lanes whitening[3]; // the splats of Gaussians that are not visible are not written
   for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {
     const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;
@@ -90,9 +91,9 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const floatL l11 = whitening[0].all, l12 = whitening[1].all, l22 = whitening[2].all;
   const floatL m_g = m[SLOT_G].all, m_gu = m[SLOT_GU].all, m_gv = m[SLOT_GV].all;
 
-  // Opacity, (29) and (41): sum of g is o dL/do, and do/dlogit = o (1 - o).
+  // Opacity, (29) and (41): the sum of g is o dL/do, and do/dlogit = o (1 - o).
   Lanes d_screen[2];
-  d->opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also where o is next to 1
+  d->opacity.all = m_g * sigmoidL(-GATHER(opacity_logits, 1, 0)); // 1 - o, also for o close to 1
 #ifdef PENALTIES                                                  // (91)
   const floatL opacity = sigmoidL(GATHER(opacity_logits, 1, 0));
   d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
@@ -110,7 +111,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d_screen[1].all = side_y * d_my;
 #endif
 #else
-  // (50). Mean on the image: -W^T (sum of g w).
+  // (50): the mean on the image, -W^T (sum of g w).
   const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
   const floatL d_my = -INVERSE_WHITEN2 * fmaL(l12, m_gu, l22 * m_gv);
 #ifdef ABSOLUTE_GRADIENTS
@@ -122,10 +123,11 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
 #endif
 
-  // (58). The columns of M = J A S, whitened: w[k] times the scale. Of order one, and differences of nothing large.
+  // (58): the whitened columns of M = J A S, which are w[k] times the scale. They are of order one, without differences
+  // of large numbers.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
 #ifdef ANTIALIASED
-  // (84). The compensated opacity falls with the determinant of the filtered covariance, and rises with the other's.
+  // (84): the compensated opacity falls with the filtered covariance's determinant and rises with the unfiltered one's.
   const intL compensated = p.det0 / p.det > LEAST_COMPENSATION * LEAST_COMPENSATION;
   const floatL thinner = compensated ? m_g : (floatL)(0.0f), by_det0 = compensated ? m_g / p.det0 : (floatL)(0.0f);
   const floatL uu = fmaL((floatL)(unwhiten), m[SLOT_GUU].all, -INVERSE_WHITEN2 * thinner),
@@ -138,7 +140,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   floatL wu[3], wv[3];
   const floatL lean = l11 / p.syy;
   FOR_AXES(k) {
-#ifdef RAYS // the same by minors of the directions' plane, and of the low-pass' columns
+#ifdef RAYS // the same, with minors of the directions' plane and of the low-pass columns
     const float inverse = 1.0f / p.distance, b1 = inverse * p.c1[k], b2 = inverse * p.c2[k];
     float minors = 0.0f;
     for (int j = 3; j < 5; ++j) minors = fma1(p.m2[j], fma1(p.m2[j], b1, -(p.m1[j] * b2)), minors);
@@ -155,14 +157,14 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
   }
 
-  // (122). The gradient of nearness by depth, which along the axis is towards the camera.
+  // (122): the gradient of nearness by depth; along the axis it points towards the camera.
 #ifndef NEARNESS
 #define LESS_NEAR(z)
 #else
 #define LESS_NEAR(z) -m[SLOT_NEAR].all / ((z) * (z))
 #endif
 
-  // (59) to (61): log scales, the turn in the Gaussian's own frame, and what the Jacobian takes of the gradient.
+  // (59) to (61): log scales, the rotation in the Gaussian's own frame, and the gradient through the Jacobian.
   floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
 #ifdef LENS
   Lanes lens[4];
@@ -183,7 +185,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     const floatL other_l = p.s[n] * p.s[k] * c[1], other_n = p.s[k] * p.s[l] * c[2];
     d->scale[k].all = fmaL(by_det0, fmaL(other_l, other_l, other_n * other_n), d->scale[k].all);
     const floatL lever = by_det0 * minor * area;
-#ifdef RAYS // (29) of docs/cameras.md: the minors are the axes' parts along the mean's direction
+#ifdef RAYS // (29) of docs/cameras.md: the minors are the axes' components along the mean's direction
     const float turned_by = camera[CAMERA_HAND] / (p.distance * p.distance);
     across_x = fma1(lever, turned_by * p.c1[k], across_x);
     across_y = fma1(lever, turned_by * p.c2[k], across_y);
@@ -238,15 +240,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const float d_x = fma1(turn_x, p.t.e1[0], fma1(turn_y, p.t.e2[0], -(shrink * p.f[0])));
   const float d_y = fma1(turn_x, p.t.e1[1], fma1(turn_y, p.t.e2[1], -(shrink * p.f[1])));
   const float d_z = fma1(turn_x, p.t.e1[2], fma1(turn_y, p.t.e2[2], -(shrink * p.f[2])));
-#elif defined(ORTHOGRAPHIC) // the image is linear in x and y, and in nothing else
-  const floatL d_x = p.jx * d_mx, d_y = p.jy * d_my, d_z = (floatL)(0.0f)LESS_NEAR(p.z);
-#ifdef LENS
-  const floatL beyond_x = (floatL)(0.0f), beyond_y = beyond_x;
-#endif
 #else
-  // Mean in the camera's frame, (52): through the image position, and through J. With the ratio clamped, J moves with
-  // z alone.
-  const floatL rx = p.x / p.z, ry = p.y / p.z;
 #ifdef ANTIALIASED
   const float hand = camera[CAMERA_HAND];
   const floatL by_j02 = fmaL(l11, along_u, -(hand * (p.jy / p.jx) * across_x));
@@ -254,13 +248,10 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #else
   const floatL by_j02 = l11 * along_u, by_j12 = fmaL(l12, along_u, l22 * along_v);
 #endif
-  const floatL d_j02 = rx == p.rx ? by_j02 : (floatL)(0.0f);
-  const floatL d_j12 = ry == p.ry ? by_j12 : (floatL)(0.0f);
-#ifdef LENS // (145): a clamped ratio is a place on the image, which stays where it is
-  const floatL beyond_x = (by_j02 - d_j02) / p.z, beyond_y = (by_j12 - d_j12) / p.z;
-#endif
-  const floatL d_x = p.jx * (d_mx - d_j02 / p.z), d_y = p.jy * (d_my - d_j12 / p.z);
-  const floatL d_z = -fmaL(d_x, rx, fmaL(d_y, ry, d_size / p.z)) LESS_NEAR(p.z);
+  const floatL at[3] = {p.x, p.y, p.z}, limited[2] = {p.rx, p.ry};
+  floatL by_mean[3], beyond[2];
+  mean_gradient(at, limited, p.jx, p.jy, d_mx, d_my, by_j02, by_j12, d_size, by_mean, beyond);
+  const floatL d_x = by_mean[0], d_y = by_mean[1], d_z = by_mean[2] LESS_NEAR(p.z);
 #endif
 
 #ifdef LENS
@@ -268,25 +259,19 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   lens[0].all += compensated ? m_g : (floatL)(0.0f);
   lens[1].all += compensated ? m_g : (floatL)(0.0f);
 #endif
-  lens[0].all = fmaL(p.jx * p.x, d_mx, fmaL(p.jx * p.z * p.rx, beyond_x, lens[0].all));
-  lens[1].all = fmaL(p.jy * p.y, d_my, fmaL(p.jy * p.z * p.ry, beyond_y, lens[1].all));
-  lens[2].all = d_mx + beyond_x;
-  lens[3].all = d_my + beyond_y;
+  lens[0].all = fmaL(p.jx * p.x, d_mx, fmaL(p.jx * p.z * p.rx, beyond[0], lens[0].all)); // (145)
+  lens[1].all = fmaL(p.jy * p.y, d_my, fmaL(p.jy * p.z * p.ry, beyond[1], lens[1].all));
+  lens[2].all = d_mx + beyond[0];
+  lens[3].all = d_my + beyond[1];
 #endif
 
-  // Colour, (38) to (40): a channel that is clamped has no gradient; the basis depends on the mean through the view
-  // direction, but for SH so large that the sum overflows.
+  // Colour, (38) to (40): a clamped channel has no gradient. The basis depends on the mean through the view direction;
+  // that part is left out if very large SH coefficients make it overflow.
   floatL vx = FROM_CAMERA(means, X, 0), vy = FROM_CAMERA(means, Y, 1), vz = FROM_CAMERA(means, Z, 2);
   const floatL length = sqrt(fmaL(vx, vx, fmaL(vy, vy, vz * vz)));
-#ifdef ORTHOGRAPHIC // one direction for all
-  vx = (floatL)(camera[CAMERA_R20]);
-  vy = (floatL)(camera[CAMERA_R21]);
-  vz = (floatL)(camera[CAMERA_R22]);
-#else
-  vx /= length;
-  vy /= length;
-  vz /= length;
-#endif
+  vx = (floatL)(SEEN_ALONG(vx, length, camera[CAMERA_R20]));
+  vy = (floatL)(SEEN_ALONG(vy, length, camera[CAMERA_R21]));
+  vz = (floatL)(SEEN_ALONG(vz, length, camera[CAMERA_R22]));
   Lanes weight[16];
   sh_basis(SH_USED(coefficients), vx, vy, vz, &d->basis[0].all);
   for (uint lane = 0; lane < lanes_used; ++lane) {
@@ -320,11 +305,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   const floatL along = d_v[0] * vx + d_v[1] * vy + d_v[2] * vz;
   FOR_AXES(k) {
     const floatL v = k == 0 ? vx : (k == 1 ? vy : vz);
-#ifdef ORTHOGRAPHIC
-    const floatL by_colour = (floatL)(0.0f);
-#else
-    const floatL by_colour = (d_v[k] - along * v) / length;
-#endif
+    const floatL by_colour = (floatL)(BY_DIRECTION(d_v[k] - along * v, length));
     const floatL above = by_colour < 1e37f ? by_colour : (floatL)(0.0f);
     d->mean[k].all = camera[CAMERA_R00 + k] * d_x + camera[CAMERA_R10 + k] * d_y + camera[CAMERA_R20 + k] * d_z +
                      (by_colour > -1e37f ? above : (floatL)(0.0f));

@@ -1,10 +1,10 @@
 // Real spherical harmonics to degree 3, signs and order of Kerbl et al. 2023; basis[k] at the unit direction (x, y, z).
 
 #define SH_CONSTANT 0.28209479177387814f
-// Of a channel. The squares that SSIM multiplies stay finite below it, and no picture has a colour over it.
+// Limit of a channel. Below it the squares that SSIM multiplies stay finite, and no picture has a brighter colour.
 #define COLOUR_LIMIT 1e9f
 
-// Of the coefficients that there are, how many are looked at (RasterizerConfig.sh_degree_limit).
+// The number of stored coefficients that are used (RasterizerConfig.sh_degree_limit).
 #ifdef SH_LIMIT
 #define SH_USED(coefficients) ((coefficients) < SH_LIMIT ? (coefficients) : SH_LIMIT)
 #else
@@ -34,7 +34,7 @@ static inline void sh_basis(int coefficients, floatL x, floatL y, floatL z, floa
   basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
 }
 
-// d[3]: sum over k of weight[k] times the gradient of basis[k] by (x, y, z).
+// d[3]: the sum over k of weight[k] times the gradient of basis[k] by (x, y, z).
 static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z, const floatL *weight,
                                          floatL *d) {
   d[0] = d[1] = d[2] = (floatL)(0.0f);
@@ -61,17 +61,17 @@ static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, f
           8.0f * c11 * x * z * weight[13] + c14 * (xx - yy) * weight[14];
 }
 
-// Floats from the bits of finite halves, exactly, also where they are denormal; vload_half is slower.
+// Exact floats from the bits of finite halves, also of denormal ones; vload_half is slower.
 static inline float4 float_from_half(int4 bits) {
   const int4 magnitude = bits & 0x7fff;
   const float4 normal = as_float4((magnitude << 13) + (112 << 23));
-  const float4 tiny = as_float4(magnitude + 0x3f000000) - 0.5f; // steps of 2^-24, as the floats from 0.5 on have
+  const float4 tiny = as_float4(magnitude + 0x3f000000) - 0.5f; // steps of 2^-24, like the floats from 0.5 to 1
   const float4 positive = magnitude < 0x400 ? tiny : normal;
   return as_float4(as_int4(positive) | (bits & 0x8000) << 16);
 }
 
-// The three channels of a coefficient; where it is the row's last, four would be too many. shT: how the bands above 0
-// are stored (RasterizerConfig.sh_storage).
+// The three channels of a coefficient; a load of four would read past the end of the row's last one. shT: storage type
+// of the bands above 0 (RasterizerConfig.sh_storage).
 #ifdef SH_HALF
 typedef ushort shT;
 static inline float4 sh_channels(__global const shT *f, int last) {
@@ -94,15 +94,15 @@ static inline float4 sh_fma(float a, float4 b, float4 c) {
 #endif
 }
 
-// Of the coefficients that there are, how many Gaussian i's colour has: with SH_DEGREES those of its own bands.
+// The number of coefficients of Gaussian i's colour; with SH_DEGREES, of its own bands.
 #ifdef SH_DEGREES
 #define SH_OF_GAUSSIAN(i, coefficients) min(SH_USED(coefficients), (sh_degrees[i] + 1) * (sh_degrees[i] + 1))
 #else
 #define SH_OF_GAUSSIAN(i, coefficients) SH_USED(coefficients)
 #endif
 
-// A Gaussian's colour without its floor, (12) of docs/gradients.md, from one lane of the basis: `dc` (3) and `rest`
-// (coefficients - 1, 3) are its own, of which the first `used` coefficients count, dc with them.
+// A Gaussian's colour before clamping at 0, (12) of docs/gradients.md, from one lane of the basis. `dc` (3) and `rest`
+// (coefficients - 1, 3) are its SH coefficients; the first `used` count, including dc.
 static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coefficients, __global const float *dc,
                                __global const shT *rest) {
   float4 colour = sh_fma(SH_CONSTANT, (float4)(dc[0], dc[1], dc[2], 0.0f), (float4)(0.5f));
@@ -111,12 +111,12 @@ static inline float4 sh_colour(const Lanes *basis, uint lane, int used, int coef
   return colour;
 }
 
-// A colour that is not finite, or of COLOUR_LIMIT or more, is not drawn: one such pixel would be all of the loss.
+// A colour that is not finite, or at least COLOUR_LIMIT, is not drawn: one such pixel would dominate the loss.
 static inline int colour_is_drawn(float4 colour) {
   return colour.x < COLOUR_LIMIT && colour.y < COLOUR_LIMIT && colour.z < COLOUR_LIMIT;
 }
 
-// Red, green and blue one after the other, with the floor of (12).
+// Stores red, green and blue, clamped at 0 as in (12).
 static inline void store_colour(float4 colour, __global float *rgb) {
   rgb[0] = colour.x > 0.0f ? colour.x : 0.0f;
   rgb[1] = colour.y > 0.0f ? colour.y : 0.0f;

@@ -1,10 +1,11 @@
-// Forms that the kernels which write and read a splat or a slot must agree on, beside the layouts on top of every text.
+// Conventions that the writers and readers of a splat or slot share, in addition to the layouts at the top of every
+// source.
 
-// A splat's L11, L12 and L22 are the whitening W times this, sqrt(log2(e) / 2); the slots' moments are of that product.
+// A splat's L11, L12 and L22 are the whitening W times this, sqrt(log2(e) / 2); the slots' moments use that product.
 #define WHITEN 0.84932180028801904f
 #define INVERSE_WHITEN2 1.38629436111989062f // 1 / WHITEN^2 = 2 ln 2
 
-// The larger eigenvalue of the covariance of which (l11, l12, l22) is the whitening.
+// The larger eigenvalue of the covariance whose whitening is (l11, l12, l22).
 static inline float larger_eigenvalue(float l11, float l12, float l22) {
   const float syy = 1.0f / (l22 * l22);
   const float sxy = -(l12 / l11) * syy;
@@ -13,8 +14,8 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
   return middle + sqrt(fma1(half_difference, half_difference, sxy * sxy));
 }
 
-// Floats from one pair's slot to the next. The contribution, where it is kept, is behind the gradients, and that by
-// nearness (one over the depth) behind it.
+// Floats between slots. The optional contribution follows the gradients, and the optional gradient by nearness (1 /
+// depth) follows that.
 #ifdef ABSOLUTE_GRADIENTS
 #define SLOT_GRADIENTS SLOT_SIZE
 #else
@@ -33,6 +34,7 @@ static inline float larger_eigenvalue(float l11, float l12, float l22) {
 #define SLOT_STRIDE SLOT_KEPT
 #endif
 
-// From the first pixel's centre to the mean: whole pixels apart from the rest, which a float32 of the sum would cut.
+// From the first pixel's centre to the mean. Whole pixels and remainder are subtracted separately, because a float32 of
+// their sum would lose digits.
 #define FROM_TILE(splat, axis, origin)                                                                                 \
   ((splat[SPLAT_PIXEL_##axis] - (float)(origin)) + (splat[SPLAT_SUB_##axis] - 0.5f))

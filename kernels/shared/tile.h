@@ -1,20 +1,20 @@
-// The one place that says which tiles a projected Gaussian reaches. Counting and emitting both call it: were they to
-// disagree by one tile, the emitted pairs would overrun or leave holes in the arrays that the count sized.
+// The only code that decides which tiles a projected Gaussian reaches. Counting and emitting must both use it: if they
+// disagreed by one tile, the emitted pairs would overrun, or leave gaps in, the arrays sized by the count.
 #include "shared/splat.h"
 
-// Slack in pixels over what float32 loses here; a tile too many only costs time, one too few would show.
+// Slack in pixels, more than float32's rounding here. An extra tile only costs time; a missing one would be visible.
 #define TILE_SLACK 0.01f
 
-// u^2 + v^2 at the edge of a Gaussian's ellipse: where its alpha is ALPHA_MIN, unless RasterizerConfig.extent says
-// other.
+// u^2 + v^2 at the edge of a Gaussian's ellipse, where alpha is ALPHA_MIN unless RasterizerConfig.extent says
+// otherwise.
 #ifdef EXTENT_BUDGET
 #define EXTENT(log2o) EXTENT_BUDGET
 #else
 #define EXTENT(log2o) ((log2o) - LOG2_ALPHA_MIN)
 #endif
 
-// First index of the tiles (or rows, at size 1) whose last pixel centre is at or after `low`, within [0, count].
-// Rounding goes by integers after the clamp: ceil and floor are calls in some drivers, and here in the inner loop.
+// First index of the tiles (at size 1, of the rows) whose last pixel centre is at or after `low`, within [0, count]. It
+// rounds through integers after the clamp, because ceil and floor are calls in some drivers.
 static inline int first_cell(float low, float size, int count) {
   float cell = (low - TILE_SLACK - (size - 0.5f)) * (1.0f / size);
   cell = cell > 0.0f ? cell : 0.0f;
@@ -30,18 +30,18 @@ static inline int end_cell(float high, float size, int count) {
   return (int)(cell < (float)count ? cell : (float)count);
 }
 
-// Up to how many tiles a box is listed whole: finding out which of them the ellipse reaches takes longer than blending
-// finds that it reaches none of a tile's pixels.
+// The largest box, in tiles, that is listed whole: testing which tiles the ellipse reaches takes longer than blending
+// needs to find a tile's pixels unreached.
 #ifdef BOX_TILE_TEST // RasterizerConfig.tile_test
 #define SMALL_BOX 0x7fffffff
 #elif !defined(SMALL_BOX)
 #define SMALL_BOX 16
 #endif
 
-#ifdef RAYS // what a pixel shows is a direction: project_rays.cl has found the box
+#ifdef RAYS // pixels are directions; project_rays.cl has computed the box
 typedef struct {
-  int tile_x0, tile_x1, tile_y0, tile_y1; // of the box; where x0 > x1 it goes round: [x0, tiles_x) and [0, x1)
-  int box;                                // how many tiles
+  int tile_x0, tile_x1, tile_y0, tile_y1; // of the box; it wraps if x0 > x1: [x0, tiles_x) and [0, x1)
+  int box;                                // number of tiles
 } Ellipse;
 
 static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int tiles_y) {
@@ -64,14 +64,14 @@ static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, in
 typedef struct {
   float mx, my, l11, l12, l22, half_w, half_h;
   float budget;                           // u^2 + v^2 at its edge
-  float tangent;                          // dy / dx from the mean to the ellipse's rightmost point, times half_w
+  float tangent;                          // dy from the mean to the rightmost point
   int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
-  int box;                                // how many
+  int box;                                // number of tiles
 } Ellipse;
 
 #ifdef SQUARE_TILE_TEST
-// In pixels: the larger eigenvalue of the covariance, as Kerbl et al.'s code has it, which comes back from its
-// whitening.
+// The longer half axis in pixels, as in Kerbl et al.'s code, from the larger eigenvalue of the covariance. That is
+// recovered from the whitening.
 static inline float longest_half_axis(__global const float *splat) {
   const float larger = larger_eigenvalue(splat[SPLAT_L11], splat[SPLAT_L12], splat[SPLAT_L22]);
   return sqrt(EXTENT(splat[SPLAT_LOG2O]) * larger);
@@ -84,7 +84,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   e.my = splat[SPLAT_PIXEL_Y] + splat[SPLAT_SUB_Y];
   e.half_w = splat[SPLAT_HALF_W];
   e.half_h = splat[SPLAT_HALF_H];
-#ifdef SQUARE_TILE_TEST // RasterizerConfig.tile_test; no smaller than the box, whatever rounding does
+#ifdef SQUARE_TILE_TEST // RasterizerConfig.tile_test; at least the box, despite rounding
   const float radius = longest_half_axis(splat);
   e.half_w = radius > e.half_w ? radius : e.half_w;
   e.half_h = radius > e.half_h ? radius : e.half_h;
@@ -104,7 +104,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   return e;
 }
 
-// The right edge of the ellipse, from the mean, over the offsets [d0, d1] in y; the left edge by symmetry
+// The ellipse's right edge, relative to the mean, over the offsets [d0, d1] in y; the left edge follows by symmetry
 // (docs/gradients.md, equation 47).
 static inline float right_edge(const Ellipse *e, float d0, float d1) {
   if (e->tangent >= d0 && e->tangent <= d1) return e->half_w;
@@ -113,7 +113,7 @@ static inline float right_edge(const Ellipse *e, float d0, float d1) {
   return (-e->l12 * dy + sqrt(rest > 0.0f ? rest : 0.0f)) / e->l11;
 }
 
-// The tiles [*x0, *x1) that the ellipse reaches in tile row ty, or those of its box if they are few; all in one part.
+// The tiles [*x0, *x1) that the ellipse reaches in tile row ty, or those of a small box; all in one part.
 #define SPANS 1
 static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
   *x0 = e->tile_x0;
@@ -132,7 +132,7 @@ static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, in
 }
 #endif
 
-// How many tiles those of all rows are.
+// The number of tiles over all rows.
 static inline uint tile_count(const Ellipse *e, int tiles_x) {
   if (e->box <= SMALL_BOX) return e->box;
   uint count = 0;

@@ -1,4 +1,4 @@
-// Pieces that the kernels for any number of values a Gaussian share. Needs cells.h.
+// Code that the kernels for any number of values per Gaussian share. Needs cells.h.
 #ifndef VALUES
 #error "VALUES must be defined: values of a Gaussian that a pass has, 1 to 32"
 #endif
@@ -12,10 +12,10 @@
 #define LANE_PIXEL_Y(lane) 0
 #endif
 
-// A short loop over the pass's values, without a loop where a lane is an item (lanes.h).
+// A short loop over the pass's values, unrolled if a lane is an item (lanes.h).
 #define FOR_VALUES(k) UNROLL for (int k = 0; k < VALUES; ++k)
 
-// Cells of the i-th pair that have a pixel which takes it, or may.
+// Cells of the i-th pair with a pixel that takes it, or may take it.
 #ifdef RECORD_CELLS // by blend
 #define CELLS_OF_PAIR(i, splat) cells_from_sorted[i]
 #else

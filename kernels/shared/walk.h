@@ -1,23 +1,25 @@
-// The gradient of blending by an item a Gaussian, BY_GAUSSIAN: a group's items walk the pixels of a tile one behind the
-// other, each with a Gaussian and its sums in registers, and hand the pixels' state on in local memory. The pixels are
-// in ITEMS chunks, each a part of a row. In round r of a turn item j is at chunk (r - j) % ITEMS: a chunk meets the
-// Gaussians in their order, an item begins its next Gaussian where it has left the last chunk, and a barrier serves all
-// pixels of a chunk. What is common to a chunk's row is worked out once.
+// The gradient of blending with one Gaussian per item, BY_GAUSSIAN. A group's items walk the pixels of a tile one
+// behind another. Each has a Gaussian and its sums in registers, and passes the pixels' state on in local memory.
+//
+// The pixels are in ITEMS chunks, each a piece of a row. In round r of a turn item j is at chunk (r - j) % ITEMS. So a
+// chunk meets the Gaussians in their order, an item starts its next Gaussian right after its last chunk, and one
+// barrier serves all pixels of a chunk. Values common to a chunk's row are computed once.
 #if ITEMS < 16 || ITEMS > 128
 #error "a chunk is a row of a tile, or a part of one of two pixels or more"
 #endif
-#define CHUNK (TILE * TILE / ITEMS) // pixels
+#define CHUNK (TILE * TILE / ITEMS) // in pixels
 #define ROW_CHUNKS (TILE / CHUNK)
 #define CHUNK_BLOCK(chunk) ((chunk) / ROW_CHUNKS / BLOCK_H * BLOCK_COLUMNS + (chunk) % ROW_CHUNKS * CHUNK / BLOCK_W)
 
-// A pixel's place: items that are at chunks beside each other read places beside each other.
+// A pixel's place: items at neighbouring chunks read neighbouring places.
 #define PLACE(x, y) ((x) % CHUNK * ITEMS + (y) * ROW_CHUNKS + (x) / CHUNK)
 
-// Pixels in local memory: transmittance and `behind`, which change; the image's gradient and, as bits, the stop.
+// Pixels in local memory. Passing: transmittance and `behind`, which change. Fixed: the image's gradient and, as bits,
+// the stop.
 typedef float2 Passing;
 typedef float4 Fixed;
 
-// A Gaussian under way. i: its pair, before `begin` where there is none.
+// A Gaussian in progress. i: its pair, before `begin` if there is none.
 typedef struct {
   float mx, my, l11, l12, l22, log2o, red, green, blue;
   int i;
@@ -27,7 +29,7 @@ typedef struct {
 #endif
 } Walker;
 
-// The gradient by nearness of a tile's pixels, at the places of their state.
+// The gradient by nearness of a tile's pixels, in the order of their state.
 #ifdef NEARNESS
 #define NEAR_OF_STAGED , s.near
 #define NEAR_PIXELS , near
@@ -38,14 +40,14 @@ typedef struct {
 #define NEAR_PIXELS_PARAMETER
 #endif
 
-// Takes the walker's pair out of a chunk's pixels, and adds their gradients to its sums (SLOT_STRIDE). Pixels that do
-// not take it go along with an alpha of 0: of 32 items some have one that does, and branches would keep the pixels of a
-// chunk apart.
+// Removes the walker's pair from a chunk's pixels, and adds their gradients to its sums (SLOT_STRIDE). Pixels that do
+// not take it are processed with alpha 0: among 32 items some nearly always have one that does, and branches would
+// serialise a chunk's pixels.
 static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,
                               float *sums NEAR_PIXELS_PARAMETER) {
   const float dy = w->my - (float)(chunk / ROW_CHUNKS), v = w->l22 * dy;
   const float left = (float)(chunk % ROW_CHUNKS * CHUNK);
-  float g_row = 0.0f, gu_row = 0.0f; // sums of g and g u: v is the row's
+  float g_row = 0.0f, gu_row = 0.0f; // sums of g and g u; v is the same in the whole row
   _Pragma("unroll") for (int k = 0; k < CHUNK; ++k) {
     const int place = k * ITEMS + chunk;
     const Fixed pixel = fixed[place];

@@ -165,7 +165,7 @@ def test_nan_in_backgrounds_that_depths_do_not_have() -> None:
 
 
 def test_other_kinds_of_numbers_come_back_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arguments, "_SAID", set())
+    monkeypatch.setattr(arguments, "_CONVERSIONS_REPORTED", set())
     float64 = clouds.cloud(8)
     float64["means"].requires_grad_()
     with pytest.warns(UserWarning, match="tensors of float64 on cpu are copied to float32 on the CPU"):

@@ -28,7 +28,7 @@ from clsplat.torch import (
     rasterize_to_pixels,
     spherical_harmonics,
 )
-from clsplat.torch.absent import HOMES, NEED_CUDA, OWN
+from clsplat.torch.gsplat.absent_names import CUDA_ONLY_MODULES, CUDA_ONLY_NAMES, PURE_PYTHON_NAMES
 
 pytestmark = pytest.mark.needs("torch")
 
@@ -214,11 +214,11 @@ def test_every_name_of_gsplat_is_here_or_absent() -> None:
 
     gsplat = pytest.importorskip("gsplat")
     exported = {name for name in gsplat.all if not name.startswith("_")}
-    wrapper = import_module(HOMES[0])
+    wrapper = import_module(CUDA_ONLY_MODULES[0])
     defined = {
         name
         for name, value in inspect.getmembers(wrapper, inspect.isfunction)
         if value.__module__ == wrapper.__name__ and not name.startswith("_")
     }
-    ours = {*clsplat.torch.__all__, *NEED_CUDA, *OWN}
+    ours = {*clsplat.torch.__all__, *CUDA_ONLY_NAMES, *PURE_PYTHON_NAMES}
     assert exported | defined <= ours

@@ -157,13 +157,13 @@ def test_the_probe_has_the_gradient_by_means2d(default_device: Device, absolute:
 def test_a_pass_that_is_gone_is_made_again(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays, call = cloud(), jax.jit(jax.grad(lambda given: loss(given, device=default_device)))
     kept = call(arrays)
-    monkeypatch.setattr(MODULE, "_kept", MODULE.Kept(0))
+    monkeypatch.setattr(MODULE, "_kept", MODULE.PendingForwards(0))
     again = call(arrays)
     assert all(np.array_equal(kept[name], again[name]) for name in ARRAYS)
 
 
 def test_no_pass_stays_behind_its_gradient(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(MODULE, "_kept", MODULE.Kept(8))
+    monkeypatch.setattr(MODULE, "_kept", MODULE.PendingForwards(8))
     jax.block_until_ready(gradient(lambda given: loss(given, device=default_device), cloud()))
     clsplat.jax.rasterize(**cloud(), **SIZE, device=default_device).images.block_until_ready()
     assert not MODULE._kept._results

@@ -23,19 +23,19 @@ from tiny import write_scene
 from clsplat.bench import plots
 from clsplat.bench import settings as tradeoff
 from clsplat.bench import stages as bench_stages
-from clsplat.bench import subject as bench_subject
-from clsplat.bench.labels import LEADER, crossed, place_labels, shared
+from clsplat.bench import workload as bench_subject
+from clsplat.bench.label_places import LEADER_LINE_DISTANCE_PX, crossed, place_labels, shared
 from clsplat.cli.main import main
-from clsplat.config.presets import PRESETS
+from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT, TILE
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import SPLAT, TILE
 from clsplat.reference import render as reference
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import count_pairs
-from clsplat.stages.limit import Limits, measure_limits
+from clsplat.stages.peak import Limits, measure_limits
 
 SMALL = ["--gaussians", "400", "--size", "70x50", "--repeat", "1"]
 FRAME = {"project", "duplicate", "ranges", "blend"}
@@ -312,7 +312,7 @@ def test_json_has_the_contract(capsys: Capture) -> None:
     assert {"contributing", "evaluated"} <= set(result["pairs"])
     assert 0 < result["pairs"]["contributing"] <= result["pairs"]["evaluated"]
     assert result["limit"]["pairs_per_second"] > 0
-    fast = PRESETS["fast"]
+    fast = RASTERIZER_PRESETS["fast"]
     assert result["rasterizer"]["alpha_min"] == fast.alpha_min
     assert result["rasterizer"]["sh_degree_limit"] == 1, "a flag goes before the preset"
 
@@ -365,16 +365,16 @@ def test_crop_of_the_reference_is_part_of_it(crop: tuple[int, int, int, int]) ->
 def test_settings_hold_every_switch_and_preset() -> None:
     named = tradeoff.settings()
     assert "preset exact = default" in named
-    assert {config.switches() for config in PRESETS.values()} <= set(named.values())
+    assert {config.switches() for config in RASTERIZER_PRESETS.values()} <= set(named.values())
     for field in BenchSwitches.__dataclass_fields__:
         assert any(getattr(config, field) != getattr(BenchSwitches(), field) for config in named.values()), field
 
 
 @pytest.mark.slow
 def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tradeoff, "CROP", 48)
+    monkeypatch.setattr(tradeoff, "REFERENCE_CROP_SIDE_PX", 48)
     candidates = {
-        "exact": PRESETS["exact"],
+        "exact": RASTERIZER_PRESETS["exact"],
         "no row-skip": BenchSwitches(row_skip=False),
         "coarse": RasterizerConfig(alpha_min=8 / 255),
     }
@@ -383,7 +383,7 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
     assert result["error_is_against"] == "the exact preset's frame"
     assert result["crop"] == [11, 1, 48, 48]
     assert exact["max_abs"] == rows["max_abs"] == 0.0
-    assert exact["psnr"] == tradeoff.PSNR_MAX
+    assert exact["psnr"] == tradeoff.MAX_PSNR_DB
     assert 0 < coarse["max_abs"] < 0.3
     assert 20 < coarse["psnr"] < 80
     assert result["exact_against_float64"]["max_abs"] < 2e-5
@@ -393,16 +393,16 @@ def test_time_against_error(profiled: Device, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tradeoff, "CROP", 48)
+    monkeypatch.setattr(tradeoff, "REFERENCE_CROP_SIDE_PX", 48)
     every = tradeoff.settings()
-    off = every[tradeoff.ALL_OFF]
+    off = every[tradeoff.ALL_EXACT_SWITCHES_OFF]
     for field, value in asdict(off).items():
         if isinstance(value, bool | str) and field != "sh_storage":  # it and the numbers are approximations
             assert value != getattr(BenchSwitches(), field), field
     assert (off.tile_test, off.alpha_min) == ("square", BenchSwitches().alpha_min)
     times = iter([50.0, 100.0, 150.0, 210.0])  # of a frame and of a step, on and off
     monkeypatch.setattr(Device, "timed", lambda _device, work: (work(), next(times)))
-    candidates = {"preset exact = default": PRESETS["exact"], tradeoff.ALL_OFF: off}
+    candidates = {"preset exact = default": RASTERIZER_PRESETS["exact"], tradeoff.ALL_EXACT_SWITCHES_OFF: off}
     result = tradeoff.compare(bench_subject.synthetic(300, 70, 50), profiled, candidates, repeat=1)
     assert [(point["frame_ms"], point["iteration_ms"]) for point in result["points"]] == [(50, 100), (150, 210)]
     assert result["points"][1]["max_abs"] == 0.0
@@ -425,10 +425,12 @@ def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
 
 
 def test_small_frames_are_compared_with_float64(profiled: Device) -> None:
-    result = tradeoff.compare(bench_subject.synthetic(200, 40, 30), profiled, {"exact": PRESETS["exact"]}, repeat=1)
+    result = tradeoff.compare(
+        bench_subject.synthetic(200, 40, 30), profiled, {"exact": RASTERIZER_PRESETS["exact"]}, repeat=1
+    )
     assert result["error_is_against"] == "the float64 reference"
     assert result["crop"] == [0, 0, 40, 30]
-    assert 90 < result["points"][0]["psnr"] < tradeoff.PSNR_MAX
+    assert 90 < result["points"][0]["psnr"] < tradeoff.MAX_PSNR_DB
 
 
 def test_front() -> None:
@@ -436,14 +438,14 @@ def test_front() -> None:
 
 
 def test_what_approximates() -> None:
-    exact = asdict(PRESETS["exact"])
-    off = asdict(tradeoff.settings()[tradeoff.ALL_OFF])
+    exact = asdict(RASTERIZER_PRESETS["exact"])
+    off = asdict(tradeoff.settings()[tradeoff.ALL_EXACT_SWITCHES_OFF])
     for field in exact:  # a new setting is one or the other
-        assert (field in tradeoff.MAY_CHANGE_BITS) != (off[field] != exact[field]), field
+        assert (field in tradeoff.APPROXIMATING_SETTINGS) != (off[field] != exact[field]), field
     named = {name for name, config in tradeoff.settings().items() if tradeoff.approximate(config)}
     for name in ("preset fast", "extent 3sigma", "sh-storage half", "alpha-min 2/255"):
         assert name in named
-    assert tradeoff.ALL_OFF not in named
+    assert tradeoff.ALL_EXACT_SWITCHES_OFF not in named
     assert not any(name.startswith(("no ", "tile", "key", "depth", "preset exact")) for name in named)
 
 
@@ -466,7 +468,7 @@ def result() -> dict[str, object]:
         a_point("exact", 40.0, 160.0, 0.0, approximate=False),
         a_point("no early-stop", 42.0, 160.0, 0.0, approximate=False),
         a_point("tile-test square", 60.0, 160.0, 0.0, approximate=False),
-        a_point(tradeoff.ALL_OFF, 170.0, 160.0, 0.0, approximate=False),
+        a_point(tradeoff.ALL_EXACT_SWITCHES_OFF, 170.0, 160.0, 0.0, approximate=False),
         a_point("fast", 30.0, 50.0, 0.02),
         a_point("fast again", 30.1, 50.1, 0.021),
         a_point("slow", 80.0, 40.0, 0.03),
@@ -501,7 +503,11 @@ def test_plots_are_written(tmp_path: Path, result: dict[str, object], name: str)
     if kind == ".PNG":
         return
     switches, error = map(words_of, first)
-    names = [word for word in switches if word in ("no early-stop", "tile-test square", tradeoff.ALL_OFF, "fast")]
+    names = [
+        word
+        for word in switches
+        if word in ("no early-stop", "tile-test square", tradeoff.ALL_EXACT_SWITCHES_OFF, "fast")
+    ]
     assert names == ["no early-stop", "tile-test square"]  # the axis runs upwards: what is worth most is on top
     assert {"1.05", "1.50", "a frame", "a training step", "a title"} <= set(switches)
     assert "All off: 4.25 times for a frame, 4.13 times for a step." in switches
@@ -547,7 +553,7 @@ def test_labels_cover_nothing() -> None:
         inside = (boxes[:, None, :2] < points) & (points < boxes[:, None, 2:])
         assert not inside.all(axis=2).any()
         assert not crossed(boxes, leaders).any()
-        apart = np.linalg.norm(points.clip(boxes[:, :2], boxes[:, 2:]) - points, axis=1) > LEADER
+        apart = np.linalg.norm(points.clip(boxes[:, :2], boxes[:, 2:]) - points, axis=1) > LEADER_LINE_DISTANCE_PX
         assert [place.leader is not None for place in places] == apart.tolist()
 
 
@@ -577,7 +583,7 @@ def test_segments_through_a_box(segment: tuple[tuple[float, float], ...], goes_t
 @pytest.mark.needs("matplotlib")
 @pytest.mark.usefixtures("_quick")
 def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    some = {"exact": PRESETS["exact"], "fast": PRESETS["fast"]}
+    some = {"exact": RASTERIZER_PRESETS["exact"], "fast": RASTERIZER_PRESETS["fast"]}
     monkeypatch.setattr(tradeoff, "settings", lambda: some)
     path = tmp_path / "plot.svg"
     files = tmp_path / "plot-switches.svg", tmp_path / "plot-error.svg"
@@ -651,7 +657,7 @@ def test_plot_of_training(tmp_path: Path) -> None:
     run = tmp_path / "run"
     scene = write_scene(tmp_path / "scene")
     assert main(["train", str(scene), "-o", str(run), "--iterations", "4", "--eval-at", "2"]) == 0
-    tool = Path(__file__).parents[2] / "tools" / "plot_training.py"
+    tool = Path(__file__).parents[2] / "tools" / "bench" / "plot_training.py"
     output = tmp_path / "training.svg"
     done = subprocess.run(
         [sys.executable, str(tool), str(run), "-o", str(output)], capture_output=True, text=True, check=False

@@ -16,9 +16,9 @@ from pipeline import shaped
 
 from clsplat.bench import shapes as tune
 from clsplat.cli.main import main
-from clsplat.device import shapes
 from clsplat.device.context import Device, list_devices
-from clsplat.device.shapes import (
+from clsplat.device.drivers import shapes
+from clsplat.device.drivers.shapes import (
     Shape,
     candidates,
     default_shape,

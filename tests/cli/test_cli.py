@@ -13,15 +13,16 @@ import pytest
 from calls import Capture, command, error_line
 from fakes import Pipeline
 
-from clsplat.cli.eval import Eval
+from clsplat.cli.eval import EvalVerb
 from clsplat.cli.main import main, parse
 from clsplat.cli.options import SeveralDevices
 from clsplat.cli.session import Services
-from clsplat.cli.train import Train
+from clsplat.cli.train import TrainVerb
+from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
-from clsplat.config.verbs import DEMO_ITERATIONS
 from clsplat.errors import ClsplatError, InputError
 from clsplat.runs.run import Run
+from clsplat.scenes.sfm.reconstruct import SfmSettings
 
 
 @pytest.mark.smoke
@@ -56,16 +57,16 @@ def test_help_loads_nothing_heavy(verb: str) -> None:
 def test_flags_become_the_config() -> None:
     line = "train S -o R --iterations 50 --eval-at 10,20,30 --warmup 5 --optimiser.beta1 0.8 --density.every 0"
     verb = parse([*line.split(), "--density.absolute-gradients", "--background", "random", "--device", "gpu"])
-    assert isinstance(verb, Train)
+    assert isinstance(verb, TrainVerb)
     assert (verb.scene, verb.output, verb.device) == (Path("S"), Path("R"), SeveralDevices("gpu"))
     config = verb.config
     assert (config.iterations, config.eval_at, config.warmup) == (50, (10, 20, 30), (5,))
     assert (config.optimiser.beta1, config.density.every, config.density.absolute_gradients) == (0.8, 0, True)
     assert config.background == "random"
     assert config.seed == TrainConfig().seed
-    assert parse(["train", "S", "--output", "R"]) == Train(Path("R"), Path("S"))
+    assert parse(["train", "S", "--output", "R"]) == TrainVerb(Path("R"), Path("S"))
     assert parse(["train", "S", "-o", "R", "--warmup", ""]).config.warmup == ()  # type: ignore[union-attr]
-    assert parse(["eval", "R"]) == Eval(Path("R"))
+    assert parse(["eval", "R"]) == EvalVerb(Path("R"))
 
 
 def test_the_demo_takes_the_steps_it_is_given(tmp_path: Path) -> None:
@@ -92,7 +93,7 @@ def test_a_demo_of_no_steps_is_refused_before_anything_is_made(tmp_path: Path, c
     [
         ("--sh-degree 4", "--sh-degree 4: expected 0 to 3"),
         ("--iterations 0", "--iterations 0: expected at least 1"),
-        ("--eval-at 20,10", "--eval-at 20,10: expected steps"),
+        *((f"--eval-at {steps}", f"--eval-at {steps}: expected steps") for steps in ("20,10", "0", "-5", "5,5")),
         ("--dssim-weight 2", "--dssim-weight 2.0"),
         ("--test-every -1", "--test-every -1"),
     ],
@@ -145,9 +146,11 @@ def test_warnings_are_lines(model: str, folder: str, pipeline: Pipeline, capsys:
 def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:
     calls = []
 
-    def reconstruct(photos: Path, output: Path, *, progress: Callable[..., None], **options: object) -> Path:
+    def reconstruct(
+        photos: Path, output: Path, settings: SfmSettings, *, progress: Callable[..., None], **options: object
+    ) -> Path:
         progress("matching photos", 0.5)
-        calls.append((str(photos), options))
+        calls.append((str(photos), settings, options))
         output.mkdir()
         (output / "sfm.json").write_text('{"photos": 3}')
         return output
@@ -157,8 +160,8 @@ def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:
     captured = capsys.readouterr()
     assert json.loads(captured.out) == {"photos": 3}
     assert captured.err.splitlines()[0] == "matching photos 50 %"
-    options = {"matching": "sequential", "camera_model": "auto", "threads": None, "seed": 0, "overwrite": False}
-    assert calls == [(folder, options)]
+    options = {"threads": None, "overwrite": False, "masks": None}
+    assert calls == [(folder, SfmSettings("sequential", "auto"), options)]
     assert main(["sfm", str(tmp_path / "none"), "-o", str(tmp_path / "out")]) == 2
     assert "none: no such folder" in error_line(capsys)
 

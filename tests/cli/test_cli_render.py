@@ -12,9 +12,9 @@ from calls import Capture, error_line
 from fakes import Pipeline, camera
 
 from clsplat.cli.main import main, parse
-from clsplat.cli.render import Render
-from clsplat.cli.render_job import resizer
-from clsplat.config.presets import PRESETS
+from clsplat.cli.render.job import resizer
+from clsplat.cli.render.verb import RenderVerb
+from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.runs.run import Run
@@ -41,9 +41,9 @@ def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture)
     own = RasterizerConfig(alpha_min=3 / 255, sh_tolerance=0.5)
     Run.create(run, TrainConfig(rasterizer=own))
 
-    def parsed(path: object, *flags: str) -> Render:
+    def parsed(path: object, *flags: str) -> RenderVerb:
         verb = parse(["render", str(path), "--cameras", "S", "-o", "{name}.png", "--alpha", "--json", *flags])
-        assert isinstance(verb, Render)
+        assert isinstance(verb, RenderVerb)
         assert (verb.model, verb.output, verb.alpha, verb.json) == (Path(str(path)), "{name}.png", True, True)
         return verb
 
@@ -53,8 +53,8 @@ def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture)
         assert parsed(path).rasterizer == bundle
         assert parsed(path, *half).rasterizer == replace(bundle, **changes)
         for preset in ("exact", "default", "fast"):
-            assert parsed(path, "--preset", preset).rasterizer == PRESETS[preset]
-            assert parsed(path, *half, "--preset", preset).rasterizer == replace(PRESETS[preset], **changes)
+            assert parsed(path, "--preset", preset).rasterizer == RASTERIZER_PRESETS[preset]
+            assert parsed(path, *half, "--preset", preset).rasterizer == replace(RASTERIZER_PRESETS[preset], **changes)
     assert parsed(run, "--rasterizer.sh-tolerance", "0").rasterizer == replace(own, sh_tolerance=0.0)
     assert main(["render", model, "--cameras", "S", "-o", "{name}.png", "--rasterizer.sh-tolerance", "-1"]) == 2
     assert "--rasterizer.sh-tolerance -1.0: expected 0 to 1" in error_line(capsys)

@@ -18,8 +18,8 @@ from clsplat.cli import parsing
 from clsplat.cli.main import main, parse
 from clsplat.cli.options import DeviceOptions, Verb
 from clsplat.cli.session import Services, imported
-from clsplat.cli.train import Train
-from clsplat.config.presets import PRESETS
+from clsplat.cli.train import TrainVerb
+from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.training import TrainConfig
 from clsplat.progress import aligned
 from clsplat.runs.run import Run
@@ -74,14 +74,14 @@ def test_a_command_line_is_parsed_once(line: str, tmp_path: Path, monkeypatch: p
     assert calls == [words]
 
 
-@pytest.mark.parametrize("flag", [each.name for each in fields(Train) if each.type == "Flag"])
+@pytest.mark.parametrize("flag", [each.name for each in fields(TrainVerb) if each.type == "Flag"])
 def test_every_flag_goes_with_resume(flag: str, tmp_path: Path, capsys: Capture) -> None:
     if flag == "overwrite":
         pytest.skip("--resume and --overwrite exclude each other")
     Run.create(tmp_path / "run", TrainConfig(seed=5), scene=tmp_path)
     words = ["train", "-o", str(tmp_path / "run"), "--resume"]
     verb = parse(words if flag == "resume" else [*words, f"--{flag.replace('_', '-')}"])
-    assert isinstance(verb, Train)
+    assert isinstance(verb, TrainVerb)
     assert getattr(verb, flag)
     assert verb.config.seed == 5
     assert capsys.readouterr().err == ""
@@ -89,15 +89,15 @@ def test_every_flag_goes_with_resume(flag: str, tmp_path: Path, capsys: Capture)
 
 def test_a_flag_that_repeats_the_default_changes_a_runs_setting(tmp_path: Path) -> None:
     usual = TrainConfig()
-    config = replace(usual, iterations=9, report=False, rasterizer=PRESETS["fast"], warmup=(1, 2))
+    config = replace(usual, iterations=9, report=False, rasterizer=RASTERIZER_PRESETS["fast"], warmup=(1, 2))
     Run.create(tmp_path, config, scene=tmp_path)
     words = ["train", "-o", str(tmp_path), "--resume"]
     verb = parse([*words, f"--iterations={usual.iterations}", "--report", "--rasterizer.sh_storage", "float"])
-    assert isinstance(verb, Train)
-    fast = replace(PRESETS["fast"], sh_storage="float")
+    assert isinstance(verb, TrainVerb)
+    fast = replace(RASTERIZER_PRESETS["fast"], sh_storage="float")
     assert verb.config == replace(config, iterations=usual.iterations, report=True, rasterizer=fast)
     off = parse([*words, "--no-report", "--density.no-absolute-gradients", "--warmup", ""])
-    assert isinstance(off, Train)
+    assert isinstance(off, TrainVerb)
     assert off.config == replace(config, warmup=())
 
 

@@ -227,7 +227,7 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--crop=90,90,90,91,91,91"], "--crop: none of the 300 Gaussians is left"),
         (["--crop-sphere", "0,0,0,-1"], "--crop-sphere: none of the 300"),
         (["--transform", "1,2"], "expected 16 numbers"),
-        (["--transform", "1,0,0,0,0,2,0,0,0,0,1,0,0,0,0,1"], "no similarity"),
+        (["--transform", "1,0,0,0,0,2,0,0,0,0,1,0,0,0,0,1"], "not a similarity"),
         (["--scale", "0"], "--scale 0.0: expected"),
         (["--scale", "nan"], "--scale nan: expected"),
         (["--drop-sh", "4"], "--drop-sh 4: expected 0 to 3"),
@@ -239,8 +239,8 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--rotate", "90"], "--rotate 90: expected 3 numbers"),
         (["--translate", "1,2,inf"], "--translate 1,2,inf: expected 3 numbers"),
         (["--up", "z"], "out.ply is 3DGS PLY"),
-        (["--spz-version", "3"], "--spz-version: is of SPZ files, "),
-        (["--sh-bits", "5"], "--sh-bits: is of SPZ files, "),
+        (["--spz-version", "3"], "--spz-version: is for SPZ files, "),
+        (["--sh-bits", "5"], "--sh-bits: is for SPZ files, "),
         *((["--sh-bits", bits], f"--sh-bits {bits}: expected bits from 1 to 8") for bits in ("0", "9,4", "5,4,3", "x")),
     ],
 )
@@ -493,14 +493,11 @@ def test_models_that_do_not_go_together(model: Path, tmp_path: Path, capsys: Cap
     placed.save(near)
     assert convert(model, tmp_path / "a.ply", "--merge", light) == 0
     assert (
-        f"warning: --merge {light}: its colours are of {colour.LINEAR}, those of {model} of sRGB"
+        f"warning: --merge {light}: its colours are {colour.LINEAR}, but those of {model} are sRGB"
         in capsys.readouterr().err
     )
     assert convert(model, tmp_path / "b.ply", "--merge", far) == 0
-    assert (
-        f"--merge {far}: counts from a place 500000 world units from that of {model}; its pos"
-        in capsys.readouterr().err
-    )
+    assert f"--merge {far}: its origin is 500000 world units from that of {model}; its pos" in capsys.readouterr().err
     assert convert(near, tmp_path / "c.ply", "--merge", far) == 0
     assert capsys.readouterr().err == ""
 
@@ -546,4 +543,4 @@ def test_pictures_of_sh_that_are_no_more(tmp_path: Path) -> None:
 @pytest.mark.parametrize("flags", [("--resolution", 200), ("--background", "white"), ("--test-every", 4)])
 def test_flags_of_a_scene_without_one(model: Path, flags: tuple[object, ...], capsys: Capture) -> None:
     assert convert(model, model.with_name("a.splat"), *flags) == 2
-    assert f"{flags[0]}: of measuring on a scene, expected --scene with it" in error_line(capsys)
+    assert f"{flags[0]}: for measuring on a scene, expected --scene with it" in error_line(capsys)

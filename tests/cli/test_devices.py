@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from calls import error_line
 
-from clsplat.bench.subject import synthetic
+from clsplat.bench.workload import synthetic
 from clsplat.cli.main import main
 from clsplat.device.context import list_devices, open_device
 

@@ -12,8 +12,8 @@ import pytest
 from calls import error_line
 
 from clsplat.cli.main import main
-from clsplat.device import installation
 from clsplat.device.context import list_devices
+from clsplat.device.drivers import diagnostics
 
 Capture = pytest.CaptureFixture[str]
 
@@ -30,9 +30,9 @@ def test_it_names_packages_and_devices(capsys: Capture) -> None:
 
 
 def test_what_is_missing_has_advice_and_status_1(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(installation, "listed_devices", lambda: ([], "a driver took the process down (signal 6)"))
-    monkeypatch.setattr(installation, "gpus", lambda: ["NVIDIA"])
-    monkeypatch.setattr(installation, "families", lambda: ["debian"])
+    monkeypatch.setattr(diagnostics, "listed_devices", lambda: ([], "a driver took the process down (signal 6)"))
+    monkeypatch.setattr(diagnostics, "gpus", lambda: ["NVIDIA"])
+    monkeypatch.setattr(diagnostics, "families", lambda: ["debian"])
     assert main(["doctor"]) == 1
     text = capsys.readouterr().out
     assert re.search(r"^missing +device +a driver took the process down \(signal 6\)$", text, re.MULTILINE)

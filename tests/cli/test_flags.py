@@ -13,11 +13,11 @@ import tyro
 from calls import Capture, error_line
 from models import random_gaussians
 
-from clsplat.cli.flags import OTHERS, grouped_help, near, options
+from clsplat.cli.flags import OTHER_FLAGS_TITLE, grouped_help, near, options
 from clsplat.cli.main import main
 from clsplat.cli.parsing import VERBS, _text_rules, verb_class
-from clsplat.cli.render import Render
-from clsplat.cli.render_help import MOST, RENDER_GROUPS
+from clsplat.cli.render.help_page import MOST_NEEDED_FLAGS, RENDER_GROUPS
+from clsplat.cli.render.verb import RenderVerb
 from clsplat.config.pictures import SamplingConfig
 
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
@@ -54,9 +54,9 @@ def test_the_flags_are_those_that_the_parser_takes(verb: str) -> None:
 def test_the_groups_have_every_flag_once(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     text = render_help(capsys, monkeypatch)
     titles = [title for title, _ in RENDER_GROUPS]
-    assert f"\n{OTHERS}:\n" not in text, "a flag is in no group of render_help"
+    assert f"\n{OTHER_FLAGS_TITLE}:\n" not in text, "a flag is in no group of render_help"
     found = [flag for title in titles for flag in section(text, title)]
-    assert sorted(found) == sorted((option.names or (option.metavar,))[-1] for option in options(Render))
+    assert sorted(found) == sorted((option.names or (option.metavar,))[-1] for option in options(RenderVerb))
     assert len(set(found)) == len(found) > 60
     assert max(len(section(text, title)) for title in titles[1:]) <= 8
     assert max(map(len, text.splitlines())) <= 80
@@ -66,8 +66,8 @@ def test_the_groups_have_every_flag_once(capsys: Capture, monkeypatch: pytest.Mo
 
 def test_the_twelve_come_first(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     text = render_help(capsys, monkeypatch)
-    assert section(text, "Needed most") == ["RUN|MODEL", *(f"--{name}" for name in MOST)]
-    assert len(MOST) == 12
+    assert section(text, "Needed most") == ["RUN|MODEL", *(f"--{name}" for name in MOST_NEEDED_FLAGS)]
+    assert len(MOST_NEEDED_FLAGS) == 12
     assert text.startswith("usage: clsplat render RUN|MODEL -o PATTERN [OPTIONS]\n\nRender a model from the cameras")
     lines = text.splitlines()
     for word in ("width", "frames", "channels", "colorspace", "shutter-angle"):  # on the first two pages of 40 lines
@@ -79,23 +79,23 @@ def test_the_twelve_come_first(capsys: Capture, monkeypatch: pytest.MonkeyPatch)
 def test_what_is_said_is_the_fields_docstring_and_default(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     wide = " ".join(render_help(capsys, monkeypatch, 100).split())
     for part in (
-        f"more are smoother and take as much longer. (default: {SamplingConfig().samples})",
+        f"More are smoother, and take proportionally longer. (default: {SamplingConfig().samples})",
         "--shutter-open FLOAT Opening of the shutter, in frames from the frame, such as -0.25",
-        "--eye both|left|right Render one eye of --stereo alone, such as for a video. (default: both)",
-        "--rasterizer.transmittance-min FLOAT A Gaussian that would take",
+        "--eye both|left|right Render only one eye of --stereo, such as for a video. (default: both)",
+        "--rasterizer.transmittance-min FLOAT Leave out a Gaussian that would reduce",
         "-o, --output PATTERN File names of the images",
     ):
         assert part in wide
     assert {field.name.replace("_", "-") for field in fields(SamplingConfig)} <= {
-        option.key for option in options(Render)
+        option.key for option in options(RenderVerb)
     }
 
 
 def test_a_flag_of_no_group_is_among_others() -> None:
-    text = grouped_help(Render, "clsplat render", (("First", ("output", "video.*")),), 80)
+    text = grouped_help(RenderVerb, "clsplat render", (("First", ("output", "video.*")),), 80)
     assert section(text, "First")[0] == "--output"
     assert {"--video.fps", "--video.crf"} <= set(section(text, "First"))
-    assert {"--cameras", "--samples"} <= set(section(text, OTHERS))
+    assert {"--cameras", "--samples"} <= set(section(text, OTHER_FLAGS_TITLE))
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_a_signal_writes_a_checkpoint_first(
     assert process.status_of(caught.value) == 128 + number
     assert signal.getsignal(number) == before
     assert [step for step, _ in run.checkpoints()] == [5], "the step that was begun is finished"
-    assert not (run.path / locks.NAME).exists()
+    assert not (run.path / locks.LOCK_FILE_NAME).exists()
 
 
 @posix
@@ -174,7 +174,7 @@ def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
         "from clsplat.cli import main as cli\n"
         "from clsplat.cli import train\n"
         "def work(*_):\n"
-        "    import clsplat.scenes.data_set\n"
+        "    import clsplat.scenes.dataset\n"
         "train.run = work\n"
         "sys.exit(main())\n"
     )
@@ -197,9 +197,9 @@ def test_the_second_process_is_told_of_the_first(tmp_path: Path) -> None:
 def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     with holder(tmp_path):
         pass
-    assert (tmp_path / locks.NAME).exists(), "its file is there, and nobody has it locked"
+    assert (tmp_path / locks.LOCK_FILE_NAME).exists(), "its file is there, and nobody has it locked"
     with locks.locked(tmp_path, "eval"), locks.locked(tmp_path, "report"):
-        assert json.loads((tmp_path / locks.NAME).read_text())["verb"] == "eval"
+        assert json.loads((tmp_path / locks.LOCK_FILE_NAME).read_text())["verb"] == "eval"
     assert not list(tmp_path.iterdir())
 
 
@@ -213,7 +213,9 @@ def test_a_second_training_changes_nothing(flag: str, tmp_path: Path, capsys: Ca
     with holder(run) as other:
         assert main(["train", str(tmp_path), "-o", str(run), *([flag] if flag.startswith("--") else [])]) == 2
         assert f"is being written by clsplat train (process {other.pid})" in error_line(capsys)
-        left = {path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != locks.NAME}
+        left = {
+            path: path.read_bytes() for path in run.rglob("*") if path.is_file() and path.name != locks.LOCK_FILE_NAME
+        }
     assert left == files
 
 
@@ -242,7 +244,7 @@ def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.slow
 @posix
 def test_the_tool_makes_tables() -> None:
-    tool = [sys.executable, str(Path(__file__).parents[2] / "tools" / "interruptions.py"), "--markdown"]
+    tool = [sys.executable, str(Path(__file__).parents[2] / "tools" / "stress" / "interruptions.py"), "--markdown"]
     calls = ["--verbs", "train,info", "--events", "SIGTERM,second process"]
     done = subprocess.run([*tool, *calls], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr

@@ -245,18 +245,18 @@ def test_kill_and_resume_give_the_same_model(scene: Path, tmp_path: Path, long_m
 def test_ctrl_c_before_the_first_step(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture
 ) -> None:
-    from clsplat.training import trainer
+    from clsplat.training import trained_model
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     run = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(trainer, "upload_gaussians", interrupt)
+        patch.setattr(trained_model, "upload_gaussians", interrupt)
         assert train(scene, run, CONFIG) == 130
     message = f"clsplat: interrupted before the first checkpoint; go on with: clsplat train -o {run} --resume"
     looked, started, *_, interrupted = capfd.readouterr().err.splitlines()
-    assert looked.startswith("looked at 10 photographs: ")
+    assert looked.startswith("inspected 10 photographs: ")
     assert started.startswith(f"{scene.name}: 8 pictures to train on, 2 held out, 40 points; on ")
     assert interrupted == message
     assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 0

@@ -19,16 +19,18 @@ from models import random_gaussians
 from packaging.requirements import Requirement
 from quick import quick
 
-from clsplat import files, process
+from clsplat import process
 from clsplat.cli.parsing import _unboxed
-from clsplat.device import quirks
-from clsplat.device.quirks import driver_advice
+from clsplat.device.drivers import quirks
+from clsplat.device.drivers.quirks import driver_advice
 from clsplat.errors import InputError
 from clsplat.evaluation.held_out import picture_names
-from clsplat.files import identity, name_trouble
+from clsplat.files import atomic
+from clsplat.files.names import identity, name_trouble
 from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
-from clsplat.scenes import sfm_photos, transforms
+from clsplat.scenes.readers import transforms
+from clsplat.scenes.sfm import photos as sfm_photos
 from clsplat.shots import frame_numbers
 
 if sys.version_info >= (3, 11):
@@ -117,17 +119,17 @@ def test_a_file_that_another_program_has_open_is_tried_again(monkeypatch: pytest
             raise left.pop()
 
     with pytest.raises(PermissionError):
-        files._patiently(act, windows=False)
+        atomic._patiently(act, windows=False)
     assert len(tries) == 1
-    files._patiently(act, windows=True)
+    atomic._patiently(act, windows=True)
     assert len(tries) == 4
 
     def never() -> None:
         raise PermissionError(errno.EACCES, "in use")
 
-    monkeypatch.setattr(files, "PATIENCE", 0.05)
+    monkeypatch.setattr(atomic, "WINDOWS_RETRY_SECONDS", 0.05)
     with pytest.raises(PermissionError, match="in use"):
-        files._patiently(never, windows=True)
+        atomic._patiently(never, windows=True)
 
 
 def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +151,7 @@ def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.M
         video.add(frame_planes(np.zeros((32, 32, 3), np.float32)))
     assert asked
     asked.clear()
-    files.atomic_write(tmp_path / "a", b"a")  # its folder is not flushed there, which is all that it loses
+    atomic.atomic_write(tmp_path / "a", b"a")  # its folder is not flushed there, which is all that it loses
     assert asked
     assert (tmp_path / "a").read_bytes() == b"a"
 
@@ -165,7 +167,7 @@ def test_a_read_only_photo_is_copied_on_windows(tmp_path: Path, monkeypatch: pyt
         asked.append((path, mode))
         return False
 
-    monkeypatch.setattr(sfm_photos, "WINDOWS", True)
+    monkeypatch.setattr(sfm_photos, "ON_WINDOWS", True)
     monkeypatch.setattr(os, "access", access)
     sfm_photos.stage_photos(photos, [photos / "a.png"], target, lambda _: None, 1)
     assert asked == [(photos / "a.png", os.W_OK)]
@@ -315,7 +317,7 @@ def test_no_module_wants_what_only_posix_has(tmp_path: Path) -> None:
     assert (tmp_path / "b.splat").stat().st_size == 4 * 32
 
 
-ASCII_FILES = {"clsplat/device/shapes.py", "clsplat/selftest/child.py"}
+ASCII_FILES = {"clsplat/device/drivers/shapes.py", "clsplat/selftest/worker.py"}
 """These read what json.dumps wrote, which is ASCII."""
 
 
@@ -439,6 +441,6 @@ def test_pyopencl_is_imported_in_one_room() -> None:
     names = [
         path.relative_to(ROOT).as_posix()
         for path in PACKAGE
-        if "import pyopencl" in path.read_text("utf-8") and path.parent.name != "device"
+        if "import pyopencl" in path.read_text("utf-8") and "device" not in path.parts
     ]
     assert names == []

@@ -196,7 +196,8 @@ def test_a_bent_picture_is_held_out_straight(folder: Path, tmp_path: Path, capsy
     call = f"--frames 2 --holdout {tmp_path}/all.exr --stmap {tmp_path}/shift.exr"
     assert render(folder, tmp_path / "told", call) == 0
     assert (
-        "all.exr: ends with the frame, and nothing is held out where the bent picture looks" in capsys.readouterr().err
+        "all.exr: ends with the frame, and nothing is held out where the warped picture extends"
+        in capsys.readouterr().err
     )
 
 
@@ -240,9 +241,9 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
         (f"--holdout {folder}/none.####.exr", "none.0001.exr: no such hold-out, expected a depth or deep EXR"),
         (f"{held} --width 20", f"z.0001.exr: is of a frame of {WIDTH}x{HEIGHT}, expected 20x"),
         (f"{held} --holdout.channel depth.Z", "has no channel depth.Z, but Z; name its depths with --holdout.channel"),
-        ("--holdout.channel Z", "--holdout.channel Z: is of hold-outs, expected --holdout with it"),
+        ("--holdout.channel Z", "--holdout.channel Z: is for holdouts, expected --holdout with it"),
         (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
-        ("--holdout.depths ray", "--holdout.depths ray: is of hold-outs, expected --holdout with it"),
+        ("--holdout.depths ray", "--holdout.depths ray: is for holdouts, expected --holdout with it"),
         (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such hold-out"),
         (f"--holdout {folder}/z.{{shot}}.exr", "{shot} is not known, expected {name}"),
         (f"--holdout {tmp_path}/nan.exr", "values of Z are not a number, expected depths and alpha of surfaces"),

@@ -397,7 +397,7 @@ def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: 
     output.close()
     before = photo.read_bytes()
     assert render(shot, tmp_path, pattern=pattern) == 2
-    assert f"{photo}: there already, and no frames of clsplat; name other files, or give --over" in error_line(capsys)
+    assert f"{photo}: exist, and clsplat did not make them; name other files, or give --over" in error_line(capsys)
     assert list(tmp_path.iterdir()) == [photo]
     assert photo.read_bytes() == before
     assert render(shot, tmp_path, "--overwrite", pattern=pattern) == 0

@@ -249,7 +249,7 @@ def test_wrong_mattes_are_one_line(
         ([{"name": "m", "mesh": "none.obj"}], "none.obj: no such file"),
         ([{"name": "m", "box": [1, 0, 0, 0, 1, 1]}], "'box' is [1, 0, 0, 0, 1, 1], expected the least x, y and z"),
         ([{"name": "m", "sphere": [0, 0, 0, -1]}], "expected x, y, z and a radius of at least 0"),
-        ([{"name": "a", "sphere": [0, 0, 0, 1]}], "has the matte 'a', of a name that is there twice"),
+        ([{"name": "a", "sphere": [0, 0, 0, 1]}], "has the matte 'a', a name that is used twice"),
     ],
 )
 def test_wrong_volumes_are_one_line(mattes: Any, message: str, folder: Path, tmp_path: Path, capsys: Capture) -> None:

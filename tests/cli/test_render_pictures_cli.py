@@ -219,6 +219,22 @@ def test_deep(shot: list[str], plain: np.ndarray, tmp_path: Path, capsys: Captur
     assert not oiio.ImageBuf(str(tmp_path / "a.0002.exr")).spec().deep
 
 
+def test_deep_of_a_shutter_and_a_lens(shot: list[str], tmp_path: Path) -> None:
+    flags = (
+        "--model-colorspace lin_rec709 --colorspace lin_rec709 --samples 4 --shutter-angle 360 --aperture 0.1 --focus 2"
+    )
+    flat, _ = picture(shot, tmp_path / "flat", f"{flags} --alpha")
+    assert render(shot, tmp_path / "deep", f"{flags} --deep --frames 2") == 0
+    image = oiio.ImageBuf(str(tmp_path / "deep" / "a.0002.exr"))
+    over = oiio.ImageBufAlgo.flatten(image).get_pixels(oiio.FLOAT)
+    np.testing.assert_allclose(over[:, :, :4], flat, atol=4e-6)  # slices of four samples, merged
+    before = (tmp_path / "deep" / "a.0002.exr").stat().st_mtime_ns
+    assert render(shot, tmp_path / "deep", f"{flags} --deep --frames 2 --skip-existing") == 0
+    assert (tmp_path / "deep" / "a.0002.exr").stat().st_mtime_ns == before
+    assert render(shot, tmp_path / "deep", f"{flags} --deep --frames 2 --skip-existing --samples 5") == 0
+    assert (tmp_path / "deep" / "a.0002.exr").stat().st_mtime_ns != before
+
+
 def test_another_colour_space_is_not_what_is_wanted(shot: list[str], tmp_path: Path) -> None:
     picture(shot, tmp_path)
     _, spec = picture(shot, tmp_path, "--colorspace ACEScg --skip-existing")
@@ -516,20 +532,20 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--shutter-open 0.1", "a.#.exr", "--shutter-open 0.1 --shutter-close None: expected two times"),
         ("--aperture 0.1", "a.#.exr", "--focus 0.0: expected the depth that is in focus"),
         ("--deep --supersample 2", "a.#.exr", "deep EXR: --supersample has no deep samples"),
-        ("--deep --channels rgb,depth", "a.#.exr", "--deep: has no depth beside colour, alpha and depths"),
+        ("--deep --channels rgb,depth", "a.#.exr", "--deep: cannot hold depth, only colour, alpha, depths"),
         ("--deep --parts several", "a.#.exr", "--deep and --parts several exclude each other"),
         ("--deep", "a.#.tif", "cannot hold deep samples, expected an .exr file"),
         ("--deep --background white", "a.#.exr", "--deep and --background exclude each other"),
         ("--deep.bins 8", "a.#.exr", "expected --deep with it"),
-        ("--video.fps 25", "a.#.exr", "--video flags are of videos, expected the name of an .mp4 or .mov file"),
+        ("--video.fps 25", "a.#.exr", "--video flags are for videos, expected the name of an .mp4 or .mov file"),
         ("--channels rgb,depth", "a.mp4", "an MP4 cannot hold depth"),
         ("--alpha", "a.mp4", "an MP4 cannot hold alpha"),
         ("--alpha", "a.#.jpg", "a JPG cannot hold alpha"),
-        ("--video.prores 422", "a.mp4", "--video.prores 422: is of ProRes, expected the name of a .mov"),
-        ("--video.crf 5", "a.mov", "--video.crf 5: is of H.264, expected the name of an .mp4"),
+        ("--video.prores 422", "a.mp4", "--video.prores 422: is for ProRes, expected the name of a .mov"),
+        ("--video.crf 5", "a.mov", "--video.crf 5: is for H.264, expected the name of an .mp4"),
         ("--alpha", "a.mov", "ProRes hq cannot hold alpha, expected --video.prores 4444"),
         ("--bits 8", "a.#.dpx", "a.#.dpx has 10 or 16 bits, expected one of them"),
-        ("--bits 10", "a.#.png", "--bits 10: is of DPX, expected 8 or 16"),
+        ("--bits 10", "a.#.png", "--bits 10: is for DPX, expected 8 or 16"),
         ("--alpha", "a.#.dpx", "a DPX of 10 bits is written without alpha here, expected --bits 16"),
         ("--video.crf 99", "a.mp4", "--video.crf 99: expected 0 to 51"),
         ("--colorspace ACEScg", "a.#.png", "its colours would be ACEScg, which is linear, expected sRGB; write .exr"),

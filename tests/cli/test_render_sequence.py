@@ -22,7 +22,7 @@ from clsplat.cli.main import main
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.models.formats import usd
-from clsplat.sequence.cast import load_cast
+from clsplat.sequence.job_models import load_cast
 
 MODEL = hidden_model(30)
 COUNT = 5
@@ -144,7 +144,7 @@ def test_motion_blur_is_the_mean_over_the_shutter(folder: Path) -> None:
 def test_gaps_are_filled_and_told(folder: Path, capsys: Capture) -> None:
     (folder / "capture.0003.ply").unlink()
     assert render(folder, "capture.####.ply", "all", "--channels alpha --exr float") == 0
-    assert "has no file of the frame(s) 3, made of the files beside them; there are the frames 1-2,4-5" in (
+    assert "has no file of the frame(s) 3, made from the neighbouring files; there are the frames 1-2,4-5" in (
         capsys.readouterr().err
     )
     means = (at(2).means.astype(float) + at(4).means) / 2
@@ -186,10 +186,10 @@ def test_placed_as_one(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("model", "flags", "words"),
     [
-        ("none.####.ply", "", "none.####.ply: no file has such a name, expected one a frame, such as "),
+        ("none.####.ply", "", "none.####.ply: no file has such a name, expected one per frame, such as "),
         ("late.####.ply", "", "has no file of the frame(s) 1-2,5; there are the frames 3-4; give --frames 3-4"),
         ("capture.####.ply", "--channels objects", "--channels objects: "),
-        ("capture.####.ply", "--appearance a.png", "--appearance a.png: is of one run's model"),
+        ("capture.####.ply", "--appearance a.png", "--appearance a.png: is for one run's model"),
         ("odd.####.ply", "", "odd.####.ply: frame 2 is antialiased, frame 1 is not antialiased"),
         ("torn.####.ply", "", "torn.0002.ply: "),
     ],

@@ -23,20 +23,20 @@ from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.pictures import SamplingConfig
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.frame.times import sample_moments
+from clsplat.frame.shutter_times import sample_moments
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import linear_to_srgb, srgb_to_linear
 from clsplat.models import edit
-from clsplat.models.placed import Ensemble, Placement, grade, placed, rows_of
+from clsplat.models.instances import Ensemble, Placement, grade, placed, rows_of
 from clsplat.reference.blend import layers
 from clsplat.reference.render import forward
 from clsplat.rendering.renderer import Renderer
-from clsplat.sequence.cast import load_cast
 from clsplat.sequence.farm import Failure, WorkerJob, render_frame
+from clsplat.sequence.job_models import load_cast
 from clsplat.sequence.task import RenderOptions, make_tasks
 from clsplat.shots import read_shot
-from clsplat.shots.layout import parse_transform, read_layout
-from clsplat.spherical_harmonics import C0, sh_basis
+from clsplat.shots.shot_file import parse_transform, read_layout
+from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 CLOSE = 1e-5
 """Float32's rounding of means and SH that were turned once more, in a picture of values up to 2."""
@@ -162,7 +162,7 @@ def test_opacity_and_colour_over_time(folder: Path, tmp_path: Path) -> None:
     opacity = 0.6 / (1 + np.exp(-B.opacity_logits.astype(np.float64)))
     gain, offset, saturation = np.array([1.5, 1, 0.75]), np.array([0.05, 0, -0.05]), 0.5
     sh = B.sh.astype(np.float64) * gain
-    sh[:, 0] += (0.5 * gain + offset - 0.5) / C0
+    sh[:, 0] += (0.5 * gain + offset - 0.5) / SH_C0
     luma = sh @ [0.2126, 0.7152, 0.0722]
     sh = saturation * sh + (1 - saturation) * luma[:, :, None]
     by_hand = replace(B, sh=sh.astype(np.float32), opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32))
@@ -316,11 +316,11 @@ WRONG: list[tuple[dict[str, Any] | str, str]] = [
     ({"keys": [{"scale": 1}]}, "model 'b': key 0: has no 'frame'"),
     ({"keys": [{"frame": 1, "scale": 1}, {"frame": 1, "scale": 2}]}, "has two keys at frame 1"),
     ({"scale": 2, "keys": [{"frame": 1, "scale": 1}]}, "has 'scale' for all frames and in keys"),
-    ({"matrix": [1, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "frame 0: has a transform that is no similarity"),
+    ({"matrix": [1, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}, "frame 0: has a transform that is not a similarity"),
     ({"matrix": [1, 2]}, "'matrix' is [1, 2], expected a list of 16 numbers"),
     ({"first_frame": 3}, "has 'first_frame' without 'matrices'"),
     ({"path": "c.ply"}, "model 'b': "),
-    ({"name": "a"}, "model 'a': is there twice"),
+    ({"name": "a"}, "model 'a': has a name that is used twice"),
     ("{}", "'clsplat_shot' is None, expected 1"),
     ('{"clsplat_shot": 1, "models": []}', "has no models"),
     ("[", "is not JSON"),
@@ -360,12 +360,12 @@ def test_wrong_transforms_are_one_line(text: str, message: str, folder: Path, tm
 def test_models_that_are_not_drawn_alike(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     replace(B, antialiased=True).save(folder / "soft.ply")
     assert render(folder, layout(folder, "unlike", path="soft.ply"), tmp_path / "none") == 2
-    assert "model 'b': is antialiased, 'a' is otherwise" in error_line(capsys)
+    assert "model 'b': is antialiased, unlike 'a'" in error_line(capsys)
     B.save(folder / "linear.ply", comments=("clsplat colorspace lin_rec709",))
     assert render(folder, layout(folder, "unlike", path="linear.ply"), tmp_path / "none") == 2
     assert "model 'b': is of the colour space lin_rec709, expected sRGB as 'a' is" in error_line(capsys)
     assert render(folder, layout(folder, "shot"), tmp_path / "none", "", "--appearance", "x.jpg") == 2
-    assert "--appearance x.jpg: is of one run's model" in error_line(capsys)
+    assert "--appearance x.jpg: is for one run's model" in error_line(capsys)
 
 
 def test_a_worker_places_what_it_has_read(folder: Path, tmp_path: Path) -> None:

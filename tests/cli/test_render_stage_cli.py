@@ -19,13 +19,13 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.pictures import SamplingConfig
-from clsplat.frame.times import sample_moments
+from clsplat.frame.shutter_times import sample_moments
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR, SRGB, linear_to_srgb, srgb_to_linear
 from clsplat.models import edit
 from clsplat.models.formats import colour_space, load, usd
 from clsplat.rendering.renderer import Renderer
-from clsplat.spherical_harmonics import C0
+from clsplat.spherical_harmonics import SH_C0
 
 require("pxr")
 from pxr import Gf, Sdf, Usd, UsdGeom  # noqa: E402
@@ -161,7 +161,7 @@ def test_units_move_nothing_and_cameras_may_be_others(stage: Usd.Stage, tmp_path
 
 def test_prims_without_sh(stage: Usd.Stage, tmp_path: Path) -> None:
     for name, colours in (("One", [(0.2, 0.5, 0.9)]), ("Each", [(0.2, 0.5, 0.9), (0.9, 0.1, 0.0)]), ("None", [])):
-        prim = stage.DefinePrim(f"/{name}", usd.TYPE)
+        prim = stage.DefinePrim(f"/{name}", usd.GAUSSIAN_PRIM_TYPE)
         prim.CreateAttribute("positions", Sdf.ValueTypeNames.Point3fArray).Set([(0, 0, 0), (1, 0, 0)])
         prim.CreateAttribute("scales", Sdf.ValueTypeNames.Float3Array).Set([(0.1, 0.2, 0.3)] * 2)
         if colours:
@@ -170,7 +170,7 @@ def test_prims_without_sh(stage: Usd.Stage, tmp_path: Path) -> None:
     stage.RemovePrim("/Asset")
     stage.Flatten().Export(str(tmp_path / "plain.usda"))
     model = load(tmp_path / "plain.usda")
-    colours = 0.5 + C0 * model.sh[:, 0]
+    colours = 0.5 + SH_C0 * model.sh[:, 0]
     wanted = linear_to_srgb(np.array([[0.2, 0.5, 0.9]] * 2 + [[0.2, 0.5, 0.9], [0.9, 0.1, 0.0]], np.float32))
     np.testing.assert_allclose(colours[:4], wanted, atol=1e-6)  # displayColor is linear, models are sRGB
     np.testing.assert_allclose(colours[4:], 0.5)
@@ -185,7 +185,7 @@ def test_prims_without_sh(stage: Usd.Stage, tmp_path: Path) -> None:
 def test_a_linear_stage(where: str, stage: Usd.Stage, tmp_path: Path, capsys: Capture) -> None:
     prim = stage.GetPrimAtPath("/Asset/Gaussians")
     if where == "attribute":
-        prim.GetAttribute(usd.COEFFICIENTS).SetColorSpace("lin_rec709_scene")
+        prim.GetAttribute(usd.SH_COEFFICIENTS_ATTRIBUTE).SetColorSpace("lin_rec709_scene")
     else:
         named = prim if where == "prim" else prim.GetParent()
         named.CreateAttribute("colorSpace:name", Sdf.ValueTypeNames.Token).Set("lin_rec709_scene")
@@ -208,7 +208,7 @@ def test_wrong_stages_are_one_line(stage: Usd.Stage, tmp_path: Path, capsys: Cap
     assert render(stage, tmp_path / "ok", "--frames 1") == 0
     capsys.readouterr()
     assert render(stage, tmp_path / "none", "--frames 1-3") == 2
-    assert "/Asset/Gaussians at 2: has a transform that is no similarity" in error_line(capsys)
+    assert "/Asset/Gaussians at 2: has a transform that is not a similarity" in error_line(capsys)
     assert not (tmp_path / "none").exists()
 
 

@@ -18,7 +18,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.cli.main import main
 from clsplat.models import edit
 from clsplat.models.formats import load, usd
-from clsplat.shots.stage import StageModels, read_stage
+from clsplat.shots.usd_models import StageModels, read_stage
 
 require("pxr")
 from pxr import Gf, Sdf, Usd, UsdGeom  # noqa: E402
@@ -211,8 +211,8 @@ def test_what_stays_undrawn_is_one_warning(tmp_path: Path, capsys: Capture) -> N
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "not drawn" in line]
     assert line.endswith(
         f"{path}: not drawn: /Lost (its {tmp_path}/gone.usdc cannot be opened), /Forest/Unused/Gaussians (which no "
-        "instance of /Forest draws), /Forest/Rock (Mesh) and 1 more; of a stage only ParticleField3DGaussianSplat "
-        "prims are drawn"
+        "instance of /Forest draws), /Forest/Rock (Mesh) and 1 more; only ParticleField3DGaussianSplat prims "
+        "of a stage are drawn"
     )
     found = edit.merge([edit.transform(load(tmp_path / "model.usdc"), shifted(x, y)) for x, y in ((0, 0), (0.5, 0.25))])
     stage.RemovePrim("/Lost")
@@ -244,7 +244,7 @@ def test_wrong_instancers_are_one_line(tmp_path: Path, capsys: Capture) -> None:
     stage = new_stage(tmp_path, "loop")
     with_model(stage, "/A/Forest/Tree")
     instancer(stage, "/A/Forest", ["/A"], [0]).CreatePositionsAttr([(0, 0, 0)])
-    assert "/A/Forest: is in a prototype of its own" in error_of(stage).replace("/A/Forest[0]/Forest", "/A/Forest")
+    assert "/A/Forest: is inside its own prototype" in error_of(stage).replace("/A/Forest[0]/Forest", "/A/Forest")
     stage = new_stage(tmp_path, "none")
     with_model(stage, "/Forest/Tree")
     instancer(stage, "/Forest", ["/Forest/Tree"], [])

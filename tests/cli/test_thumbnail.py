@@ -55,7 +55,7 @@ def test_a_model_of_linear_colours_has_a_thumbnail(model: Path, capsys: Capture)
         (["render", "model.ply", "-o", "a.png", "--path", "through"], "--path through: goes through cameras"),
         (["render", "model.ply", "-o", "#.png", "--path", "spiral", "--count", "0"], "--count 0: expected 1 to"),
         (["render", "model.ply", "-o", "a.png", "--path", "spiral", "--usd-camera", "c"], "--usd-camera c: expected"),
-        (["render", "model.ply", "-o", "a.png", "--cameras", "x", "--up", "y"], "--up y: is of paths around the"),
+        (["render", "model.ply", "-o", "a.png", "--cameras", "x", "--up", "y"], "--up y: is for paths around the"),
         (["thumbnail", "model.ply", "--up", "north"], "--up north: expected x, y, z"),
         (["thumbnail", "model.ply", "--size", "8"], "--size 8: expected 16 to 8192"),
         (["thumbnail", "model.ply", "-o", "a.##.png"], "a.##.png: has a place for frames' numbers, expected the name"),
@@ -66,7 +66,7 @@ def test_a_model_of_linear_colours_has_a_thumbnail(model: Path, capsys: Capture)
         (["thumbnail", "model.ply", "-o", "a.mp4"], "a.mp4: has the extension '.mp4', expected one of .exr, .png"),
         (
             ["render", "model.ply", "-o", "a.png", "--path", "spiral", "--lenses", "native"],
-            "--lenses native: is of the",
+            "--lenses native: is for cameras",
         ),
         (["thumbnail", "nowhere.ply"], "nowhere.ply: no such file"),
     ],

@@ -11,7 +11,7 @@ import pytest
 from tiny import write_scene
 
 from clsplat.cli.main import main
-from clsplat.config.presets import PRESETS, Schedule, bundled, scheduled
+from clsplat.config.presets import RASTERIZER_PRESETS, Schedule, bundled, scheduled
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.runs.run import Run
@@ -45,12 +45,8 @@ OUT_OF_RANGE = {
     "--density.opacity-reset-every": ("-1",),
     "--density.opacity-reset-to": ("0", "1", "nan"),
     "--density.max-gaussians": ("0", "-1"),
-    "--density.views-agree": ("0", "-1"),
     "--density.min-contribution": ("-1", "nan", "inf"),
     "--density.prune-every": ("-1",),
-    "--density.edge-views": ("-1",),
-    "--density.prune-at": ("0", "-5", "9,5", "5,5", "3000"),
-    "--density.prune-fraction": ("-0.1", "1", "nan", "0.5"),
     "--density.growth": ("budget", "mcmc"),
     "--density.spread": ("-1", "nan", "inf"),
     "--density.noise-rate": ("-1", "nan", "inf"),
@@ -85,22 +81,20 @@ def test_a_value_out_of_range(flag: str, value: str, tmp_path: Path, capsys: Cap
 
 def test_no_number_of_the_optimiser_or_density_control_is_left_out() -> None:
     for config, prefix in ((OptimiserConfig(), "--optimiser."), (DensityConfig(), "--density.")):
-        numbers = [
-            each.name for each in fields(config) if not isinstance(getattr(config, each.name), bool)
-        ]  # and steps
+        numbers = [each.name for each in fields(config) if not isinstance(getattr(config, each.name), bool)]
         flags = {prefix + name.replace("_", "-") for name in numbers}
         assert flags == {flag for flag in OUT_OF_RANGE if flag.startswith(prefix)}
 
 
 def test_defaults_presets_and_the_ends_of_ranges_make_sense() -> None:
     TrainConfig().check()
-    for preset in PRESETS.values():
+    for preset in RASTERIZER_PRESETS.values():
         TrainConfig(rasterizer=preset).check()
     still = {each.name: 0.0 for each in fields(OptimiserConfig) if each.name.endswith(("_rate", "_rate_end"))}
     OptimiserConfig(**still, means_rate_steps=1, beta1=0, beta2=0, cooldown_to=1).check()  # type: ignore[arg-type]
     DensityConfig(every=0, start=0, stop=0, opacity_reset_every=0, dense_fraction=1, max_gaussians=1).check()
     DensityConfig(max_world_fraction=1e9).check()  # prunes none
-    DensityConfig(prune_at=(1, 2), prune_fraction=0.99, growth="budget", max_gaussians=1, views_agree=1).check()
+    DensityConfig(growth="budget", max_gaussians=1).check()
 
 
 def test_an_evaluation_after_the_last_step(tmp_path: Path, capsys: Capture) -> None:
@@ -125,7 +119,7 @@ def test_a_schedule_makes_sense_for_any_number_of_steps(schedule: Schedule, iter
 
 @pytest.mark.parametrize("iterations", [1, 2, 3, 13, 7000, 30_000])
 def test_presets_make_sense_for_any_number_of_steps(iterations: int) -> None:
-    for preset, rasterizer in PRESETS.items():
+    for preset, rasterizer in RASTERIZER_PRESETS.items():
         for schedule in (None, *get_args(Schedule)):
             if (preset, schedule) == ("fast", "high-rates"):
                 continue
@@ -178,10 +172,10 @@ def test_high_rates_on_the_command_line(tmp_path: Path, capsys: Capture) -> None
 def test_a_setting_that_two_places_have_has_one_default() -> None:
     import inspect
 
-    from clsplat.cli.convert import Convert
+    from clsplat.cli.convert import ConvertVerb
     from clsplat.cli.options import PageOptions
-    from clsplat.cli.render import Render
-    from clsplat.cli.render_job import bits_of
+    from clsplat.cli.render.job import bits_of
+    from clsplat.cli.render.verb import RenderVerb
     from clsplat.config.pictures import Encoding
     from clsplat.scenes.loading import load_scene
     from clsplat.viewer.server import Address
@@ -192,8 +186,8 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
     assert [default(each, "port") for each in (PageOptions, Address)] == [8080] * 2
     assert [default(each, "host") for each in (PageOptions, Address)] == ["127.0.0.1"] * 2
     held_out = inspect.signature(load_scene).parameters["test_every"].default
-    assert [default(each, "test_every") for each in (TrainConfig, Convert)] == [held_out] * 2 == [8] * 2
+    assert [default(each, "test_every") for each in (TrainConfig, ConvertVerb)] == [held_out] * 2 == [8] * 2
     names = {"exr": "depth", "parts": "parts", "compression": "compression", "quality": "quality"}
     for flag, name in names.items():
-        assert default(Render, flag) == default(Encoding, name), flag
-    assert bits_of("a.png", default(Render, "bits"), ["rgb"]) == default(Encoding, "bits")
+        assert default(RenderVerb, flag) == default(Encoding, name), flag
+    assert bits_of("a.png", default(RenderVerb, "bits"), ["rgb"]) == default(Encoding, "bits")

@@ -93,7 +93,7 @@ def test_cameras_stand_inside_the_wall_and_look_at_the_middle():
     views = ray_caster.cameras(40, 320, 240, seed=0)
     assert len(views) == 40
     for view in views:
-        assert np.hypot(*view.position[:2]) < ray_caster.WALL_RADIUS - 0.5
-        x, y, z = view.rotation @ ray_caster.CENTRE + view.translation
+        assert np.hypot(*view.position[:2]) < ray_caster.WALL_RADIUS_METRES - 0.5
+        x, y, z = view.rotation @ ray_caster.SCENE_CENTRE + view.translation
         assert z > 0
         assert abs(view.fx * x / z) < 40 and abs(view.fy * y / z) < 40

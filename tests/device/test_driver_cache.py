@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.device.quirks import make_cache_folder
+from clsplat.device.drivers.quirks import make_cache_folder
 
 
 def test_a_home_below_a_file_gets_a_folder_elsewhere(tmp_path: Path) -> None:

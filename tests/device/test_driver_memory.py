@@ -19,15 +19,16 @@ from calls import Capture
 from dying import ALWAYS, DRIVER, Standing
 
 from clsplat.cli.main import main
-from clsplat.device import child, context, known, launch, rehearsal, shapes
+from clsplat.device import context, launch, sandbox
 from clsplat.device.buffers import allocate
 from clsplat.device.context import Device
+from clsplat.device.drivers import driver_records, shapes, worker_process
 from clsplat.device.program import Kernels, Variant, build
 from clsplat.errors import DeviceError, DriverError
-from clsplat.files import locked
-from clsplat.selftest import trust
-from clsplat.selftest.result import STAGES
-from clsplat.selftest.trust import Report
+from clsplat.files.locks import locked
+from clsplat.selftest import driver_check
+from clsplat.selftest.driver_check import DriverReport
+from clsplat.selftest.result import SELFTEST_STAGES
 
 POSIX = pytest.mark.skipif(os.name == "nt", reason="signals are sent as POSIX has it")
 
@@ -36,16 +37,16 @@ POSIX = pytest.mark.skipif(os.name == "nt", reason="signals are sent as POSIX ha
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache of its own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    known.tell_once.cache_clear()
+    driver_records.tell_once.cache_clear()
     return tmp_path / "cache"
 
 
 REMEMBER = """
 import sys
-from clsplat.device import known
+from clsplat.device.drivers import driver_records
 from clsplat.device.context import all_devices
 for number in range(25):
-    known.remember(all_devices()[0], "8x1", kernels={f"{sys.argv[1]} {number}": ""})
+    driver_records.remember(all_devices()[0], "8x1", kernels={f"{sys.argv[1]} {number}": ""})
 """
 
 
@@ -53,7 +54,7 @@ def test_processes_that_remember_at_once(elsewhere: Path) -> None:
     words = [[sys.executable, "-c", REMEMBER, name] for name in "ab"]
     begun = [subprocess.Popen(each) for each in words]
     assert [each.wait(timeout=60) for each in begun] == [0, 0]
-    found = known.entries(context.all_devices()[0])["8x1"].kernels
+    found = driver_records.entries(context.all_devices()[0])["8x1"].kernels
     assert set(found) == {f"{name} {number}" for name in "ab" for number in range(25)}
 
 
@@ -87,15 +88,15 @@ def test_what_could_not_be_written_is_written_later(elsewhere: Path) -> None:
     device = context.all_devices()[0]
     elsewhere.write_text("a file where the folder would be")
     with pytest.warns(UserWarning, match="cannot be written"):
-        known.remember(device, "8x1", kernels={"first": ""})
-    known.remember(device, "8x1", kernels={"second": ""})  # told once
-    assert set(known.entries(device)["8x1"].kernels) == {"first", "second"}
+        driver_records.remember(device, "8x1", kernels={"first": ""})
+    driver_records.remember(device, "8x1", kernels={"second": ""})  # told once
+    assert set(driver_records.entries(device)["8x1"].kernels) == {"first", "second"}
     elsewhere.unlink()
-    known.remember(device, "8x1", kernels={"third": ""})
-    shapes_of = json.loads(known.memory_path().read_bytes())[known.driver_key(device)]
+    driver_records.remember(device, "8x1", kernels={"third": ""})
+    shapes_of = json.loads(driver_records.memory_path().read_bytes())[driver_records.driver_key(device)]
     assert set(shapes_of["8x1"]["kernels"]) == {"first", "second", "third"}
-    known.memory_path().unlink()
-    assert not known.entries(device)
+    driver_records.memory_path().unlink()
+    assert not driver_records.entries(device)
 
 
 def test_a_shape_that_one_device_cannot_take(elsewhere: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
@@ -119,7 +120,7 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
     standing("abort", ALWAYS)
     device = standing_device.cl_device
     first, second, third = shapes.shapes_in_turn(device)[:3]
-    known.remember(device, first.label, failed="it failed")
+    driver_records.remember(device, first.label, failed="it failed")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert main(["devices"]) == 0
@@ -128,10 +129,10 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
     assert opened.shape == second
     with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {second.label} is taken"):
         opened.kernels("scan")
-    known.tell_once.cache_clear()
-    monkeypatch.setattr(trust, "_short_test", lambda tried, _: "as well" if tried.shape == second else "")
+    driver_records.tell_once.cache_clear()
+    monkeypatch.setattr(driver_check, "_short_test", lambda tried, _: "as well" if tried.shape == second else "")
     with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {third.label} is taken") as told:
-        trust.require(context.open_device()).kernels("scan")
+        driver_check.require(context.open_device()).kernels("scan")
     assert sum("is taken" in str(each.message) for each in told) == 1
 
 
@@ -143,16 +144,16 @@ def test_a_failure_is_forgotten_when_what_failed_works(
     standing("abort", 1)
     with pytest.raises(DriverError):
         context.open_device().kernels("scan")
-    failed = known.entries(device)[label].failed
+    failed = driver_records.entries(device)[label].failed
     assert "probe.cl" in failed
-    monkeypatch.setattr(trust, "examine", lambda *_: Report())
+    monkeypatch.setattr(driver_check, "examine", lambda *_: DriverReport())
     assert main(["selftest", "--device", str(index)]) == 0
     assert f"The shape is not used all the same: {failed}; tried once more: " in capsys.readouterr().out
-    assert known.entries(device)[label].failed == failed
+    assert driver_records.entries(device)[label].failed == failed
     standing("abort", ALWAYS)
     assert main(["selftest", "--device", str(index), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["remembered"] == ""
-    assert known.entries(device)[label].failed == ""
+    assert driver_records.entries(device)[label].failed == ""
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,10 @@ def test_a_failure_is_forgotten_when_what_failed_works(
     ids=["a stage", "a kernel of the test", "another kernel"],
 )
 def test_what_is_left_of_a_failure(trial: dict[str, str], kernels: dict[str, str], left: str) -> None:
-    assert trust._still(0, known.Entry(failed="it failed", trial=trial), Report(kernels=kernels)) == left
+    assert (
+        driver_check._still(0, driver_records.Entry(failed="it failed", trial=trial), DriverReport(kernels=kernels))
+        == left
+    )
 
 
 @pytest.mark.parametrize("python", [None, "", "missing"])
@@ -193,7 +197,7 @@ def test_a_trial_ends_at_once_when_the_process_is_asked_to(standing: Standing) -
         timer = threading.Timer(1.0, lambda: os.kill(os.getpid(), signal.SIGINT))
         timer.start()
         begun = time.monotonic()
-        with pytest.raises(child.TrialInterrupted):
+        with pytest.raises(worker_process.TrialInterrupted):
             kernels("scan")
         assert time.monotonic() - begun < 20
         assert noted == [True]
@@ -210,18 +214,18 @@ def test_other_threads_do_not_wait_for_a_trial_either(standing: Standing) -> Non
     def work() -> None:
         try:
             device.kernels("scan")
-        except child.TrialInterrupted as error:
+        except worker_process.TrialInterrupted as error:
             ends.append(type(error))
 
     thread = threading.Thread(target=work)
     thread.start()
-    while not child._alive:
+    while not worker_process._alive:
         time.sleep(0.01)
     time.sleep(0.5)
-    child.abandon()
+    worker_process.abandon()
     thread.join(timeout=20)
-    assert ends == [child.TrialInterrupted]
-    (process,) = [each for each in rehearsal._processes.values() if each._index == DRIVER]
+    assert ends == [worker_process.TrialInterrupted]
+    (process,) = [each for each in sandbox._processes.values() if each._index == DRIVER]
     with process._lock:  # as if it hung; the end of this process does not wait for it
         begun = time.monotonic()
         process.end()
@@ -244,7 +248,7 @@ def test_ctrl_c_while_a_driver_hangs(
     if verb == "view":
         pytest.importorskip("viser")
     numbers = standing("hang", 1)
-    known.remember(standing_device.cl_device, standing_device.shape.label, stages=STAGES)
+    driver_records.remember(standing_device.cl_device, standing_device.shape.label, stages=SELFTEST_STAGES)
     words = INTERRUPTED[verb].format(scene=scene, run=trained, new=tmp_path / "new").split()
     process = subprocess.Popen([sys.executable, "-m", "clsplat", *words], stderr=subprocess.PIPE, text=True)
     while not numbers.exists() and process.poll() is None:

@@ -20,13 +20,14 @@ from tiny import CONFIG
 
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
-from clsplat.device import context, known, rehearsal
-from clsplat.device.child import TIMEOUT, Child
+from clsplat.device import context, sandbox
 from clsplat.device.context import Device
+from clsplat.device.drivers import driver_records
+from clsplat.device.drivers.shapes import shapes_in_turn
+from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, Child
 from clsplat.device.program import build, variant_of
-from clsplat.device.shapes import shapes_in_turn
 from clsplat.errors import DriverError
-from clsplat.selftest import trust
+from clsplat.selftest import driver_check
 
 QUICK = [("abort", verb) for verb in VERBS]
 OTHERS = {
@@ -46,11 +47,11 @@ def test_a_driver_that_fails_in_every_shape(
 ) -> None:  # fmt: skip
     standing(how, 1)
     if how == "hang":
-        monkeypatch.setenv(TIMEOUT, "4")  # it does not come; what does come takes well under a second
+        monkeypatch.setenv(DRIVER_TIMEOUT_VARIABLE, "4")  # it does not come; what does come takes well under a second
         device = standing_device.cl_device
         others = [shape.label for shape in shapes_in_turn(device) if shape != standing_device.shape]
         for label in others:  # one shape is enough to wait for
-            known.remember(device, label, failed="it hung before")
+            driver_records.remember(device, label, failed="it hung before")
     before = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
     new = tmp_path / "new"
     assert call(verb, scene, trained, new) == 1
@@ -71,7 +72,7 @@ def test_another_shape_is_taken(
     how: str, verb: str, standing: Standing, scene: Path, trained: Path, tmp_path: Path, standing_device: Device,
     capsys: Capture, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setenv(TIMEOUT, "20" if how == "hang" else "120")
+    monkeypatch.setenv(DRIVER_TIMEOUT_VARIABLE, "20" if how == "hang" else "120")
     standing(how, 4, 4)
     label = standing_device.shape.label
     assert call(verb, scene, trained, tmp_path / "new") == 0
@@ -80,7 +81,7 @@ def test_another_shape_is_taken(
     assert ".cl" in warning
     assert "is taken" in warning
     # the next process begins with it
-    failed = known.entries(standing_device.cl_device)[label].failed
+    failed = driver_records.entries(standing_device.cl_device)[label].failed
     assert failed in warning
     assert main(["devices", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -107,7 +108,7 @@ def test_a_process_that_ended_once_is_no_failure(
     standing("once", number, number)
     assert call("eval", scene, trained, tmp_path / "new") == 0
     assert "warning" not in capsys.readouterr().err
-    assert not any(entry.failed for entry in known.entries(standing_device.cl_device).values())
+    assert not any(entry.failed for entry in driver_records.entries(standing_device.cl_device).values())
 
 
 def test_what_failed_is_not_waited_for_twice(standing: Standing, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,7 +116,7 @@ def test_what_failed_is_not_waited_for_twice(standing: Standing, monkeypatch: py
     device = context.open_device()
     with pytest.raises(DriverError, match="signal 6"):
         device.kernels("scan")
-    monkeypatch.setattr(rehearsal._Process, "ask", lambda *_: pytest.fail("it was tried again"))
+    monkeypatch.setattr(sandbox._Process, "ask", lambda *_: pytest.fail("it was tried again"))
     with pytest.raises(DriverError, match="signal 6"):
         device.kernels("scan")
 
@@ -132,8 +133,8 @@ def test_modules_of_the_folder_that_we_are_in_are_not_taken(
 
 
 def test_a_child_ends_with_its_parent_and_is_heard_whatever_else_is_said(tmp_path: Path) -> None:
-    code = "import sys, time; from clsplat.device.child import *; end_with_parent(); sys.stdout.write('half a line'); "
-    code += "tell(said=1); time.sleep(600)"
+    code = "import sys, time; from clsplat.device.drivers.worker_process import *; end_with_parent(); "
+    code += "sys.stdout.write('half a line'); tell(said=1); time.sleep(600)"
     child = Child([sys.executable, "-c", code])
     assert child.receive(60) == {"said": 1}
     assert child._process.stdin is not None
@@ -149,7 +150,7 @@ def test_what_the_system_kills_is_not_the_drivers_fault(
     standing("kill", 1)
     assert call("eval", scene, trained, tmp_path / "new") == 1
     assert "its test could not be made: the process was ended by signal 9 in probe.cl" in error_of(capsys)
-    assert not any(entry.failed for entry in known.entries(standing_device.cl_device).values())
+    assert not any(entry.failed for entry in driver_records.entries(standing_device.cl_device).values())
 
 
 @pytest.mark.parametrize(
@@ -163,8 +164,10 @@ def test_a_trial_that_there_is_no_memory_for_is_left_out(
     with pytest.warns(UserWarning, match="not enough memory to try every kernel") as told:
         context.open_device().kernels("scan")
     assert sum("not enough memory" in str(each.message) for each in told) == 1
-    assert not any(entry.failed or entry.kernels for entry in known.entries(standing_device.cl_device).values())
-    monkeypatch.setattr(rehearsal._Process, "ask", lambda *_: pytest.fail("it was tried again"))
+    assert not any(
+        entry.failed or entry.kernels for entry in driver_records.entries(standing_device.cl_device).values()
+    )
+    monkeypatch.setattr(sandbox._Process, "ask", lambda *_: pytest.fail("it was tried again"))
     context.open_device()._built("scan", context.open_device()._fma[0])
 
 
@@ -175,10 +178,10 @@ def test_what_failed_in_every_shape_is_tried_anew(
     standing("abort", ALWAYS)
     device = standing_device.cl_device
     for shape in shapes_in_turn(device):
-        known.remember(device, shape.label, failed="it did once")
+        driver_records.remember(device, shape.label, failed="it did once")
     assert call("eval", scene, trained, tmp_path / "new") == 0
     assert "warning" not in capsys.readouterr().err
-    assert known.entries(device)[standing_device.shape.label].failed == ""
+    assert driver_records.entries(device)[standing_device.shape.label].failed == ""
 
 
 @pytest.mark.slow
@@ -190,7 +193,7 @@ def test_training_goes_on_after_a_late_failure(
     numbers = standing(how, ALWAYS)
     assert train(scene, tmp_path / "whole", LATE) == 0
     latest = number_of(name, numbers)
-    known.memory_path().unlink()
+    driver_records.memory_path().unlink()
     run = tmp_path / "run"
     standing(how, latest, latest)
     assert train(scene, run, LATE) == 1
@@ -215,15 +218,17 @@ def test_what_was_mended_gives_the_same_bytes(
     numbers = standing("launch", ALWAYS)
     assert train(scene, tmp_path / "whole", LATE) == 0
     latest = number_of("gather_rows", numbers)
-    known.memory_path().unlink()
+    driver_records.memory_path().unlink()
     standing("launch", latest, latest)
     assert train(scene, tmp_path / "run", LATE) == 1
     monkeypatch.delenv("CLSPLAT_STAND_IN")
     forget()
     with monkeypatch.context() as patch:
-        patch.setattr(trust, "examine", partial(trust.examine, quick=True))  # one scene of its three tells as much here
+        patch.setattr(
+            driver_check, "examine", partial(driver_check.examine, quick=True)
+        )  # one scene of its three tells as much here
         assert main(["selftest", "--device", str(DRIVER)]) == 0
-    assert known.entries(standing_device.cl_device)[standing_device.shape.label].failed == ""
+    assert driver_records.entries(standing_device.cl_device)[standing_device.shape.label].failed == ""
     assert main(["train", "-o", str(tmp_path / "run"), "--resume"]) == 0
     models = [(tmp_path / name / "model.ply").read_bytes() for name in ("whole", "run")]
     assert models[0] == models[1]
@@ -237,7 +242,7 @@ def test_what_has_worked_is_not_tried_again(
     standing("abort", ALWAYS)
     assert train(scene, tmp_path / "first", config) == 0
     forget()
-    monkeypatch.setattr(rehearsal._Process, "ask", lambda *_: pytest.fail("a kernel that is known was tried"))
+    monkeypatch.setattr(sandbox._Process, "ask", lambda *_: pytest.fail("a kernel that is known was tried"))
     assert train(scene, tmp_path / "second", config) == 0
     first, second = ((tmp_path / name / "model.ply").read_bytes() for name in ("first", "second"))
     assert first == second
@@ -248,9 +253,9 @@ def test_a_time_that_makes_no_sense(
     text: str, standing: Standing, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     standing("abort", ALWAYS)
-    monkeypatch.setenv(TIMEOUT, text)
+    monkeypatch.setenv(DRIVER_TIMEOUT_VARIABLE, text)
     assert main(VERBS["bench"].split()) == 2
-    assert f"{TIMEOUT}={text}: expected seconds" in error_of(capsys)
+    assert f"{DRIVER_TIMEOUT_VARIABLE}={text}: expected seconds" in error_of(capsys)
 
 
 def test_a_text_that_no_cache_has(standing_device: Device) -> None:

@@ -13,15 +13,16 @@ from dying import ALWAYS, LATE, Standing, call, error_of, forget, number_of
 
 from clsplat.api import train as train_on
 from clsplat.cli.main import main
-from clsplat.device import known, launch
-from clsplat.device.child import TIMEOUT, TrialInterrupted
+from clsplat.device import launch
 from clsplat.device.context import Device
+from clsplat.device.drivers import driver_records
+from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, TrialInterrupted
 from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.training import loop as training
-from clsplat.training import watched
+from clsplat.training.step import monitor
 
 WITHOUT = replace(LATE, checkpoint_every=0, optimiser=replace(LATE.optimiser, sparse=True), report=False)
 """Adam has a kernel for each number of floats in a row: that of SH is built in step 12, behind the others."""
@@ -111,14 +112,14 @@ def test_what_is_half_changed_is_not_kept(
 ) -> None:
     """A launch that fails although its trial did not, behind the first that changes rows."""
     run = Run.create(tmp_path / "run", WITHOUT, scene=scene)
-    real = watched.Watched.add_statistics
+    real = monitor.StepMonitor.add_statistics
 
     def add_statistics(self, statistics, rows):
-        if self.trainer.step == 5 and self.trainer.mark is None:
+        if self.number == 5 and self.changes.__self__.mark is None:
             raise DriverError("it failed")
         return real(self, statistics, rows)
 
-    monkeypatch.setattr(watched.Watched, "add_statistics", add_statistics)
+    monkeypatch.setattr(monitor.StepMonitor, "add_statistics", add_statistics)
     with pytest.raises(DriverError) as raised:
         train_on(load_scene(scene), WITHOUT, device=default_device, run=run)
     assert str(raised.value) == "it failed"
@@ -134,12 +135,12 @@ def test_the_checkpoint_of_a_late_failure_gives_the_same_bytes(
     numbers = standing(how, ALWAYS)
     assert train(scene, tmp_path / "whole", WITHOUT) == 0
     latest = number_of(name, numbers)
-    known.memory_path().unlink()
+    driver_records.memory_path().unlink()
     standing(how, latest, latest)
     assert train(scene, tmp_path / "run", WITHOUT) == 1
     assert f"; the checkpoint of step {step} is written: " in error_of(capsys)
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == [f"step-{step:07}.npz"]
-    known.memory_path().unlink()  # else it would go on in another shape
+    driver_records.memory_path().unlink()  # else it would go on in another shape
     monkeypatch.delenv("CLSPLAT_STAND_IN")
     forget()
     assert main(["train", "-o", str(tmp_path / "run"), "--resume"]) == 0
@@ -157,10 +158,10 @@ def test_a_late_failure_of_other_verbs(
     numbers = standing("launch" if how == "launch" else "abort", ALWAYS)
     assert call(verb, scene, trained, tmp_path / "whole") == 0
     latest = len(numbers.read_text().splitlines())
-    known.memory_path().unlink()
+    driver_records.memory_path().unlink()
     before = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
     standing(how, latest, latest)
-    monkeypatch.setenv(TIMEOUT, "8" if how == "hang" else "120")
+    monkeypatch.setenv(DRIVER_TIMEOUT_VARIABLE, "8" if how == "hang" else "120")
     capsys.readouterr()
     status = call(verb, scene, trained, tmp_path / "new")
     if status == 0:  # the short self-test came by it, and took another shape; or it was built anew

@@ -9,7 +9,7 @@ from collections.abc import Set as AbstractSet
 
 import pytest
 
-from clsplat.device.quirks import pin_threads
+from clsplat.device.drivers.quirks import pin_threads
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="PoCL pins threads on Linux alone")
 

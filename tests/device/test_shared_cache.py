@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A driver's cache of kernels that other processes use at the same time, and signals while it is filled.
 
-`tools/stress_cache.py` starts forty processes at once on an empty one.
+`tools/stress/stress_cache.py` starts forty processes at once on an empty one.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ TEXT = "kernel void {name}(global float *out) {{ out[0] = 1.0f; }}\n"
 
 @pytest.fixture(autouse=True)
 def no_binaries(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program.binaries, "load", lambda *_: None)
-    monkeypatch.setattr(program.binaries, "save", lambda *_: None)
+    monkeypatch.setattr(program.binary_cache, "load", lambda *_: None)
+    monkeypatch.setattr(program.binary_cache, "save", lambda *_: None)
 
 
 def contended(monkeypatch: pytest.MonkeyPatch, failures: list[str]) -> list[str]:

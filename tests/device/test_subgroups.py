@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.device import context
 from clsplat.device.context import Device
-from clsplat.device.quirks import subgroup_ways
+from clsplat.device.drivers.quirks import subgroup_ways
 from clsplat.errors import DeviceError
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import metrics
-from clsplat.evaluation.held_out import evaluate, picture_names
+from clsplat.evaluation.held_out import EvaluatedModel, evaluate, picture_names
 from clsplat.images.alpha import background_colour, composite
 
 
@@ -36,7 +36,7 @@ def half(photo: Photo) -> np.ndarray:
 
 def test_result_is_the_contract() -> None:
     views = photos()
-    result = evaluate(half, views, (0, 0, 0), step=7, gaussians=100, seconds=1.5)
+    result = evaluate(half, views, (0, 0, 0), model=EvaluatedModel(7, 100, 1.5))
     assert (result["step"], result["gaussians"], result["seconds"]) == (7, 100, 1.5)
     assert [view["name"] for view in result["views"]] == ["b/0.jpg", "a.png", "c.JPG"]
     for view, record in zip(views, result["views"], strict=True):
@@ -48,12 +48,12 @@ def test_result_is_the_contract() -> None:
 
 
 def test_a_perfect_render_is_valid_json() -> None:
-    result = evaluate(Photo.load, photos(), (0, 0, 0), step=None, gaussians=1, seconds=None)
+    result = evaluate(Photo.load, photos(), (0, 0, 0), model=EvaluatedModel(None, 1, None))
     assert json.loads(json.dumps(result, allow_nan=False))["mean"]["psnr"] == 120
 
 
 def test_no_views() -> None:
-    assert evaluate(half, [], (0, 0, 0), step=1, gaussians=1, seconds=0.0)["mean"] == {}
+    assert evaluate(half, [], (0, 0, 0), model=EvaluatedModel(1, 1, 0.0))["mean"] == {}
 
 
 def test_straight_alpha_over_the_background() -> None:
@@ -69,16 +69,16 @@ def test_alpha_views_are_measured_over_the_same_background() -> None:
     rng = np.random.default_rng(0)
     view = Photo("a.png", rng.random((16, 16, 4)).astype(np.float32))
     over_white = composite(view.pixels, (1, 1, 1))
-    result = evaluate(lambda _: over_white, [view], (1, 1, 1), step=1, gaussians=1, seconds=0.0)
+    result = evaluate(lambda _: over_white, [view], (1, 1, 1), model=EvaluatedModel(1, 1, 0.0))
     assert result["mean"]["psnr"] == 120
 
 
 def test_trouble_names_the_view() -> None:
     with pytest.raises(InputError, match=r"small\.png: .*too small for SSIM"):
-        evaluate(half, [Photo("small.png", np.zeros((8, 8, 3)))], (0, 0, 0), step=1, gaussians=1, seconds=0.0)
+        evaluate(half, [Photo("small.png", np.zeros((8, 8, 3)))], (0, 0, 0), model=EvaluatedModel(1, 1, 0.0))
     nothing = np.full((16, 16, 3), np.nan)
     with pytest.raises(ClsplatError, match=r"render of a\.png has values that are not finite"):
-        evaluate(lambda _: nothing, [Photo("a.png", nothing)], (0, 0, 0), step=1, gaussians=1, seconds=0.0)
+        evaluate(lambda _: nothing, [Photo("a.png", nothing)], (0, 0, 0), model=EvaluatedModel(1, 1, 0.0))
 
 
 def test_picture_names() -> None:
@@ -90,20 +90,20 @@ def test_renders_in_other_spaces_are_left_as_srgb(tmp_path: Path) -> None:
     from skimage.io import imread
 
     views = photos()[1:2]
-    linear = evaluate(half, views, (0, 0, 0), tmp_path, step=1, gaussians=1, seconds=0.0, space="lin_rec709")
-    assert linear == evaluate(half, views, (0, 0, 0), step=1, gaussians=1, seconds=0.0), "they are measured as they are"
+    linear = evaluate(half, views, (0, 0, 0), tmp_path, model=EvaluatedModel(1, 1, 0.0), space="lin_rec709")
+    assert linear == evaluate(half, views, (0, 0, 0), model=EvaluatedModel(1, 1, 0.0)), "they are measured as they are"
     values = half(views[0]).astype(np.float64)
     curve = np.where(values > 0.0031308, 1.055 * values ** (1 / 2.4) - 0.055, 12.92 * values)  # IEC 61966-2-1
     np.testing.assert_allclose(imread(tmp_path / "a.png") / 255, curve, atol=0.5 / 255 + 1e-6)
     with pytest.raises(InputError, match="the model's colour space nowhere: not in the configuration"):
-        evaluate(half, views, (0, 0, 0), tmp_path, step=1, gaussians=1, seconds=0.0, space="nowhere")
+        evaluate(half, views, (0, 0, 0), tmp_path, model=EvaluatedModel(1, 1, 0.0), space="nowhere")
 
 
 def test_renders_are_left_as_pictures(tmp_path: Path) -> None:
     from skimage.io import imread
 
     views = photos()
-    evaluate(half, views, (0, 0, 0), tmp_path / "test", step=1, gaussians=1, seconds=0.0)
+    evaluate(half, views, (0, 0, 0), tmp_path / "test", model=EvaluatedModel(1, 1, 0.0))
     files = sorted(str(path.relative_to(tmp_path / "test")) for path in (tmp_path / "test").rglob("*.*"))
     assert files == ["a.png", "b/0.png", "c.png"]
     picture = imread(tmp_path / "test" / "b" / "0.png")
@@ -119,7 +119,7 @@ def test_pixels_that_a_mask_leaves_out_are_not_measured() -> None:
     for fill in (0.0, 0.7):
         image = np.where(truth[:, :, 4:] > 0, render, fill).astype(np.float32)
         view = Photo("a.png", truth)
-        scores.append(evaluate(lambda _view, i=image: i, [view], (0, 0, 0), step=1, gaussians=1, seconds=0.0)["views"])
+        scores.append(evaluate(lambda _view, i=image: i, [view], (0, 0, 0), model=EvaluatedModel(1, 1, 0.0))["views"])
     assert scores[0] == scores[1]
     assert scores[0][0]["counted"] == 0.75
     kept = truth[:, :, 4] > 0
@@ -129,4 +129,4 @@ def test_pixels_that_a_mask_leaves_out_are_not_measured() -> None:
 def test_a_mask_that_leaves_nothing_is_named() -> None:
     view = Photo("a.png", np.zeros((30, 40, 5), np.float32))
     with pytest.raises(InputError, match=r"a\.png: its mask leaves nothing"):
-        evaluate(lambda v: v.pixels[:, :, :3], [view], (0, 0, 0), step=1, gaussians=1, seconds=0.0)
+        evaluate(lambda v: v.pixels[:, :, :3], [view], (0, 0, 0), model=EvaluatedModel(1, 1, 0.0))

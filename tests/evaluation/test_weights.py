@@ -47,7 +47,7 @@ class Answer(BaseHTTPRequestHandler):
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    monkeypatch.delenv(lpips_weights.VARIABLE, raising=False)
+    monkeypatch.delenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, raising=False)
     metrics.prepare_lpips.cache_clear()
     metrics._lpips_model.cache_clear()
     found = ThreadingHTTPServer(("127.0.0.1", 0), Answer)
@@ -76,25 +76,26 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lpips", stand_in)
     torch = ModuleType("torch")
     torch.device = type("device", (), {})  # type: ignore[attr-defined]  # tyro looks for it
+    torch.Tensor = type("Tensor", (), {})  # type: ignore[attr-defined]  # scipy looks for it
     monkeypatch.setitem(sys.modules, "torch", torch)
 
 
 def test_they_are_fetched_once(server: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr(lpips_weights, "URL", f"{server}/whole/{NAME}")
+    monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/whole/{NAME}")
     lpips_weights.fetch()
     assert lpips_weights.place().read_bytes() == BODY
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "fetching VGG-16's weights for LPIPS, for 300 s at most (CLSPLAT_LPIPS_TIMEOUT)" in captured.err
-    monkeypatch.setattr(lpips_weights, "URL", f"http://127.0.0.1:9/{NAME}")
+    monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"http://127.0.0.1:9/{NAME}")
     lpips_weights.fetch()
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("seconds", ["0.3", "0"])
 def test_a_silent_server_has_a_limit(seconds: str, server: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lpips_weights, "URL", f"{server}/silent/{NAME}")
-    monkeypatch.setenv(lpips_weights.VARIABLE, seconds)
+    monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/silent/{NAME}")
+    monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, seconds)
     start = time.monotonic()
     with pytest.raises(ClsplatError) as caught:
         lpips_weights.fetch()
@@ -104,7 +105,7 @@ def test_a_silent_server_has_a_limit(seconds: str, server: str, monkeypatch: pyt
 
 
 def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lpips_weights, "URL", f"{server}/other/{NAME}")
+    monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/other/{NAME}")
     with pytest.raises(ClsplatError, match=r"could not be fetched \(what came has another digest"):
         lpips_weights.fetch()
     assert not list(lpips_weights.place().parent.iterdir())
@@ -112,14 +113,14 @@ def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.Monk
 
 def test_a_limit_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("soon", "-1", "nan", "inf"):
-        monkeypatch.setenv(lpips_weights.VARIABLE, text)
-        with pytest.raises(InputError, match=f"{lpips_weights.VARIABLE} is '{text}', expected seconds"):
+        monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, text)
+        with pytest.raises(InputError, match=f"{lpips_weights.LPIPS_TIMEOUT_VARIABLE} is '{text}', expected seconds"):
             lpips_weights.limit()
 
 
 @pytest.mark.usefixtures("installed")
 def test_nothing_is_on_standard_output(server: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr(lpips_weights, "URL", f"{server}/whole/{NAME}")
+    monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/whole/{NAME}")
     assert metrics.lpips_missing() is None
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -130,8 +131,8 @@ def test_nothing_is_on_standard_output(server: str, monkeypatch: pytest.MonkeyPa
 def test_train_says_once_what_is_missing(
     server: str, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    monkeypatch.setattr(lpips_weights, "URL", f"{server}/silent/{NAME}")
-    monkeypatch.setenv(lpips_weights.VARIABLE, "0.2")
+    monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/silent/{NAME}")
+    monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, "0.2")
     config = short(iterations=2, eval_at=(1,), report=False, density={"every": 0})
     assert command_train(scene, tmp_path / "run", config, "--json") == 0
     captured = capsys.readouterr()
@@ -146,7 +147,7 @@ def test_train_says_once_what_is_missing(
 
 def test_without_the_extra_the_file_says_so(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metrics, "find_spec", lambda _name: None)
-    monkeypatch.setattr(lpips_weights, "URL", f"{server}/whole/{NAME}")
+    monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/whole/{NAME}")
 
     class View:
         name = "a.png"
@@ -156,6 +157,6 @@ def test_without_the_extra_the_file_says_so(server: str, monkeypatch: pytest.Mon
 
         load_masked = load
 
-    result = held_out.evaluate(View.load, [View()], (0, 0, 0), step=1, gaussians=1, seconds=0.0)
+    result = held_out.evaluate(View.load, [View()], (0, 0, 0), model=held_out.EvaluatedModel(1, 1, 0.0))
     assert result["lpips_missing"] == "the optional extra is not installed (no lpips): pip install 'clsplat[lpips]'"
     assert not lpips_weights.place().exists(), "nothing is fetched that nobody could use"

@@ -14,7 +14,7 @@ from compare import assert_same_bits
 from quick import quick
 
 from clsplat.camera import Camera, Window
-from clsplat.config.channels import CHANNELS
+from clsplat.config.channels import FRAME_CHANNELS
 from clsplat.config.pictures import Encoding, FramingConfig, SamplingConfig
 from clsplat.device.context import open_device
 from clsplat.errors import InputError
@@ -22,11 +22,11 @@ from clsplat.frame.draw import drawn_by
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
 from clsplat.frame.strips import in_strips, strip_rows, strips, write_in_strips
 from clsplat.frame.window import crop, framed
-from clsplat.images.frame_files import Header, write_channels
+from clsplat.images.frame_files import FrameFileHeader, write_channels
 from clsplat.rendering.renderer import Renderer
 
 CLOUD, CAMERA = scenes.random_cloud(3000, 8, 150, 200)
-EVERYTHING = tuple(CHANNELS)
+EVERYTHING = tuple(FRAME_CHANNELS)
 
 
 def test_strips_cover_the_picture_and_end_with_tiles() -> None:
@@ -69,7 +69,7 @@ def test_everything_at_once_in_strips() -> None:
 def test_files_are_those_of_the_whole(ending: str, tmp_path: Path) -> None:
     names = EVERYTHING if ending == "exr" else ("rgb",) if ending == "jpg" else ("rgb", "alpha")
     camera = crop(CAMERA, 5, 21, 100, 150)
-    header = Header({"clsplat:frame": 7}, window=Window(5, 21, 150, 200) if ending == "exr" else None)
+    header = FrameFileHeader({"clsplat:frame": 7}, window=Window(5, 21, 150, 200) if ending == "exr" else None)
     draw = drawn_by(Renderer(), CLOUD)
     write_channels(tmp_path / f"whole.{ending}", draw(camera, names), Encoding(), header)
     write_in_strips(tmp_path / f"strips.{ending}", draw, camera, names, 32, Encoding(), header)

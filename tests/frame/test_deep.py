@@ -15,16 +15,19 @@ from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
 from pipeline import EVERY_SHAPE, shaped, shapes_of
 from quick import quick
+from slices import flattened, in_front
 
 from clsplat.camera import Camera, Window
-from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding
+from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.frame.deep_exr import render_deep, write_deep
+from clsplat.frame.deep import render_deep
+from clsplat.frame.deep_exr import write_deep
+from clsplat.frame.pipeline import FramePipeline
 from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
-from clsplat.images.colour import LINEAR, Colours
-from clsplat.images.frame_files import Header, camera_matrices
+from clsplat.images.colour import LINEAR
+from clsplat.images.frame_files import FrameFileHeader, camera_matrices
 from clsplat.reference import deep as twin
 from clsplat.reference import render as reference
 from clsplat.reference.blend import layers
@@ -36,14 +39,6 @@ SCENES = {
     "equal_depth": scenes.NAMED["equal_depth"],
     "cloud": lambda: scenes.random_cloud(600, 8, 70, 50),
 }
-
-
-def flattened(slices: np.ndarray) -> np.ndarray:
-    """(bins, H, W, 5) to (H, W, 4): the slices over each other, front to back."""
-    flat = np.zeros((*slices.shape[1:3], 4), np.float64)
-    for image in slices.astype(np.float64):
-        flat += (1 - flat[:, :, 3:]) * image[:, :, :4]
-    return flat.astype(np.float32)
 
 
 def read(path: Path) -> tuple[Any, list[NDArray[np.float64]]]:
@@ -101,12 +96,6 @@ def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
         assert_same_bits(other, first)
 
 
-def in_front(slices: NDArray[Any], depth: float) -> NDArray[np.float64]:
-    """(H, W): alpha of the slices in front of a depth."""
-    left = np.where(slices[..., 4] < depth, 1 - slices[..., 3].astype(np.float64), 1.0)
-    return np.asarray(1 - left.prod(axis=0))
-
-
 def test_a_holdout_at_any_depth(default_device: Device) -> None:
     """The alpha in front of each of 40 depths, against the Gaussians one by one in float64."""
     gaussians, camera = scenes.random_cloud(4000, 8, 70, 50)
@@ -161,16 +150,30 @@ def test_windows_and_little_memory_change_no_bit() -> None:
     assert renderer.device.memory.peak <= limit
 
 
+def write(
+    path: Path,
+    renderer: Renderer,
+    gaussians: Gaussians,
+    camera: Camera,
+    bins: int = 16,
+    colour: ColourConfig | None = None,
+    **how: Any,
+) -> None:
+    pipeline = FramePipeline(renderer, gaussians, PictureConfig(colour or ColourConfig()))
+    draw, convert, rows = pipeline.draw_deep(bins, lambda _: camera)
+    write_deep(path, draw, camera, rows(camera), bins, convert=convert, **how)
+
+
 def made(tmp_path: Path, camera: Camera | None = None, **options: Any) -> tuple[Path, Gaussians, Camera]:
     gaussians, own = scenes.random_cloud(600, 8, 71, 50)
     camera = camera or own
-    write_deep(tmp_path / "a.exr", Renderer(), gaussians, camera, DeepConfig(bins=6), **options)
+    write(tmp_path / "a.exr", Renderer(), gaussians, camera, 6, **options)
     assert list(tmp_path.iterdir()) == [tmp_path / "a.exr"]
     return tmp_path / "a.exr", gaussians, camera
 
 
 def test_a_file(tmp_path: Path) -> None:
-    header = Header({"clsplat:frame": 7}, camera_matrices(scenes.tilted_camera(71, 50)))
+    header = FrameFileHeader({"clsplat:frame": 7}, camera_matrices(scenes.tilted_camera(71, 50)))
     empty_at_the_left = crop(scenes.tilted_camera(71, 50), -48, 0, 119, 50)
     path, gaussians, camera = made(tmp_path, empty_at_the_left, encoding=Encoding(depth="float"), header=header)
     spec, pixels = read(path)
@@ -192,7 +195,7 @@ def test_a_file(tmp_path: Path) -> None:
 
 def test_halves_and_a_window(tmp_path: Path) -> None:
     camera = crop(scenes.tilted_camera(71, 50), 5, 3, 40, 30)
-    header = Header(window=Window(5, 3, 71, 50))
+    header = FrameFileHeader(window=Window(5, 3, 71, 50))
     path, gaussians, _ = made(tmp_path, camera, encoding=Encoding("half", compression="piz"), header=header)
     spec, pixels = read(path)
     assert (spec.x, spec.y, spec.width, spec.height, spec.full_width, spec.full_height) == (5, 3, 40, 30, 71, 50)
@@ -205,7 +208,7 @@ def test_halves_and_a_window(tmp_path: Path) -> None:
 def test_strips_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, *_ = made(tmp_path)
     whole = path.read_bytes()
-    monkeypatch.setattr("clsplat.frame.deep_exr.DEEP_STRIP_FLOATS", 71 * 5 * 6 * 16)
+    monkeypatch.setattr("clsplat.frame.deep.DEEP_STRIP_FLOATS", 71 * 5 * 6 * 16)
     made(tmp_path)
     assert path.read_bytes() == whole
 
@@ -215,17 +218,16 @@ def test_files_in_little_memory(tmp_path: Path) -> None:
     gaussians, camera = scenes.random_cloud(20_000, 4, 300, 200, degree=1)
     limit = 14 << 20  # the slices of all of it are 23 MB
     renderer = Renderer(open_device(None, limit))
-    write_deep(tmp_path / "little.exr", renderer, gaussians, camera)
+    write(tmp_path / "little.exr", renderer, gaussians, camera)
     assert renderer.device.memory.peak <= limit
-    write_deep(tmp_path / "plenty.exr", Renderer(), gaussians, camera)
+    write(tmp_path / "plenty.exr", Renderer(), gaussians, camera)
     assert (tmp_path / "little.exr").read_bytes() == (tmp_path / "plenty.exr").read_bytes()
 
 
 def test_colours_are_converted(tmp_path: Path) -> None:
-    colours = Colours(ColourConfig(colorspace=LINEAR))
     path, *_ = made(tmp_path, encoding=Encoding(depth="float"))
     _, plain = read(path)
-    _, linear = read(made(tmp_path, encoding=Encoding(depth="float"), colours=colours)[0])
+    _, linear = read(made(tmp_path, encoding=Encoding(depth="float"), colour=ColourConfig(colorspace=LINEAR))[0])
     sample, converted = (max(pixels, key=len)[0] for pixels in (plain, linear))
     straight = sample[:3] / sample[3]
     wanted = np.where(straight > 0.04045, ((straight + 0.055) / 1.055) ** 2.4, straight / 12.92) * sample[3]
@@ -235,8 +237,8 @@ def test_colours_are_converted(tmp_path: Path) -> None:
 
 def test_what_cannot_be(tmp_path: Path) -> None:
     gaussians, camera = scenes.one()
-    with pytest.raises(InputError, match=r"a\.png: deep samples want an \.exr file"):
-        write_deep(tmp_path / "a.png", Renderer(), gaussians, camera)
+    with pytest.raises(InputError, match=r"a\.png: deep samples need an \.exr file"):
+        write(tmp_path / "a.png", Renderer(), gaussians, camera)
     for config, message in (
         (DeepConfig(bins=0), "--deep.bins 0: expected 1 to 256"),
         (DeepConfig(bins=257), "--deep.bins 257: expected 1 to 256"),

@@ -13,7 +13,7 @@ from compare import assert_close, assert_same_bits
 from quick import quick
 
 from clsplat.camera import Camera, Projection, Window
-from clsplat.config.channels import CHANNELS
+from clsplat.config.channels import FRAME_CHANNELS
 from clsplat.config.pictures import FramingConfig, parse_overscan
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -25,7 +25,7 @@ from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
 
 WIDTH, HEIGHT = 150, 100
-EVERYTHING = tuple(CHANNELS)
+EVERYTHING = tuple(FRAME_CHANNELS)
 PERSPECTIVE = scenes.random_cloud(3000, 8, WIDTH, HEIGHT)
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""README and docs/ against the code: the commands that they give, and the flags, files, tests and places they name."""
+"""README.md and its like, and docs/, against the code: the commands that they give, and the flags, files, tests and
+places they name."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ from clsplat.cli.main import main, parse
 from clsplat.cli.parsing import VERBS
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+DOORS = ("README.md", "CONTRIBUTING.md", "SECURITY.md")
+PAGES = [*(ROOT / name for name in DOORS), *sorted((ROOT / "docs").rglob("*.md"))]
 FENCED = re.compile(r"^( *)```.*?\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?: {4}\S.*\n)+")
 NOT_HERE = {"clsplat/drivers.json", "clsplat/binaries", "clsplat/kernels", "clsplat/render.py"}
@@ -81,7 +83,7 @@ def test_flags_are_those_of_their_verb(capsys: Capture) -> None:
 
 
 def tools() -> list[Path]:
-    return [path for path in (ROOT / "tools").iterdir() if path.is_file()]
+    return [path for path in (ROOT / "tools").rglob("*") if path.is_file() and path.suffix != ".pyc"]
 
 
 def test_tools_take_their_flags() -> None:
@@ -93,8 +95,8 @@ def test_tools_take_their_flags() -> None:
         if not path.is_file():
             wrong.append(call)
         elif path.name != "test":  # which hands them on to pytest
-            parts = [path, ROOT / "tools/measuring.py", *(tools() if path.name == "stress" else ())]
-            text = "".join(part.read_text("utf-8") for part in parts)
+            parts = [path, ROOT / "tools/bench/measuring.py", *(path.parent.iterdir() if path.stem == "run" else ())]
+            text = "".join(part.read_text("utf-8") for part in parts if part.is_file())
             wrong += [call for flag in flags_in(call) if f'"{flag}"' not in text]
     assert wrong == []
 

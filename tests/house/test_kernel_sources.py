@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from clsplat.device.source import kernel_root
+from clsplat.layouts.columns import header
 
+SHARED = kernel_root() / "shared"
 LABELS = ["Owner", "Launch", "Buffers", "Equations"]
 FILES = sorted(kernel_root().glob("*.cl"))
 
@@ -15,6 +17,11 @@ FILES = sorted(kernel_root().glob("*.cl"))
 def opening(path: Path) -> list[str]:
     lines = path.read_text(encoding="utf-8").splitlines()
     return lines[: next(i for i, line in enumerate(lines) if not line.startswith("//"))]
+
+
+def test_the_layouts_are_those_of_python() -> None:
+    written = (SHARED / "layouts.h").read_text(encoding="utf-8")
+    assert written == header(), "python -m clsplat.layouts.columns > kernels/shared/layouts.h writes it anew"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import rooms
 from needs import require
 
 from clsplat.device.source import kernel_root
@@ -108,19 +109,41 @@ def test_the_hosted_workflow_runs_what_the_package_says_it_supports() -> None:
     assert names == {"OpenCL driver on macOS", "OpenCL driver on Windows"}
 
 
+def test_hosted_linters_and_those_of_a_commit_are_those_of_ci() -> None:
+    yaml = pytest.importorskip("yaml", reason="the extra `test` brings it")
+    (job,) = yaml.safe_load((ROOT / ".github/workflows/lint.yml").read_text("utf-8"))["jobs"].values()
+    commands = {step["run"].removeprefix(".venv/bin/") for step in job["steps"] if ".venv" in step.get("run", "")}
+    text = (ROOT / ".ci/run").read_text("utf-8")
+    for words in ('"$python" -m ', '"${python%/*}/', '"'):
+        text = text.replace(words, "")
+    assert len(commands) == 5 and {command for command in commands if f" {command}\n" not in text} == set()
+    extra = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]["dev"]
+    (here,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))["repos"]
+    assert {name for hook in here["hooks"] for name in hook["additional_dependencies"]} < set(extra)
+    assert {hook["entry"].split()[0] for hook in here["hooks"]} < {command.split()[0] for command in commands}
+
+
+def test_the_citation_has_the_version_of_the_package() -> None:
+    yaml = pytest.importorskip("yaml", reason="the extra `test` brings it")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert [citation[key] for key in ("title", "version", "license")] == [
+        project[key] for key in ("name", "version", "license")
+    ]
+
+
 def _number(python: str) -> int:
     return int(python.partition(".")[2])
 
 
-def test_the_architecture_names_every_room() -> None:
-    text = (ROOT / "docs/architecture.md").read_text("utf-8")
-    rooms = text.partition("| room | what is in it |")[2].partition("\n\n")[0]
-    named = set(re.findall(r"^\| `(\w+)", rooms, re.MULTILINE))
-    assert named == {path.parent.name for path in (ROOT / "clsplat").glob("*/__init__.py")}
+def test_the_table_of_rooms_is_that_of_the_contracts() -> None:
+    assert (ROOT / "docs/architecture.md").read_text("utf-8") == rooms.page(), "tools/ci/rooms.py --write"
+    assert {path.parent.name for path in (ROOT / "clsplat").glob("*/__init__.py")} < set(rooms.orders()[""])
 
 
 def test_the_page_of_tools_names_every_tool() -> None:
     text = (ROOT / "docs/tools.md").read_text("utf-8")
-    named = {name for row in re.findall(r"^\| (`.*?) \|", text, re.MULTILINE) for name in re.findall(r"`([\w.]+)", row)}
-    tools = {path.name for path in (ROOT / "tools").iterdir() if path.is_file()}
-    assert named - {"hooks"} == tools
+    rows = re.findall(r"^\| (`.*?) \|", text, re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`(?:hooks/)?([\w.]+)", row)}
+    tools = (path for path in (ROOT / "tools").rglob("*") if path.is_file() and path.suffix != ".pyc")
+    assert named == {path.name for path in tools}

@@ -113,7 +113,7 @@ def test_a_model_in_linear_values() -> None:
 
 def test_a_space_that_is_not_there() -> None:
     with pytest.raises(
-        InputError, match=r"^--colorspace ACEScq: not in the configuration ocio://.*; near it are ACEScg"
+        InputError, match=r"^--colorspace ACEScq: not in the configuration ocio://.*; similar names: ACEScg"
     ):
         Colours(ColourConfig(colorspace="ACEScq"))
     with pytest.raises(InputError, match=r"^--model-colorspace zzz: .*; it has .+, .+, .+ and \d+ more"):

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scenes import tilted_camera
 
 from clsplat.camera import Window
-from clsplat.config.channels import CHANNELS
+from clsplat.config.channels import FRAME_CHANNELS
 from clsplat.config.pictures import Encoding
 from clsplat.errors import ClsplatError, InputError
 from clsplat.images.frame_files import (
-    Header,
+    FrameFileHeader,
     attribute,
     camera_matrices,
     check_format,
@@ -36,7 +36,7 @@ def everything() -> dict[str, NDArray[Any]]:
     """A value of its own for each channel; colours beyond 0 and 1, an index that a float32 does not hold."""
     rng = np.random.default_rng(0)
     made: dict[str, NDArray[Any]] = {}
-    for name, layer in CHANNELS.items():
+    for name, layer in FRAME_CHANNELS.items():
         shape = (HEIGHT, WIDTH, len(layer.names))
         made[name] = rng.uniform(-1, 3, shape).astype(np.float32)
     made["depth"] = rng.uniform(1e-3, 1e6, (HEIGHT, WIDTH)).astype(np.float32)
@@ -82,7 +82,7 @@ def test_exr(parts: Any, depth: Any, tmp_path: Path) -> None:
     found, specs = read(path)
     assert [name for spec in specs for name in spec.channelnames].count("R") == 1
     assert len(specs) == (1 if parts == "one" else 10)
-    for name, layer in CHANNELS.items():
+    for name, layer in FRAME_CHANNELS.items():
         planes = layers[name].reshape(HEIGHT, WIDTH, -1)
         for index, channel in enumerate(layer.names):
             wanted = planes[:, :, index]
@@ -109,7 +109,7 @@ def test_the_header(tmp_path: Path) -> None:
     layers = everything()
     del layers["id"]
     camera = tilted_camera(WIDTH, HEIGHT)
-    header = Header({"clsplat:frame": 7, "Software": "clsplat"}, camera_matrices(camera))
+    header = FrameFileHeader({"clsplat:frame": 7, "Software": "clsplat"}, camera_matrices(camera))
     write_channels(tmp_path / "a.exr", layers, Encoding(compression="piz"), header)
     _, (spec,) = read(tmp_path / "a.exr")
     assert spec.getattribute("clsplat:frame") == 7
@@ -155,7 +155,9 @@ def test_matrices_of_an_orthographic_camera(far: float) -> None:
 
 
 def test_a_window(tmp_path: Path) -> None:
-    write_channels(tmp_path / "a.exr", everything(), Encoding(parts="several"), Header(window=Window(5, 3, 100, 50)))
+    write_channels(
+        tmp_path / "a.exr", everything(), Encoding(parts="several"), FrameFileHeader(window=Window(5, 3, 100, 50))
+    )
     _, (spec, *_) = read(tmp_path / "a.exr")
     assert (spec.x, spec.y, spec.width, spec.height) == (5, 3, WIDTH, HEIGHT)
     assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, 100, 50)
@@ -215,7 +217,7 @@ def test_a_dpx_as_another_reader_sees_it(tmp_path: Path) -> None:
 
     steps = np.arange(1024).reshape(32, 32)
     rgb = np.stack([steps, steps[::-1], np.full_like(steps, 1023)], axis=2)
-    header = Header({"Software": "clsplat 1", "clsplat:model": "ab" * 32, "clsplat:settings": "c0" * 16})
+    header = FrameFileHeader({"Software": "clsplat 1", "clsplat:model": "ab" * 32, "clsplat:settings": "c0" * 16})
     write_channels(tmp_path / "a.dpx", {"rgb": (rgb / 1023).astype(np.float32)}, Encoding(bits=10), header)
     with av.open(str(tmp_path / "a.dpx")) as container:
         (frame,) = container.decode(video=0)

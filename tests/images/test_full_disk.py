@@ -15,7 +15,7 @@ from needs import missing
 from quick import quick
 
 from clsplat.errors import WriteError
-from clsplat.files import require_room
+from clsplat.files.atomic import require_room
 from clsplat.models import formats
 
 MOUNT = 'mkdir -p "$1" && mount -t tmpfs -o size="$2" none "$1" && shift 2 && exec "$@"'

@@ -102,12 +102,13 @@ def test_arrays_in_any_order_of_memory_and_on_the_device(default_device: Device)
     turned[0] = np.repeat(flat.means2d, 2, axis=0)[::2].astype(np.float64)
     on_device = [upload(default_device, array) for array in flat.arrays]
     for arrays in (turned, on_device):
-        got = pixels_module.Pixels(session_of(default_device), *arrays, WIDTH, HEIGHT)
+        gaussians = pixels_module.screen_gaussians(default_device, *arrays)
+        got = pixels_module.PixelPass(session_of(default_device), gaussians, (WIDTH, HEIGHT))
         assert_same_bits(got.image, image)
 
 
 def test_more_pairs_than_there_is_room_for(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pixels_module, "MAX_PAIRS", 10)
+    monkeypatch.setattr(pixels_module, "MAX_PAIRS_PER_BAND", 10)
     with pytest.raises(CapacityError, match="has room for 10"):
         cloud(60, WIDTH, HEIGHT).pixels(default_device, WIDTH, HEIGHT)
 

@@ -101,7 +101,7 @@ def test_three_cameras_have_the_sum_of_their_gradients(device: Device) -> None:
     means, full = SUBJECT.means.astype(np.float64), SUBJECT.full(rounded=False)
     sums: dict[str, Any] = {"means": 0.0, "covariances": 0.0}
     for index, (viewmat, intrinsics) in enumerate(zip(*three_views(), strict=True)):
-        view = twin.View(viewmat, intrinsics, 100, 70)
+        view = twin.EwaViewTwin(viewmat, intrinsics, 100, 70)
         wanted = twin.project(means, full, view)
         assert (np.abs(wanted.radii - projected.radii[index]) > 1).sum() == 0
         result = twin.project_grad(means, full, view, wanted, {name: values[index] for name, values in by.items()})

@@ -11,7 +11,7 @@ import pytest
 import clsplat
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.rasterize import RENDER_MODES, Rasterization
+from clsplat.library.rasterize import RASTERIZE_RENDER_MODES, Rasterization
 
 WIDTH, HEIGHT = 40, 24
 
@@ -101,7 +101,7 @@ def test_cameras_of_several_sizes(default_device: Device) -> None:
 
 def test_depths_are_channels_of_their_own(default_device: Device) -> None:
     arguments = with_lenses(scene())
-    by_mode = {mode: call(arguments, default_device, render_mode=mode) for mode in RENDER_MODES}
+    by_mode = {mode: call(arguments, default_device, render_mode=mode) for mode in RASTERIZE_RENDER_MODES}
     rgb, depth = by_mode["RGB"].images, by_mode["D"].images
     alpha = by_mode["RGB"].alphas
     # blend.cl and values.cl add the same products in the same order, and fuse them alike

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.library.listed import RasterizedPixels, rasterize_to_pixels
+from clsplat.library.tile_list_pixels import RasterizedPixels, rasterize_to_pixels
 from clsplat.library.tiles import isect_offset_encode, isect_tiles
 from clsplat.reference import values as twin
 

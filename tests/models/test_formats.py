@@ -29,7 +29,7 @@ from clsplat.models import difference, edit, formats
 from clsplat.models.formats import Format
 from clsplat.rendering.renderer import Renderer
 
-WRITTEN = {row.name: row for row in formats.FORMATS if row.write}
+WRITTEN = {row.name: row for row in formats.MODEL_FORMATS if row.write}
 SIZE = 96
 
 
@@ -245,7 +245,7 @@ def test_a_spoilt_file_is_one_line_in_bounded_memory(name: str, way: str, tmp_pa
 
 
 def test_no_such_ending_and_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"x\.doc: the ending is none .*\.ply"):
+    with pytest.raises(InputError, match=r"x\.doc: not the ending .*\.ply"):
         formats.save(tmp_path / "x.doc", asymmetric())
     with pytest.raises(InputError, match=r"x\.ksplat: ksplat is read only, expected one of .*\.ply"):
         formats.save(tmp_path / "x.ksplat", asymmetric())
@@ -253,7 +253,7 @@ def test_no_such_ending_and_no_such_file(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"{name}: no such file, expected a model file, .*ply"):
             formats.load(tmp_path / name)
     (tmp_path / "x.doc").write_bytes(b"words")
-    with pytest.raises(InputError, match=r"x\.doc: the ending is none of a model file"):
+    with pytest.raises(InputError, match=r"x\.doc: not the ending of a model file"):
         formats.load(tmp_path / "x.doc")
 
 
@@ -290,7 +290,7 @@ def test_the_table_is_sound() -> None:
     assert all(ending == ending.lower() for ending in endings)
     page = (Path(clsplat.__file__).parents[1] / "docs/formats.md").read_text("utf-8")
     assert [ending for ending in endings if f"`{ending}`" not in page] == []
-    for row in formats.FORMATS:
+    for row in formats.MODEL_FORMATS:
         assert "http" in (sys.modules[row.read.__module__].__doc__ or ""), f"{row.name} cites no specification"
 
 
@@ -313,7 +313,7 @@ def test_a_format_is_one_row(
     row = Format(
         "ours", (".ours",), read, write, recognises, loses="no more than NumPy", describe=lambda _: {"version": 7}
     )
-    monkeypatch.setattr(formats, "FORMATS", (*formats.FORMATS, row))
+    monkeypatch.setattr(formats, "MODEL_FORMATS", (*formats.MODEL_FORMATS, row))
     model, path = random_gaussians(300), tmp_path / "a.ours"
     model.save(path)
     assert path.read_bytes().startswith(b"ours")

@@ -297,7 +297,7 @@ def test_null_is_what_json_has_no_number_for(tmp_path: Path) -> None:
     assert users < 30
     with pytest.warns(UserWarning, match=f"has null in place of 1 of 256 numbers, which {users} of 300 Gaussians use"):
         read = formats.load(path)
-    wanted = np.where(flat, np.float32(np.log(packing.LEAST_SCALE)), plain.log_scales)
+    wanted = np.where(flat, np.float32(np.log(packing.MIN_SCALE)), plain.log_scales)
     np.testing.assert_array_equal(read.log_scales, wanted)
     colour = int(np.abs(np.array(meta["sh0"]["codebook"]) - plain.sh[7, 0, 1]).argmin())
     change(tmp_path, lambda meta: meta["sh0"]["codebook"].__setitem__(colour, None))
@@ -314,7 +314,7 @@ def test_null_in_the_ranges_of_version_1(tmp_path: Path) -> None:
     change(tmp_path, lambda meta: meta["scales"]["mins"].__setitem__(0, None))
     read = formats.load(tmp_path)
     top = np.float32(meta["scales"]["maxs"][0])
-    wanted = np.where(plain.log_scales[:, 0] == top, top, np.float32(np.log(packing.LEAST_SCALE)))
+    wanted = np.where(plain.log_scales[:, 0] == top, top, np.float32(np.log(packing.MIN_SCALE)))
     np.testing.assert_array_equal(read.log_scales[:, 0], wanted)
     np.testing.assert_array_equal(read.log_scales[:, 1:], plain.log_scales[:, 1:])
 

@@ -36,7 +36,7 @@ SAME = dict.fromkeys(BOUNDS, 2e-6) | {"rotations": 2e-6, "opacities": 0.0011}
 SAMPLES = ["biker", "amaebi-dm_pod", *(f"splat-transform_minimal-{each}" for each in ("v2", "v3", "v4"))]
 
 
-@pytest.mark.parametrize("version", spz.VERSIONS)
+@pytest.mark.parametrize("version", spz.SPZ_VERSIONS)
 @pytest.mark.parametrize("degree", range(4))
 def test_it_comes_back_with_the_stated_loss(tmp_path: Path, version: int, degree: int) -> None:
     model, path = lopsided(degree=degree), tmp_path / "model.spz"
@@ -149,7 +149,7 @@ def with_extensions(data: bytes, *records: tuple[int, bytes]) -> bytes:
     """A version 4 file with records between its header and its table."""
     packed = b"".join(struct.pack("<II", kind, len(value)) + value for kind, value in records)
     (table,) = struct.unpack_from("<I", data, 16)
-    flags = data[14] | spz.HAS_EXTENSIONS
+    flags = data[14] | spz.EXTENSIONS_FLAG
     return (
         data[:14] + bytes([flags, data[15]]) + struct.pack("<I", table + len(packed)) + data[20:32] + packed + data[32:]
     )
@@ -161,11 +161,13 @@ def test_extensions_are_passed_over_and_a_frame_is_honoured(tmp_path: Path) -> N
     plain, data = spz.read(path), path.read_bytes()
     path.write_bytes(with_extensions(data, (0xADBE0002, bytes(12)), (0x12345678, b"more")))
     assert_within(spz.read(path), plain, **dict.fromkeys(BOUNDS, 0))
-    path.write_bytes(with_extensions(data, (spz.COORDINATE_SYSTEM, struct.pack("<I", 6))))  # RDF, which is ours
+    path.write_bytes(
+        with_extensions(data, (spz.COORDINATE_SYSTEM_EXTENSION, struct.pack("<I", 6)))
+    )  # RDF, which is ours
     ours = spz.read(path)
     np.testing.assert_array_equal(ours.means, plain.means * [1, -1, -1])
     np.testing.assert_array_equal(ours.sh[:, 1], -plain.sh[:, 1])  # -y
-    path.write_bytes(with_extensions(data, (spz.COORDINATE_SYSTEM, struct.pack("<I", 12))))
+    path.write_bytes(with_extensions(data, (spz.COORDINATE_SYSTEM_EXTENSION, struct.pack("<I", 12))))
     with pytest.raises(InputError, match="coordinate system 12"):
         spz.read(path)
 
@@ -183,7 +185,7 @@ def test_a_fourth_band_is_left_out(tmp_path: Path) -> None:
     assert_within(found, spz.read(path), **dict.fromkeys(BOUNDS, 0))
 
 
-@pytest.mark.parametrize("version", spz.VERSIONS)
+@pytest.mark.parametrize("version", spz.SPZ_VERSIONS)
 def test_damaged_files(tmp_path: Path, version: int) -> None:
     path = tmp_path / "model.spz"
     spz.write(path, lopsided(20), version=version)
@@ -229,7 +231,7 @@ def test_a_file_that_is_none(tmp_path: Path, data: bytes, message: str) -> None:
 def test_bombs_are_refused_and_take_no_memory(version: int, degree: int, count: int, tmp_path: Path) -> None:
     """A kilobyte of gzip may become a megabyte behind the last Gaussian."""
     path = tmp_path / "model.spz"
-    payload = count * sum(spz.Header(version, count, degree, 12, 0).widths.values())
+    payload = count * sum(spz.SpzHeader(version, count, degree, 12, 0).widths.values())
     with gzip.open(path, "wb") as file:
         file.write(header(version, count, degree) + bytes(payload))
         for _ in range(64):
@@ -266,7 +268,7 @@ def test_reading_keeps_no_second_copy(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("version", spz.VERSIONS)
+@pytest.mark.parametrize("version", spz.SPZ_VERSIONS)
 def test_a_million_in_two_seconds(tmp_path: Path, version: int) -> None:
     path = tmp_path / "model.spz"
     spz.write(path, random_gaussians(1_000_000), version=version)

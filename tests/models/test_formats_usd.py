@@ -65,7 +65,7 @@ def test_the_stage_has_what_the_schema_asks_for(tmp_path: Path) -> None:
     stage = Usd.Stage.Open(str(path))
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     assert UsdGeom.GetStageMetersPerUnit(stage) == 0.5
-    prim = stage.GetPrimAtPath(usd.PRIM)
+    prim = stage.GetPrimAtPath(usd.GAUSSIANS_PRIM_PATH)
     definition = prim.GetPrimDefinition()
     if not definition.GetPropertyNames():
         pytest.skip("this usd-core has no such schema")
@@ -81,9 +81,9 @@ def test_the_stage_has_what_the_schema_asks_for(tmp_path: Path) -> None:
     assert (turn.inv() * wanted).magnitude().max() < 1e-6
     np.testing.assert_allclose(np.array(get("scales")), np.exp(model.log_scales), rtol=1e-6)
     np.testing.assert_allclose(np.array(get("opacities")), 1 / (1 + np.exp(-model.opacity_logits)), rtol=1e-6)
-    assert get(usd.DEGREE) == 2
+    assert get(usd.SH_DEGREE_ATTRIBUTE) == 2
     # "grouped by particle"
-    np.testing.assert_array_equal(np.array(get(usd.COEFFICIENTS)).reshape(-1, 9, 3), model.sh)
+    np.testing.assert_array_equal(np.array(get(usd.SH_COEFFICIENTS_ATTRIBUTE)).reshape(-1, 9, 3), model.sh)
     low, high = np.array(get("extent"))
     assert (low < model.means.min(axis=0)).all() and (high > model.means.max(axis=0)).all()
 
@@ -92,7 +92,12 @@ def test_a_far_model_counts_from_the_prim_above(tmp_path: Path) -> None:
     model, path = with_origin(lopsided(), 4.5e5, 5.4e6, 123), tmp_path / "model.usdc"
     usd.write(path, model)
     stage = Usd.Stage.Open(str(path))
-    assert UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath(usd.PRIM))[3] == (4.5e5, 5.4e6, 123, 1)
+    assert UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetPrimAtPath(usd.GAUSSIANS_PRIM_PATH))[3] == (
+        4.5e5,
+        5.4e6,
+        123,
+        1,
+    )
     back = usd.read(path)
     np.testing.assert_array_equal(back.origin, model.origin)
     np.testing.assert_array_equal(back.means, model.means)
@@ -105,7 +110,7 @@ def test_prims_move_turn_and_scale(tmp_path: Path) -> None:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2 * turn.as_matrix(), [1, 2, 3]
     stage = Usd.Stage.Open(str(path))
-    UsdGeom.Xformable(stage.GetPrimAtPath(usd.WORLD)).AddTransformOp().Set(Gf.Matrix4d(matrix.T))
+    UsdGeom.Xformable(stage.GetPrimAtPath(usd.WORLD_PRIM_PATH)).AddTransformOp().Set(Gf.Matrix4d(matrix.T))
     stage.GetRootLayer().Save()
     moved = usd.read(path)
     np.testing.assert_allclose(moved.means, 2 * model.means @ turn.as_matrix().T + [1, 2, 3], atol=1e-5)
@@ -119,10 +124,12 @@ def test_prims_move_turn_and_scale(tmp_path: Path) -> None:
 def test_halves_and_what_is_absent(tmp_path: Path) -> None:
     path = tmp_path / "model.usda"
     stage = Usd.Stage.CreateNew(str(path))
-    prim = stage.DefinePrim("/Splats", usd.TYPES[1])  # the name of the draft
+    prim = stage.DefinePrim("/Splats", usd.GAUSSIAN_PRIM_TYPES[1])  # the name of the draft
     prim.CreateAttribute("positionsh", Sdf.ValueTypeNames.Point3hArray).Set([(1, 2, 3), (4, 5, 6)])
-    prim.CreateAttribute(usd.DEGREE, Sdf.ValueTypeNames.Int).Set(0)
-    prim.CreateAttribute(f"{usd.COEFFICIENTS}h", Sdf.ValueTypeNames.Half3Array).Set([(0.5, 0.25, 0), (1, 1, 1)])
+    prim.CreateAttribute(usd.SH_DEGREE_ATTRIBUTE, Sdf.ValueTypeNames.Int).Set(0)
+    prim.CreateAttribute(f"{usd.SH_COEFFICIENTS_ATTRIBUTE}h", Sdf.ValueTypeNames.Half3Array).Set(
+        [(0.5, 0.25, 0), (1, 1, 1)]
+    )
     stage.GetRootLayer().Save()
     model = usd.read(path)
     np.testing.assert_array_equal(model.means, [[1, 2, 3], [4, 5, 6]])

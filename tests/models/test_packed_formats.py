@@ -15,7 +15,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.models import edit, formats
 from clsplat.models.codec import values as packing
 from clsplat.models.formats import compressed_ply, ply
-from clsplat.spherical_harmonics import C0
+from clsplat.spherical_harmonics import SH_C0
 
 CHUNK = [
     *(f"{end}_{name}" for end in ("min", "max") for name in "xyz"),
@@ -60,7 +60,7 @@ def test_a_compressed_ply_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.means, [[1, -2, 5], [-1, -2, 3]])
     np.testing.assert_allclose(read.log_scales, [[-6, -5, -4], [-1, -5, -3]])
     rgb = np.array([[1.0, 0.25, 1.5], [0.0, 0.25, 0.5]])
-    np.testing.assert_allclose(read.sh[:, 0], (rgb - 0.5) / C0, rtol=1e-6)
+    np.testing.assert_allclose(read.sh[:, 0], (rgb - 0.5) / SH_C0, rtol=1e-6)
     np.testing.assert_allclose(packing.opacities(read.opacity_logits), [128 / 255, 0.25 / 255], rtol=1e-5)
     tiny = np.sqrt(2) * (512 / 1023 - 0.5)
     half = np.sqrt(0.5)
@@ -73,7 +73,7 @@ def test_a_compressed_ply_by_hand(tmp_path: Path) -> None:
 def test_a_compressed_ply_of_old_has_colours_of_0_to_1(tmp_path: Path) -> None:
     path = tmp_path / "a.compressed.ply"
     path.write_bytes(compressed([(0, 0, 0, 0xFF00FFFF)], BOUNDS, colours=False))
-    np.testing.assert_allclose(0.5 + C0 * formats.load(path).sh[0, 0], [1, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * formats.load(path).sh[0, 0], [1, 0, 1], atol=1e-6)
 
 
 def test_chunks_are_of_neighbours_and_the_last_may_be_short(tmp_path: Path) -> None:
@@ -147,8 +147,8 @@ def test_a_splat_by_hand(tmp_path: Path) -> None:
     path.write_bytes(record)
     read = formats.load(path)
     np.testing.assert_array_equal(read.means, [[1, 2, 3]])
-    np.testing.assert_allclose(read.log_scales, np.log([[0.5, 0.25, packing.LEAST_SCALE]]), rtol=1e-6)
-    np.testing.assert_allclose(0.5 + C0 * read.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    np.testing.assert_allclose(read.log_scales, np.log([[0.5, 0.25, packing.MIN_SCALE]]), rtol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * read.sh[0, 0], [1, 0, 0.2], atol=1e-6)
     np.testing.assert_allclose(packing.opacities(read.opacity_logits), [0.8], rtol=1e-6)
     np.testing.assert_allclose(read.quaternions, [[-0.5, 0.5, 0, 91 / 128]])
     for data, message in (
@@ -172,7 +172,7 @@ def ksplat(model: Gaussians, level: int, counts: tuple[int, ...], *, bucket: int
     rest = np.concatenate([np.zeros((len(model), 0), np.float32), *bands], axis=1)
     rgba = np.random.default_rng(2).integers(1, 255, (len(model), 4))
     wanted = edit.take(model, np.arange(len(model)))
-    wanted.sh[:, 0] = (rgba[:, :3] / 255 - 0.5) / C0
+    wanted.sh[:, 0] = (rgba[:, :3] / 255 - 0.5) / SH_C0
     wanted.opacity_logits = np.log(rgba[:, 3] / (255 - rgba[:, 3])).astype(np.float32)
     header = bytearray(4096)
     struct.pack_into("<BBxxIIIIHxx3fff", header, 0, 0, 1, *[len(counts)] * 2, *[len(model)] * 2, level, 0, 0, 0, -2, 2)
@@ -253,7 +253,7 @@ def test_records_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     both = compressed([(0, 0, 0, 0xFF00FF80), (2047 << 21, 0, 0, 0x00FF0080)], BOUNDS)
     path.write_bytes(both.replace(struct.pack("<f", 0.5), struct.pack("<f", -np.inf)))  # the least blue
     with pytest.warns(UserWarning, match=r"1 of 2 Gaussians has .*, the first is Gaussian 1 with a colour; it is"):
-        np.testing.assert_allclose(0.5 + C0 * formats.load(path).sh[:, 0], [[1, 0.25, 1.5]], atol=1e-6)
+        np.testing.assert_allclose(0.5 + SH_C0 * formats.load(path).sh[:, 0], [[1, 0.25, 1.5]], atol=1e-6)
 
 
 @pytest.mark.parametrize(

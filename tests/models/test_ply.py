@@ -47,8 +47,8 @@ def test_round_trip(tmp_path: Path, degree: int, count: int) -> None:
 
 def test_round_trip_over_block_seams(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "model.ply"
-    monkeypatch.setattr(ply, "BLOCK_ROWS", 8)
-    monkeypatch.setattr(ply_file, "BLOCK_ROWS", 8)
+    monkeypatch.setattr(ply, "IO_BLOCK_ROWS", 8)
+    monkeypatch.setattr(ply_file, "IO_BLOCK_ROWS", 8)
     for count in (7, 8, 9, 16, 17):
         gaussians = random_gaussians(count, 1)
         gaussians.save(path)
@@ -189,7 +189,7 @@ def test_no_gaussians(tmp_path: Path) -> None:
 
 
 def test_values_that_are_not_finite_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ply_file, "BLOCK_ROWS", 2)
+    monkeypatch.setattr(ply_file, "IO_BLOCK_ROWS", 2)
     table, path = plain_table(9), tmp_path / "model.ply"
     table[3, 1], table[3, 2], table[7, 0] = np.nan, np.inf, -np.inf
     write_plain(path, table)
@@ -295,7 +295,7 @@ def test_reading_makes_no_second_copy_of_the_file(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     # three blocks of rows, of 8 MB each: the last, the next, and what reading it has joined. The file has 50 MB.
-    assert peak < own + 3 * ply.BLOCK_ROWS * 248 + (2 << 20)
+    assert peak < own + 3 * ply.IO_BLOCK_ROWS * 248 + (2 << 20)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from tiny import hidden_model
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
-from clsplat.models.series import ALONE, PAIR, Series, between, follows
+from clsplat.models.series import CACHED_SAMPLES_PAIR, CACHED_SAMPLES_SINGLE, ModelSeries, between, follows
 
 MODEL = hidden_model(60)
 STEP = np.array([0.02, 0.0, -0.03], np.float32)
@@ -40,8 +40,8 @@ def assert_same(found: Gaussians, wanted: Gaussians) -> None:
         assert_same_bits(found.arrays()[name], array)
 
 
-def series(count: int = 6, read: object = tracked, first: int = 1, **more: bool) -> Series:
-    return Series(range(first, first + count), read, "capture.####.ply", **more)  # type: ignore[arg-type]
+def series(count: int = 6, read: object = tracked, first: int = 1, **more: bool) -> ModelSeries:
+    return ModelSeries(range(first, first + count), read, "capture.####.ply", **more)  # type: ignore[arg-type]
 
 
 def test_samples_are_their_own() -> None:
@@ -150,12 +150,12 @@ def test_samples_are_read_once_and_few_are_held() -> None:
     for frame in range(1, 25):
         made.at(frame)
         alone = sum(each() is not None for each in alive)
-        assert alone <= ALONE
+        assert alone <= CACHED_SAMPLES_SINGLE
         if frame < 24:
             made.at(frame + 0.25)
         most = max(most, sum(each() is not None for each in alive))
     assert reads == dict.fromkeys(range(24), 1)
-    assert most <= PAIR
+    assert most <= CACHED_SAMPLES_PAIR
 
 
 def test_the_next_that_is_expected_is_read_ahead() -> None:

@@ -20,10 +20,10 @@ from clsplat.gaussians import Gaussians
 from clsplat.models import edit, formats
 from clsplat.models.codec import soundness, values
 from clsplat.models.formats import gltf, ply
-from clsplat.shots.stage import read_stage
+from clsplat.shots.usd_models import read_stage
 
 FLOATS = ["model.ply", "model.gltf", "model.usda"]
-LEAST = np.float32(np.log(values.LEAST_SCALE))
+LEAST = np.float32(np.log(values.MIN_SCALE))
 
 
 def written(path: Path, model: Gaussians) -> Path:
@@ -167,11 +167,13 @@ def test_prims_of_a_stage(tmp_path: Path) -> None:
     model.sh[[3, 4]], model.opacity_logits[0] = np.nan, np.inf
     path = written(tmp_path / "model.usda", model)
     stage = Usd.Stage.Open(str(path))
-    shift = UsdGeom.Xformable(stage.GetPrimAtPath(formats.usd.WORLD)).AddTranslateOp()
+    shift = UsdGeom.Xformable(stage.GetPrimAtPath(formats.usd.WORLD_PRIM_PATH)).AddTranslateOp()
     shift.Set(Gf.Vec3d(0, 0, 0), 1)
     shift.Set(Gf.Vec3d(1, 0, 0), 5)
     stage.Save()
-    with pytest.warns(UserWarning, match=f"{path}: {formats.usd.PRIM}: 2 of 20 .* Gaussian 3 with a colour;") as caught:
+    with pytest.warns(
+        UserWarning, match=f"{path}: {formats.usd.GAUSSIANS_PRIM_PATH}: 2 of 20 .* Gaussian 3 with a colour;"
+    ) as caught:
         models = read_stage(path)
     assert len(caught) == 1
     assert models is not None
@@ -251,7 +253,7 @@ def test_opacities_in_place_of_logits(tmp_path: Path, name: str) -> None:
     _, texts = told(path)
     assert len(texts) == 1
     assert texts[0].startswith("all opacities lie in ")
-    assert texts[0].endswith("`clsplat convert --activated opacities` writes a right model")
+    assert texts[0].endswith("`clsplat convert --activated opacities` writes a correct model")
     white = 255 if name == "levels" else 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -268,7 +270,7 @@ def test_scales_in_place_of_logs(tmp_path: Path, name: str) -> None:
     _, texts = told(path)
     assert len(texts) == 1
     assert texts[0].startswith("all scales lie in ")
-    assert texts[0].endswith("`clsplat convert --activated scales` writes a right model")
+    assert texts[0].endswith("`clsplat convert --activated scales` writes a correct model")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         right = formats.load(path, activated="scales")
@@ -305,14 +307,14 @@ def with_logs(path: Path, model: Gaussians, scales: np.ndarray) -> Path:
             file.seek(document["bufferViews"][view]["byteOffset"])
             file.write(scales.astype("<f4").tobytes())
     elif path.suffix == ".splat":
-        rows = np.frombuffer(path.read_bytes(), formats.splat.ROW).copy()
+        rows = np.frombuffer(path.read_bytes(), formats.splat.SPLAT_RECORD).copy()
         rows["scales"] = scales
         path.write_bytes(rows.tobytes())
     else:
         from pxr import Usd, Vt
 
         stage = Usd.Stage.Open(str(path))
-        stage.GetPrimAtPath(formats.usd.PRIM).GetAttribute("scales").Set(Vt.Vec3fArray.FromNumpy(scales))
+        stage.GetPrimAtPath(formats.usd.GAUSSIANS_PRIM_PATH).GetAttribute("scales").Set(Vt.Vec3fArray.FromNumpy(scales))
         stage.Save()
     return path
 
@@ -324,7 +326,7 @@ def test_negative_scales_are_logs(tmp_path: Path, file: str, offset: float, monk
     """Of all Gaussians, those of other blocks of rows too; in larger units most are over 0."""
     if file.endswith(".usda"):
         require("pxr")
-    monkeypatch.setattr(values, "BLOCK_ROWS", 64)
+    monkeypatch.setattr(values, "IO_BLOCK_ROWS", 64)
     model = lopsided(300, degree=0)
     model.log_scales += offset
     model.log_scales[:50] = np.abs(model.log_scales[:50])
@@ -345,7 +347,7 @@ def test_a_kernel_that_is_not_known_is_drawn_as_an_ellipse(tmp_path: Path, kerne
     gltf.write(path, model)
     wanted = formats.load(path)
     document = json.loads(path.read_text())
-    document["meshes"][0]["primitives"][0]["extensions"][gltf.EXTENSION]["kernel"] = kernel
+    document["meshes"][0]["primitives"][0]["extensions"][gltf.GAUSSIAN_EXTENSION]["kernel"] = kernel
     path.write_text(json.dumps(document))
     read, texts = told(path)
     (text,) = texts

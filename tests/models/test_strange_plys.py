@@ -16,7 +16,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.models import formats
 from clsplat.models.codec import ply_file, values
 from clsplat.models.info import model_info
-from clsplat.spherical_harmonics import C0
+from clsplat.spherical_harmonics import SH_C0
 
 KINDS = {"uchar": "u1", "ushort": "u2", "uint": "u4", "int": "i4", "float": "f4", "double": "f8"}
 
@@ -56,8 +56,8 @@ def test_two_scales_are_those_of_a_flat_gaussian(tmp_path: Path, order: str) -> 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read = Gaussians.load(path)
-        assert model_info(path)["scale"]["p0"] == pytest.approx(values.LEAST_SCALE)
-    model.log_scales[:, 2] = np.log(values.LEAST_SCALE)
+        assert model_info(path)["scale"]["p0"] == pytest.approx(values.MIN_SCALE)
+    model.log_scales[:, 2] = np.log(values.MIN_SCALE)
     assert_equal(read, model)
     del table["scale_1"]
     with pytest.raises(InputError, match="PLY lacks the property scale_1"):
@@ -97,7 +97,7 @@ def test_colours_stand_in_for_coefficients(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Their range is that of all rows, of which a block may have the dark ones alone."""
-    monkeypatch.setattr(ply_file, "BLOCK_ROWS", 8)
+    monkeypatch.setattr(ply_file, "IO_BLOCK_ROWS", 8)
     model = random_gaussians(50, 0)
     table = {name: column for name, column in columns(model).items() if not name.startswith("f_dc")}
     colours = np.full((50, 3), min(levels))
@@ -107,7 +107,7 @@ def test_colours_stand_in_for_coefficients(
             tmp_path / "model.ply", table | dict(zip(names, colours.T, strict=True)), dict.fromkeys(names, kind), order
         )
         read = Gaussians.load(path)
-        np.testing.assert_allclose(0.5 + C0 * read.sh[:, 0], colours / white, atol=1e-6)  # float32's rounding
+        np.testing.assert_allclose(0.5 + SH_C0 * read.sh[:, 0], colours / white, atol=1e-6)  # float32's rounding
         model.sh = read.sh
         assert_equal(read, model)
     assert model_info(path)["ignored"] == []
@@ -168,7 +168,7 @@ def test_words_for_infinite(tmp_path: Path, word: str, sign: int) -> None:
 def test_a_word_that_is_no_number_is_told_with_its_row(
     tmp_path: Path, word: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ply_file, "BLOCK_ROWS", 2)
+    monkeypatch.setattr(ply_file, "IO_BLOCK_ROWS", 2)
     path, lines = ascii_file(tmp_path)
     at = lines.index("end_header") + 1
     lines[at + 5] = lines[at + 5].rsplit(" ", 1)[0] + f" {word}"
@@ -197,7 +197,7 @@ def test_whole_colours_in_text_that_are_no_number(tmp_path: Path) -> None:
         read = Gaussians.load(path)
     assert len(caught) == 1
     # float32's rounding
-    np.testing.assert_allclose(0.5 + C0 * read.sh[:, 0, 0], np.array([0, 1000, 65535, 5, 6]) / 65535, atol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * read.sh[:, 0, 0], np.array([0, 1000, 65535, 5, 6]) / 65535, atol=1e-6)
 
 
 @pytest.mark.parametrize(("lines", "fits"), [(9_000, True), (10_000, False), (12_000, False)])
@@ -226,4 +226,4 @@ def test_a_header_is_bounded(tmp_path: Path) -> None:
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         # the bound, as bytes, as text and as words, and the head by which the format is told
-        assert peak < 6 * ply_file.MAX_HEADER_BYTES
+        assert peak < 6 * ply_file.MAX_PLY_HEADER_BYTES

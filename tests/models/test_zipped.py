@@ -129,14 +129,14 @@ def test_bombs_encryption_and_damage(tmp_path: Path, monkeypatch: pytest.MonkeyP
     formats.save(path, random_gaussians(200, 1))
     data = bytearray(packed(archive, {"a.ply": path.read_bytes()}).read_bytes())
     for signature, at in ((b"PK\x01\x02", 8), (b"PK\x03\x04", 6)):
-        data[data.index(signature) + at] |= zipped.ENCRYPTED
+        data[data.index(signature) + at] |= zipped.ENCRYPTED_FLAG
     archive.write_bytes(data)
     with pytest.raises(InputError, match=r"is encrypted, expected a \.zip without a password"):
         formats.load(archive)
     archive.write_bytes(b"PK\x03\x04 something else")
     with pytest.raises(InputError, match=r"bomb\.zip: does not unpack \(File is not a zip file\); is it damaged"):
         formats.load(archive)
-    monkeypatch.setattr(zipped, "MAX_MEMBERS", 3)
+    monkeypatch.setattr(zipped, "MAX_ARCHIVE_FILES", 3)
     with pytest.raises(InputError, match="has more than 3 files"):
         formats.load(packed(archive, {f"{i}.txt": b"" for i in range(4)}))
 
@@ -192,7 +192,7 @@ def test_an_archive_of_sog_is_one_by_any_name(tmp_path: Path) -> None:
     empty = packed(tmp_path / "none.sog", {"readme.txt": b"x"})
     with pytest.raises(InputError, match=r"has no meta\.json in it"):
         formats.load(empty)
-    with pytest.raises(InputError, match=r"meta\.json has no means, expected that of a SOG model"):
+    with pytest.raises(InputError, match=r"meta\.json has no means, expected a SOG model's"):
         formats.load(packed(empty, {"meta.json": b'{"title": "a scan"}'}))
 
 

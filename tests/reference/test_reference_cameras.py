@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from clsplat.camera import Camera, Projection, focal_length
 from clsplat.reference.cameras import (
     cam_from_pixel,
-    period,
     pixel_from_cam,
     pixel_from_world,
     pixel_grid,
@@ -128,7 +127,7 @@ def test_equirectangular_closed_forms() -> None:
 @pytest.mark.parametrize("cx", [100.0, 0.0, 130.0, -400.0])
 def test_equirectangular_wraps_at_the_seam(cx: float) -> None:
     view = straight("equirectangular", fx=200 / (2 * np.pi), fy=100 / np.pi, cx=cx)
-    assert period(view) == pytest.approx(200)
+    assert view.model.turn(view) == pytest.approx(200)
     pixels = pixel_grid(view)
     back, _ = pixel_from_cam(view, cam_from_pixel(view, pixels)[1])
     np.testing.assert_allclose(back, pixels, atol=1e-9)

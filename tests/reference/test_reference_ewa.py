@@ -11,7 +11,7 @@ from ewa_cases import MODELS, OUTPUTS, Case, case, gradients
 
 from clsplat.arrays import Float64
 from clsplat.reference.ewa import (
-    View,
+    EwaViewTwin,
     covariances_grad,
     covariances_of,
     full_covariances,
@@ -70,7 +70,7 @@ def test_gradients_by_central_differences(model: str, shape: str) -> None:
 
 
 def test_a_ball_before_a_pinhole_camera() -> None:
-    view = View(np.eye(4), np.array([[50.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48)
+    view = EwaViewTwin(np.eye(4), np.array([[50.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48)
     projected = project(np.array([[0.0, 0, 2]]), 0.04 * np.eye(3)[None], view)
     variances = np.array([(50 * 0.2 / 2) ** 2 + 0.3, (60 * 0.2 / 2) ** 2 + 0.3])
     np.testing.assert_allclose(projected.means2d, [[32, 24]], atol=1e-12)
@@ -81,7 +81,7 @@ def test_a_ball_before_a_pinhole_camera() -> None:
 
 
 def test_radii_end_where_alpha_is_a_255th() -> None:
-    view = View(np.eye(4), np.array([[50.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48)
+    view = EwaViewTwin(np.eye(4), np.array([[50.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48)
     means, covariances = np.tile([0.0, 0, 2], (4, 1)), np.tile(0.04 * np.eye(3), (4, 1, 1))
     projected = project(means, covariances, view, np.array([1.0, 0.1, 1.001 / 255, 0.999 / 255]))
     sigma = np.sqrt((50 * 0.1) ** 2 + 0.3)
@@ -101,7 +101,7 @@ def test_radii_end_where_alpha_is_a_255th() -> None:
     ],
 )
 def test_what_is_culled(mean: list[float], changes: dict[str, float]) -> None:
-    view = View(np.eye(4), np.array([[50.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48, **changes)  # type: ignore[arg-type]
+    view = EwaViewTwin(np.eye(4), np.array([[50.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48, **changes)  # type: ignore[arg-type]
     projected = project(np.array([mean], float), 0.04 * np.eye(3)[None], view)
     assert projected.radii.tolist() == [[0, 0]]
 
@@ -110,7 +110,7 @@ def test_a_fisheye_near_its_axis_is_a_pinhole_camera() -> None:
     """Angle and tangent part by a third of the angle's square, 1e-6 here, and the Jacobian by its square."""
     subject = case(1)
     means, full = np.array([[1e-3, 2e-3, 2.0]]), subject.full(rounded=False)
-    views = [View(np.eye(4), subject.view.intrinsics, 100, 70, model) for model in ("pinhole", "fisheye")]
+    views = [EwaViewTwin(np.eye(4), subject.view.intrinsics, 100, 70, model) for model in ("pinhole", "fisheye")]
     plain, bent = (project(means, full, view) for view in views)
     np.testing.assert_allclose(bent.means2d, plain.means2d, atol=1e-6)
     np.testing.assert_allclose(bent.conics, plain.conics, rtol=2e-5)
@@ -118,7 +118,7 @@ def test_a_fisheye_near_its_axis_is_a_pinhole_camera() -> None:
 
 def test_a_fisheye_s_series_and_its_closed_form_meet() -> None:
     """At the angle where one gives way to the other, both good to 1e-12."""
-    view = View(np.eye(4), case(1).view.intrinsics, 100, 70, "fisheye")
+    view = EwaViewTwin(np.eye(4), case(1).view.intrinsics, 100, 70, "fisheye")
     places = np.array([[np.sqrt(1e-3) * (1 + s), 0, 1.0] for s in (-1e-9, 1e-9)])
     projected = project(places, np.tile(0.01 * np.eye(3), (2, 1, 1)), view)
     np.testing.assert_allclose(projected.jacobians[0], projected.jacobians[1], rtol=1e-7, atol=1e-7)

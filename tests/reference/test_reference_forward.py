@@ -14,7 +14,7 @@ from skimage.metrics import structural_similarity
 from clsplat.gaussians import Gaussians
 from clsplat.reference.blend import blend
 from clsplat.reference.loss import l1_dssim, ssim
-from clsplat.reference.project import ALPHA_MIN, frustum_limits, project, rotation_matrices
+from clsplat.reference.project import ALPHA_MIN, project, rotation_matrices
 from clsplat.reference.render import forward, parameters, render
 from clsplat.reference.sort import depth_order
 from clsplat.reference.tiles import touched_tiles
@@ -54,7 +54,7 @@ def test_covariance_is_the_square_root_squared() -> None:
         gaussians, camera = scenes.NAMED[scene]()
         arrays = parameters(gaussians)
         projected = project(**arrays, camera=camera, sh_degree=3)
-        low, high = frustum_limits(camera)
+        low, high = camera.frustum_limits
         for n in np.flatnonzero(projected.visible):
             q = arrays["quaternions"][n] / np.linalg.norm(arrays["quaternions"][n])
             axes = np.eye(3) + 2 * np.cross(q[1:], np.cross(q[1:], np.eye(3)) + q[0] * np.eye(3))
@@ -77,7 +77,7 @@ def test_covariance_is_the_square_root_squared() -> None:
 
 def test_frustum_limits_follow_the_principal_point() -> None:
     camera = scenes.tilted_camera(100, 50)
-    low, high = frustum_limits(camera)
+    low, high = camera.frustum_limits
     assert_close(low, [-0.42 - 0.15, -(0.57 * 50 + 7.5) / 110], absolute=1e-15)
     assert_close(high, [0.58 + 0.15, (0.43 * 50 + 7.5) / 110], absolute=1e-15)
 

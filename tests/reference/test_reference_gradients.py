@@ -20,10 +20,10 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 from clsplat.reference.adam import adam
-from clsplat.reference.blend import ALPHA_MAX, blend, blend_grad
+from clsplat.reference.blend import BLEND_ALPHA_MAX, blend, blend_grad
 from clsplat.reference.loss import l1_dssim
-from clsplat.reference.project import ALPHA_MIN, covariance_grad, frustum_limits, project, project_grad
-from clsplat.reference.render import forward, parameters, render_grad
+from clsplat.reference.project import ALPHA_MIN, covariance_grad, project, project_grad
+from clsplat.reference.render import forward, parameters, projected_gradients, render_grad
 from clsplat.reference.sh import sh_basis_grad
 from clsplat.spherical_harmonics import sh_basis
 
@@ -62,17 +62,8 @@ class Objective:
         width, height = self.camera.width, self.camera.height
         image = blend(projected, width, height, BACKGROUND).image
         screen = blend_grad(projected, width, height, BACKGROUND, l1_dssim(image, self.target)[1])
-        return project_grad(
-            **self.arrays,
-            camera=self.camera,
-            sh_degree=3,
-            projected=projected,
-            d_means2d=screen.means2d,
-            d_covariances=covariance_grad(projected.conics, screen.conics),
-            d_opacities=screen.opacities,
-            d_colors=screen.colors,
-            antialiased=self.antialiased,
-        )
+        by = projected_gradients(projected, screen)
+        return project_grad(self.arrays, self.camera, 3, projected, by, antialiased=self.antialiased)
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["", "antialiased"])
@@ -88,7 +79,7 @@ def test_overlap_exercises_the_clamps(overlap: tuple[Objective, Arrays]) -> None
     arrays, camera = objective.arrays, objective.camera
     p = arrays["means"] @ camera.rotation.T + camera.translation
     ratios = p[:, :2] / p[:, 2:]
-    low, high = frustum_limits(camera)
+    low, high = camera.frustum_limits
     clamped = ((ratios < low) | (ratios > high)).any(axis=1)
     moved = np.abs(gradients["means"]).max(axis=1) > 1e-6
     assert np.count_nonzero(clamped & moved) >= 3
@@ -219,8 +210,8 @@ def test_whitened_moments_give_the_same_gradients(scene: str) -> None:
         if splat is None:
             continue
         raw = splat.raw
-        alphas[position][splat.box] = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0)
-        free[position][splat.box] = (raw >= ALPHA_MIN) & (raw <= ALPHA_MAX)
+        alphas[position][splat.box] = np.where(raw >= ALPHA_MIN, np.minimum(raw, BLEND_ALPHA_MAX), 0)
+        free[position][splat.box] = (raw >= ALPHA_MIN) & (raw <= BLEND_ALPHA_MAX)
     added = np.arange(len(order))[:, None, None] <= result.blended.last
     alphas *= added
     before = np.cumprod(np.concatenate([np.ones((1, height, width)), 1 - alphas]), axis=0)

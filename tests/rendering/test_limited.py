@@ -22,9 +22,9 @@ from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SlotFields
 from clsplat.errors import CapacityError
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import SlotFields
 from clsplat.rendering.memory_needs import plan_frame, plan_step
 from clsplat.rendering.memory_plan import Need, plan
 from clsplat.rendering.rasterizer import Rasterizer
@@ -202,18 +202,18 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     gaussians, camera = random_cloud(6000, 11, 100, 80)
     fields = SlotFields(absolute=True, contributions=True)
     config = RasterizerConfig()
-    need = plan_step(device, 6000, 16, [camera], config, fields=fields, agreement=True).need
+    need = plan_step(device, 6000, 16, [camera], config, fields=fields).need
     rasterizer = Rasterizer(device, config)
     rasterizer.capacity = capacity or rasterizer.capacity
     model, first, second = (upload_gaussians(device, gaussians) for _ in range(3))
     background = upload(device, np.zeros(3, np.float32))
-    statistics = new_statistics(device, 6000, agreement=True, contributions=True)
+    statistics = new_statistics(device, 6000, contributions=True)
     frame = rasterizer.forward(model, camera, background)
     photograph = target(device, rasterizer.work, np.zeros((80, 100, 4), np.float32), background)
     result = loss(device, rasterizer.work, frame.blended.image, photograph, 100, 80, 0.2)
     slots, screen = rasterizer.pair_gradients(frame, result.gradient, fields=fields), rasterizer.screen(6000, fields)
     view = (frame.camera_array, frame.projected, slots, screen, rasterizer.readback)
-    rates = dict.fromkeys(GROUPS, 1e-3)
+    rates = dict.fromkeys(PARAMETER_GROUPS, 1e-3)
     project_step(device, 1, rates, OptimiserConfig(), (model, first, second), *view, fields=fields)
     assert len(frame.bands) == 1 if capacity is None else len(frame.bands) > 2
     pairs = frame.part.pairs.tile_keys.shape[0] if capacity is None else capacity

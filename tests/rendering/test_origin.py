@@ -25,7 +25,7 @@ from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.scene import FAR
+from clsplat.scenes.scene import FAR_ORIGIN_RATIO
 
 OFFSET = np.array([5e5, -4.2e6, 333.3])
 """As UTM coordinates are: metres, far from their zero."""
@@ -63,8 +63,8 @@ def test_an_ordinary_scene_has_its_own_origin(scene: Path) -> None:
 
 def test_just_far_enough(tmp_path: Path) -> None:
     size = load_scene(far_scene(tmp_path / "at", np.zeros(3))).extent / 1.1
-    near = load_scene(far_scene(tmp_path / "near", np.array([0.9 * FAR * size, 0, 0])))
-    far = load_scene(far_scene(tmp_path / "far", np.array([1.1 * FAR * size, 0, 0])))
+    near = load_scene(far_scene(tmp_path / "near", np.array([0.9 * FAR_ORIGIN_RATIO * size, 0, 0])))
+    far = load_scene(far_scene(tmp_path / "far", np.array([1.1 * FAR_ORIGIN_RATIO * size, 0, 0])))
     assert not near.origin.any()
     assert far.origin.any()
 

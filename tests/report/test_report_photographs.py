@@ -16,13 +16,18 @@ from tiny import HEIGHT, VIEWS, WIDTH, short, write_scene
 
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
-from clsplat.evaluation.depths import DARKEST, WORST, coloured, depth_picture, keep_depths
+from clsplat.evaluation.depths import DEPTH_PICTURE_VIEWS, FARTHEST_DEPTH_GREY, coloured, depth_picture, keep_depths
 from clsplat.gaussians import Gaussians
 from clsplat.images.writing import write_image
-from clsplat.report.photographs import SHOWN, masked_photographs
+from clsplat.report.photographs import MAX_MASKED_PHOTOGRAPHS, masked_photographs
 from clsplat.runs.run import Run, owned_files
+from clsplat.scenes.analysis.mask_overlay import (
+    IGNORED_OVERLAY_RGB,
+    MASK_OVERLAY_OPACITY,
+    TRANSPARENT_OVERLAY_RGB,
+    masked,
+)
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.marked import CLEAR, IGNORED, STRENGTH, masked
 
 
 def with_masks(folder: Path) -> Path:
@@ -36,7 +41,9 @@ def with_masks(folder: Path) -> Path:
     return scene
 
 
-@pytest.mark.parametrize(("meaning", "colour"), [("ignore", IGNORED), ("transparent", CLEAR)])
+@pytest.mark.parametrize(
+    ("meaning", "colour"), [("ignore", IGNORED_OVERLAY_RGB), ("transparent", TRANSPARENT_OVERLAY_RGB)]
+)
 def test_what_is_left_out_is_coloured(tmp_path: Path, meaning: str, colour: tuple[float, float, float]) -> None:
     scene = with_masks(tmp_path / "scene")
     plain = load_scene(scene).views[1].load()
@@ -44,7 +51,7 @@ def test_what_is_left_out_is_coloured(tmp_path: Path, meaning: str, colour: tupl
     assert picture.left_out == 0.5
     drawn, half = picture.drawn(), WIDTH // 2
     assert (drawn[:, half:] == plain[:, half:]).all()
-    wanted = plain[:, :half] + STRENGTH * (np.array(colour, np.float32) - plain[:, :half])
+    wanted = plain[:, :half] + MASK_OVERLAY_OPACITY * (np.array(colour, np.float32) - plain[:, :half])
     assert np.abs(drawn[:, :half] - wanted).max() < 1e-6
 
 
@@ -52,7 +59,7 @@ def test_some_are_shown_and_all_are_counted(tmp_path: Path) -> None:
     scene = load_scene(with_masks(tmp_path / "scene"), masks=MaskUse("ignore"))
     shown, count = masked_photographs(scene, only_files=True)
     assert count == VIEWS - 1
-    assert len(shown) == min(SHOWN, count)
+    assert len(shown) == min(MAX_MASKED_PHOTOGRAPHS, count)
     assert all(each.left_out == 0.5 and each.name != "00.png" for each in shown)
     assert masked_photographs(load_scene(tmp_path / "scene"), only_files=True) == ([], 0)
 
@@ -62,7 +69,7 @@ def test_a_run_with_masks_shows_them(tmp_path: Path) -> None:
     assert train(scene, run, short(iterations=2), "--masks", "ignore") == 0
     root = parse((run / "report.html").read_text("utf-8"))
     figures = root.one("div", id="masks").all("figure")
-    assert len(figures) == min(SHOWN, VIEWS - 1)
+    assert len(figures) == min(MAX_MASKED_PHOTOGRAPHS, VIEWS - 1)
     assert "50 % left out" in figures[0].words
     assert "red is ignored" in root.words
     assert "blue is transparent" not in root.words
@@ -96,7 +103,7 @@ def test_depth_is_light_where_it_is_near() -> None:
     depth = np.array([[1.0, 2.0, 3.0, 9.0]])
     picture = depth_picture(depth, np.array([[1.0, 1.0, 1.0, 0.2]]))[0, :, 0]
     assert picture[0] == 1
-    assert 1 > picture[1] > picture[2] >= DARKEST
+    assert 1 > picture[1] > picture[2] >= FARTHEST_DEPTH_GREY
     assert picture[3] == 0
     assert not depth_picture(depth, np.zeros((1, 4))).any()
 
@@ -104,9 +111,9 @@ def test_depth_is_light_where_it_is_near() -> None:
 def test_the_worst_views_have_photograph_render_and_depth(reported: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(reported, tmp_path / "run"))
     records = json.loads((run / "eval.json").read_text())["views"]
-    assert len(list((run / "depth").glob("*.png"))) == min(WORST, len(records))
+    assert len(list((run / "depth").glob("*.png"))) == min(DEPTH_PICTURE_VIEWS, len(records))
     figures = parse((run / "report.html").read_text("utf-8")).one("div", id="worst").all("figure")
-    assert [len(figure.all("img")) for figure in figures] == [3] * min(WORST, len(records))
+    assert [len(figure.all("img")) for figure in figures] == [3] * min(DEPTH_PICTURE_VIEWS, len(records))
     least = min(records, key=lambda record: record["psnr"])["name"]
     assert figures[0].words.strip().startswith(least)
     model = Gaussians.load(run / "model.ply")

@@ -6,26 +6,22 @@ from __future__ import annotations
 import errno
 import os
 import re
-import sys
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+import stress_kills
 from calls import Capture, train
 from quick import quick
 from tiny import CONFIG, short
 
-from clsplat import files
 from clsplat.cli.main import main
 from clsplat.errors import InputError
-from clsplat.files import TEMPORARY_SUFFIX
+from clsplat.files import atomic
+from clsplat.files.atomic import TEMPORARY_SUFFIX
 from clsplat.runs.checkpoints import STATE_KEY, Checkpoint
 from clsplat.runs.run import Run
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-
-import stress_kills
 
 STATE = {"rng": {"state": 2**100}, "seconds": 0.25}
 
@@ -181,7 +177,7 @@ def test_a_checkpoint_that_cannot_be_written_is_named(
         return real(path, *arguments, **options)  # type: ignore[call-overload]
 
     with monkeypatch.context() as patch:
-        patch.setattr(files, "open", refusing, raising=False)
+        patch.setattr(atomic, "open", refusing, raising=False)
         assert train(scene, folder, short(checkpoint_every=10)) == 1
     said = capfd.readouterr().err.splitlines()[-1]
     path = folder / "checkpoints" / "step-0000020.npz"
@@ -211,7 +207,7 @@ def test_a_folder_that_is_read_only_is_named(scene: Path, tmp_path: Path, capfd:
 
 @pytest.mark.slow
 def test_a_few_kills(capfd: Capture, default_device: object) -> None:
-    """`tools/stress_kills.py --kills 100` is the long form."""
+    """`tools/stress/stress_kills.py --kills 100` is the long form."""
     assert stress_kills.main(["--kills", "2", "--seed", "5"]) == 0
     out = capfd.readouterr().out
     assert re.match(r"2 kills survived in \d+ s: .* each with the bytes of an undisturbed one", out)

@@ -17,7 +17,7 @@ from tiny import FEW, write_scene
 
 from clsplat.api import train
 from clsplat.cli.main import main, parse
-from clsplat.cli.train import Train
+from clsplat.cli.train import TrainVerb
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.images.reading import read_image
@@ -60,9 +60,9 @@ def refusal(run: Path, scene: Path, capsys: Capture) -> str:
 
 
 def test_the_same_scene_goes_on_from_anywhere(run: Path, own: Path) -> None:
-    known = (run / scene_record.NAME).read_bytes()
+    known = (run / scene_record.SCENE_RECORD_FILE_NAME).read_bytes()
     assert resume(run, own) == 0
-    assert (run / scene_record.NAME).read_bytes() == known
+    assert (run / scene_record.SCENE_RECORD_FILE_NAME).read_bytes() == known
 
 
 def test_a_changed_photograph_is_refused(run: Path, own: Path, capsys: Capture) -> None:
@@ -113,19 +113,19 @@ def test_another_resolution_is_not_another_scene(run: Path, own: Path) -> None:
 
 
 def test_a_run_of_an_earlier_version_resumes_with_one_line(run: Path, own: Path, capsys: Capture) -> None:
-    (run / scene_record.NAME).unlink()
+    (run / scene_record.SCENE_RECORD_FILE_NAME).unlink()
     capsys.readouterr()
     assert resume(run, own) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if scene_record.NAME in line]
+    told = [line for line in capsys.readouterr().err.splitlines() if scene_record.SCENE_RECORD_FILE_NAME in line]
     assert len(told) == 1
     assert told[0].startswith(f"clsplat: warning: {run}: has no scene.json, as runs of earlier versions")
-    assert (run / scene_record.NAME).exists()
+    assert (run / scene_record.SCENE_RECORD_FILE_NAME).exists()
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"views": {"a": {}}}', '{"views": 3, "points": {}}'])
 def test_a_damaged_record_is_named(text: str, run: Path, own: Path, capsys: Capture) -> None:
-    (run / scene_record.NAME).write_text(text)
-    assert f"{run / scene_record.NAME}: is damaged" in refusal(run, own, capsys)
+    (run / scene_record.SCENE_RECORD_FILE_NAME).write_text(text)
+    assert f"{run / scene_record.SCENE_RECORD_FILE_NAME}: is damaged" in refusal(run, own, capsys)
 
 
 def test_the_digest_is_of_the_photograph(scene: Path, own: Path) -> None:
@@ -161,7 +161,7 @@ def test_a_scene_elsewhere_cannot_be_accepted(scene: Path, tmp_path: Path) -> No
     scene_record.write(run, known)
     far = load_scene(write_scene(tmp_path / "far"))
     far.origin = np.array([1024.0, 0, 0])
-    with pytest.raises(InputError, match="lies elsewhere in the world"):
+    with pytest.raises(InputError, match="has another origin in the world"):
         scene_record.check(run, far, tmp_path, 0, accept=True)
 
 
@@ -177,8 +177,8 @@ def test_what_is_given_beside_resume(given: str, tmp_path: Path) -> None:
     Run.create(tmp_path, replace(FEW, report=True))
     verb = parse(["train", "-o", str(tmp_path), "--resume", *given.split()])
     fresh = parse(["train", "-o", str(tmp_path), *given.split()])
-    assert isinstance(verb, Train)
-    assert isinstance(fresh, Train)
+    assert isinstance(verb, TrainVerb)
+    assert isinstance(fresh, TrainVerb)
     assert replace(verb, resume=False, config=fresh.config) == fresh
     assert verb.config == replace(FEW, report="--no-report" not in given)
 
@@ -186,7 +186,7 @@ def test_what_is_given_beside_resume(given: str, tmp_path: Path) -> None:
 def test_all_display_options_beside_resume(tmp_path: Path) -> None:
     Run.create(tmp_path, FEW)
     verb = parse(["train", "-o", str(tmp_path), "--resume", *" ".join(DISPLAY).split()])
-    assert isinstance(verb, Train)
+    assert isinstance(verb, TrainVerb)
     assert (verb.json, verb.view, verb.page.port, verb.accept_changes, verb.resume) == (True, True, 9, True, True)
 
 
@@ -201,9 +201,10 @@ def foreign(run: Path, own: Path, tmp_path: Path) -> Path:
 
 def test_a_checkpoint_of_another_scene_is_refused(foreign: Path, scene: Path, capsys: Capture) -> None:
     line = refusal(foreign, scene, capsys)
-    named = f"{foreign / 'checkpoints' / 'step-0000003.npz'}: is of a training on another scene than {foreign} is of"
-    assert f"{named}, expected one of this run; remove it, or --accept-changes goes on from it" in line
-    with pytest.raises(InputError, match="is of a training on another scene"):
+    named = f"{foreign / 'checkpoints' / 'step-0000003.npz'}: is from a training on another scene than {foreign}"
+    said = f"{named}, expected a checkpoint of this run; remove it, or go on from it with --accept-changes"
+    assert said in line
+    with pytest.raises(InputError, match="is from a training on another scene"):
         train(load_scene(scene), replace(FEW, iterations=4), run=Run.open(foreign), resume=True)
     assert resume(foreign, scene, "--accept-changes") == 0
     assert resume(foreign, scene, "--iterations", "5") == 0, "from now on it is of this run"

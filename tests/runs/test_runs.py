@@ -14,11 +14,11 @@ from models import random_gaussians
 
 import clsplat
 from clsplat.cli.main import main, parse
-from clsplat.cli.train import Train
+from clsplat.cli.train import TrainVerb
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import TEMPORARY_SUFFIX
+from clsplat.files.atomic import TEMPORARY_SUFFIX
 from clsplat.runs.run import Run, is_run
 from clsplat.runs.settings import parse_config, read_config
 
@@ -84,7 +84,7 @@ def test_a_setting_of_an_earlier_version_still_loads(
     path = tmp_path / "config.toml"
     path.write_text(f'clsplat = "1"\n[train]\niterations = 9\n[train.rasterizer]\nsh_angle = {angle}\n')
     verb = parse(["train", "S", "-o", str(tmp_path), "--resume"])
-    assert isinstance(verb, Train)
+    assert isinstance(verb, TrainVerb)
     assert verb.config == TrainConfig(iterations=9)
     assert main(["eval", str(tmp_path)]) == 2, "it has no model"
     told = [line for line in capsys.readouterr().err.splitlines() if "sh_angle" in line]
@@ -102,23 +102,45 @@ def test_a_setting_of_an_earlier_version_is_told_once(tmp_path: Path) -> None:
 
 def test_switches_that_only_the_bench_has_are_passed_over(tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
-    text = tomli_w.dumps({"clsplat": "1", "train": {"rasterizer": asdict(BenchSwitches())}})
+    gone = dict.fromkeys(("vector_skip", "last_contributor", "gradient_skip", "opacity_cull"), True)
+    text = tomli_w.dumps({"clsplat": "1", "train": {"rasterizer": asdict(BenchSwitches()) | gone}})
     path.write_text(text)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert read_config(path) == (TrainConfig(), None), "as every earlier version wrote them"
     path.write_text(
         text.replace("row_skip = true", "row_skip = false")
+        .replace("gradient_skip = true", "gradient_skip = false")
         .replace('extent = "opacity"', 'extent = "constant"')
         .replace("sh_degree_limit = 3", "sh_degree_limit = 1")
     )
     with pytest.warns(UserWarning, match="passed over") as told:
         assert read_config(path) == (TrainConfig(rasterizer=RasterizerConfig(sh_degree_limit=1)), None)
     assert len(told) == 1
-    assert str(told[0].message).endswith(": train.rasterizer.extent = 'constant', train.rasterizer.row_skip = False")
+    named = ("extent = 'constant'", "row_skip = False", "gradient_skip = False")
+    assert str(told[0].message).endswith(": " + ", ".join(f"train.rasterizer.{name}" for name in named))
     path.write_text(text.replace('extent = "opacity"', "extent = 3"))
     with pytest.raises(InputError, match=r"train\.rasterizer\.extent is 3, expected one of opacity, 3sigma"):
         read_config(path)
+
+
+def test_settings_of_training_that_are_gone_are_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    nothing = {"edge_views": 0, "prune_at": [], "prune_fraction": 0.0, "views_agree": 1}
+    path.write_text(tomli_w.dumps({"train": {"frequency_steps": 0, "density": nothing | {"every": 50}}}))
+    config = TrainConfig(density=DensityConfig(every=50))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_config(path) == (config, None), "as every earlier version wrote them"
+    once = {"edge_views": 5, "prune_at": [600, 3000], "prune_fraction": 0.25, "views_agree": 2}
+    path.write_text(tomli_w.dumps({"train": {"frequency_steps": 500, "density": once | {"every": 50}}}))
+    with pytest.warns(UserWarning, match="passed over") as told:
+        assert read_config(path) == (config, None)
+    assert len(told) == 1
+    assert str(told[0].message).endswith(
+        ": train.frequency_steps = 500, train.density.edge_views = 5, train.density.prune_at = [600, 3000], "
+        "train.density.prune_fraction = 0.25, train.density.views_agree = 2"
+    )
 
 
 def test_a_run_is_not_written_over(tmp_path: Path) -> None:

@@ -16,10 +16,10 @@ from tiny import write_scene
 
 from clsplat.cli.main import main
 from clsplat.errors import InputError
-from clsplat.scenes.colmap import read_cameras
-from clsplat.scenes.data_set import Lens
+from clsplat.scenes.dataset import Lens
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.transforms import read_poses
+from clsplat.scenes.readers.colmap import read_cameras
+from clsplat.scenes.readers.transforms import read_poses
 
 NO_POINTS = (np.empty((0, 3)), np.empty((0, 3), np.uint8))
 

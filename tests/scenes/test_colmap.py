@@ -14,7 +14,7 @@ from needs import SCENES
 
 from clsplat.errors import InputError
 from clsplat.rotations import rotation_from_quaternion
-from clsplat.scenes.colmap import find_model, read_cameras, read_model
+from clsplat.scenes.readers.colmap import find_model, read_cameras, read_model
 
 
 def make_model(folder: Path, names: list[str] | None = None, model: str = "PINHOLE") -> pycolmap.Reconstruction:

@@ -18,10 +18,10 @@ from clsplat.config.depth import DepthUse
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.images.depth_maps import map_header, read_map
-from clsplat.scenes.colmap import read_tracks
-from clsplat.scenes.data_set import Lens
-from clsplat.scenes.depth import KnownDepth, with_depths
+from clsplat.scenes.dataset import Lens
+from clsplat.scenes.depth_sources import KnownDepth, with_depths
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.readers.colmap import read_tracks
 from clsplat.scenes.scene import Scene
 
 POINTS, MAPS, RELATIVE = DepthUse("points"), DepthUse("maps"), DepthUse("maps", "relative")

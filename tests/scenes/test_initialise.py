@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from clsplat.errors import InputError
-from clsplat.scenes.initialise import MIN_SQUARED_DISTANCE, from_points, mean_squared_distance, random_points
-from clsplat.spherical_harmonics import C0
+from clsplat.scenes.start.initialise import MIN_SQUARED_DISTANCE, from_points, mean_squared_distance, random_points
+from clsplat.spherical_harmonics import SH_C0
 
 
 def brute_force(points: np.ndarray) -> np.ndarray:
@@ -44,7 +44,7 @@ def test_what_a_gaussian_starts_as() -> None:
     np.testing.assert_array_equal(gaussians.means, points.astype(np.float32))
     np.testing.assert_array_equal(gaussians.quaternions, np.tile(np.float32([1, 0, 0, 0]), (30, 1)))
     np.testing.assert_allclose(1 / (1 + np.exp(-gaussians.opacity_logits)), 0.1, rtol=1e-6)
-    np.testing.assert_allclose(0.5 + C0 * gaussians.sh[:, 0], colors, atol=1e-6)
+    np.testing.assert_allclose(0.5 + SH_C0 * gaussians.sh[:, 0], colors, atol=1e-6)
     np.testing.assert_allclose(np.exp(2 * gaussians.log_scales), np.tile(brute_force(points)[:, None], 3), rtol=1e-5)
 
 

@@ -16,10 +16,11 @@ from clsplat.config.masks import MaskUse
 from clsplat.errors import InputError
 from clsplat.images.reading import companions, find_images
 from clsplat.images.writing import write_image
-from clsplat.scenes import sfm, sfm_photos
-from clsplat.scenes.findings import findings
+from clsplat.scenes.analysis.photo_findings import findings
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.masks import OTHER_FOLDERS, find_masks, masks_beside, read_mask
+from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm import reconstruct
+from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, find_masks, masks_beside, read_mask
 
 IGNORE = MaskUse("ignore")
 
@@ -221,7 +222,7 @@ def test_masks_of_other_programs(photo: str, mask: str, tmp_path: Path) -> None:
     assert masks_beside(images) == {photo: tmp_path / mask}
     paths, _ = sfm_photos.find_photos(tmp_path / "images")
     assert sorted(paths) == sorted(image.path for image in images)
-    assert sfm._masks(tmp_path / "images", paths, IGNORE) == {photo: tmp_path / mask}
+    assert reconstruct._masks(tmp_path / "images", paths, IGNORE) == {photo: tmp_path / mask}
     present = find_images(tmp_path / "images")
     listed = {image.path for image in images}
     assert {path for path in present if path not in listed} == companions(
@@ -242,10 +243,10 @@ def test_folders_of_masks_by_other_names(mask: str, tmp_path: Path) -> None:
     masks_at(tmp_path, mask)
     assert masks_beside(images) == {}
     found = {"IMG_1.jpg": tmp_path / mask}
-    assert masks_beside(images, others=OTHER_FOLDERS) == found
-    assert sfm._masks(tmp_path / "images", [image.path for image in images], IGNORE) == found
+    assert masks_beside(images, others=OTHER_MASK_FOLDERS) == found
+    assert reconstruct._masks(tmp_path / "images", [image.path for image in images], IGNORE) == found
     masks_at(tmp_path, "masks/IMG_1.png")  # these go first
-    assert masks_beside(images, others=OTHER_FOLDERS) == {"IMG_1.jpg": tmp_path / "masks" / "IMG_1.png"}
+    assert masks_beside(images, others=OTHER_MASK_FOLDERS) == {"IMG_1.jpg": tmp_path / "masks" / "IMG_1.png"}
 
 
 def test_white_may_be_what_moves(tmp_path: Path) -> None:
@@ -261,7 +262,7 @@ def test_white_may_be_what_moves(tmp_path: Path) -> None:
     assert not [text for text in inverted.warnings if "dynamic_masks" in text]
     paths = sorted((scene / "images").iterdir())
     with pytest.warns(UserWarning, match="white is taken for what counts"):
-        sfm._masks(scene / "images", paths, IGNORE)
+        reconstruct._masks(scene / "images", paths, IGNORE)
 
 
 @pytest.mark.brings("renderers, video tools", "masks/mask_0007.png for image_0007.png", "by their numbers")

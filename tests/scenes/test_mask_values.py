@@ -13,7 +13,7 @@ from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 from clsplat.config.masks import MaskUse
 from clsplat.errors import InputError
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.masks import read_mask
+from clsplat.scenes.supervision.masks import read_mask
 
 IGNORE = MaskUse("ignore")
 

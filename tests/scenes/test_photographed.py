@@ -11,10 +11,10 @@ import pytest
 
 from clsplat.config.masks import MaskUse
 from clsplat.images.writing import write_image
-from clsplat.scenes.data_set import PANORAMA, Lens
-from clsplat.scenes.initialise import NEAREST, photographed
-from clsplat.scenes.masks import Mask
+from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.start.initialise import COLOUR_VIEWS_PER_POINT, photographed
+from clsplat.scenes.supervision.masks import Mask
 
 SIDE = 120
 RED, BLUE, GREY = np.uint8([200, 40, 0]), np.uint8([10, 60, 220]), np.uint8([128, 128, 128])
@@ -27,14 +27,14 @@ HIDING, SHOWING = tuple(np.linspace(-0.9, 0.9, 9)), (2.3, 2.7, 3.1, -2.5, -2.9)
 LENSES = {
     "pinhole": Lens("PINHOLE", SIDE, SIDE, (60.0, 60.0, SIDE / 2, SIDE / 2)),
     "fisheye": Lens("FISHEYE", SIDE, SIDE, (50.0, 50.0, SIDE / 2, SIDE / 2)),
-    "panorama": Lens(PANORAMA, 4 * SIDE, 2 * SIDE, (4.0 * SIDE, 2.0 * SIDE)),
+    "panorama": Lens("EQUIRECTANGULAR", 4 * SIDE, 2 * SIDE, (4.0 * SIDE, 2.0 * SIDE)),
 }
 
 
 def rays_of(lens: Lens) -> np.ndarray:
     """Directions (H, W, 3) of the pixels in camera space, of any length."""
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    if lens.model == PANORAMA:
+    if lens.is_panorama:
         turn, lift = (x / lens.width - 0.5) * 2 * np.pi, (y / lens.height - 0.5) * np.pi
         return np.stack([np.sin(turn) * np.cos(lift), np.sin(lift), np.cos(turn) * np.cos(lift)], axis=-1)
     x, y = (x - lens.centre[0]) / lens.focal, (y - lens.centre[1]) / lens.focal
@@ -112,7 +112,7 @@ def test_what_a_few_photographs_have_before_a_point_does_not_count(tmp_path: Pat
     )
 
 
-@pytest.mark.parametrize("count", [1, 2, NEAREST + 5])
+@pytest.mark.parametrize("count", [1, 2, COLOUR_VIEWS_PER_POINT + 5])
 @pytest.mark.parametrize("level", [0, 1, 128, 255])
 def test_photographs_of_one_grey_give_that_grey(tmp_path: Path, level: int, count: int) -> None:
     front, back = squares()
@@ -124,10 +124,10 @@ def test_photographs_of_one_grey_give_that_grey(tmp_path: Path, level: int, coun
 
 
 def test_the_nearest_photographs_count(tmp_path: Path) -> None:
-    """Of more than NEAREST: those from afar have another colour."""
+    """Of more than COLOUR_VIEWS_PER_POINT: those from afar have another colour."""
     front, _ = squares()
-    views = [view_of(tmp_path, LENSES["pinhole"], x) for x in np.linspace(-0.5, 0.5, NEAREST)]
-    for index in range(2 * NEAREST):
+    views = [view_of(tmp_path, LENSES["pinhole"], x) for x in np.linspace(-0.5, 0.5, COLOUR_VIEWS_PER_POINT)]
+    for index in range(2 * COLOUR_VIEWS_PER_POINT):
         path, centre = tmp_path / f"far{index}.png", np.array([0.0, 0.0, -4.0 - index])
         write_image(path, np.full((SIDE, SIDE, 3), 255, np.uint8))
         camera = LENSES["pinhole"].camera(np.eye(3), -centre, "native")

@@ -13,13 +13,13 @@ from needs import missing
 from ring import points, write_cloud, write_colmap, write_transforms
 from test_scene import make_colmap
 
-from clsplat.config.points import POINTS_OF_FILE, StartPoints
+from clsplat.config.points import DEFAULT_MAX_FILE_POINTS, StartPoints
 from clsplat.config.training import TrainConfig
-from clsplat.scenes import doubts
-from clsplat.scenes.cloud import with_points
-from clsplat.scenes.colmap import read_model, read_tracks
+from clsplat.scenes.analysis import sanity_checks
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.point_files import BESIDE, COLOURS, read_cloud, read_point_cloud
+from clsplat.scenes.point_files import PLY_COLOUR_PROPERTIES, START_CLOUD_NAMES, read_cloud, read_point_cloud
+from clsplat.scenes.readers.colmap import read_model, read_tracks
+from clsplat.scenes.start.point_cloud import with_points
 
 XYZ, RGB = points(60)
 RGB[0], RGB[1] = 0, 255
@@ -36,7 +36,7 @@ NO_POINTS = (np.empty((0, 3)), np.empty((0, 3), np.uint8))
     [("uchar", 255), ("ushort", 255), ("ushort", 65535), ("int", 255), ("int", 65535), ("float", 1), ("float", 255),
      ("float", 65535), ("double", 1), ("double", 255)],
 )  # fmt: skip
-@pytest.mark.parametrize("names", COLOURS)
+@pytest.mark.parametrize("names", PLY_COLOUR_PROPERTIES)
 def test_colours_count_by_their_values(kind: str, scale: int, names: tuple[str, ...], tmp_path: Path) -> None:
     write_cloud(tmp_path / "a.ply", XYZ, RGB / 255 * scale, kind, names)
     xyz, colours = read_point_cloud(tmp_path / "a.ply")
@@ -158,7 +158,7 @@ def test_a_named_cloud_in_another_case_is_found(tmp_path: Path) -> None:
 
 @pytest.mark.brings("3DGS, nerfstudio, Brush", "clouds that no file names, such as `points3d.ply`",
                     "started from where the scene has no points, else named")  # fmt: skip
-@pytest.mark.parametrize("name", [*BESIDE, "POINTS3D.PLY"])
+@pytest.mark.parametrize("name", [*START_CLOUD_NAMES, "POINTS3D.PLY"])
 @pytest.mark.parametrize("kind", ["blender", "transforms", "colmap"])
 def test_a_cloud_beside_a_scene_without_points_is_taken(kind: str, name: str, tmp_path: Path) -> None:
     if kind == "colmap":
@@ -172,7 +172,7 @@ def test_a_cloud_beside_a_scene_without_points_is_taken(kind: str, name: str, tm
     np.testing.assert_array_equal(scene.points, XYZ.astype(np.float32))
     np.testing.assert_allclose(scene.point_colors, RGB / 255, atol=1e-6)
     assert f"{path}: its 60 points are the scene's, which names none" in scene.warnings
-    assert not [text for text in doubts.of_scene(scene, "black") if "not used" in text]
+    assert not [text for text in sanity_checks.of_scene(scene, "black") if "not used" in text]
 
 
 def test_of_several_the_first_by_name_is_taken_and_the_others_told(tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_of_several_the_first_by_name_is_taken_and_the_others_told(tmp_path: Pat
     write_cloud(tmp_path / "points3d.ply", XYZ, RGB)
     scene = load_scene(tmp_path)
     assert len(scene.points) == 60
-    (told,) = [text for text in doubts.of_scene(scene, "black") if "--points" in text]
+    (told,) = [text for text in sanity_checks.of_scene(scene, "black") if "--points" in text]
     assert told.startswith(f"{tmp_path / 'init.ply'} (50 points) is not used, as the scene has points of its own")
 
 
@@ -197,17 +197,17 @@ def test_one_beside_a_scene_with_points_is_told(kind: str, tmp_path: Path) -> No
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.points, plain.points)
     assert scene.warnings == []
-    (told,) = [text for text in doubts.of_scene(scene, "black") if "--points" in text]
+    (told,) = [text for text in sanity_checks.of_scene(scene, "black") if "--points" in text]
     assert told.startswith(f"{tmp_path / 'sparse_pc.ply'} (60 points) is not used")
     chosen = with_points(scene, StartPoints(str(tmp_path / "sparse_pc.ply"), "replace", 100))
-    assert not [text for text in doubts.of_scene(chosen, "black") if "--points" in text], "it is now"
+    assert not [text for text in sanity_checks.of_scene(chosen, "black") if "--points" in text], "it is now"
 
 
 def test_the_copy_that_3dgs_makes_of_the_models_points_is_silent(tmp_path: Path) -> None:
     write_colmap(tmp_path)
     write_cloud(tmp_path / "sparse" / "0" / "points3D.ply", *points())
     scene = load_scene(tmp_path)
-    assert not [text for text in doubts.of_scene(scene, "black") if "--points" in text]
+    assert not [text for text in sanity_checks.of_scene(scene, "black") if "--points" in text]
     assert scene.warnings == []
 
 
@@ -230,7 +230,7 @@ def test_a_cloud_that_does_not_read_or_lies_elsewhere_is_told_and_passed_over(tm
     assert "points3d.ply" in scene.warnings[0]
     assert "sparse_pc.ply: its points are 1e+06 from the cameras that see them" in scene.warnings[1]
     assert all(text.endswith("; it is not used") for text in scene.warnings)
-    assert not [text for text in doubts.of_scene(scene, "black") if "points of its own" in text]
+    assert not [text for text in sanity_checks.of_scene(scene, "black") if "points of its own" in text]
 
 
 # How many
@@ -242,16 +242,16 @@ def test_a_limit_is_of_the_scenes_own_points_too(tmp_path: Path) -> None:
     thinned = with_points(scene, TrainConfig(points_limit=500).start_points)
     assert 400 < len(thinned.points) <= 500
     assert with_points(scene, TrainConfig(points_limit=3000).start_points).points is scene.points
-    assert TrainConfig(points="a.ply").start_points.limit == POINTS_OF_FILE
+    assert TrainConfig(points="a.ply").start_points.limit == DEFAULT_MAX_FILE_POINTS
     assert TrainConfig(points="a.ply", points_limit=7).start_points.limit == 7
 
 
 def test_very_many_points_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene(write_colmap(tmp_path))
-    monkeypatch.setattr(doubts, "MANY_POINTS", 399)
-    (told,) = [text for text in doubts.of_scene(scene, "black") if "--points-limit" in text]
+    monkeypatch.setattr(sanity_checks, "MANY_START_POINTS", 399)
+    (told,) = [text for text in sanity_checks.of_scene(scene, "black") if "--points-limit" in text]
     assert told.startswith("400 points to start from are a Gaussian each")
-    monkeypatch.setattr(doubts, "MANY_POINTS", 400)
+    monkeypatch.setattr(sanity_checks, "MANY_START_POINTS", 400)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert not [text for text in doubts.of_scene(scene, "black") if "--points-limit" in text]
+        assert not [text for text in sanity_checks.of_scene(scene, "black") if "--points-limit" in text]

@@ -3,45 +3,51 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from models import random_gaussians
+from quality.experiments import UNITS, psnr_of
+from quality.made_scenes import in_units
 from tiny import cameras, short
 
-from clsplat.camera import NEAR, Camera
+from clsplat.api import train
+from clsplat.camera import DEFAULT_NEAR_PLANE, Camera
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
-from clsplat.scenes.initialise import MIN_SQUARED_DISTANCE, squared_floor
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
+from clsplat.scenes.start.initialise import MIN_SQUARED_DISTANCE, squared_floor
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from check_scales import BOUND, FACTORS, OFFSET, in_units, measured
-
-CASES = [*((factor, 0.0) for factor in FACTORS[1:]), (1.0, OFFSET)]
+BOUND = 0.3
+"""dB between two units."""
 
 
-@pytest.mark.parametrize(("factor", "offset"), CASES)
-def test_a_scene_looks_the_same_in_all_units(factor: float, offset: float, scene: Path, default_device: Device) -> None:
-    config = short(iterations=20)
-    usual = measured(load_scene(scene), config, default_device, 1.0, 0.0)
-    other = measured(load_scene(scene), config, default_device, factor, offset)
-    assert usual.psnr > 15
-    assert abs(other.psnr - usual.psnr) < BOUND
+@pytest.mark.parametrize(("factor", "offset"), UNITS[1:])
+def test_a_scene_looks_the_same_in_all_units(
+    factor: float, offset: float, scene: Path, default_device: Device, tmp_path: Path
+) -> None:
+    renderer = Renderer(default_device)
+
+    def psnr(scene: Scene) -> float:
+        train(scene, short(iterations=20), device=default_device).save(tmp_path / "model.ply")
+        model = Gaussians.load(tmp_path / "model.ply")
+        return psnr_of(lambda view: renderer.render(model, view.camera).image, scene.test_views)
+
+    usual = psnr(load_scene(scene))
+    assert usual > 15
+    assert abs(psnr(in_units(load_scene(scene), factor, np.full(3, offset))) - usual) < BOUND
 
 
 def test_the_near_plane_follows_the_extent_of_small_scenes(scene: Path) -> None:
     loaded = load_scene(scene)
     assert in_units(loaded, 1e-4, np.zeros(3)).near == pytest.approx(1e-6 * loaded.extent)
-    assert in_units(loaded, 1e3, np.zeros(3)).near == NEAR
+    assert in_units(loaded, 1e3, np.zeros(3)).near == DEFAULT_NEAR_PLANE
 
 
 def test_cameras_in_one_place_take_the_extent_of_the_points(scene: Path) -> None:
@@ -86,19 +92,19 @@ def test_a_model_keeps_its_near_plane(tmp_path: Path, default_device: Device) ->
 def test_an_ordinary_model_has_no_word_of_it(tmp_path: Path) -> None:
     random_gaussians(20, seed=3).save(tmp_path / "model.ply")
     assert b"near" not in (tmp_path / "model.ply").read_bytes().partition(b"end_header")[0]
-    assert Gaussians.load(tmp_path / "model.ply").near == NEAR
+    assert Gaussians.load(tmp_path / "model.ply").near == DEFAULT_NEAR_PLANE
 
 
 @pytest.mark.parametrize("words", ["near", "near x", "near -1", "near nan", "near 1 2"])
 def test_a_comment_that_is_not_ours_is_passed_over(words: str, tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     random_gaussians(20, seed=3).save(path, comments=[f"clsplat {words}"])
-    assert Gaussians.load(path).near == NEAR
+    assert Gaussians.load(path).near == DEFAULT_NEAR_PLANE
 
 
 def test_small_models_of_other_tools_are_seen_too(tmp_path: Path, default_device: Device) -> None:
     model, camera = small_model()
-    replace(model, near=NEAR).save(tmp_path / "model.ply")  # as one without the comment
+    replace(model, near=DEFAULT_NEAR_PLANE).save(tmp_path / "model.ply")  # as one without the comment
     again = Gaussians.load(tmp_path / "model.ply")
     assert again.near < 1e-5
     assert Renderer(default_device).render(again, camera).alpha.any()

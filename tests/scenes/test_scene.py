@@ -21,7 +21,7 @@ from clsplat.camera import Camera
 from clsplat.errors import InputError
 from clsplat.images.reading import companions, read_image
 from clsplat.images.writing import write_image
-from clsplat.scenes.layouts import detect
+from clsplat.scenes.folder_layouts import detect
 from clsplat.scenes.loading import camera_bounds, load_scene
 
 RNG = np.random.default_rng(2)

@@ -18,10 +18,12 @@ from systems import can_link
 from clsplat.config.masks import MaskUse
 from clsplat.demo import ray_caster
 from clsplat.errors import ClsplatError, InputError
-from clsplat.scenes import sfm, sfm_photos
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm import reconstruct as sfm
 
 WIDTH, HEIGHT, COUNT = 240, 180, 12
+PINHOLE = sfm.SfmSettings(camera_model="SIMPLE_PINHOLE")
 # EXIF orientation: what a viewer does to stored pixels to show the photo; here its inverse, shown to stored
 STORED_FROM_SHOWN = {
     1: lambda image: image,
@@ -79,7 +81,7 @@ def scene(photos, tmp_path_factory):
     output = sfm.reconstruct(
         photos,
         tmp_path_factory.mktemp("scenes") / "scene",
-        camera_model="SIMPLE_PINHOLE",
+        PINHOLE,
         progress=lambda text, fraction: heard.append((text, fraction)),
     )
     return output, heard
@@ -120,7 +122,7 @@ def test_every_pose_is_recovered(scene, pictures):
     assert (camera.width, camera.height) == (WIDTH, HEIGHT)
     assert camera.params[0] == pytest.approx(pictures[1][0].fx, rel=0.02)
 
-    record = json.loads((output / sfm.RECORD).read_text())
+    record = json.loads((output / sfm.SFM_RECORD_FILE).read_text())
     assert record["unregistered"] == []
     assert record["photos"] == len(record["registered"]) == COUNT
     assert record["mean_reprojection_error"] < 0.5
@@ -141,9 +143,9 @@ def test_every_pose_is_recovered(scene, pictures):
 def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos, tmp_path):
     output, _ = scene
     before = (output / "sparse/0/images.bin").stat().st_mtime_ns
-    assert sfm.reconstruct(photos, output, camera_model="SIMPLE_PINHOLE") == output
+    assert sfm.reconstruct(photos, output, PINHOLE) == output
     with pytest.raises(InputError, match="other photos or settings"):
-        sfm.reconstruct(photos, output, camera_model="SIMPLE_PINHOLE", max_features=100)
+        sfm.reconstruct(photos, output, sfm.SfmSettings(camera_model="SIMPLE_PINHOLE", max_features=100))
     assert (output / "sparse/0/images.bin").stat().st_mtime_ns == before
 
 
@@ -152,19 +154,19 @@ def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos,
 def test_a_result_that_has_changed_since_is_not_used_again(scene, photos, tmp_path, change):
     copy = tmp_path / "scene"
     shutil.copytree(scene[0], copy)
-    assert sfm.reconstruct(photos, copy, camera_model="SIMPLE_PINHOLE") == copy
+    assert sfm.reconstruct(photos, copy, PINHOLE) == copy
     picture = copy / "images/view_03.jpg"
     if change == "gone":
         picture.unlink()
     else:
         picture.write_bytes(picture.read_bytes()[:-100])
     with pytest.raises(InputError, match=r"scene: images/view_03\.jpg are gone or changed since .* --overwrite"):
-        sfm.reconstruct(photos, copy, camera_model="SIMPLE_PINHOLE")
+        sfm.reconstruct(photos, copy, PINHOLE)
 
 
 @pytest.mark.slow
 def test_same_seed_same_bytes(scene, photos, tmp_path):
-    again = sfm.reconstruct(photos, tmp_path / "again", camera_model="SIMPLE_PINHOLE", threads=3)
+    again = sfm.reconstruct(photos, tmp_path / "again", PINHOLE, threads=3)
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (again / "sparse/0" / name).read_bytes() == (scene[0] / "sparse/0" / name).read_bytes(), name
 
@@ -188,7 +190,7 @@ def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp
     messages = [str(warning.message) for warning in caught if warning.category is UserWarning]
     assert any("phone.heic" in message for message in messages)
     assert any("stray.jpg" in message and "could not be placed" in message for message in messages)
-    assert json.loads((output / sfm.RECORD).read_text())["unregistered"] == ["stray.jpg"]
+    assert json.loads((output / sfm.SFM_RECORD_FILE).read_text())["unregistered"] == ["stray.jpg"]
 
     found = sorted(path.relative_to(output / "images").as_posix() for path in (output / "images").rglob("*.JPG"))
     assert found == [f"{'left' if index < 6 else 'right'}/{index:02d}.JPG" for index in range(COUNT)]
@@ -212,9 +214,7 @@ def test_photos_that_lose_their_alpha_are_named(pictures, tmp_path):
     assert wanted in message
     assert oiio.ImageInput.open(str(tmp_path / "scene/images/00.png")).spec().nchannels == 3
     # without distortion there is nothing to undo: pycolmap copies the files
-    copied = warnings_of(
-        lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "copied", camera_model="SIMPLE_PINHOLE")
-    )
+    copied = warnings_of(lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "copied", PINHOLE))
     assert copied == []
     assert oiio.ImageInput.open(str(tmp_path / "copied/images/00.png")).spec().nchannels == 4
 
@@ -265,9 +265,9 @@ def test_bad_folders(tmp_path, photos):
     with pytest.raises(InputError, match="is a file"):
         sfm.reconstruct(photos, tmp_path / "few/view_00.jpg")
     with pytest.raises(InputError, match="expected auto, exhaustive or sequential"):
-        sfm.reconstruct(photos, tmp_path / "out", matching="nearest")
+        sfm.reconstruct(photos, tmp_path / "out", sfm.SfmSettings(matching="nearest"))
     with pytest.raises(InputError, match="camera model 'LENS'"):
-        sfm.reconstruct(photos, tmp_path / "out", camera_model="LENS")
+        sfm.reconstruct(photos, tmp_path / "out", sfm.SfmSettings(camera_model="LENS"))
     assert not (tmp_path / "out").exists()
 
 
@@ -296,7 +296,7 @@ def task_of(monkeypatch):
 
     monkeypatch.setattr(sfm, "_run_worker", run)
     monkeypatch.setattr(sfm, "_move_into_place", move)
-    real = sfm.sfm_photos.stage_photos
+    real = sfm_photos.stage_photos
 
     def stage(images, paths, target, report, threads):
         (target.parent / "result" / "images").mkdir(parents=True)
@@ -392,8 +392,8 @@ def test_camera_groups():
 @pytest.mark.slow
 def test_the_whole_demo_registers(tmp_path):
     ray_caster.write_photos(tmp_path / "photos")
-    output = sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", camera_model="SIMPLE_PINHOLE")
-    record = json.loads((output / sfm.RECORD).read_text())
+    output = sfm.reconstruct(tmp_path / "photos", tmp_path / "scene", PINHOLE)
+    record = json.loads((output / sfm.SFM_RECORD_FILE).read_text())
     assert record["unregistered"] == []
     assert record["points"] > 2000
     assert record["mean_reprojection_error"] < 0.3
@@ -401,7 +401,7 @@ def test_the_whole_demo_registers(tmp_path):
 
 @pytest.mark.slow
 def test_cameras_of_their_own_and_sequential_matching(photos, tmp_path):
-    output = sfm.reconstruct(photos, tmp_path / "scene", matching="sequential", shared_camera=False)
+    output = sfm.reconstruct(photos, tmp_path / "scene", sfm.SfmSettings(matching="sequential", shared_camera=False))
     assert len(pycolmap.Reconstruction(output / "sparse/0").cameras) == COUNT
 
 

@@ -18,7 +18,8 @@ from scipy.ndimage import map_coordinates
 from clsplat.config.masks import MaskUse
 from clsplat.demo import ray_caster
 from clsplat.errors import InputError
-from clsplat.scenes import sfm, sfm_copies, sfm_photos
+from clsplat.scenes.sfm import copies, photos
+from clsplat.scenes.sfm import reconstruct as sfm
 
 COUNT, WIDTH, HEIGHT = 4, 240, 180
 Picture = NDArray[np.uint8]
@@ -277,9 +278,9 @@ def test_a_stereo_rig_stays(pictures: list[Picture], tmp_path: Path, used: Any) 
 def test_a_folder_without_copies_is_not_compared(
     pictures: list[Picture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, used: Any
 ) -> None:
-    monkeypatch.setattr(sfm_photos, "thumb_of", lambda *_: pytest.fail("compared"))
-    monkeypatch.setattr(sfm_copies, "image_size", lambda *_: pytest.fail("looked at"))
-    monkeypatch.setattr(sfm_copies, "short_digest", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr(photos, "thumb_of", lambda *_: pytest.fail("compared"))
+    monkeypatch.setattr(copies, "image_size", lambda *_: pytest.fail("looked at"))
+    monkeypatch.setattr(copies, "short_digest", lambda *_: pytest.fail("read"))
     for index, picture in enumerate(pictures):
         write(tmp_path / "in" / "a" / f"{index}.jpg", picture)
         write(tmp_path / "in" / "b" / f"{index + COUNT}.jpg", np.roll(picture, 20, axis=0))
@@ -298,11 +299,11 @@ def test_copies_are_no_photographs_to_count(pictures: list[Picture], tmp_path: P
 def test_what_is_compared_has_one_scale_in_every_type() -> None:
     ramp = np.linspace(0, 1, WIDTH)[None, :, None] * np.ones((HEIGHT, 1, 3))
     thumbs = [
-        sfm_copies.thumb_of(np.rint(255 * ramp).astype(np.uint8), -1),
-        sfm_copies.thumb_of(np.rint(65535 * ramp).astype(np.uint16), -1),
-        sfm_copies.thumb_of(ramp.astype(np.float32), -1),
-        sfm_copies.thumb_of(np.rint(255 * ramp[:, :, :1]).astype(np.uint8), -1),
-        sfm_copies.thumb_of(np.rint(255 * np.dstack([1 - ramp[:, :, 0], ramp])).astype(np.uint8), 0),
+        copies.thumb_of(np.rint(255 * ramp).astype(np.uint8), -1),
+        copies.thumb_of(np.rint(65535 * ramp).astype(np.uint16), -1),
+        copies.thumb_of(ramp.astype(np.float32), -1),
+        copies.thumb_of(np.rint(255 * ramp[:, :, :1]).astype(np.uint8), -1),
+        copies.thumb_of(np.rint(255 * np.dstack([1 - ramp[:, :, 0], ramp])).astype(np.uint8), 0),
     ]
     for thumb in thumbs:
         assert thumb.shape == (72, 96)

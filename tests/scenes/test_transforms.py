@@ -14,7 +14,7 @@ from needs import SCENES
 from clsplat.errors import InputError
 from clsplat.images.writing import write_image
 from clsplat.scenes.point_files import read_point_cloud
-from clsplat.scenes.transforms import read_blender, read_poses, read_transforms
+from clsplat.scenes.readers.transforms import read_blender, read_poses, read_transforms
 
 POSE = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 

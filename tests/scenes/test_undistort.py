@@ -9,7 +9,7 @@ import pytest
 from systems import posix
 
 from clsplat.camera import Camera
-from clsplat.scenes.data_set import Lens, models, undistort
+from clsplat.scenes.dataset import Lens, models, undistort
 
 ZERO, EYE = np.zeros(3), np.eye(3)
 WIDTH, HEIGHT = 96, 64
@@ -132,7 +132,7 @@ def test_reading_cameras_leaves_the_handler_of_sigterm() -> None:
     code = """
 import os, signal
 signal.signal(signal.SIGTERM, lambda *_: print("taken"))
-import clsplat.scenes.data_set
+import clsplat.scenes.dataset
 os.kill(os.getpid(), signal.SIGTERM)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

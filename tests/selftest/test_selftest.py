@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,36 +16,37 @@ from drivers import KEPT
 from pipeline import shaped
 from quick import quick
 
+import clsplat.stages
 from clsplat.cli.main import main
-from clsplat.device import known
-from clsplat.device.child import MARK, REGARDLESS, TIMEOUT
 from clsplat.device.context import Device, all_devices, list_devices
-from clsplat.device.program import BREAK
-from clsplat.device.shapes import shape_of
+from clsplat.device.drivers import driver_records
+from clsplat.device.drivers.shapes import shape_of
+from clsplat.device.drivers.worker_process import CHILD_MESSAGE_PREFIX, DRIVER_TIMEOUT_VARIABLE, TRUST_DRIVER_VARIABLE
+from clsplat.device.program import BREAK_KERNEL_VARIABLE
 from clsplat.errors import DeviceError, InputError
-from clsplat.selftest import trust
-from clsplat.selftest.child import run
+from clsplat.selftest import driver_check
+from clsplat.selftest.driver_check import DriverReport, examine
 from clsplat.selftest.harness import error_of
 from clsplat.selftest.result import (
-    APPEARANCE,
-    BACKWARD,
-    BOUNDS,
-    CHANNELS,
-    DEEP,
-    DEPTH,
-    FORWARD,
-    HOLDOUT,
-    LENSES,
-    LIBRARY,
-    MASKS,
-    POSES,
-    RAYS,
-    STAGES,
-    TRAINING,
+    APPEARANCE_STAGES,
+    BACKWARD_STAGES,
+    CHANNEL_STAGES,
+    DEEP_STAGES,
+    DEPTH_STAGES,
+    FORWARD_STAGES,
+    HOLDOUT_STAGES,
+    LENS_STAGES,
+    LIBRARY_STAGES,
+    MASK_STAGES,
+    POSE_STAGES,
+    RAY_STAGES,
+    SELFTEST_STAGES,
+    STAGE_BOUNDS_ULP,
+    TRAINING_STAGES,
     Result,
 )
 from clsplat.selftest.scenes import keys, scenes
-from clsplat.selftest.trust import Report, examine
+from clsplat.selftest.worker import DEFAULT_DEFINES, run
 
 Capture = pytest.CaptureFixture[str]
 
@@ -74,6 +76,9 @@ BROKEN = {
     "deep: -now - after > slack": ("now - after > slack", "deep"),
     "deep: left * alpha": ("left + alpha", "deep"),
     "deep: to[plane * DEEP_ALPHA] = 1.0f -": ("to[plane * DEEP_ALPHA] =", "deep"),
+    "deep_merge: depth[other] < depth[p]": ("depth[other] > depth[p]", "deep_merge"),
+    "deep_merge: -t[p], at[plane * DEEP_ALPHA]": ("t[p], at[plane * DEEP_ALPHA]", "deep_merge"),
+    "deep_merge: 1.0f - after / first": ("after / first", "deep_merge"),
     "holdout: before * alpha * through": ("before * alpha", "holdout"),
     "holdout: depth - surface[HELD_Z]": ("surface[HELD_Z] - depth", "holdout"),
     "project_rays: l22 * t.e2[0]": ("l11 * t.e2[0]", "rays"),
@@ -109,23 +114,23 @@ BROKEN = {
 
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
-    monkeypatch.setenv(BREAK, change)
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
     groups = (
-        FORWARD,
-        CHANNELS,
-        DEEP,
-        HOLDOUT,
-        RAYS,
-        MASKS,
-        BACKWARD,
-        *APPEARANCE.values(),
-        DEPTH,
-        POSES,
-        LENSES,
-        LIBRARY,
+        FORWARD_STAGES,
+        CHANNEL_STAGES,
+        DEEP_STAGES,
+        HOLDOUT_STAGES,
+        RAY_STAGES,
+        MASK_STAGES,
+        BACKWARD_STAGES,
+        *APPEARANCE_STAGES.values(),
+        DEPTH_STAGES,
+        POSE_STAGES,
+        LENS_STAGES,
+        LIBRARY_STAGES,
     )
     group = next(stages for stages in groups if last in stages)
-    before = () if group is FORWARD else FORWARD
+    before = () if group is FORWARD_STAGES else FORWARD_STAGES
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
 
 
@@ -145,13 +150,13 @@ def test_one_wrong_operation_is_found(words: str, monkeypatch: pytest.MonkeyPatc
 
 
 def test_every_stage_has_an_operation_that_is_broken() -> None:
-    assert {stage for _, stage in BROKEN.values()} == set(STAGES) == set(BOUNDS)
+    assert {stage for _, stage in BROKEN.values()} == set(SELFTEST_STAGES) == set(STAGE_BOUNDS_ULP)
 
 
 @pytest.mark.slow
 def test_in_every_shape(shaped_device: Device) -> None:
     results = list(run(shaped_device, quick=True))
-    assert [result.stage for result in results] == list(STAGES)
+    assert [result.stage for result in results] == list(SELFTEST_STAGES)
     assert [result for result in results if not result.passed] == []
     # All drivers here round as IEEE 754 has it.
     assert [result.stage for result in results if result.same_bits is not True] == []
@@ -167,7 +172,7 @@ def test_all_scenes_in_the_shape_of_a_cpu(default_device: Device, lanes: int) ->
 
 @pytest.mark.slow
 def test_a_shape_without_a_stored_digest_is_no_failure(default_device: Device) -> None:
-    stages = (*FORWARD, "blend_grad")
+    stages = (*FORWARD_STAGES, "blend_grad")
     results = {result.stage: result for result in run(shaped(default_device, 1, 8), quick=True, stages=stages)}
     assert results["blend_grad"].passed
     assert results["blend_grad"].same_bits is None
@@ -197,7 +202,7 @@ def test_rounding_otherwise_is_told_and_forgiven(
     stem = words.partition(":")[0]
     stage = {"project_rays": "rays", "density": "statistics"}.get(stem, stem)
     results = condemned(default_device, monkeypatch, f"{words} => {SLOPPY[words]}", stage)
-    report = Report(results)
+    report = DriverReport(results)
     assert report.failure == ""
     assert any(result.same_bits is False for result in results)
     assert "can be trusted, but its bits are not those of other devices" in report.verdict
@@ -207,19 +212,19 @@ def test_rounding_otherwise_is_told_and_forgiven(
 
 @pytest.mark.parametrize("change", ["blend", "blend: a", ": a => b"])
 def test_a_change_that_makes_no_sense(change: str, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK, change)
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
     with pytest.raises(InputError, match="expected STEM: WORDS => WORDS"):
         default_device.with_shape().kernels("blend")
 
 
 def test_a_change_of_words_that_are_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK, "blend: abacus => slide rule")
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blend: abacus => slide rule")
     with pytest.raises(InputError, match=r"blend\.cl has no such words"):
         default_device.with_shape().kernels("blend")
 
 
 def test_a_change_of_a_kernel_that_is_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK, "blender: alpha => beta")
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blender: alpha => beta")
     known = r"blender is no kernel, expected one of adam, alpha_loss, appearance and \d+ more$"
     with pytest.raises(InputError, match=known):
         default_device.with_shape().kernels("scan")
@@ -248,6 +253,17 @@ def test_scenes_are_frozen() -> None:
     assert found.max() < 2**20
 
 
+def test_kernels_of_one_lane_are_built_with_one() -> None:
+    """A kernel file that every launcher asks for with LANES=1 need not build in a shape of 8 or 16 lanes."""
+    asked: dict[str, set[bool]] = {}
+    for file in Path(clsplat.stages.__path__[0]).glob("*.py"):
+        for stem, defines in re.findall(r'\.kernels\("(\w+)"(.*?)\)', file.read_text()):
+            asked.setdefault(stem, set()).add("LANES=1" in defines)
+    narrow = {stem for stem, one in asked.items() if one == {True}}
+    assert {"deep_merge", "grid", "noise"} <= narrow
+    assert [stem for stem in narrow if DEFAULT_DEFINES.get(stem, {}).get("LANES") != 1] == []
+
+
 # The verb
 
 
@@ -263,7 +279,7 @@ def test_every_driver_here_passes(capsys: Capture) -> None:
     assert [record["version"] for record in found] == [info.version for info in list_devices()]
     for record in found:
         assert record["trusted"], record["verdict"]
-        assert [stage["stage"] for stage in record["stages"]] == list(STAGES)
+        assert [stage["stage"] for stage in record["stages"]] == list(SELFTEST_STAGES)
         assert all(stage["same_bits"] for stage in record["stages"])
         assert record["build_seconds"] > 0
 
@@ -275,7 +291,7 @@ def test_the_table(capsys: Capture) -> None:
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"{index}: {KEPT[index].name}, OpenCL ")
     assert lines[1].split()[:3] == ["stage", "worst", "error"]
-    assert [line.split()[0] for line in lines[2:-1]] == ["build", *STAGES]
+    assert [line.split()[0] for line in lines[2:-1]] == ["build", *SELFTEST_STAGES]
     assert lines[-1] == "This driver can be trusted."
 
 
@@ -291,7 +307,7 @@ def test_the_table(capsys: Capture) -> None:
     ),
 )
 def test_a_broken_driver_fails(change: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK, change)
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
     assert main(["selftest", "--device", str(min(KEPT))]) == 1
     captured = capsys.readouterr()
     assert captured.out.splitlines()[-1].startswith("This driver cannot be trusted: ")
@@ -307,19 +323,19 @@ def test_no_such_device(capsys: Capture) -> None:
 # Drivers that die
 
 
-def child(monkeypatch: pytest.MonkeyPatch, code: str) -> Report:
-    monkeypatch.setattr(trust, "python_module", lambda *_, **__: [sys.executable, "-c", code])
-    monkeypatch.setenv(TIMEOUT, "2")
+def child(monkeypatch: pytest.MonkeyPatch, code: str) -> DriverReport:
+    monkeypatch.setattr(driver_check, "python_module", lambda *_, **__: [sys.executable, "-c", code])
+    monkeypatch.setenv(DRIVER_TIMEOUT_VARIABLE, "2")
     return examine(0, shape_of(all_devices()[0])[0])
 
 
 def test_a_driver_that_aborts(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = f'import os; print({MARK!r} + \'{{"begins": "building blend.cl"}}\', flush=True); os.abort()'
+    code = f'import os; print({CHILD_MESSAGE_PREFIX!r} + \'{{"begins": "building blend.cl"}}\', flush=True); os.abort()'
     assert child(monkeypatch, code).failure == "the process was ended by signal 6 in building blend.cl"
 
 
 def test_a_driver_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = f'import time; print({MARK!r} + \'{{"begins": "blend"}}\', flush=True); time.sleep(60)'
+    code = f'import time; print({CHILD_MESSAGE_PREFIX!r} + \'{{"begins": "blend"}}\', flush=True); time.sleep(60)'
     report = child(monkeypatch, code)
     assert report.failure == "the driver did not come back within 2 s from blend"
 
@@ -334,20 +350,20 @@ def test_a_child_that_ends_early(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def untrusting(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    monkeypatch.delenv(REGARDLESS)
+    monkeypatch.delenv(TRUST_DRIVER_VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return known.memory_path()
+    return driver_records.memory_path()
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
     """The stages of each test that is asked for; none is made, and all pass."""
     made: list[tuple[str, ...]] = []
 
-    def counting(_index: int, _shape: Any, stages: Sequence[str], **_: object) -> Report:
+    def counting(_index: int, _shape: Any, stages: Sequence[str], **_: object) -> DriverReport:
         made.append(tuple(stages))
-        return Report()
+        return DriverReport()
 
-    monkeypatch.setattr(trust, "examine", counting)
+    monkeypatch.setattr(driver_check, "examine", counting)
     return made
 
 
@@ -359,33 +375,33 @@ def saved_stages(path: Path, device: Device) -> list[str]:
 
 def test_it_is_tested_once(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     made = counted(monkeypatch)
-    for stages in (FORWARD, FORWARD, TRAINING, TRAINING, FORWARD):
-        trust.require(default_device, stages)
-    assert made == [FORWARD, TRAINING], "first a frame, later training, nothing again"
-    for stages in (CHANNELS, TRAINING, (*FORWARD, *CHANNELS)):
-        trust.require(default_device, stages)
-    assert made[2:] == [(*FORWARD, *CHANNELS)], "what is not remembered yet, and what it stands on"
-    remembered = [name for name in STAGES if name in (*TRAINING, *CHANNELS)]
+    for stages in (FORWARD_STAGES, FORWARD_STAGES, TRAINING_STAGES, TRAINING_STAGES, FORWARD_STAGES):
+        driver_check.require(default_device, stages)
+    assert made == [FORWARD_STAGES, TRAINING_STAGES], "first a frame, later training, nothing again"
+    for stages in (CHANNEL_STAGES, TRAINING_STAGES, (*FORWARD_STAGES, *CHANNEL_STAGES)):
+        driver_check.require(default_device, stages)
+    assert made[2:] == [(*FORWARD_STAGES, *CHANNEL_STAGES)], "what is not remembered yet, and what it stands on"
+    remembered = [name for name in SELFTEST_STAGES if name in (*TRAINING_STAGES, *CHANNEL_STAGES)]
     assert sorted(remembered) == saved_stages(untrusting, default_device)
-    trust.require(shaped(default_device, 4, 1))
-    assert made[3:] == [TRAINING], "another shape has other kernels"
-    monkeypatch.setattr("clsplat.__version__", "0.0.0")
-    trust.require(default_device, FORWARD)
-    assert made[4:] == [FORWARD], "so has another version"
+    driver_check.require(shaped(default_device, 4, 1))
+    assert made[3:] == [TRAINING_STAGES], "another shape has other kernels"
+    monkeypatch.setattr(driver_records, "package_version", lambda: "0.0.0")
+    driver_check.require(default_device, FORWARD_STAGES)
+    assert made[4:] == [FORWARD_STAGES], "so has another version"
 
 
 def test_a_failure_is_an_error_and_not_remembered(
     untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(BREAK, "blend: before * alpha => before + alpha")
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blend: before * alpha => before + alpha")
     with pytest.raises(DeviceError, match=r"cannot be trusted: blend: image is off by .* clsplat selftest tells more"):
-        trust.require(default_device, FORWARD)
+        driver_check.require(default_device, FORWARD_STAGES)
     assert not untrusting.exists()
-    monkeypatch.setenv(REGARDLESS, "1")
-    trust.require(default_device, FORWARD)
-    monkeypatch.delenv(BREAK)
-    monkeypatch.setenv(REGARDLESS, "0")
-    trust.require(default_device, FORWARD)
+    monkeypatch.setenv(TRUST_DRIVER_VARIABLE, "1")
+    driver_check.require(default_device, FORWARD_STAGES)
+    monkeypatch.delenv(BREAK_KERNEL_VARIABLE)
+    monkeypatch.setenv(TRUST_DRIVER_VARIABLE, "0")
+    driver_check.require(default_device, FORWARD_STAGES)
     assert untrusting.exists()
 
 
@@ -395,21 +411,21 @@ def test_a_memory_that_is_broken_or_read_only(
     made = counted(monkeypatch)
     untrusting.parent.mkdir(parents=True)
     untrusting.write_text("[]")
-    trust.require(default_device, FORWARD)
+    driver_check.require(default_device, FORWARD_STAGES)
     assert len(made) == 1
     assert len(json.loads(untrusting.read_text())) == 1
     monkeypatch.setenv("POCL_CACHE_DIR", str(untrusting.parent))  # it has no device without a folder for its kernels
     monkeypatch.setenv("XDG_CACHE_HOME", str(untrusting))  # a file, where a folder would have to be
     with pytest.warns(UserWarning, match="cannot be written"):
-        trust.require(default_device, FORWARD)
-    trust.require(default_device, FORWARD)
+        driver_check.require(default_device, FORWARD_STAGES)
+    driver_check.require(default_device, FORWARD_STAGES)
     assert len(made) == 2, "this process remembers it"
 
 
 @pytest.mark.parametrize("names", [1, None, [1], [["blend"]], {"blend": 1}])
 def test_a_memory_with_an_entry_of_another_kind(names: object, untrusting: Path, default_device: Device) -> None:
     device, label = default_device.cl_device, default_device.shape.label
-    known.remember(device, label, stages=["blend"], kernels={"a": ""})
+    driver_records.remember(device, label, stages=["blend"], kernels={"a": ""})
     (key,) = json.loads(untrusting.read_text())
     for entry in (
         names,
@@ -419,29 +435,29 @@ def test_a_memory_with_an_entry_of_another_kind(names: object, untrusting: Path,
         {label: {"failed": names}},
     ):
         untrusting.write_text(json.dumps({key: entry, "another": names}))
-        assert known.entries(device).get(label, known.Entry()) == known.Entry()
-        known.remember(device, label, stages=["blend"])
-        assert known.entries(device)[label].stages == {"blend"}
+        assert driver_records.entries(device).get(label, driver_records.Entry()) == driver_records.Entry()
+        driver_records.remember(device, label, stages=["blend"])
+        assert driver_records.entries(device)[label].stages == {"blend"}
 
 
 @pytest.mark.parametrize("text", [b"\xff", b"[" * 100_000, b"1" * 5000, b"null"])
 def test_a_memory_that_does_not_parse(text: bytes, untrusting: Path) -> None:
     untrusting.parent.mkdir(parents=True)
     untrusting.write_bytes(text)
-    assert known.entries(all_devices()[0]) == {}
+    assert driver_records.entries(all_devices()[0]) == {}
 
 
 def test_other_bits_are_a_warning(untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK, "arithmetic: x / y => (x / y) * 1.00000012f")
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "arithmetic: x / y => (x / y) * 1.00000012f")
     with pytest.warns(UserWarning, match=r"its bits are not those of other devices in arithmetic: .* division"):
-        trust.require(default_device, FORWARD)
+        driver_check.require(default_device, FORWARD_STAGES)
     assert untrusting.exists()
 
 
 def test_training_asks_for_it(
     untrusting: Path, scene: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(BREAK, "project_grad: sums[field] += slot[field] => sums[field] -= slot[field]")
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "project_grad: sums[field] += slot[field] => sums[field] -= slot[field]")
     run_folder = tmp_path / "run"
     assert main(["train", str(scene), "-o", str(run_folder), "--iterations", "1"]) == 2
     assert "cannot be trusted: project_grad: " in capsys.readouterr().err
@@ -452,11 +468,11 @@ def test_training_asks_for_it(
 def test_rendering_and_evaluating_ask_for_what_they_need(
     untrusting: Path, scene: Path, trained: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(BREAK, "project_grad: sums[field] += slot[field] => sums[field] -= slot[field]")
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "project_grad: sums[field] += slot[field] => sums[field] -= slot[field]")
     frames = str(tmp_path / "{name}.png")
     assert main(["render", str(trained), "--cameras", str(scene), "-o", frames]) == 0, "that has no gradient"
     assert main(["eval", str(trained / "model.ply"), "--scene", str(scene)]) == 0
-    monkeypatch.setenv(BREAK, "blend: before * alpha => before + alpha")
+    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blend: before * alpha => before + alpha")
     for words in (
         ["render", str(trained), "--cameras", str(scene), "-o", frames],
         ["eval", str(trained / "model.ply"), "--scene", str(scene)],
@@ -471,10 +487,10 @@ def test_rendering_and_evaluating_ask_for_what_they_need(
 def test_asking_again_starts_no_process(
     untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trust.require(default_device, FORWARD)
+    driver_check.require(default_device, FORWARD_STAGES)
 
     def started(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(trust, "examine", started)
-    trust.require(default_device, FORWARD)
+    monkeypatch.setattr(driver_check, "examine", started)
+    driver_check.require(default_device, FORWARD_STAGES)

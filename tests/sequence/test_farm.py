@@ -25,9 +25,9 @@ from tiny import HEIGHT, WIDTH, cameras, hidden_model
 from clsplat.cli.main import main
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.errors import InputError
-from clsplat.files import digest
+from clsplat.files.documents import digest
 from clsplat.sequence import farm
-from clsplat.sequence.existing import stamp
+from clsplat.sequence.finished_frames import stamp
 from clsplat.sequence.task import RenderOptions, make_tasks
 from clsplat.shots.shot import Shot, numbered
 
@@ -160,7 +160,7 @@ def test_a_frame_that_fails_ends_the_job(
 
 @pytest.mark.needs("distributed")
 def test_no_scheduler(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(farm, "PATIENCE", 1)
+    monkeypatch.setattr(farm, "SCHEDULER_TIMEOUT_SECONDS", 1)
     assert render(shot, tmp_path, "--scheduler", "tcp://127.0.0.1:9") == 2
     assert "--scheduler tcp://127.0.0.1:9: no scheduler answers there" in error_line(capsys)
     assert render(shot, tmp_path, "--scheduler", "nonsense://x") == 2
@@ -175,7 +175,7 @@ def test_a_scheduler_without_workers(
     """It is said at once and again, until a worker comes, who does the work."""
     import distributed
 
-    monkeypatch.setattr(farm, "REMINDER", 1.0)
+    monkeypatch.setattr(farm, "NO_WORKERS_WARNING_SECONDS", 1.0)
     with distributed.LocalCluster(n_workers=0, processes=True, dashboard_address=None) as empty:
         come = threading.Timer(4.0, lambda: empty.scale(1))
         come.start()
@@ -223,9 +223,9 @@ def test_what_a_worker_does(shot: list[str], tmp_path: Path) -> None:
     again = record_of(farm.render_frame(replace(task, before=first), job))
     assert again.seconds > 0
     assert stamp(task.path) != first
-    renderer = farm._HELD.renderer
+    renderer = farm._WORKER_RENDERER.renderer
     farm.render_frame(replace(task, before=stamp(task.path)), job)
-    assert farm._HELD.renderer is renderer, "the model is loaded once"
+    assert farm._WORKER_RENDERER.renderer is renderer, "the model is loaded once"
     task = replace(task, before=stamp(task.path))
     for wrong, message in [
         (replace(job, digest="0" * 64), "on a worker, expected 000000000000"),
@@ -310,7 +310,7 @@ def test_the_open_job_description_runs(openjd: str, shot: list[str], whole: dict
 
 def test_the_opencue_example_calls_render_as_it_is() -> None:
     from clsplat.cli.main import parse
-    from clsplat.cli.render import Render
+    from clsplat.cli.render.verb import RenderVerb
 
     tree = ast.parse((ROOT / "docs" / "farm" / "opencue_render.py").read_text())
     values = [
@@ -322,7 +322,7 @@ def test_the_opencue_example_calls_render_as_it_is() -> None:
     ]  # type: ignore[attr-defined]
     assert words[0] == "clsplat"
     verb = parse([word.replace("#FRAMESPEC#", "1-3,7") for word in words[1:]])
-    assert isinstance(verb, Render)
+    assert isinstance(verb, RenderVerb)
     assert (verb.frames, verb.skip_existing, verb.progress) == ("1-3,7", True, "json")
 
 

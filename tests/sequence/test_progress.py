@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from clsplat.progress import Counted, FrameProgress, StageProgress, TrainProgress, duration
+from clsplat.progress import CountedFraction, FrameProgress, StageProgress, TrainProgress, duration
 from clsplat.sequence.task import Record
 
 
@@ -200,9 +200,9 @@ def test_counts_are_told_as_such_and_the_last_always(now: list[float], capsys: p
     progress = StageProgress()
     for second, done in ((0.0, 0), (3.0, 7), (10.5, 12), (12.0, 23)):
         now[0] = second
-        progress("placing cameras", Counted(done, 25, "cameras stand"))
+        progress("placing cameras", CountedFraction(done, 25, "cameras stand"))
     progress("undistorting photos", None)
-    progress("placing cameras", Counted(2, 2, "cameras stand"))
+    progress("placing cameras", CountedFraction(2, 2, "cameras stand"))
     progress("done", None)
     assert capsys.readouterr().err.splitlines() == [
         "placing cameras: 0 of 25 cameras stand",
@@ -216,5 +216,5 @@ def test_counts_are_told_as_such_and_the_last_always(now: list[float], capsys: p
 
 @pytest.mark.parametrize(("done", "part", "text"), [(0, 0.0, "0 of 8 x"), (2, 0.25, "2 of 8 x"), (9, 1.0, "8 of 8 x")])
 def test_a_count_is_a_fraction(done: int, part: float, text: str) -> None:
-    assert Counted(done, 8, "x") == part
-    assert Counted(done, 8, "x").text == text
+    assert CountedFraction(done, 8, "x") == part
+    assert CountedFraction(done, 8, "x").text == text

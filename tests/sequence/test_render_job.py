@@ -19,21 +19,21 @@ from calls import left_behind
 from scenes import tilted_camera
 
 from clsplat.camera import Camera
-from clsplat.config.channels import CHANNELS
+from clsplat.config.channels import FRAME_CHANNELS
 from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.errors import ClsplatError, InputError
-from clsplat.files import temporary_name
+from clsplat.files.atomic import temporary_name
 from clsplat.frame.draw import Planes
-from clsplat.sequence import existing, workers
+from clsplat.sequence import finished_frames, workers
 from clsplat.sequence import task as sequence_task
-from clsplat.sequence.existing import is_complete
+from clsplat.sequence.finished_frames import is_complete
 from clsplat.sequence.frame_renderer import FrameRenderer, RenderedFrame
 from clsplat.sequence.task import Record, RenderOptions, Task, make_tasks, settings_digest
 from clsplat.sequence.workers import encode_frame, run_tasks
 from clsplat.shots.motion import camera_after, camera_before, stretches
 from clsplat.shots.shot import Frame, Shot, numbered
 
-EVERYTHING = tuple(CHANNELS)
+EVERYTHING = tuple(FRAME_CHANNELS)
 OPTIONS = RenderOptions(("rgb", "alpha", "depth"), attributes={"clsplat:model": "abc", "Software": "clsplat"})
 
 
@@ -56,7 +56,7 @@ def tasks_in(folder: Path, count: int = 6, channels: tuple[str, ...] = OPTIONS.c
 def planes_of(task: Task, channels: tuple[str, ...] = OPTIONS.channels) -> Planes:
     rng = np.random.default_rng(task.number)
     size = (task.camera.height, task.camera.width)
-    return {name: rng.uniform(0, 1, (*size, len(CHANNELS[name].names))).astype(np.float32) for name in channels}
+    return {name: rng.uniform(0, 1, (*size, len(FRAME_CHANNELS[name].names))).astype(np.float32) for name in channels}
 
 
 def rendered(task: Task) -> RenderedFrame:
@@ -341,26 +341,26 @@ def test_stale_temporaries_of_the_shot_alone_go(tmp_path: Path) -> None:
     left_behind(tmp_path / "a.0002.exr")
     left_behind(tmp_path / "a.0003.exr")
     others.append(left_behind(tmp_path / "a.0004.exr"))
-    existing.remove_temporaries(tasks)
+    finished_frames.remove_temporaries(tasks)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(others)
-    existing.remove_temporaries(tasks_in(tmp_path / "none", 3))
+    finished_frames.remove_temporaries(tasks_in(tmp_path / "none", 3))
 
 
 def test_folders_are_looked_at_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "a.0002.exr").mkdir()
     with pytest.raises(InputError, match=r"file: is a file, expected a folder"):
-        existing.check_folders(tasks_in(tmp_path / "file" / "shot"))
+        finished_frames.check_folders(tasks_in(tmp_path / "file" / "shot"))
     with pytest.raises(InputError, match=r"a\.0002\.exr: is a folder, expected the name of a file"):
-        existing.check_folders(tasks_in(tmp_path))
-    existing.check_folders(tasks_in(tmp_path / "new" / "shot"))
+        finished_frames.check_folders(tasks_in(tmp_path))
+    finished_frames.check_folders(tasks_in(tmp_path / "new" / "shot"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
     with pytest.raises(InputError, match="is not writable"):
-        existing.check_folders(tasks_in(tmp_path / "new" / "shot"))
+        finished_frames.check_folders(tasks_in(tmp_path / "new" / "shot"))
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system")))
     with pytest.raises(InputError, match="cannot be made: the disk is read-only"):
-        existing.make_folders(tasks_in(tmp_path / "new" / "shot"))
+        finished_frames.make_folders(tasks_in(tmp_path / "new" / "shot"))
 
 
 def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from needs import require
 
 from clsplat.camera import Camera
 from clsplat.cli.main import main
-from clsplat.cli.render_job import check_warps
+from clsplat.cli.render.job import check_warps
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import PictureConfig, WarpConfig
 from clsplat.config.stereo import EYES, StereoConfig
@@ -31,7 +31,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.sequence.frame_renderer import FrameRenderer
 from clsplat.sequence.task import RenderOptions, Task
 from clsplat.shots.stereo import for_eye, pair_of_stage, seen_by
-from clsplat.stages.holdout import HELD_BYTES
+from clsplat.stages.holdout import HELD_PIXEL_BYTES
 
 DISTANCE, CONVERGENCE = 0.2, 4.0
 KEY = {"world_from_cam": [1, 0, 0, 0], "fov_x": 40}
@@ -171,8 +171,8 @@ def test_records_tell_the_eyes_apart(shot: list[str], tmp_path: Path, capsys: Ca
     ("pattern", "flags", "message"),
     [
         ("a.##.png", "--stereo 0.1", "has no {eye} in it"),
-        ("a.mp4", "--stereo 0.1", "a video is of one eye, expected --eye left or right"),
-        ("{eye}.mp4", "--stereo 0.1", "a video is of one eye"),
+        ("a.mp4", "--stereo 0.1", "a video holds one eye, expected --eye left or right"),
+        ("{eye}.mp4", "--stereo 0.1", "a video holds one eye"),
         ("{eye}.##.exr", "", "has an eye's name in it, expected --stereo"),
         ("a.##.exr", "--stereo 0", "--stereo 0: expected the distance of the eyes above 0, or stage"),
         ("a.##.exr", "--stereo wide", "--stereo wide: expected the distance"),
@@ -215,7 +215,7 @@ def test_a_pair_of_a_stage(shot: list[str], tmp_path: Path, capsys: Capture) -> 
     assert (
         pair_of_stage(stage) == pair_of_stage(stage, "rig") == pair_of_stage(stage, "two") == ("/rig/one", "/rig/two")
     )
-    with pytest.raises(InputError, match="--usd-camera single: is of no pair, expected --usd-camera with one of /rig"):
+    with pytest.raises(InputError, match="--usd-camera single: belongs to no pair, expected --usd-camera with one of"):
         pair_of_stage(stage, "single")
     call = ["render", shot[0], "--cameras", str(stage), "--width", "64", "--progress", "none"]
     assert main([*call, "-o", f"{tmp_path}/%V.##.exr", "--stereo", "stage"]) == 0
@@ -304,7 +304,7 @@ def test_a_pair_in_strips_is_no_file_of_one_eye(tmp_path: Path) -> None:
 
     class InStrips(FrameRenderer):
         def _rows(self, camera: Camera, planes: int) -> int:
-            return 16 if planes > HELD_BYTES else camera.height
+            return 16 if planes > HELD_PIXEL_BYTES else camera.height
 
     camera, deep = scenes.tilted_camera(64, 40), [[(1.0, z) for z in (3.0, 4.0, 5.0)]] * (64 * 40)
     write_samples(tmp_path / "z.exr", (64, 40), deep)

@@ -17,7 +17,7 @@ from clsplat.errors import InputError
 from clsplat.images.writing import write_image
 from clsplat.reference.cameras import cam_from_pixel
 from clsplat.shots import choose_shot, read_shot
-from clsplat.shots.clsplat_json import FILE, KEY
+from clsplat.shots.readers.clsplat_json import CAMERA_FILE_PROPERTIES, KEY_FRAME_PROPERTIES
 from clsplat.shots.shot import Shot
 from clsplat.stages.device_camera import pack_camera
 
@@ -360,7 +360,7 @@ def test_the_examples_of_the_documentation(tmp_path: Path) -> None:
     for shot in shots:  # each looks from y = -4 along +y, the world's z up
         np.testing.assert_allclose(shot.cameras[0].position[:2], [0, -4])
         np.testing.assert_allclose(shot.cameras[0].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-8)
-    for name in (*FILE, *KEY):
+    for name in (*CAMERA_FILE_PROPERTIES, *KEY_FRAME_PROPERTIES):
         assert f"`{name}`" in text, name
 
 

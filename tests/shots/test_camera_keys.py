@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
-from clsplat.shots.keys import Key, interpolate, tangents
+from clsplat.shots.keyframes import Key, interpolate, tangents
 from clsplat.shots.shot import Shot, numbered
 
 # Rotations and positions of a few units go through some ten products in float64.

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
-from clsplat.shots.generated import PATHS, parabola_weights, spiral, through
+from clsplat.shots.generated import PATH_GENERATORS, parabola_weights, spiral, through
 from clsplat.shots.viewpoints import look_at
 
 FOCUS = np.array([5.0, -2.0, 7.0])
@@ -129,7 +129,7 @@ def test_through_cameras_that_stand_still() -> None:
         np.testing.assert_allclose(camera.rotation, one.rotation, atol=1e-12)
 
 
-@pytest.mark.parametrize("make", PATHS.values(), ids=PATHS)
+@pytest.mark.parametrize("make", PATH_GENERATORS.values(), ids=PATH_GENERATORS)
 def test_any_number_of_frames(make: Callable[[Sequence[Camera], int], list[Camera]]) -> None:
     cameras = dome([0.0, 0.5, 1.0], [0.1, 0.2, 0.1])
     for frames in (1, 2, 17):

@@ -11,8 +11,8 @@ from quick import quick
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK, REFUSED
-from clsplat.gaussians import GROUPS, group_shapes
+from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
+from clsplat.layouts.columns import READBACK, REFUSED
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
 from clsplat.stages.adam import adam, add_view
@@ -22,24 +22,24 @@ from clsplat.stages.device_gaussians import allocate_gaussians
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 100])
 def test_steps(shaped_device: Device, count: int) -> None:
     rng = np.random.default_rng(count)
-    rates = {group: 10.0**-index for index, group in enumerate(GROUPS)}
+    rates = {group: 10.0**-index for index, group in enumerate(PARAMETER_GROUPS)}
     shapes = group_shapes(count, 4)
     counts = upload(shaped_device, np.ones(count, np.uint32))
     p, g, m, v = (allocate_gaussians(shaped_device, count, 4, zero=True) for _ in range(4))
     wanted = {}
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         values = rng.standard_normal(shapes[group]).astype(np.float32)
         p[group].set(values)
         wanted[group] = (values.astype(np.float64), np.zeros(shapes[group]), np.zeros(shapes[group]))
     for step in range(1, 5):
-        for group in GROUPS:
+        for group in PARAMETER_GROUPS:
             gradient = (10.0 ** rng.uniform(-8, 2) * rng.standard_normal(shapes[group])).astype(np.float32)
             g[group].set(gradient)
             wanted[group] = reference(
                 wanted[group][0], gradient.astype(np.float64), *wanted[group][1:], step, rates[group], 0.9, 0.999, 1e-15
             )
         adam(shaped_device, step, rates, OptimiserConfig(), p, g, m, v, counts)
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step, of which there were four.
         assert_close(p[group].get(), wanted[group][0], relative=1e-6, absolute=1e-4 * rates[group])
         assert not g[group].get().any(), "the gradient is to be left zero"
@@ -60,7 +60,7 @@ def test_views_are_added_in_order(shaped_device: Device, count: int) -> None:
             gradients[group].set(values[group])
         views.append((seen, values))
         add_view(shaped_device, upload(shaped_device, 5 * seen.astype(np.uint32)), gradients, sums, shown)
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         exact = add_views([values[group].astype(np.float64) for _, values in views], [seen for seen, _ in views])
         # two roundings, of sums that are at most three times as large as their largest term
         assert_close(sums[group].get(), exact, relative=1e-6, absolute=1e-6)
@@ -74,7 +74,17 @@ def test_views_are_added_in_order(shaped_device: Device, count: int) -> None:
 def test_no_gradient_no_step(device: Device) -> None:
     p, g, m, v = (allocate_gaussians(device, 20, 1, zero=True) for _ in range(4))
     p["means"].fill(0.5)
-    adam(device, 1, dict.fromkeys(GROUPS, 0.1), OptimiserConfig(), p, g, m, v, upload(device, np.ones(20, np.uint32)))
+    adam(
+        device,
+        1,
+        dict.fromkeys(PARAMETER_GROUPS, 0.1),
+        OptimiserConfig(),
+        p,
+        g,
+        m,
+        v,
+        upload(device, np.ones(20, np.uint32)),
+    )
     assert np.all(p["means"].get() == 0.5)
 
 
@@ -96,7 +106,7 @@ def test_sparse_steps_are_those_of_the_visible(shaped_device: Device, count: int
             before[group, index] = values
             dense[index][group].set(values)
             sparse[index][group].set(values)
-    rates = dict.fromkeys(GROUPS, 0.1)
+    rates = dict.fromkeys(PARAMETER_GROUPS, 0.1)
     adam(shaped_device, 3, rates, OptimiserConfig(), *dense, counts)
     adam(shaped_device, 3, rates, OptimiserConfig(sparse=True), *sparse, counts)
     for (group, index), values in before.items():
@@ -115,7 +125,7 @@ def test_sh_rest_waits_for_its_step(device: Device) -> None:
     for step in range(1, 8):
         g["sh_rest"].fill(0.5 * step if step % 3 == 0 else 0.0)
         before = p["sh_rest"].get()
-        adam(device, step, dict.fromkeys(GROUPS, 0.1), config, p, g, m, v, counts)
+        adam(device, step, dict.fromkeys(PARAMETER_GROUPS, 0.1), config, p, g, m, v, counts)
         if step % 3:
             np.testing.assert_array_equal(p["sh_rest"].get(), before)
         else:
@@ -128,7 +138,7 @@ def test_sh_rest_waits_for_its_step(device: Device) -> None:
 def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: int, sparse: bool) -> None:
     """Element by element, whatever shares its vector; counted by what was wrong."""
     device, rng = shaped_device, np.random.default_rng(count)
-    rates = dict.fromkeys(GROUPS, 0.01)
+    rates = dict.fromkeys(PARAMETER_GROUPS, 0.01)
     spoils = {  # array, value, what is then in the first and second moment, place in the counts
         "parameter": (0, np.nan, (0, np.inf), 0),
         "coefficient": (0, -2e7, (0, np.inf), 0),
@@ -147,7 +157,7 @@ def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: 
         models = []
         for spoilt in (True, False):
             arrays = [allocate_gaussians(device, count, 4) for _ in range(4)]
-            for g in GROUPS:
+            for g in PARAMETER_GROUPS:
                 for index, array in enumerate(arrays):
                     values = start[g][index].copy()
                     if spoilt and (g, index) == (group, which):
@@ -156,16 +166,16 @@ def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: 
             shown = upload(device, np.ones(count, np.uint32))
             counts = found if spoilt else upload(device, np.zeros(len(READBACK), np.uint32))
             adam(device, 5, rates, OptimiserConfig(sparse=sparse), *arrays, shown, counts)
-            models.append([{g: array[g].get() for g in GROUPS} for array in arrays])
+            models.append([{g: array[g].get() for g in PARAMETER_GROUPS} for array in arrays])
         before_them = len(READBACK) - len(REFUSED)
         assert found.get().tolist() == [0] * before_them + [int(index == place) for index in range(len(REFUSED))], name
         got, wanted = models
         before = np.float32(value) if which == 0 else start[group][0][row, column]
         np.testing.assert_equal(got[0][group][row, column], before)
         assert (got[2][group][row, column], got[3][group][row, column]) == marks, name
-        assert not any(got[1][g].any() for g in GROUPS), "the gradient is to be left zero"
+        assert not any(got[1][g].any() for g in PARAMETER_GROUPS), "the gradient is to be left zero"
         for index in (0, 2, 3):
             got[index][group][row, column] = wanted[index][group][row, column]
-            for g in GROUPS:
+            for g in PARAMETER_GROUPS:
                 # A neighbour in the vector is worked out as a scalar, whose root a driver may round otherwise.
                 assert_close(got[index][g], wanted[index][g], relative=1e-6)

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK
+from clsplat.layouts.columns import READBACK
 from clsplat.reference import appearance as reference
 from clsplat.stages.appearance import Gains, gain_gradient, remove_gains, step_gains
 

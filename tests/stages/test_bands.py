@@ -14,7 +14,7 @@ from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
@@ -131,7 +131,7 @@ def test_without_a_pair(default_device: Device) -> None:
     frame = rasterizer.forward(on_device, camera, upload(default_device, np.array(BACKGROUND, np.float32)))
     gradients = allocate_gaussians(default_device, on_device.count, on_device.coefficients, zero=True)
     rasterizer.backward(on_device, frame, frame.blended.image, gradients)
-    assert not any(gradients[group].get().any() for group in GROUPS)
+    assert not any(gradients[group].get().any() for group in PARAMETER_GROUPS)
 
 
 @pytest.mark.parametrize("name", ["random_cloud", "overlap", "many_per_tile"])

@@ -13,23 +13,23 @@ from quick import quick
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import PLAIN_SLOTS, READBACK
-from clsplat.gaussians import GROUPS
-from clsplat.rendering.rasterizer import Frame, Rasterizer, Room
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import PLAIN_SLOTS, READBACK
+from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.density import add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.project import project_step
-from clsplat.stages.scan import MOST_ALONE, Elements, scan
-from clsplat.stages.sort import BITONIC_MAX, bitonic_sort, radix_sort
+from clsplat.stages.scan import MAX_SINGLE_CHUNK_ELEMENTS, Elements, scan
+from clsplat.stages.sort import MAX_BITONIC_KEYS, bitonic_sort, radix_sort
 
 SEAMS = [
     (most, count)
-    for most in (1, 64, 1023, 1024, 1025, MOST_ALONE, MOST_ALONE + 1, 20_000)
+    for most in (1, 64, 1023, 1024, 1025, MAX_SINGLE_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS + 1, 20_000)
     for count in sorted({0, 1, most // 3, most - 1, most})
 ]
 """Elements that a launch is for at most, about a group's and a chunk's, and elements that there are."""
 NAMES = ("VISIBLE", "PAIRS", "STOPPED", *(name for name in READBACK if name.startswith("REFUSED")))
-RATES = dict.fromkeys(GROUPS, 0.01)
+RATES = dict.fromkeys(PARAMETER_GROUPS, 0.01)
 
 
 def elements(device: Device, most: int, count: int) -> Elements:
@@ -54,7 +54,7 @@ def test_sorts_of_as_many_as_the_device_says(shaped_device: Device, most: int, c
     on_device, found = upload(shaped_device, keys), elements(shaped_device, most, count)
     order, work = np.argsort(keys[:count], kind="stable"), Workspace(shaped_device)
     results = [radix_sort(shaped_device, work, "radix", on_device, 17, 0, found)]
-    if most <= BITONIC_MAX:
+    if most <= MAX_BITONIC_KEYS:
         results.append(bitonic_sort(shaped_device, work, "bitonic", on_device, found))
     for sorted_keys, positions in results:
         assert_same_bits(sorted_keys.get()[:count], keys[order])
@@ -70,7 +70,7 @@ def scene(name: str) -> scenes.Scene:
     return gaussians, camera
 
 
-def drawn(device: Device, name: str) -> tuple[Rasterizer, DeviceGaussians, Frame]:
+def drawn(device: Device, name: str) -> tuple[Rasterizer, DeviceGaussians, ForwardPass]:
     """The rasterizer, the model and its frame with the exact number of pairs."""
     gaussians, camera = scene(name)
     rasterizer, held = Rasterizer(device), upload_gaussians(device, gaussians)
@@ -78,10 +78,10 @@ def drawn(device: Device, name: str) -> tuple[Rasterizer, DeviceGaussians, Frame
 
 
 def by_capacity(
-    rasterizer: Rasterizer, held: DeviceGaussians, exact: Frame, pairs: int
-) -> tuple[Frame, dict[str, int]]:
+    rasterizer: Rasterizer, held: DeviceGaussians, exact: ForwardPass, pairs: int
+) -> tuple[ForwardPass, dict[str, int]]:
     """A frame with room for so many pairs, and what its copy of the counts has."""
-    frame = rasterizer.forward(held, exact.camera, exact.background, room=Room(pairs, 1))
+    frame = rasterizer.forward(held, exact.camera, exact.background, room=PairCapacity(pairs, 1))
     assert frame.part.counted.arriving is not None
     arrived = frame.part.counted.arriving()
     return frame, {name: int(arrived[READBACK.index(name)]) for name in NAMES}
@@ -120,14 +120,14 @@ def test_a_pass_that_stops_changes_nothing(shaped_device: Device, cause: str) ->
     assert not frame.projected.tile_counts.get().any()
     moments = [allocate_gaussians(shaped_device, held.count, held.coefficients, zero=True) for _ in range(2)]
     moments[0]["means"].fill(0.5)  # which alone would move what is not in view
-    before = [model[group].get() for model in (held, *moments) for group in GROUPS]
+    before = [model[group].get() for model in (held, *moments) for group in PARAMETER_GROUPS]
     gradient = upload(shaped_device, np.ones(frame.blended.image.shape, np.float32))
     slots, screen = rasterizer.pair_gradients(frame, gradient), rasterizer.screen(held.count, PLAIN_SLOTS)
     view = (frame.camera_array, frame.projected, slots, screen, rasterizer.readback)
     project_step(shaped_device, 3, RATES, OptimiserConfig(), (held, *moments), *view)
     statistics = new_statistics(shaped_device, held.count)
-    add_statistics(shaped_device, statistics, frame.camera, frame.projected, screen, 0.0)
-    after = [model[group].get() for model in (held, *moments) for group in GROUPS]
+    add_statistics(shaped_device, statistics, frame.camera, frame.projected, screen)
+    after = [model[group].get() for model in (held, *moments) for group in PARAMETER_GROUPS]
     for one, other in zip(after, before, strict=True):
         assert_same_bits(one, other)
     assert not any(array.get().any() for array in statistics.named().values())

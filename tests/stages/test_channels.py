@@ -19,7 +19,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.reference import channels as twin
 from clsplat.reference import render as reference
-from clsplat.stages.channels import Features, channels, features
+from clsplat.stages.channels import Features, Motion, channels, features
 from clsplat.stages.device_camera import pack_camera
 
 ALL = Features.of(("normal", "position", "motion", "backward"))
@@ -47,8 +47,9 @@ def run(device: Device, scene: tuple[Gaussians, Camera], wanted: Features = ALL)
     device, work = rasterizer.device, rasterizer.work
     after = upload(device, pack_camera(moved(camera)))
     before = upload(device, pack_camera(earlier(camera)))
-    rows = features(device, work, wanted, pipeline.gaussians, frame.camera_array, after, frame.projected, before)
-    found = channels(device, work, wanted, rows, frame.part.lists, frame.projected, frame.blended, camera.height)
+    motion = Motion(after, before)
+    rows = features(device, work, wanted, pipeline.gaussians, frame.camera_array, frame.projected, motion)
+    found = channels(device, work, wanted, rows, frame.part.lists, frame.inputs, frame.blended)
     means, whole = pipeline.crop(found.means.get()), pipeline.crop(found.whole.get())
     result = {name: means[:, :, at : at + width] for name, at, width in fields(wanted)}
     result.update(median=means[:, :, -2], first=means[:, :, -1], count=whole[:, :, 0], index=whole[:, :, 1])
@@ -146,7 +147,7 @@ def test_behind_the_other_camera(device: Device) -> None:
     passed = replace(camera, translation=camera.translation - np.array([0.0, 0.0, 100.0]))
     after = upload(rasterizer.device, pack_camera(passed))
     wanted = Features.of(("motion",))
-    of = (pipeline.gaussians, frame.camera_array, after, frame.projected)
+    of = (pipeline.gaussians, frame.camera_array, frame.projected, Motion(after))
     rows = features(rasterizer.device, rasterizer.work, wanted, *of).get()
     assert_same_bits(rows[:, 1:], np.zeros((1, 2), np.float32))
 

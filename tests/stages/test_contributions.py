@@ -14,9 +14,9 @@ from test_bands import in_bands, most_in_a_tile
 
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SLOT, SlotFields
+from clsplat.layouts.columns import SLOT, SlotFields
 from clsplat.reference import render as reference
-from clsplat.stages.density import CONTRIBUTIONS, add_contributions, carry, list_rows, new_statistics
+from clsplat.stages.density import CONTRIBUTION_STATISTICS, add_contributions, carry, list_rows, new_statistics
 from clsplat.stages.project import Projected
 
 WITH = SlotFields(contributions=True)
@@ -125,26 +125,26 @@ def test_epochs(device: Device, count: int) -> None:
     assert not statistics.current_totals.get().any()
     assert not statistics.current_largest.get().any()
     statistics.forget_contributions()
-    for name in CONTRIBUTIONS:
+    for name in CONTRIBUTION_STATISTICS:
         assert np.isinf(statistics.named()[name].get()).all()
 
 
 def test_what_goes_on_when_rows_move(device: Device) -> None:
-    statistics = new_statistics(device, 4, agreement=True, contributions=True)
+    statistics = new_statistics(device, 4, contributions=True)
     for index, array in enumerate(statistics.named().values()):
         array.set(np.arange(4, dtype=np.float32) + 10 * index)
     names = list(statistics.named())
     assert names == [
-        *("gradient_sums", "seen", "radii", "agreeing"),
+        *("gradient_sums", "seen", "radii"),
         *("current_totals", "current_largest", "whole_totals", "whole_largest"),
     ]
     listed = list_rows(device, np.array([0, 2, 3, 2], np.uint32), np.array([False, False, False, True]))
-    densified = new_statistics(device, 4, agreement=True, contributions=True)
+    densified = new_statistics(device, 4, contributions=True)
     carry(device, listed.rows, statistics, densified, densified=True)
     for index, (name, array) in enumerate(densified.named().items()):
-        wanted = np.array([0, 2, 3, np.inf]) + 10 * index if name in CONTRIBUTIONS else np.zeros(4)
+        wanted = np.array([0, 2, 3, np.inf]) + 10 * index if name in CONTRIBUTION_STATISTICS else np.zeros(4)
         np.testing.assert_array_equal(array.get(), wanted, f"{name}: all else starts again")
-    pruned = new_statistics(device, 3, agreement=True, contributions=True)
+    pruned = new_statistics(device, 3, contributions=True)
     carry(device, list_rows(device, np.array([0, 2, 3], np.uint32), None).rows, statistics, pruned, densified=False)
     for index, array in enumerate(pruned.named().values()):
         np.testing.assert_array_equal(array.get(), np.array([0, 2, 3]) + 10 * index)

@@ -12,14 +12,14 @@ from compare import assert_close, assert_same_bits
 from pipeline import Pipeline
 
 from clsplat.camera import Camera
-from clsplat.config.marking import MarkRules
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT
-from clsplat.gaussians import GROUPS, Gaussians, group_shapes
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, group_shapes
+from clsplat.layouts.columns import SPLAT
+from clsplat.optimisation.density_rules import MarkRules
 from clsplat.reference import density as twin
 from clsplat.reference import render as reference
-from clsplat.stages.density import Marker, add_statistics, gather, list_rows, new_statistics, widen
+from clsplat.stages.density import DeviceMarker, add_statistics, gather, list_rows, new_statistics, widen
 from clsplat.stages.device_gaussians import DeviceGaussians, to_host
 from clsplat.stages.project import Projected, Screen
 
@@ -52,18 +52,16 @@ def test_gather_takes_rows_and_zeros(device: Device, count: int, coefficients: i
             got = gather(device, listed.rows, source, renews=renews)
             on_host = gather(device, listed.rows.get(), to_host(source), renews=renews)
             assert (got.count, got.coefficients) == (length, coefficients)
-            for name in GROUPS:
+            for name in PARAMETER_GROUPS:
                 wanted = host[name][rows]
                 wanted[fresh & renews] = 0
                 np.testing.assert_array_equal(got[name].get(), wanted, err_msg=name)
                 np.testing.assert_array_equal(on_host[name].get(), wanted, err_msg=f"{name} on the host")
-    for name in GROUPS:
+    for name in PARAMETER_GROUPS:
         np.testing.assert_array_equal(source[name].get(), host[name], err_msg=f"{name} of the source")
 
 
-RULES = MarkRules(
-    gradient=2.0, agreeing=1.0, strongest=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5
-)
+RULES = MarkRules(gradient=2.0, strongest=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5)
 
 
 @pytest.mark.parametrize("count", SIZES)
@@ -78,7 +76,7 @@ def test_marks_are_the_twins(device: Device, count: int, wide: bool, streamed: b
         near = (at, *(np.nextafter(at, np.float32(side)) for side in (-np.inf, np.inf)))
         return rng.choice(np.concatenate([*near, [-9, 0, 9, np.nan, np.inf, -np.inf]]).astype(np.float32), size)
 
-    statistics = new_statistics(device, count, agreement=wide, contributions=wide)
+    statistics = new_statistics(device, count, contributions=wide)
     host = {name: values(0.25, 1, 4) for name in statistics.named()}
     host["gradient_sums"], host["seen"] = values(2, 3, 6, 9), rng.integers(0, 4, count).astype(np.float32)
     statistics.load(host)
@@ -89,12 +87,12 @@ def test_marks_are_the_twins(device: Device, count: int, wide: bool, streamed: b
         source[name].set(parameters[name])
     work = Workspace(device)
     model = replace(to_host(source), rows=device.row_alignment) if streamed else source
-    marker = Marker(device, work, model, statistics)
-    limits = (MarkRules(), RULES, replace(RULES, radius=4.0, contribution=0.25, least=(1.0, count // 2)))
+    marker = DeviceMarker(device, work, model, statistics)
+    limits = (MarkRules(), RULES, replace(RULES, radius=4.0, contribution=0.25))
     for limit in (*limits, replace(limits[2], gradient=0.0, strongest=(-np.inf, 0))):
         rules = limit
         if not wide:
-            rules = replace(rules, agreeing=-np.inf, contribution=-np.inf, least=MarkRules.least)
+            rules = replace(rules, contribution=-np.inf)
         scored = twin.scores(rules, host)
         np.testing.assert_array_equal(marker.scores(rules), scored)
         entries, halves = twin.rows(rules, host, parameters["log_scales"], parameters["opacity_logits"])
@@ -123,7 +121,7 @@ def test_widen_keeps_values_and_adds_zeros(device: Device, before: int, after: i
     assert rest.shape == (65, after - 1, 3)
     np.testing.assert_array_equal(rest[:, : before - 1], host["sh_rest"])
     assert not rest[:, before - 1 :].any()
-    for name in list(GROUPS)[:-1]:
+    for name in list(PARAMETER_GROUPS)[:-1]:
         np.testing.assert_array_equal(got[name].get(), host[name], err_msg=name)
 
 
@@ -197,22 +195,3 @@ def test_gradients_in_ndc_do_not_depend_on_the_resolution(device: Device) -> Non
     # the low-pass of 0.3 square pixels and the pixel grid weigh more at half the size
     assert sums[0] > 0
     assert sums[1] == pytest.approx(sums[0], rel=0.1)
-
-
-@pytest.mark.parametrize("count", SIZES)
-def test_views_over_the_threshold_are_counted(device: Device, count: int) -> None:
-    rng = np.random.default_rng(count)
-    camera = scenes.straight_camera(60, 40)
-    statistics, agreeing = new_statistics(device, count, agreement=True), np.zeros(count)
-    splats = upload(device, np.ones((count, len(SPLAT)), np.float32))
-    for _ in range(3):
-        tiles = rng.integers(0, 2, count).astype(np.uint32)
-        screen = rng.normal(size=(count, 2)).astype(np.float32)
-        norms = np.hypot(30 * screen[:, 0].astype(float), 20 * screen[:, 1].astype(float))
-        assert np.all(np.abs(norms / 25 - 1) > 1e-6), "none is so near that rounding decides"
-        projected = Projected(splats, upload(device, tiles))
-        add_statistics(device, statistics, camera, projected, Screen(upload(device, screen)), 25.0)
-        agreeing += (tiles > 0) & (norms >= 25)
-    assert statistics.agreeing is not None
-    np.testing.assert_array_equal(statistics.agreeing.get(), agreeing)
-    assert new_statistics(device, count).agreeing is None, "not counted unless asked for"

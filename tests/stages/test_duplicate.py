@@ -13,15 +13,15 @@ from quick import quick
 from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT
+from clsplat.layouts.columns import SPLAT
 from clsplat.reference import project as reference_project
 from clsplat.reference import render as reference
 from clsplat.reference.tiles import touched_tiles
 from clsplat.stages import scan as stages_scan
 from clsplat.stages.duplicate import count
 from clsplat.stages.project import Projected
-from clsplat.stages.scan import MOST_ALONE
-from clsplat.stages.sort import BITONIC_WINS
+from clsplat.stages.scan import MAX_SINGLE_CHUNK_ELEMENTS
+from clsplat.stages.sort import BITONIC_KEYS_BY_KIND
 
 NAMES = [*scenes.NAMED, "cloud"]
 IN_EVERY_SHAPE = ["off_frustum", "equal_depth", "cloud"]
@@ -90,7 +90,7 @@ def test_equal_depths_go_by_index(device: Device) -> None:
 
 
 def square_tiles(
-    projected: reference_project.Projected, width: int, height: int, *, slack: float = 0.0, threshold: float
+    projected: reference_project.ProjectedTwin, width: int, height: int, *, slack: float = 0.0, threshold: float
 ) -> list[NDArray[np.int64]]:
     """Tiles that have a pixel centre in a square around each Gaussian, like `touched_tiles`.
 
@@ -150,7 +150,7 @@ def counted(device: Device, depths: np.ndarray, visible: np.ndarray, **options: 
     return count(device, Workspace(device), Projected(upload(device, splats), upload(device, tiles)), **options)
 
 
-@pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1025, 9000, MOST_ALONE + 1])
+@pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1025, 9000, MAX_SINGLE_CHUNK_ELEMENTS + 1])
 def test_key_bits_are_those_in_which_the_visible_depths_differ(shaped_device: Device, n: int) -> None:
     rng = np.random.default_rng(n)
     depths, visible = rng.uniform(1.5, 11, n).astype(np.float32), rng.random(n) < 0.7
@@ -174,9 +174,9 @@ def test_key_bits_of_no_gaussian_and_of_equal_ones(shaped_device: Device) -> Non
 
 
 def test_fewer_bits_are_fewer_launches(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages_scan, "MOST_ALONE", 0)  # else one item sorts so few alone, in one launch
-    monkeypatch.setattr(stages_scan, "LEAST_CHUNK", 256)
-    monkeypatch.setitem(BITONIC_WINS, default_device.kind, 0)  # of so few, which a GPU sorts in one launch
+    monkeypatch.setattr(stages_scan, "MAX_SINGLE_CHUNK_ELEMENTS", 0)  # else one item sorts so few alone, in one launch
+    monkeypatch.setattr(stages_scan, "MIN_CHUNK_ELEMENTS", 256)
+    monkeypatch.setitem(BITONIC_KEYS_BY_KIND, default_device.kind, 0)  # of so few, which a GPU sorts in one launch
     device = default_device.with_shape()  # with a recorder of its own: nobody else's launches are counted
     gaussians, camera = make("cloud")
     # Depths from 2 to 3 differ in 22 bits: two digits of 11 rather than three.

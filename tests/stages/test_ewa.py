@@ -16,10 +16,20 @@ from quick import quick
 from clsplat.arrays import Float64
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import EWA_GRADIENT, SUM_ROWS
 from clsplat.errors import InputError
+from clsplat.layouts.columns import EWA_GRADIENT, SUM_ROWS
 from clsplat.reference import ewa as twin
-from clsplat.stages.ewa import Ewa, EwaCamera, EwaGradients, EwaInputs, camera_gradients, ewa, ewa_array, ewa_grad
+from clsplat.stages.ewa import (
+    Ewa,
+    EwaCamera,
+    EwaGradients,
+    EwaImageGradients,
+    EwaInputs,
+    PlacedEwaCamera,
+    camera_gradients,
+    ewa,
+    ewa_grad,
+)
 from clsplat.stages.sums import padded, row_sums
 
 WAYS = [(model, covariances, full) for model in MODELS for covariances in (False, True) for full in (False, True)]
@@ -28,7 +38,7 @@ FIRST, OTHERS = ("pinhole", False, True), [("fisheye", True, True), ("ortho", Fa
 """Of the quick run: in every shape, and in a device's own."""
 
 
-def camera_of(view: twin.View) -> EwaCamera:
+def camera_of(view: twin.EwaViewTwin) -> EwaCamera:
     planes = (view.near, view.far, view.eps2d, view.radius_clip)
     return EwaCamera(view.viewmat, view.intrinsics, view.width, view.height, *planes, view.model)
 
@@ -45,8 +55,7 @@ class Run:
 
     device: Device
     inputs: EwaInputs
-    camera: EwaCamera
-    camera_array: DeviceArray
+    camera: PlacedEwaCamera
     arrays: Ewa
 
     @classmethod
@@ -62,8 +71,8 @@ class Run:
             filled(device, n, 3),
             filled(device, n) if full else None,
         )
-        run = cls(device, inputs, camera, ewa_array(device, camera), arrays)
-        ewa(device, inputs, camera, run.camera_array, arrays)
+        run = cls(device, inputs, PlacedEwaCamera.on(device, camera), arrays)
+        ewa(device, inputs, run.camera, arrays)
         return run
 
     def get(self, name: str) -> NDArray[Any]:
@@ -77,15 +86,15 @@ class Run:
         if into is None:
             shapes = {"covariances": 6} if self.inputs.covariances is not None else {"quaternions": 4, "scales": 3}
             into = EwaGradients(**{name: filled(device, n, width) for name, width in {"means": 3, **shapes}.items()})
-        given: dict[str, Any] = {name: upload(device, values) for name, values in by.items()}
-        where = (self.camera, self.camera_array, self.arrays, into)
-        sums = ewa_grad(device, Workspace(device), self.inputs, *where, add=add, by_camera=True, **given)
+        given = EwaImageGradients(**{name: upload(device, values) for name, values in by.items()})
+        where = (self.camera, self.arrays, given, into)
+        sums = ewa_grad(device, Workspace(device), self.inputs, *where, add=add, by_camera=True)
         assert sums is not None
         arrays = {name: array.get() for name, array in vars(into).items() if array is not None}
         return arrays, *camera_gradients(sums.get())
 
 
-def assert_projected(run: Run, wanted: twin.Projected, *, compensated: bool) -> None:
+def assert_projected(run: Run, wanted: twin.EwaProjectedTwin, *, compensated: bool) -> None:
     """Radii are those of the twin but where a side is within rounding of a whole pixel; what only one of them culls is
     one of those."""
     radii = run.get("radii")

@@ -37,7 +37,7 @@ def test_what_is_beyond_it_is_left_out(default_device: Device, kind: str) -> Non
     camera, renderer = camera_of(kind), Renderer(default_device)
     gaussians = replace(CLOUD, by_rays=camera.by_rays)
     local = gaussians.means.astype(np.float64) @ camera.rotation.T + camera.translation
-    depths = local[:, 2] if camera.kind.flat else np.linalg.norm(local, axis=1)
+    depths = local[:, 2] if camera.model.flat else np.linalg.norm(local, axis=1)
     seen = np.sort(depths[depths > camera.near])
     far = float(seen[len(seen) // 2 - 1 : len(seen) // 2 + 1].mean())  # between two of them
     cut = replace(camera, far=far)

@@ -17,8 +17,8 @@ from test_project_rays import all_around, fisheye, panorama, pinhole
 
 from clsplat.camera import Camera
 from clsplat.device.context import Device
-from clsplat.device.layout import SlotFields
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import SlotFields
 from clsplat.reference import every_pixel
 
 BENT = (0.04, -0.012, 0.004, -0.0006)
@@ -61,7 +61,7 @@ def direction_of_loss(gaussians: Gaussians, camera: Camera, band: float) -> np.n
 
 
 @cache
-def wanted(name: str) -> tuple[np.ndarray, every_pixel.Gradients]:
+def wanted(name: str) -> tuple[np.ndarray, every_pixel.GradientsTwin]:
     gaussians, camera = subject(name, 200)
     d_image = direction_of_loss(gaussians, camera, BAND)
     assert (d_image != 0).mean() > 0.8

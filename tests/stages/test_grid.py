@@ -10,21 +10,21 @@ from planes import padded
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK
+from clsplat.layouts.columns import READBACK
 from clsplat.reference import grid as reference
-from clsplat.stages.grid import SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
+from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
 
 
 def some_grids(rng: np.random.Generator, count: int) -> np.ndarray:
-    return (reference.identity(SHAPE[:3]) + rng.normal(0, 0.1, (count, *SHAPE))).astype(np.float32)
+    return (reference.identity(GRID_SHAPE[:3]) + rng.normal(0, 0.1, (count, *GRID_SHAPE))).astype(np.float32)
 
 
 def some_image(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     """An image with colours under 0 and over 1, and no luminance near a level, where the slope has a kink."""
     image = rng.uniform(-0.2, 1.3, (height, width, 3))
-    level = image @ reference.LUMINANCE * (SHAPE[0] - 1)
+    level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
     low = np.floor(level)
-    return image + ((low + 0.05 + 0.9 * (level - low) - level) / (SHAPE[0] - 1))[..., None]
+    return image + ((low + 0.05 + 0.9 * (level - low) - level) / (GRID_SHAPE[0] - 1))[..., None]
 
 
 @pytest.mark.slow_in_groups
@@ -58,7 +58,7 @@ def test_a_grid_and_its_gradient(shaped_device: Device, width: int, height: int)
 def test_a_grid_of_identities_changes_nothing(shaped_device: Device) -> None:
     image = np.random.default_rng(3).random((20, 30, 3)).astype(np.float32)
     work = Workspace(shaped_device)
-    grids = Grids.on(shaped_device, reference.identity(SHAPE[:3])[None].astype(np.float32))
+    grids = Grids.on(shaped_device, reference.identity(GRID_SHAPE[:3])[None].astype(np.float32))
     seen = apply_grid(shaped_device, work, grids, 0, upload(shaped_device, padded(image, np.nan)), 30, 20)
     assert_close(seen.get()[:, :20, :30].transpose(1, 2, 0), image, relative=3e-7)
 
@@ -77,9 +77,9 @@ def test_steps_of_one_photograph(shaped_device: Device) -> None:
     values = some_grids(rng, 3)
     grids = Grids.on(shaped_device, values)
     readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
-    state = (values[2].astype(np.float64), np.zeros(SHAPE), np.zeros(SHAPE))
+    state = (values[2].astype(np.float64), np.zeros(GRID_SHAPE), np.zeros(GRID_SHAPE))
     for visit in range(1, 6):
-        by_grid = rng.normal(0, 1, SHAPE).astype(np.float32)
+        by_grid = rng.normal(0, 1, GRID_SHAPE).astype(np.float32)
         state = reference.step(*state, by_grid.astype(np.float64), visit, 0.01)
         step_grid(shaped_device, grids, 2, upload(shaped_device, by_grid), visit, 0.01, readback)
     assert_close(grids.grids.get()[2], state[0], absolute=1e-6)
@@ -98,7 +98,7 @@ def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:
     before = some_grids(np.random.default_rng(6), 1)
     grids, values = Grids.on(shaped_device, before), np.zeros(len(READBACK), np.uint32)
     values[READBACK.index("STOPPED")] = 1
-    by_grid = upload(shaped_device, np.ones(SHAPE, np.float32))
+    by_grid = upload(shaped_device, np.ones(GRID_SHAPE, np.float32))
     step_grid(shaped_device, grids, 0, by_grid, 1, 0.1, upload(shaped_device, values))
     assert_same_bits(grids.grids.get(), before)
     assert not grids.first.get().any()
@@ -134,4 +134,4 @@ def test_the_variation_against_finite_differences() -> None:
         step = 1e-4 * rng.normal(0, 1, grid.shape)
         changed = (reference.variation(grid + step) - reference.variation(grid - step)) / 2
         assert_close(changed, (by_grid * step).sum(), relative=1e-8)
-    assert reference.variation(reference.identity(SHAPE[:3])) == 0
+    assert reference.variation(reference.identity(GRID_SHAPE[:3])) == 0

@@ -18,7 +18,14 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.reference.sh import sh_basis_grad
 from clsplat.spherical_harmonics import sh_basis
-from clsplat.stages.harmonics import HIGHEST, Harmonics, centre_array, harmonics, harmonics_grad
+from clsplat.stages.harmonics import (
+    MAX_SH_BASIS_DEGREE,
+    Harmonics,
+    HarmonicsGradients,
+    centre_array,
+    harmonics,
+    harmonics_grad,
+)
 
 CENTRE = np.array([0.1, 0.2, 3.3])
 """Of a camera; not one of float32's numbers."""
@@ -60,7 +67,7 @@ class Subject:
 def subject(count: int, degree: int = 3, *, camera: bool = True) -> Subject:
     rng = np.random.default_rng(count + degree)
     mask = np.repeat((rng.random((count, 1)) < 0.8).astype(np.int32), 2, axis=1)
-    shapes = ((count, 3), (count, 25 if degree == HIGHEST else 16, 3), (count, 3))
+    shapes = ((count, 3), (count, 25 if degree == MAX_SH_BASIS_DEGREE else 16, 3), (count, 3))
     directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
     return Subject(directions, sh, mask, by, degree, camera)
 
@@ -74,14 +81,14 @@ def run(device: Device, given: Subject, *, add: bool = False, start: float = -7.
     for array in (colours, d_sh, d_directions):
         array.fill(start)
     harmonics(device, inputs, colours)
-    by = (colours, upload(device, given.d_colours), d_sh, d_directions)
+    by = (colours, upload(device, given.d_colours), HarmonicsGradients(d_sh, d_directions))
     by_centre = harmonics_grad(device, work, inputs, *by, add=add, add_directions=add, by_centre=given.camera)
     found = {"colours": colours.get(), "sh": d_sh.get(), "directions": d_directions.get()}
     return found if by_centre is None else {**found, "centre": by_centre.get()}
 
 
 @pytest.mark.parametrize("camera", quick([False, True], True))
-@pytest.mark.parametrize("degree", range(HIGHEST + 1))
+@pytest.mark.parametrize("degree", range(MAX_SH_BASIS_DEGREE + 1))
 def test_the_kernels_against_float64(shaped_device: Device, degree: int, camera: bool) -> None:
     given = subject(300, degree, camera=camera)
     found, wanted = run(shaped_device, given), given.wanted()
@@ -131,7 +138,7 @@ def test_what_is_hidden_may_be_no_number(shaped_device: Device) -> None:
     assert found["centre"].any()
 
 
-@pytest.mark.parametrize("degree", quick(range(HIGHEST + 1), 3))
+@pytest.mark.parametrize("degree", quick(range(MAX_SH_BASIS_DEGREE + 1), 3))
 def test_no_direction_has_the_first_coefficient_alone(device: Device, degree: int) -> None:
     given = replace(subject(64, degree, camera=False), directions=np.zeros((64, 3), np.float32))
     found = run(device, given)

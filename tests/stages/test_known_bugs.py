@@ -15,10 +15,10 @@ from compare import assert_close_gradient, assert_close_images, assert_same_bits
 from pipeline import BACKGROUND, Pipeline
 
 from clsplat.device.context import Device
-from clsplat.device.layout import TILE, SlotFields
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import TILE, SlotFields
 from clsplat.reference import render as reference
-from clsplat.reference.blend import ALPHA_MAX
+from clsplat.reference.blend import BLEND_ALPHA_MAX
 from clsplat.reference.tiles import touched_tiles
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -51,7 +51,7 @@ def test_alpha_at_its_cap_passes_a_colour_gradient_alone(device: Device) -> None
 
 
 def test_alpha_just_under_its_cap_passes_all(device: Device) -> None:
-    scene = flat(0.9 * ALPHA_MAX)
+    scene = flat(0.9 * BLEND_ALPHA_MAX)
     run = Pipeline.run(device, scene)
     d_image = image_gradient(run)
     got, _ = run.backward(d_image)

@@ -16,12 +16,11 @@ from test_gradients_of_projections import CAMERAS, direction_of_loss
 from clsplat.camera import Camera
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import POSE_ROWS, TILE
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import POSE_ROWS, TILE
 from clsplat.reference import render as reference
-from clsplat.reference.project import frustum_limits
 from clsplat.stages.device_gaussians import allocate_gaussians
-from clsplat.stages.pose import LENS, lens_rows, sum_of, sums_of
+from clsplat.stages.pose import LENS_NUMBERS, lens_rows, sum_of, sums_of
 
 STEPS = np.array([1e-6, 1e-6, 1e-5, 1e-5])
 """Of the logs of the focal lengths, and of the principal point in pixels."""
@@ -45,7 +44,7 @@ def beyond(gaussians: Gaussians, camera: Camera) -> int:
     """Gaussians before the camera whose ratio is clamped."""
     x, y, z = (gaussians.means @ camera.rotation.T + camera.translation).T
     ratios = np.stack([x, y], axis=1)[z > 0.01] / z[z > 0.01, None]
-    low, high = frustum_limits(camera)
+    low, high = camera.frustum_limits
     return int(((ratios < low) | (ratios > high)).any(axis=1).sum())
 
 
@@ -79,7 +78,7 @@ def test_the_kernels_against_the_twin(shaped_device: Device, kind: str) -> None:
     planes = np.zeros((3, -(-camera.height // TILE) * TILE, -(-camera.width // TILE) * TILE), np.float32)
     planes[:, : camera.height, : camera.width] = d_image.transpose(2, 0, 1)
     plain, gradients = (allocate_gaussians(rasterizer.device, model.count, model.coefficients) for _ in range(2))
-    by_lens = allocate(rasterizer.device, (model.count, LENS), np.float32)
+    by_lens = allocate(rasterizer.device, (model.count, LENS_NUMBERS), np.float32)
     for array in (*plain.arrays.values(), *gradients.arrays.values()):
         array.fill(0.0)
     by_lens.fill(np.nan)  # rows that are not seen are not read
@@ -88,7 +87,7 @@ def test_the_kernels_against_the_twin(shaped_device: Device, kind: str) -> None:
     rasterizer.backward(model, frame, image_gradient, gradients, by_lens=by_lens)
     for group, array in plain.arrays.items():  # the model's gradients are what they are without
         assert_same_bits(array.get(), gradients[group].get())
-    sums = sums_of(rasterizer.work, model.count, LENS)
+    sums = sums_of(rasterizer.work, model.count, LENS_NUMBERS)
     lens_rows(rasterizer.device, frame.projected.tile_counts, by_lens, sums)
     got = sum_of(rasterizer.device, rasterizer.work, sums).get()[0]
     for part in (slice(2), slice(2, 4)):
@@ -98,11 +97,11 @@ def test_the_kernels_against_the_twin(shaped_device: Device, kind: str) -> None:
 @pytest.mark.parametrize("count", [1, POSE_ROWS, POSE_ROWS + 1, POSE_ROWS**2 + 1])
 def test_sums_at_the_seams(device: Device, count: int) -> None:
     """In two parts, of a model that is not on the device at once; every third row is not seen."""
-    rows = np.random.default_rng(count).standard_normal((count, LENS)).astype(np.float32)
+    rows = np.random.default_rng(count).standard_normal((count, LENS_NUMBERS)).astype(np.float32)
     seen = np.arange(count) % 3 != 1
     rows[~seen] = np.nan
     work, counts, by_lens = Workspace(device), upload(device, seen.astype(np.uint32)), upload(device, rows)
-    sums = sums_of(work, count, LENS)
+    sums = sums_of(work, count, LENS_NUMBERS)
     sums.fill(np.nan)
     for start in range(0, count, POSE_ROWS):
         stop = min(start + POSE_ROWS, count)

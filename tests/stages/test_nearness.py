@@ -17,15 +17,16 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
-from clsplat.device.layout import TILE, SlotFields
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import TILE, SlotFields
 from clsplat.reference import every_pixel
 from clsplat.reference.depth import depth_loss
 from clsplat.reference.loss import alpha_loss, l1_dssim
 from clsplat.reference.render import forward, render_grad
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
-from clsplat.stages.loss import DepthAims, loss
+from clsplat.stages.loss import loss
+from clsplat.stages.loss_terms import AlphaTerm, DepthTerm
 from clsplat.stages.target import target
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -60,10 +61,10 @@ def stepped(
     assert blended.nearness is not None
     seen = forward(gaussians, camera, BACKGROUND).blended
     aims, weights = aims_of(camera, seen.margin)
-    depth = DepthAims(padded(camera, aims, weights), 0.02)
+    depth = DepthTerm(padded(camera, aims, weights), 0.02)
     planes = target(device, rasterizer.work, photograph, frame.background, blended, alpha=alpha_weight > 0)
-    how = {"blended": blended, "alpha_weight": alpha_weight, "depth": depth}
-    result = loss(device, rasterizer.work, blended.image, planes, *size, 0.2, **how)
+    terms = (*([AlphaTerm(alpha_weight)] if alpha_weight else []), depth)
+    result = loss(device, rasterizer.work, blended.image, planes, *size, 0.2, blended=blended, terms=terms)
     gradients = allocate_gaussians(device, gaussians.means.shape[0], gaussians.sh.shape[1], zero=True)
     rasterizer.backward(model, frame, result.gradient, gradients, fields=fields)
     nearness = blended.nearness.get()[: camera.height, : camera.width]

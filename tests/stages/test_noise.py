@@ -9,15 +9,15 @@ import scenes
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
 
-from clsplat.config.exploring import Exploration, step_key
 from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK
-from clsplat.gaussians import GROUPS, Gaussians
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.layouts.columns import READBACK
+from clsplat.optimisation.step_noise import Exploration, step_key
 from clsplat.reference.noise import displacements, normal_numbers, penalty, penalty_grad
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
-from clsplat.stages.noise import REACH, highest_logit, noise
+from clsplat.stages.noise import NOISE_OPACITY_RANGE, highest_logit, noise
 from clsplat.stages.project import Screen, Slots, project_grad
 
 LOUD = Exploration(amount=40.0, key=step_key(7, 123))
@@ -40,9 +40,9 @@ def faint(count: int) -> Gaussians:
 def moved(device: Device, gaussians: Gaussians, explore: Exploration, first_row: int = 0) -> NDArray[np.float32]:
     held = upload_gaussians(device, gaussians)
     noise(device, explore, held, first_row, counts(device))
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         if group not in ("means", "sh_dc", "sh_rest"):
-            assert_same_bits(held[group].get(), getattr(gaussians, GROUPS[group].field), group)
+            assert_same_bits(held[group].get(), getattr(gaussians, PARAMETER_GROUPS[group].field), group)
     return held["means"].get()
 
 
@@ -97,7 +97,7 @@ def test_what_stays(device: Device) -> None:
     gaussians = faint(40)
     gaussians.opacity_logits[:] = -6
     gaussians.means[:] = 1.0
-    opaque = LOUD.dead + 1.01 * REACH
+    opaque = LOUD.dead + 1.01 * NOISE_OPACITY_RANGE
     gaussians.opacity_logits[0] = np.log(opaque / (1 - opaque))
     gaussians.quaternions[1] = 0
     gaussians.log_scales[2] = 80

@@ -17,8 +17,8 @@ from test_gradients_of_projections import CAMERAS, direction_of_loss, subject
 from clsplat.camera import Camera
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import POSE_ROWS, TILE
 from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import POSE_ROWS, TILE
 from clsplat.reference import every_pixel
 from clsplat.reference.pose import pose_gradient as reference
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians

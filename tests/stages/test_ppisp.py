@@ -12,11 +12,11 @@ from planes import padded
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import READBACK
+from clsplat.layouts.columns import READBACK
 from clsplat.reference import appearance, ppisp
 from clsplat.runs.appearance import held_out_looks, unmixing
 from clsplat.stages.appearance import Gains, step_gains
-from clsplat.stages.ppisp import COLOURS, VIGNETTE, Taken, camera_gradient, develop
+from clsplat.stages.ppisp import COLOUR_ENTRIES, VIGNETTE_ENTRIES, PhotoLens, camera_gradient, develop
 
 Array = np.ndarray
 
@@ -25,7 +25,7 @@ def made_up(rng: np.random.Generator, photographs: int, lenses: int) -> tuple[Ar
     """Entries of photographs and vignettes of lenses."""
     gains, mixes = rng.uniform(-1, 1, (photographs, 3)), rng.uniform(-0.2, 0.2, (photographs, 6))
     entries = np.concatenate([gains, mixes], axis=1).astype(np.float32)
-    return entries, rng.uniform(-0.5, 0.2, (lenses, VIGNETTE)).astype(np.float32)
+    return entries, rng.uniform(-0.5, 0.2, (lenses, VIGNETTE_ENTRIES)).astype(np.float32)
 
 
 @pytest.mark.slow_in_groups
@@ -37,7 +37,7 @@ def test_photographs_developed_and_the_gradient(shaped_device: Device, width: in
     image, photograph = rng.random((2, height, width, 3)).astype(np.float32)
     by_image = rng.normal(0.3, 1, image.shape).astype(np.float32)
     entries, lenses = made_up(rng, 5, 3)
-    work, taken = Workspace(shaped_device), Taken(3, 2, (0.4, 0.55))
+    work, taken = Workspace(shaped_device), PhotoLens(3, 2, (0.4, 0.55))
     colours, vignettes = Gains.on(shaped_device, entries), Gains.on(shaped_device, lenses)
     planes = np.concatenate([padded(photograph), padded(photograph)[:1]])  # the fourth is of alpha
     target = upload(shaped_device, planes)
@@ -66,20 +66,23 @@ def test_steps_of_colours_and_of_lenses(shaped_device: Device) -> None:
     entries -= entries.mean(axis=0)
     colours, vignettes = Gains.on(shaped_device, entries), Gains.on(shaped_device, lenses)
     readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
-    state: Any = entries.astype(np.float64), np.zeros((4, COLOURS)), np.zeros((4, COLOURS))
-    through: Any = lenses.astype(np.float64), np.zeros((2, VIGNETTE)), np.zeros((2, VIGNETTE))
-    factors = np.log(2) ** (np.arange(COLOURS) < 3)
-    rates = 0.01 * np.where(np.arange(COLOURS) < 3, 1.0, 0.1)
+    state: Any = entries.astype(np.float64), np.zeros((4, COLOUR_ENTRIES)), np.zeros((4, COLOUR_ENTRIES))
+    through: Any = lenses.astype(np.float64), np.zeros((2, VIGNETTE_ENTRIES)), np.zeros((2, VIGNETTE_ENTRIES))
+    factors = np.log(2) ** (np.arange(COLOUR_ENTRIES) < 3)
+    rates = 0.01 * np.where(np.arange(COLOUR_ENTRIES) < 3, 1.0, 0.1)
     for number in range(1, 12):
-        columns = rng.normal(0, 1, (COLOURS + VIGNETTE, 16)).astype(np.float32)
+        columns = rng.normal(0, 1, (COLOUR_ENTRIES + VIGNETTE_ENTRIES, 16)).astype(np.float32)
         sums = columns.astype(np.float64).sum(axis=1)
-        by_entries, by_lenses = np.zeros((4, COLOURS)), np.zeros((2, VIGNETTE))
-        by_entries[number % 4], by_lenses[number % 2] = factors * sums[:COLOURS], np.log(2) * sums[COLOURS:]
+        by_entries, by_lenses = np.zeros((4, COLOUR_ENTRIES)), np.zeros((2, VIGNETTE_ENTRIES))
+        by_entries[number % 4], by_lenses[number % 2] = (
+            factors * sums[:COLOUR_ENTRIES],
+            np.log(2) * sums[COLOUR_ENTRIES:],
+        )
         state = appearance.step(*state, by_entries, number, rates)
         through = appearance.step(*through, by_lenses, number, 0.02, centred=False)
         of_step = upload(shaped_device, columns), number
         step_gains(shaped_device, colours, number % 4, *of_step, 0.01, readback, slow=0.1)
-        step_gains(shaped_device, vignettes, number % 2, *of_step, 0.02, readback, at=COLOURS, centred=False)
+        step_gains(shaped_device, vignettes, number % 2, *of_step, 0.02, readback, at=COLOUR_ENTRIES, centred=False)
     # Eleven steps; a sum of 16 floats that nearly cancel is good to 1e-5 of itself.
     assert_close(colours.logs.get(), state[0], absolute=1e-5)
     assert_close(colours.gains.get()[:, :3], np.exp2(state[0][:, :3]), absolute=1e-5)
@@ -87,10 +90,10 @@ def test_steps_of_colours_and_of_lenses(shaped_device: Device) -> None:
 
 
 def test_mixes_stay_where_they_can_be_undone(shaped_device: Device) -> None:
-    entries = np.zeros((2, COLOURS), np.float32)
+    entries = np.zeros((2, COLOUR_ENTRIES), np.float32)
     colours = Gains.on(shaped_device, entries)
     readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
-    columns = upload(shaped_device, np.ones((COLOURS + VIGNETTE, 16), np.float32))
+    columns = upload(shaped_device, np.ones((COLOUR_ENTRIES + VIGNETTE_ENTRIES, 16), np.float32))
     for number in range(1, 40):
         step_gains(shaped_device, colours, 0, columns, number, 1.0, readback)
     logs = colours.logs.get().astype(np.float64)
@@ -102,7 +105,7 @@ def test_a_panorama_has_no_vignette(default_device: Device) -> None:
     rng = np.random.default_rng(5)
     image = rng.random((16, 16, 3)).astype(np.float32)
     entries, lenses = made_up(rng, 1, 1)
-    taken = Taken(0, 0, (0.5, 0.5), flat=False)
+    taken = PhotoLens(0, 0, (0.5, 0.5), flat=False)
     colours, vignettes = Gains.on(default_device, entries), Gains.on(default_device, lenses)
     target = upload(default_device, padded(image))
     develop(default_device, colours, vignettes, taken, target, 16, 16)
@@ -111,7 +114,7 @@ def test_a_panorama_has_no_vignette(default_device: Device) -> None:
     assert_close(target.get().transpose(1, 2, 0), wanted, absolute=4e-6)  # as above
     planes = upload(default_device, padded(image))
     columns = camera_gradient(default_device, Workspace(default_device), taken, planes, planes, 16, 16)
-    assert not columns.get()[COLOURS:].any()
+    assert not columns.get()[COLOUR_ENTRIES:].any()
 
 
 def test_the_twin_against_finite_differences() -> None:

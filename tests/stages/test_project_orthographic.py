@@ -17,7 +17,7 @@ from clsplat.camera import Camera
 from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.frame.deep_exr import render_deep
+from clsplat.frame.deep import render_deep
 from clsplat.frame.draw import on_tiles
 from clsplat.frame.window import crop
 from clsplat.reference import deep as deep_twin
@@ -145,7 +145,7 @@ def assert_same_pictures(got: tuple[RenderResult, ChannelResult], wanted: tuple[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", [{"frustum_cull": False}, {"opacity_cull": False}, {"tile_test": "square"}])
+@pytest.mark.parametrize("change", [{"frustum_cull": False}, {"tile_test": "square"}])
 def test_exact_switches_change_no_bit(default_device: Device, change: dict[str, bool]) -> None:
     gaussians, camera = orthographic(scenes.off_frustum())
     plain = Renderer(default_device).render(gaussians, camera, BACKGROUND)

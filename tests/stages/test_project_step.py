@@ -14,19 +14,19 @@ from pipeline import BACKGROUND
 from quick import quick
 
 from clsplat.camera import Camera
-from clsplat.config.exploring import Exploration
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import PLAIN_SLOTS, READBACK, REFUSED, WIDEST_SLOTS, SlotFields
-from clsplat.gaussians import GROUPS, Gaussians, group_shapes
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, group_shapes
+from clsplat.layouts.columns import PLAIN_SLOTS, READBACK, REFUSED, WIDEST_SLOTS, SlotFields
+from clsplat.optimisation.step_noise import Exploration
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.stages.adam import adam, updates_sh_rest
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.project import Screen, Slots, add_slots, project_grad, project_step
 
 EVERY_ROW = OptimiserConfig()
-RATES = {group: 10.0**-index for index, group in enumerate(GROUPS, 1)}
+RATES = {group: 10.0**-index for index, group in enumerate(PARAMETER_GROUPS, 1)}
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,11 @@ def steps(
         rng = np.random.default_rng(count)
         parameters = upload_gaussians(device, gaussians)
         first, second = (allocate_gaussians(device, count, held.coefficients) for _ in range(2))
-        for group in GROUPS:
+        for group in PARAMETER_GROUPS:
             numbers(first[group], rng, -0.1, 0.1)
             numbers(second[group], rng, 0.0, 0.1)
         if spoil == "moment":
-            for group in GROUPS:
+            for group in PARAMETER_GROUPS:
                 broken = first[group].get()
                 broken.reshape(count, -1)[count // 2, -1:] = np.inf
                 first[group].set(broken)
@@ -115,7 +115,7 @@ def after_step(
     model: tuple[DeviceGaussians, DeviceGaussians, DeviceGaussians],
     *,
     fused: bool,
-    frame: Frame,
+    frame: ForwardPass,
     slots: Slots,
 ) -> list[dict[str, NDArray[np.float32]]]:
     """Model, view and counts on the host, after a step."""
@@ -140,7 +140,7 @@ def after_step(
     view_arrays = {"screen": screen.gradients.get(), "counts": readback.get()}
     if contributions is not None:
         view_arrays["contributions"] = contributions.get()
-    return [*({group: each[group].get() for group in GROUPS} for each in model), view_arrays]
+    return [*({group: each[group].get() for group in PARAMETER_GROUPS} for each in model), view_arrays]
 
 
 def assert_alike(device: Device, case: Case, count: int, spoil: str = "") -> list[dict[str, NDArray[np.float32]]]:
@@ -181,6 +181,6 @@ def test_what_is_not_finite_is_refused_alike(shaped_device: Device, name: str, c
         # Every element of a Gaussian gets a gradient that is not finite; one of each group has such a moment.
         floats = sum(int(np.prod(shape)) for shape in group_shapes(1, 16).values())
         shown = spoil == "gradient" or not case.optimiser.sparse or (count // 2) % 4 != 1
-        most = floats if spoil == "gradient" else len(GROUPS)
+        most = floats if spoil == "gradient" else len(PARAMETER_GROUPS)
         assert (0 < refused[reason] <= most) or not shown
         assert sum(counts) == refused[reason], "and for no other reason"

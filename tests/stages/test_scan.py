@@ -10,9 +10,24 @@ from quick import quick
 
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
-from clsplat.stages.scan import MOST_ALONE, MOST_GROUPS, PER_ITEM, scan
+from clsplat.stages.scan import CHUNK_ELEMENTS_PER_ITEM, MAX_SCAN_GROUPS, MAX_SINGLE_CHUNK_ELEMENTS, scan
 
-SIZES = (1, 2, 63, 64, 65, 1023, 1024, 1025, 4096, 4097, MOST_ALONE - 1, MOST_ALONE, MOST_ALONE + 1, 100_003)
+SIZES = (
+    1,
+    2,
+    63,
+    64,
+    65,
+    1023,
+    1024,
+    1025,
+    4096,
+    4097,
+    MAX_SINGLE_CHUNK_ELEMENTS - 1,
+    MAX_SINGLE_CHUNK_ELEMENTS,
+    MAX_SINGLE_CHUNK_ELEMENTS + 1,
+    100_003,
+)
 
 
 def check(device: Device, n: int) -> None:
@@ -32,13 +47,13 @@ def test_exclusive_prefix_sum(shaped_device: Device, n: int) -> None:
 @pytest.mark.parametrize("items", quick((16, 32, 128, 256), 16))
 def test_scan_in_every_size_of_group(device: Device, items: int) -> None:
     """One launch up to a chunk, two beyond it, and chunks of several times the usual size."""
-    chunk = PER_ITEM * items
-    for n in (chunk, chunk + 1, 2 * MOST_GROUPS * chunk + 1 if items == 16 else 3 * chunk - 1):
+    chunk = CHUNK_ELEMENTS_PER_ITEM * items
+    for n in (chunk, chunk + 1, 2 * MAX_SCAN_GROUPS * chunk + 1 if items == 16 else 3 * chunk - 1):
         check(shaped(device, 1, items), n)
 
 
 def test_scan_in_place(shaped_device: Device) -> None:
-    values = np.arange(3 * MOST_ALONE - 1, dtype=np.uint32)
+    values = np.arange(3 * MAX_SINGLE_CHUNK_ELEMENTS - 1, dtype=np.uint32)
     work = Workspace(shaped_device)
     array, out = upload(shaped_device, values), allocate(shaped_device, (1,), np.uint32)
     scan(shaped_device, work, array, array, out)

@@ -14,11 +14,29 @@ from quick import quick
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.stages import scan as stages_scan
-from clsplat.stages.scan import MOST_ALONE, PER_ITEM
-from clsplat.stages.sort import BITONIC_MAX, BITONIC_WINS, WIDE_DIGIT, WIDE_FROM, bitonic_sort, radix_sort, sort
+from clsplat.stages.scan import CHUNK_ELEMENTS_PER_ITEM, MAX_SINGLE_CHUNK_ELEMENTS
+from clsplat.stages.sort import (
+    BITONIC_KEYS_BY_KIND,
+    MAX_BITONIC_KEYS,
+    MIN_WIDE_DIGIT_KEYS,
+    WIDE_DIGIT_BITS,
+    bitonic_sort,
+    radix_sort,
+    sort,
+)
 
 SIZES = (0, 1, 2, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 2048)
-RADIX_SIZES = (*SIZES, 4095, 4096, 4097, 8 * 1024 + 1, MOST_ALONE - 1, MOST_ALONE, MOST_ALONE + 1, 70_001)
+RADIX_SIZES = (
+    *SIZES,
+    4095,
+    4096,
+    4097,
+    8 * 1024 + 1,
+    MAX_SINGLE_CHUNK_ELEMENTS - 1,
+    MAX_SINGLE_CHUNK_ELEMENTS,
+    MAX_SINGLE_CHUNK_ELEMENTS + 1,
+    70_001,
+)
 
 
 def check(keys: NDArray[np.uint32], result: tuple[NDArray[np.uint32], NDArray[np.uint32]]) -> None:
@@ -67,7 +85,7 @@ def test_radix_of_keys_that_begin_at_a_base(shaped_device: Device, base: int, bi
 
 
 @pytest.mark.parametrize("bits", [13, 26])
-@pytest.mark.parametrize("n", [WIDE_FROM - 1, WIDE_FROM])
+@pytest.mark.parametrize("n", [MIN_WIDE_DIGIT_KEYS - 1, MIN_WIDE_DIGIT_KEYS])
 def test_radix_by_wide_digits(shaped_device: Device, n: int, bits: int) -> None:
     keys = np.uint32(12345) + np.random.default_rng(n).integers(0, 2**bits, n, dtype=np.uint32)
     check(keys, radix(shaped_device, keys, bits, 12345))
@@ -76,8 +94,8 @@ def test_radix_by_wide_digits(shaped_device: Device, n: int, bits: int) -> None:
 def test_one_item_sorts_a_chunk_in_one_launch(device: Device) -> None:
     """And leaves what it has in the arrays of its last pass: one, two and three passes."""
     alone = shaped(device, 1, 1)
-    for bits in (WIDE_DIGIT, WIDE_DIGIT + 1, 32):
-        keys = np.random.default_rng(bits).integers(0, 2**bits, MOST_ALONE, dtype=np.uint32)
+    for bits in (WIDE_DIGIT_BITS, WIDE_DIGIT_BITS + 1, 32):
+        keys = np.random.default_rng(bits).integers(0, 2**bits, MAX_SINGLE_CHUNK_ELEMENTS, dtype=np.uint32)
         before = copy(alone.calls)
         check(keys, radix(alone, keys, bits))
         assert alone.calls.since(before).launches == 1
@@ -90,7 +108,7 @@ GROUPS = (16, 32, 64, 128, 256)
 @pytest.mark.parametrize("items", quick(GROUPS, 64))
 def test_radix_at_the_seams_of_a_group_s_tiles(device: Device, items: int) -> None:
     """One key less and one more than a tile, and a second pass over tiles that are not full; digits of 1 to 8 bits."""
-    shaped_device, tile = shaped(device, 1, items), PER_ITEM * items
+    shaped_device, tile = shaped(device, 1, items), CHUNK_ELEMENTS_PER_ITEM * items
     for n, bits in ((tile - 1, 1), (tile, 4), (tile + 1, 5), (2 * tile, 8), (3 * tile + 7, 13), (5 * tile - 1, 32)):
         keys = np.random.default_rng(n).integers(0, 2**bits, n, dtype=np.uint32)
         check(keys, radix(shaped_device, keys, bits))
@@ -98,9 +116,9 @@ def test_radix_at_the_seams_of_a_group_s_tiles(device: Device, items: int) -> No
 
 def test_radix_of_several_tiles_a_group(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """More keys than MOST_GROUPS tiles hold: a group goes over two or three tiles, the last of them cut."""
-    monkeypatch.setattr(stages_scan, "MOST_GROUPS", 4)
+    monkeypatch.setattr(stages_scan, "MAX_SCAN_GROUPS", 4)
     items = 64  # whose kernels other tests have too
-    for n in (5 * PER_ITEM * items, 12 * PER_ITEM * items - 3):
+    for n in (5 * CHUNK_ELEMENTS_PER_ITEM * items, 12 * CHUNK_ELEMENTS_PER_ITEM * items - 3):
         keys = np.random.default_rng(n).integers(0, 2**12, n, dtype=np.uint32)
         check(keys, radix(shaped(device, 1, items), keys, 12))
 
@@ -119,7 +137,7 @@ def test_positive_floats_sort_as_their_bits(shaped_device: Device) -> None:
 
 
 def test_sort_takes_the_one_that_wins(device: Device) -> None:
-    for n in (BITONIC_WINS[device.kind], BITONIC_WINS[device.kind] + 1):
+    for n in (BITONIC_KEYS_BY_KIND[device.kind], BITONIC_KEYS_BY_KIND[device.kind] + 1):
         keys = np.random.default_rng(n).integers(0, 1000, n, dtype=np.uint32)
         out = sort(device, Workspace(device), "test", upload(device, keys), 10)
         check(keys, (out[0].get(), out[1].get()))
@@ -127,4 +145,4 @@ def test_sort_takes_the_one_that_wins(device: Device) -> None:
 
 def test_bitonic_refuses_more_than_local_memory_holds(device: Device) -> None:
     with pytest.raises(ValueError, match="at most"):
-        bitonic(device, np.zeros(BITONIC_MAX + 1, np.uint32))
+        bitonic(device, np.zeros(MAX_BITONIC_KEYS + 1, np.uint32))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from clsplat.device.buffers import Workspace, from_host, hosted, upload
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT, TILE, SlotFields
+from clsplat.layouts.columns import SPLAT, TILE, SlotFields
 from clsplat.reference import splats as twin
 from clsplat.stages.project import Projected, Slots
 from clsplat.stages.splats import ScreenGaussians, ScreenGradients, add_values, splats, splats_grad

@@ -12,15 +12,13 @@ from quick import quick
 
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import SlotFields
+from clsplat.layouts.columns import SlotFields
 
 WAYS = {
     "default": (RasterizerConfig(), SlotFields()),
     "absolute and contributions": (RasterizerConfig(), SlotFields(absolute=True, contributions=True)),
-    "no vectors skipped": (BenchSwitches(vector_skip=False), SlotFields()),
-    "no gradient skipped": (BenchSwitches(gradient_skip=False), SlotFields()),
     "nothing recorded": (BenchSwitches(record_cells=False), SlotFields()),
-    "no early stop": (BenchSwitches(early_stop=False, last_contributor=False), SlotFields()),
+    "no early stop": (BenchSwitches(early_stop=False), SlotFields()),
 }
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
-from clsplat.files import temporary_name
+from clsplat.files.atomic import temporary_name
 
 Capture = pytest.CaptureFixture[str]
 

@@ -36,7 +36,7 @@ def write_flat(
     """Channels (H, W) of the data window, which is the frame where none is given."""
     height, width = next(iter(channels.values())).shape
     output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), specification(size or (width, height), list(channels), window))
+    assert output is not None and output.open(str(path), specification(size or (width, height), list(channels), window))
     assert output.write_image(np.ascontiguousarray(np.stack(list(channels.values()), axis=2), np.float32))
     output.close()
     return path
@@ -55,7 +55,7 @@ def write_samples(path: Path, size: tuple[int, int], samples: Samples, names: Se
             for channel, value in enumerate(values):
                 data.set_deep_value(pixel, channel, sample, float(value))
     output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_deep_image(data)
+    assert output is not None and output.open(str(path), spec) and output.write_deep_image(data)
     output.close()
     return path
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from clsplat.spherical_harmonics import C0, C1, C2, C3
+from clsplat.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 ALPHA_LEAST, STOP = 1 / 255, 1e-4
 NEAR_EDGE = 1e-3
@@ -61,16 +61,16 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 def harmonics(degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
     """directions (..., 3) of any length, coefficients (..., K, 3) -> (..., 3)."""
     x, y, z = (directions / directions.norm(dim=-1, keepdim=True)).unbind(-1)
-    basis = [torch.full_like(x, C0)]
+    basis = [torch.full_like(x, SH_C0)]
     if degree > 0:
-        basis += [-C1 * y, C1 * z, -C1 * x]
+        basis += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
     if degree > 1:
-        basis += [C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * z * z - x * x - y * y), C2[3] * x * z]
-        basis += [C2[4] * (x * x - y * y)]
+        basis += [SH_C2[0] * x * y, SH_C2[1] * y * z, SH_C2[2] * (2 * z * z - x * x - y * y), SH_C2[3] * x * z]
+        basis += [SH_C2[4] * (x * x - y * y)]
     if degree > 2:
-        basis += [C3[0] * y * (3 * x * x - y * y), C3[1] * x * y * z, C3[2] * y * (4 * z * z - x * x - y * y)]
-        basis += [C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), C3[4] * x * (4 * z * z - x * x - y * y)]
-        basis += [C3[5] * z * (x * x - y * y), C3[6] * x * (x * x - 3 * y * y)]
+        basis += [SH_C3[0] * y * (3 * x * x - y * y), SH_C3[1] * x * y * z, SH_C3[2] * y * (4 * z * z - x * x - y * y)]
+        basis += [SH_C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), SH_C3[4] * x * (4 * z * z - x * x - y * y)]
+        basis += [SH_C3[5] * z * (x * x - y * y), SH_C3[6] * x * (x * x - 3 * y * y)]
     if degree > 3:  # by Legendre's functions of z, times the sines and cosines of m times the azimuth
         square = z * z
         sines, cosines = [y, 2 * x * y], [x, x * x - y * y]

@@ -50,6 +50,6 @@ def write_levels(path: Path, levels: NDArray[np.uint16]) -> None:
     import OpenImageIO as oiio
 
     output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), oiio.ImageSpec(levels.shape[1], levels.shape[0], 1, "uint16"))
+    assert output is not None and output.open(str(path), oiio.ImageSpec(levels.shape[1], levels.shape[0], 1, "uint16"))
     assert output.write_image(levels[:, :, None])
     output.close()

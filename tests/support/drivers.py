@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from clsplat.device.context import DeviceInfo, all_devices, list_devices
-from clsplat.device.shapes import Shape, default_shape
-from clsplat.files import atomic_write
-from clsplat.selftest.trust import examine
+from clsplat.device.drivers.shapes import Shape, default_shape
+from clsplat.files.atomic import atomic_write
+from clsplat.selftest.driver_check import examine
 
 NARROW = "CLSPLAT_TEST_DRIVERS"
 SESSION = "CLSPLAT_TEST_SESSION"

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +14,11 @@ from tiny import short
 
 from clsplat.cli.main import main
 from clsplat.config.training import OptimiserConfig
-from clsplat.device import context, known, rehearsal
-from clsplat.device.child import REGARDLESS
+from clsplat.device import context, sandbox
 from clsplat.device.context import Device, all_devices, open_device
-from clsplat.device.quirks import wants_cache
+from clsplat.device.drivers import driver_records
+from clsplat.device.drivers.quirks import wants_cache
+from clsplat.device.drivers.worker_process import TRUST_DRIVER_VARIABLE
 
 ALWAYS = 10**6
 """More texts than are ever built."""
@@ -36,11 +37,11 @@ def standing_device() -> Device:
 
 
 @pytest.fixture
-def standing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Standing:
+def standing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Standing]:
     """A driver that is not known yet. Called with HOW, FIRST and LAST it begins to misbehave."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("CLSPLAT_DEVICE", str(DRIVER))
-    monkeypatch.delenv(REGARDLESS)
+    monkeypatch.delenv(TRUST_DRIVER_VARIABLE)
     monkeypatch.delenv("CLSPLAT_SHAPE", raising=False)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).with_name("stand_in")))
     numbers = tmp_path / "numbers"
@@ -56,10 +57,10 @@ def standing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Standing:
 
 def forget() -> None:
     """Begin as a new process: no kernels are built, and none are tried by one that has the driver of before."""
-    for process in rehearsal._processes.values():
+    for process in sandbox._processes.values():
         process.close()
     context._open.cache_clear()
-    known.tell_once.cache_clear()
+    driver_records.tell_once.cache_clear()
 
 
 VERBS = {

@@ -23,7 +23,7 @@ class Case:
     quaternions: Float32
     scales: Float32
     opacities: Float32
-    view: twin.View
+    view: twin.EwaViewTwin
 
     @property
     def count(self) -> int:
@@ -42,7 +42,9 @@ class Case:
             return twin.full_covariances(self.covariances.astype(np.float64))
         return twin.covariances_of(self.quaternions.astype(np.float64), self.scales.astype(np.float64))
 
-    def projected(self, *, rounded: bool = False, opacities: bool = False, compensated: bool = False) -> twin.Projected:
+    def projected(
+        self, *, rounded: bool = False, opacities: bool = False, compensated: bool = False
+    ) -> twin.EwaProjectedTwin:
         """Results of the twin."""
         means, full = self.means.astype(np.float64), self.full(rounded=rounded)
         plain = twin.project(means, full, self.view)
@@ -73,11 +75,11 @@ def case(
         rng.normal(0, 1, (count, 4)).astype(np.float32),
         np.exp(rng.normal(-2.5, thin, (count, 3))).astype(np.float32),
         rng.uniform(0, 1, count).astype(np.float32),
-        twin.View(viewmat, intrinsics, width, height, model),
+        twin.EwaViewTwin(viewmat, intrinsics, width, height, model),
     )
 
 
-def gradients(projected: twin.Projected, *names: str, seed: int = 2) -> dict[str, Float32]:
+def gradients(projected: twin.EwaProjectedTwin, *names: str, seed: int = 2) -> dict[str, Float32]:
     """Random gradients by outputs, of one size in a conic's own measure, NaN for what is culled."""
     rng = np.random.default_rng(seed)
     sizes = {"means2d": projected.means2d.shape, "conics": projected.conics.shape}

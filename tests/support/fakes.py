@@ -13,7 +13,9 @@ from models import random_gaussians
 from clsplat.camera import Camera
 from clsplat.cli import main as command_line
 from clsplat.cli.session import Services
+from clsplat.config.depth import NO_DEPTH, DepthUse
 from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.config.points import StartPoints
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig
 from clsplat.errors import DeviceError, InputError
@@ -80,6 +82,8 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         warnings: list[str]
         name: str = "photos"
         points: tuple[float, ...] = ()
+        start: StartPoints = TrainConfig().start_points
+        depth_use: DepthUse = NO_DEPTH
 
         @property
         def train_views(self) -> list[FakeView]:
@@ -130,7 +134,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         lenses: str,
         missing: str,
         progress: Callable[..., None],
-    ) -> Scene:
+    ) -> Any:
         assert (masks, lenses, missing) == (NO_MASKS, "undistort", "few")
         if not Path(path).is_dir():
             raise InputError(f"{path}: no such folder")
@@ -158,7 +162,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         run.write_eval({"step": 1, "gaussians": 4, "seconds": 2.5, "mean": {"psnr": 20.0, "ssim": 0.5}, "views": [{}]})
         return gaussians
 
-    def open_device(selector: str | None, memory_limit: int | None = None) -> FakeDevice:
+    def open_device(selector: str | None, memory_limit: int | None = None) -> Any:
         if selector == "nosuch":
             raise DeviceError("--device nosuch: no such device")
         return FakeDevice()
@@ -168,6 +172,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
     ) -> FrameRenderer:
         return FrameRenderer(Renderer(open_device(device), rasterizer), gaussians, options)
 
+    renderer: Callable[..., Any] = Renderer
     monkeypatch.setattr(read, "read_cameras", lambda *_: pipe.cameras)
     monkeypatch.setattr(layers, "write_channels", pipe.write_channels)
     pipe.services = replace(
@@ -177,7 +182,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         open_device=open_device,
         require=lambda device, *_: device,
         train=train,
-        renderer=Renderer,
+        renderer=renderer,
         open_frame_renderer=open_frame_renderer,
     )
     return pipe

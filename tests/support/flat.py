@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.library.pixels import Pixels
+from clsplat.library.pixels import PixelPass, screen_gaussians
 from clsplat.library.session import session_of
 from clsplat.reference import values as twin
 
 
 @dataclass(frozen=True, eq=False)
 class Flat:
-    """Arrays in the order of `Pixels`, float32 as kernels have them, but for the radii."""
+    """Arrays in the order of `screen_gaussians`, float32 as kernels have them, but for the radii."""
 
     means2d: Float32
     conics: Float32
@@ -27,19 +27,22 @@ class Flat:
     radii: NDArray[np.int32]
 
     @property
-    def arrays(self) -> tuple[NDArray[Any], ...]:
-        """The arguments of `Pixels`."""
+    def arrays(self) -> tuple[Float32, Float32, Float32, Float32, Float32, NDArray[np.int32]]:
+        """The arguments of `screen_gaussians`, after the device."""
         return (self.means2d, self.conics, self.opacities, self.colours, self.depths, self.radii)
 
     @property
     def twin(self) -> twin.FlatGaussians:
         """The same in float64."""
-        values = (np.asarray(array, np.float64) for array in self.arrays[:5])
-        return twin.FlatGaussians(*values, (self.radii > 0).all(axis=1))
+        means2d, conics, opacities, colours, depths = (np.asarray(array, np.float64) for array in self.arrays[:5])
+        drawn = np.asarray((self.radii > 0).all(axis=1))
+        return twin.FlatGaussians(means2d, conics, opacities, colours, depths, drawn)
 
-    def pixels(self, device: Any, width: int, height: int, **how: Any) -> Pixels:
+    def pixels(self, device: Any, width: int, height: int, **how: Any) -> PixelPass:
         """Their picture."""
-        return Pixels(session_of(device), *self.arrays, width, height, **how)
+        session = session_of(device)
+        with session.lock:
+            return PixelPass(session, screen_gaussians(session.device, *self.arrays), (width, height), **how)
 
 
 def conics_of(sides: Float64, angles: Float64) -> Float32:

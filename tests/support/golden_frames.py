@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames and gradients of a few tiny scenes, pictures with every channel, and a trained model: checksums for
-`golden/frames.json`, and all of it for `tools/digests.py`."""
+`golden/frames.json`, and all of it for `tools/ci/digests.py`."""
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from pipeline import Pipeline, shaped
 from tiny import short, write_scene
 
 from clsplat.api import train
-from clsplat.config.channels import CHANNELS
+from clsplat.camera import Camera
+from clsplat.config.channels import FRAME_CHANNELS
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.rendering.renderer import Renderer
@@ -28,7 +30,7 @@ Array = NDArray[np.float32]
 LANES, ITEMS = 8, 1
 """The shape of the gradients: their sums, unlike a frame, depend on it."""
 
-SCENES = {
+SCENES: dict[str, Callable[[], tuple[Gaussians, Camera]]] = {
     "overlap": scenes.NAMED["overlap"],
     "saturating": scenes.NAMED["saturating"],
     "cloud": lambda: scenes.random_cloud(2000, 8, 150, 100),
@@ -75,8 +77,9 @@ def pictures_of(device: Device) -> dict[str, dict[str, str]]:
         step = np.array([-0.0625, 0.03125, 0.125])
         after, before = (replace(view, translation=view.translation + moved) for moved in (step, -step))
         renderer = Renderer(device)
-        render_frame = FrameRenderer(renderer, gaussians, RenderOptions(channels=tuple(CHANNELS)))
+        render_frame = FrameRenderer(renderer, gaussians, RenderOptions(channels=tuple(FRAME_CHANNELS)))
         layers = render_frame(Task(1, "1", view, Path(), after, earlier=before)).planes
+        assert layers is not None
         layers["deep"] = renderer.render_deep(gaussians, view, BINS)
         found[kind] = {name: checksum([np.ascontiguousarray(values)]) for name, values in layers.items()}
     return found

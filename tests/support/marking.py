@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.config.marking import FRESH, MarkRules
+from clsplat.optimisation.density_rules import FRESH, MarkRules
 from clsplat.reference import density as twin
 from clsplat.training.density import RowPlan
 
@@ -42,10 +42,10 @@ class TwinMarker:
     def scores(self, rules: MarkRules) -> NDArray[np.float32]:
         return twin.scores(rules, self._known())
 
-    def rows(self, rules: MarkRules, scores: NDArray[np.float32] | None = None) -> TwinRows:
+    def rows(self, rules: MarkRules) -> TwinRows:
         logits = self.parameters["opacity_logits"]
         log_scales = self.parameters.get("log_scales", np.zeros((len(logits), 3), np.float32))
-        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits, scores))
+        return TwinRows(*twin.rows(rules, self._known(), log_scales, logits))
 
 
 def on_host(plan: RowPlan, parameters: Mapping[str, NDArray[Any]]) -> RowPlan:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.files import atomic_write
+from clsplat.files.atomic import atomic_write
 
 WRITE, LEAVE_OUT = "--write-passed", "--leave-out"
 PHASES = {"setup", "call", "teardown"}

@@ -17,9 +17,9 @@ from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, all_devices, open_device
-from clsplat.device.layout import SPLAT, TILE, SlotFields
 from clsplat.gaussians import Gaussians
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.layouts.columns import SPLAT, TILE, SlotFields
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, download_gaussians, upload_gaussians
 from clsplat.stages.project import Screen
 
@@ -37,7 +37,7 @@ EVERY_SHAPE = pytest.mark.parametrize("every", quick([False, True], False))
 def shapes_of(device: Device, *more: tuple[int, int], every: bool = True) -> tuple[tuple[Any, ...], ...]:
     """(lanes, items), or (lanes, items, True) by Gaussian, that a driver is tested in: a CPU's shape, a GPU's; the
     default driver also in the scalar loop, in a mixture, by Gaussian, and in `more`, unless not `every` one is wanted.
-    Each driver in each shape: tools/digests.py."""
+    Each driver in each shape: tools/ci/digests.py."""
     every = every and device is open_device()
     return (*QUICK_SHAPES, (1, 1), (8, 16), (1, 32, True), *more) if every else QUICK_SHAPES
 
@@ -58,7 +58,7 @@ class Pipeline:
     rasterizer: Rasterizer
     gaussians: DeviceGaussians
     camera: Camera
-    frame: Frame
+    frame: ForwardPass
 
     @classmethod
     def run(

@@ -91,13 +91,15 @@ def assert_within(a: Gaussians, b: Gaussians, **bounds: float) -> None:
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
     turn = rotations(gaussians).as_matrix() * np.exp(gaussians.log_scales.astype(np.float64))[:, None]
-    return turn @ turn.transpose(0, 2, 1)
+    squares: np.ndarray = turn @ turn.transpose(0, 2, 1)
+    return squares
 
 
 def colours(gaussians: Gaussians, directions: np.ndarray) -> np.ndarray:
     """(n, directions, 3), by the reference's basis."""
     basis = sh_basis(directions, gaussians.sh_degree)
-    return np.einsum("dk,nkc->ndc", basis, gaussians.sh.astype(np.float64))
+    found: np.ndarray = np.einsum("dk,nkc->ndc", basis, gaussians.sh.astype(np.float64))
+    return found
 
 
 def damaged(data: bytes, *, step: int) -> Iterable[bytes]:

@@ -143,5 +143,5 @@ def loss_curve(scene: Scene, device: Device) -> list[float]:
     start.sh *= np.float32(0.5)
     density = {"start": 3, "stop": 13, "gradient_threshold": 0.0, "opacity_reset_every": 12}
     trainer = Trainer(scene, short(warmup=(2, 4), sh_degree_every=7, density=density), device)
-    trainer._set_parameters(upload_gaussians(device, start))
+    trainer.model.set(upload_gaussians(device, start))
     return [trainer.train_step().read()[0] for _ in range(20)]

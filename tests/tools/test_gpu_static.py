@@ -25,9 +25,9 @@ from gpu_model import Stage, predict
 from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, WALK, Rule, Run
 from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, Row, broken, sources_of
 
-from clsplat.device.layout import PLAIN_SLOTS
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import ClsplatError
+from clsplat.layouts.columns import PLAIN_SLOTS
 
 SASS = """
 .text.walk:
@@ -437,7 +437,7 @@ def test_what_is_not_known_is_told(arguments: list[str], capsys: pytest.CaptureF
 
 def test_a_rehearsed_step_is_the_packages() -> None:
     frame = {**json.loads(FRAMES.read_text())["frames"][0], "listed": 1_000_000}
-    (launches,) = ask_package("step", "1x64", [frame])
+    (launches,) = ask_package("1x64", [frame])
     sources = sources_of(launches)
     assert {source.stem for source in sources} >= set(NO_STACK)
     assert {source.items for source in sources} == {64}
@@ -496,8 +496,8 @@ def test_a_step_by_parts() -> None:
     lines = gpu_page.stage_table(predictions(), "large").splitlines()
     assert len({line.count("|") for line in lines}) == 1
     (loss,) = [line for line in lines if line.startswith("| loss |")]
-    assert loss.startswith("| loss | 4 | 2.00 | 1.00 | 3.00 | 5 |")  # target is of it, and 1 + 4 launches before
-    assert lines[-1].startswith("| all | 10 | 5.00 | 2.50 | 7.50 | 81 |")
+    assert loss.startswith("| loss | 4 | 2.00 | 1.00 | 3.00 | 3.00 |")  # target is of it
+    assert lines[-1].startswith("| all | 10 | 5.00 | 2.50 | 7.50 | 7.50 |")
     with pytest.raises(ClsplatError, match="stages turn: of no part in PARTS"):
         gpu_page.parts_of({"turn": Stage()})
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that were made to do harm: one line that names the file, in bounded memory and time. A sample of what
-`tools/stress_files.py` does at length, and each defect that it found, by name."""
+`tools/stress/stress_files.py` does at length, and each defect that it found, by name."""
 
 from __future__ import annotations
 
@@ -44,8 +44,10 @@ from clsplat.images.reading import find_images, image_size, read_image
 from clsplat.models.codec import ply_file
 from clsplat.models.formats import ply
 from clsplat.runs import run as runs
-from clsplat.scenes import colmap, point_files, sfm, transforms
+from clsplat.scenes import point_files
 from clsplat.scenes.loading import load_scene
+from clsplat.scenes.readers import colmap, transforms
+from clsplat.scenes.sfm import reconstruct
 
 
 def refusal(read: Callable[[], object]) -> str:
@@ -230,7 +232,7 @@ def model(tmp_path: Path, content: bytes) -> Path:
 
 
 def ascii_model(rows: list[str], count: int | None = None) -> bytes:
-    names = [*ply.REQUIRED]
+    names = [*ply.REQUIRED_PLY_PROPERTIES]
     lines = ["ply", "format ascii 1.0", f"element vertex {len(rows) if count is None else count}"]
     return "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", *rows, ""]).encode()
 
@@ -241,7 +243,7 @@ def test_names_in_a_ply_header_are_made_plain(tmp_path: Path) -> None:
 
 
 def test_one_long_word_is_no_table_of_long_words(tmp_path: Path) -> None:
-    row = " ".join(["0.5"] * len(ply.REQUIRED))
+    row = " ".join(["0.5"] * len(ply.REQUIRED_PLY_PROPERTIES))
     path = model(tmp_path, ascii_model([row] * 200 + [row[:-3] + "0." + "5" * 500_000]))
     assert peak_of(lambda: ply.read(path)) < 20e6
     path = model(tmp_path, ascii_model([row, row + "9" * 2_000_000]))
@@ -249,8 +251,8 @@ def test_one_long_word_is_no_table_of_long_words(tmp_path: Path) -> None:
 
 
 def test_text_cannot_claim_more_rows_than_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ply_file, "BLOCK_ROWS", 4)
-    row = " ".join(["0.5"] * len(ply.REQUIRED))
+    monkeypatch.setattr(ply_file, "IO_BLOCK_ROWS", 4)
+    row = " ".join(["0.5"] * len(ply.REQUIRED_PLY_PROPERTIES))
     path = model(tmp_path, ascii_model([row] * 9, 10**8))
     assert peak_of(lambda: ply.read(path)) < 1e6
 
@@ -284,7 +286,7 @@ def test_a_cloud_claims_at_most_what_it_has(tmp_path: Path) -> None:
 def test_any_ply_header(tmp_path_factory: pytest.TempPathFactory, words: list[str], count: int, body: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "any.ply"
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property float {word}" for word in (*ply.REQUIRED, *words)]
+    lines += [f"property float {word}" for word in (*ply.REQUIRED_PLY_PROPERTIES, *words)]
     path.write_bytes("\n".join([*lines, "end_header", ""]).encode("utf-8", "surrogatepass") + body)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -479,7 +481,7 @@ def test_a_decoder_that_says_what_is_no_text() -> None:
         def geterror(self) -> str:
             return b"\xff".decode()
 
-    assert reading.error_of(Decoder()) == "in words that are no text"
+    assert reading.error_of(Decoder()) == "in a message that is not text"
 
 
 def test_a_png_of_empty_chunks_takes_no_long_look(tmp_path: Path) -> None:
@@ -496,7 +498,7 @@ def test_names_that_no_scene_can_list(tmp_path: Path) -> None:
     for name in ("a\nb.png", "\udcff.png"):
         odd = tmp_path / "photos" / name
         odd.write_bytes((tmp_path / "photos" / "a.png").read_bytes())
-        assert "rename it" in refusal(lambda: sfm.sfm_photos.find_photos(tmp_path / "photos"))
+        assert "rename it" in refusal(lambda: reconstruct.sfm_photos.find_photos(tmp_path / "photos"))
         odd.unlink()
 
 
@@ -654,7 +656,7 @@ def test_a_checkpoints_directory_claims_at_most_what_it_has(tmp_path: Path) -> N
 )
 def test_records_that_are_none(text: str, tmp_path: Path) -> None:
     (tmp_path / "sfm.json").write_text(text)
-    refused = refusal(lambda: sfm._is_finished(tmp_path, tmp_path / "photos", "0", overwrite=False))
+    refused = refusal(lambda: reconstruct._is_finished(tmp_path, tmp_path / "photos", "0", overwrite=False))
     assert str(tmp_path) in refused
 
 

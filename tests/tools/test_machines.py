@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.skipif(os.name == "nt", reason="tools/machines.py is for systems with process groups")
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="tools/ci/machines.py is for systems with process groups")
 if os.name != "nt":
     import machines
     from machines import Found, Machine, Step, environment_of, run_all, run_machine, table, wrong
@@ -123,7 +123,7 @@ def test_ctrl_c_ends_what_runs(tmp_path: Path) -> None:
     begun = tmp_path / "begun"
     code = f"import pathlib, time; pathlib.Path({str(begun)!r}).touch(); time.sleep(600)"
     script = (
-        f"import sys; sys.path.insert(0, {str(ROOT / 'tools')!r})\n"
+        f"import sys; sys.path.insert(0, {str(ROOT / 'tools/ci')!r})\n"
         "from machines import Machine, Step, run_all\n"
         f"step = Step('it', (sys.executable, '-c', {code!r}), 600)\n"
         "sys.exit(run_all([Machine('one', '', (step,)), Machine('two', '', (step,))]))"

@@ -15,8 +15,8 @@ from drivers import KEPT, NARROW
 from quick import quick
 
 from clsplat.device.context import list_devices
-from clsplat.device.shapes import Shape
-from clsplat.selftest.trust import Report
+from clsplat.device.drivers.shapes import Shape
+from clsplat.selftest.driver_check import DriverReport
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -75,9 +75,9 @@ def test_a_shape_that_takes_the_process_down_is_not_tried(
 ) -> None:
     asked: list[Shape] = []
 
-    def examine(_index: int, shape: Shape, _stages: object, **_: object) -> Report:
+    def examine(_index: int, shape: Shape, _stages: object, **_: object) -> DriverReport:
         asked.append(shape)
-        return Report(end=end)
+        return DriverReport(end=end)
 
     monkeypatch.setattr(drivers, "examine", examine)
     monkeypatch.setattr(drivers, "default_shape", lambda _: Shape(8, 1, 8))

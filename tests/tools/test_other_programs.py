@@ -9,7 +9,7 @@ import pytest
 
 def test_the_page_has_the_tests_marks() -> None:
     text = other_programs.PAGE.read_text("utf-8")
-    assert other_programs.page(text) == text, "python3 tools/other_programs.py writes it anew"
+    assert other_programs.page(text) == text, "python3 tools/ci/other_programs.py writes it anew"
     assert len(other_programs.rows()) > 10
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""tools/site.py: what it adds to the pages, and that it ends with an error where one of them is wrong."""
+"""tools/ci/site.py: what it adds to the pages, and that it ends with an error where one of them is wrong."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGES = ("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md")
 pytestmark = [pytest.mark.slow, pytest.mark.needs("mkdocs")]
 
 
@@ -19,15 +20,15 @@ def copy(tmp_path: Path) -> Path:
     """Sources of the site, to be changed."""
     for name in ("clsplat", "docs", ".github"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "tools").mkdir()
-    for name in ("README.md", "CHANGELOG.md", "LICENSE", "tools/site.py"):
+    (tmp_path / "tools" / "ci").mkdir(parents=True)
+    for name in (*PAGES, "LICENSE", "tools/ci/site.py"):
         shutil.copyfile(ROOT / name, tmp_path / name)
     return tmp_path
 
 
 def build(root: Path) -> subprocess.CompletedProcess[str]:
     """The site of a copy, in its `out`."""
-    command = [sys.executable, str(root / "tools/site.py"), str(root / "out")]
+    command = [sys.executable, str(root / "tools/ci/site.py"), str(root / "out")]
     return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
 
 

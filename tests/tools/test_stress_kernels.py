@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sample of `tools/stress kernels`, and that it would find what is wrong."""
+"""A sample of `tools/stress/run kernels`, and that it would find what is wrong."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from stress_projection import compare
 from stress_stages import stages
 
 from clsplat import camera as clsplat_camera
-from clsplat.device import layout
 from clsplat.device.context import Device
+from clsplat.layouts import columns
 from clsplat.reference.loss import l1_dssim
 from clsplat.stages import device_camera, project
 
@@ -94,7 +94,7 @@ def test_a_wrong_camera_is_found(
 
     def wrong(camera: clsplat_camera.Camera) -> project.NDArray[np.float32]:
         packed = good(camera)
-        packed[layout.CAMERA.index(field)] += np.float32(by * max(1.0, abs(packed[layout.CAMERA.index(field)])))
+        packed[columns.CAMERA.index(field)] += np.float32(by * max(1.0, abs(packed[columns.CAMERA.index(field)])))
         return packed
 
     monkeypatch.setattr(device_camera, "pack_camera", wrong)
@@ -107,7 +107,7 @@ def test_a_culled_gaussian_is_found(default_device: Device, monkeypatch: pytest.
 
     def near(camera: clsplat_camera.Camera) -> project.NDArray[np.float32]:
         packed = good(camera)
-        packed[layout.CAMERA.index("NEAR")] = 3.0
+        packed[columns.CAMERA.index("NEAR")] = 3.0
         return packed
 
     monkeypatch.setattr(device_camera, "pack_camera", near)
@@ -128,7 +128,15 @@ def test_a_wrong_loss_is_found(default_device: Device, monkeypatch: pytest.Monke
 @pytest.mark.slow
 def test_command(tmp_path: Path) -> None:
     plot = tmp_path / "errors.svg"
-    command = [sys.executable, ROOT / "tools" / "stress", "kernels", "--cases", "600", "--only", "scales,counts,wild"]
+    command = [
+        sys.executable,
+        ROOT / "tools" / "stress" / "run",
+        "kernels",
+        "--cases",
+        "600",
+        "--only",
+        "scales,counts,wild",
+    ]
     done = subprocess.run([*command, "--json", "--plot", plot], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
@@ -148,7 +156,7 @@ def test_command(tmp_path: Path) -> None:
 )
 def test_wrong_calls(arguments: list[str]) -> None:
     done = subprocess.run(
-        [sys.executable, ROOT / "tools" / "stress", *arguments], capture_output=True, text=True, check=False
+        [sys.executable, ROOT / "tools" / "stress" / "run", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1

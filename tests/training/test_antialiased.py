@@ -24,8 +24,8 @@ from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import AnyGaussians
-from clsplat.training import sampling
-from clsplat.training.sampling import SamplingFilter
+from clsplat.training import mip_filter
+from clsplat.training.mip_filter import MipFilter
 from clsplat.training.trainer import Trainer
 
 SMOOTH = replace(CONFIG, antialiased=True)
@@ -79,14 +79,14 @@ def test_the_cameras_are_looked_at_every_hundred_steps(
     views: int, scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[int] = []
-    renew = SamplingFilter.renew
+    renew = MipFilter.before_step
 
-    def noted(self: SamplingFilter, gaussians: AnyGaussians) -> None:
+    def noted(self: MipFilter, gaussians: AnyGaussians) -> None:
         looked.append(trainer.step)
         renew(self, gaussians)
 
-    monkeypatch.setattr(sampling, "EVERY", 12)
-    monkeypatch.setattr(SamplingFilter, "renew", noted)
+    monkeypatch.setattr(mip_filter, "SAMPLING_LIMIT_INTERVAL_STEPS", 12)
+    monkeypatch.setattr(MipFilter, "before_step", noted)
     config = replace(SMOOTH, density=replace(SMOOTH.density, every=0), batch=views, iterations=48)
     trainer = Trainer(scene, config, default_device)
     while trainer.step < 48:

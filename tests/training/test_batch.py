@@ -20,7 +20,7 @@ from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device, open_devices
 from clsplat.errors import DeviceError, DriverError, InputError
-from clsplat.gaussians import GROUPS, Gaussians
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
 from clsplat.runs.run import Run
@@ -28,8 +28,9 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.adam import corrected
 from clsplat.stages.device_gaussians import allocate_gaussians
-from clsplat.training.batch import Batch, Outcome, Replica, scaled, scaled_rates, shares
-from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
+from clsplat.training.batch import Batch, Replica, ViewOutcome, scaled, scaled_rates, shares
+from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields
+from clsplat.training.step.inputs import StepRows
 from clsplat.training.trainer import Trainer
 
 TWO = short(batch=2, iterations=40)
@@ -196,25 +197,25 @@ class _Gradients(StepProbe):
     def before_rows(self, rows: StepRows) -> None:
         assert rows.gradients is not None
         self.seen = rows.projected.tile_counts.get() > 0
-        self.values = {group: rows.gradients[group].get().astype(np.float64) for group in GROUPS}
+        self.values = {group: rows.gradients[group].get().astype(np.float64) for group in PARAMETER_GROUPS}
 
 
 def test_a_step_is_that_of_the_sum_of_its_views_gradients(scene: Scene, default_device: Device) -> None:
     """Against the float64 twins, by gradients that a step of each view alone has."""
     batched, plain = (Trainer(scene, short(batch=batch), default_device) for batch in (2, 1))
-    before = {group: plain.parameters[group].get().astype(np.float64) for group in GROUPS}
+    before = {group: plain.parameters[group].get().astype(np.float64) for group in PARAMETER_GROUPS}
     views = []
     for _ in range(2):
         alone = Trainer(scene, short(), default_device)
         alone.rng.bit_generator.state, alone.queue = plain.rng.bit_generator.state, plain.queue
-        sample, probe = alone._sample(), _Gradients()
+        inputs, probe = alone._view_inputs(0), _Gradients()
         plain.rng.bit_generator.state, plain.queue = alone.rng.bit_generator.state, alone.queue
         room = allocate_gaussians(default_device, alone.parameters.count, 1, zero=True)
         step = GradientStep(
             default_device, alone.rasterizer, alone.config, 1, alone.rates(), slot_fields(alone.strategy.needs(1))
         )
         model = (alone.parameters, alone.first, alone.second)
-        step.run(model, sample.photograph, sample.camera, sample.background, probe, room)
+        step.run(model, inputs, probe, room)
         views.append(probe)
     batched.train_step()
     assert batched.step == 2
@@ -234,7 +235,7 @@ def test_trouble_on_a_further_device_ends_the_training(
 ) -> None:
     devices, begun, ended = halves(default_device.index), Event(), Event()
 
-    def fail(*_: Any, **__: Any) -> Outcome:
+    def fail(*_: Any, **__: Any) -> ViewOutcome:
         begun.set()
         time.sleep(0.05)
         ended.set()
@@ -281,5 +282,5 @@ def test_a_view_without_a_finite_loss_is_named(scene: Scene, default_device: Dev
         trainer.mend(look=True)
         (incident,) = trainer.watch.incidents
         assert (incident.stage, incident.view) == ("loss", bad)
-        assert all(np.isfinite(trainer.parameters[group].get()).all() for group in GROUPS)
+        assert all(np.isfinite(trainer.parameters[group].get()).all() for group in PARAMETER_GROUPS)
         trainer.close()

@@ -12,7 +12,7 @@ import pytest
 from calls import Capture
 from compare import assert_same_bits
 from same_bytes import interrupted, model_bytes
-from test_lenses import write_lens_scene
+from test_intrinsics import write_lens_scene
 from tiny import CONFIG, hidden_model, short, write_scene
 
 from clsplat.api import train
@@ -48,7 +48,7 @@ def test_it_is_so_where_the_scene_has_other_lenses(scene: Scene, default_device:
         for each, by_rays in zip((scene, wide, mixed), outcomes, strict=True):
             trainer = Trainer(each, config, default_device)
             kinds = {
-                trainer.camera(index, view.camera.width, view.camera.height).kind.rays
+                trainer.camera(index, view.camera.width, view.camera.height).model.along_rays
                 for index, view in enumerate(trainer.views)
                 if view.camera.projection == "perspective"
             }

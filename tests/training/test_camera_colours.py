@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_close
+from held_out import psnr_of
 from tiny import CONFIG, write_scene
 
 from clsplat.api import train
@@ -27,8 +28,8 @@ from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.training.photographs import Photographs
-from clsplat.training.ppisp import PpispOfAll
+from clsplat.training.appearance.ppisp import PpispOfAll
+from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 OF_CAMERAS = replace(CONFIG, appearance="ppisp")
@@ -44,9 +45,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 def taken_otherwise(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
     """Let photographs be float, mixed by MIXES and against them by turns, and dark in the corners."""
-    plain = Photographs.load
+    plain = ImageCache.load
 
-    def load(self: Photographs, index: int, factor: float) -> np.ndarray:
+    def load(self: ImageCache, index: int, factor: float) -> np.ndarray:
         image = plain(self, index, factor)
         values = image / np.float32(255) if image.dtype == np.uint8 else image
         height, width, _ = values.shape
@@ -56,7 +57,7 @@ def taken_otherwise(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
         values = values * light(np.array([CORNERS, 0, 0]), spread(width, height, centre))[:, :, None]
         return np.ascontiguousarray(values, np.float32)
 
-    monkeypatch.setattr(Photographs, "load", load)
+    monkeypatch.setattr(ImageCache, "load", load)
 
 
 @pytest.fixture(scope="module")
@@ -199,7 +200,7 @@ def test_where_a_photograph_was_taken(default_device: Device, scene: Scene) -> N
     assert taken[0].centre == (0.25, 0.75)
     lenses = np.array([[-1.0, 0.5, 0.25], [0.5, 0.25, -0.5]], np.float32)
     held_arrays = {name.removeprefix("appearance/"): array for name, array in appearance.arrays().items()}
-    appearance.load(held_arrays | {"lenses_logs": lenses})
+    appearance.take(held_arrays | {"lenses_logs": lenses})
     record = appearance.record()
     assert record["photographs"][first.name]["vignette"] == lenses[0].tolist()
     assert record["photographs"][first.name]["centre"] == [0.25, 0.75]
@@ -219,8 +220,8 @@ def test_refined_cameras_are_judged_through_the_lens(
         record = {"held_out": {view.name: row for view in scene.test_views}}
         monkeypatch.setattr(trainer.appearance, "record", lambda record=record: record)
         with monkeypatch.context() as patch:
-            patch.setattr(Photographs, "load", dark(trainer))
-            found[name] = trainer.judges.psnr(trainer, cameras)
+            patch.setattr(ImageCache, "load", dark(trainer))
+            found[name] = psnr_of(trainer, cameras)
     assert found["through"] > 60  # rounded to float32
     assert found["without"] < found["through"] - 10
 
@@ -228,7 +229,7 @@ def test_refined_cameras_are_judged_through_the_lens(
 def dark(trainer: Trainer) -> Callable[..., np.ndarray]:
     """Loads what the model shows of a judge's view, dark in the corners."""
 
-    def load(self: Photographs, index: int, factor: float) -> np.ndarray:
+    def load(self: ImageCache, index: int, factor: float) -> np.ndarray:
         camera = trainer.judges.views[index].camera
         renderer = Renderer(trainer.device, trainer.rasterizer)
         image = renderer.render(trainer.parameters, trainer.local(camera), (0, 0, 0)).image[:, :, :3]

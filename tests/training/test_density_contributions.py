@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The policy beyond the paper: growth by a budget, views that agree, pruning by contribution."""
+"""The policy beyond the paper: growth by a budget, pruning by contribution."""
 
 from __future__ import annotations
 
@@ -40,18 +40,13 @@ def make_plan(
     config: DensityConfig = CONFIG,
     step: int = 600,
     *,
-    opacities: ArrayLike = 0.5,
-    agreeing: ArrayLike | None = None,
     known: dict[str, np.ndarray] | None = None,
 ) -> RowPlan:
     """All small, so that who is densified is cloned, and seen in four views."""
     sums = 4 * np.asarray(gradients, np.float32)
     n = len(sums)
-    o = np.broadcast_to(np.asarray(opacities, np.float32), n)
     statistics = {"gradient_sums": sums, "seen": np.full(n, 4, np.float32), "radii": np.full(n, 5, np.float32)}
-    if agreeing is not None:
-        statistics["agreeing"] = np.asarray(agreeing, np.float32)
-    parameters = {"log_scales": np.full((n, 3), np.log(0.05), np.float32), "opacity_logits": np.log(o / (1 - o))}
+    parameters = {"log_scales": np.full((n, 3), np.log(0.05), np.float32), "opacity_logits": np.zeros(n, np.float32)}
     return on_host(plan(config, state(step, 10.0, parameters, {**statistics, **(known or {})})), parameters)
 
 
@@ -117,19 +112,6 @@ def test_the_strongest_go_first_whatever_the_threshold() -> None:
     assert (kept(made), cloned(made)) == ([0, 1, 2, 3], [1])
 
 
-# Agreement
-
-
-def test_views_have_to_agree() -> None:
-    gradients, agreeing = [STRONG, STRONG, WEAK, STRONG], [1, 2, 4, 3]
-    assert cloned(make_plan(gradients, agreeing=agreeing)) == [0, 1, 3], "the default does not ask"
-    config = replace(CONFIG, views_agree=2)
-    assert cloned(make_plan(gradients, config, agreeing=agreeing)) == [1, 3], "beside the mean, not in its place"
-    assert cloned(make_plan(gradients, replace(config, views_agree=3), agreeing=agreeing)) == [3]
-    roomy = replace(config, max_gaussians=5)
-    assert cloned(make_plan([9 * STRONG, STRONG, WEAK, 2 * STRONG], roomy, agreeing=agreeing)) == [3]
-
-
 # Contribution
 
 
@@ -140,19 +122,6 @@ def test_what_no_view_needs_goes() -> None:
     assert (kept(made), cloned(made)) == ([2, 3], []), "not known is kept; what goes is not cloned"
     made = make_plan([WEAK] * 5, CONFIG, known=known)
     assert kept(made) == [0, 1, 2, 3, 4], "only if asked for"
-
-
-@pytest.mark.parametrize(
-    ("fraction", "left"), [(0.2, [0, 1, 2, 3, 4, 5]), (0.25, [0, 1, 2, 4, 5]), (0.5, [0, 1, 4, 5])]
-)
-def test_a_fraction_of_those_that_are_known_goes(fraction: float, left: list[int]) -> None:
-    """Of equals the first; four are known."""
-    config = replace(CONFIG, prune_at=(600, 3000), prune_fraction=fraction)
-    known = contributions([7, np.inf, 5, 2, np.inf, 8])
-    assert kept(make_plan([WEAK] * 6, config, known=known)) == left
-    assert kept(make_plan([WEAK] * 6, config, step=700, known=known)) == [0, 1, 2, 3, 4, 5]
-    equal = contributions([4, 4, 4, 4])
-    assert kept(make_plan([WEAK] * 4, replace(config, prune_fraction=0.5), known=equal)) == [2, 3]
 
 
 def test_pruning_alone_adds_nothing_and_asks_for_less() -> None:
@@ -170,9 +139,9 @@ def test_pruning_alone_adds_nothing_and_asks_for_less() -> None:
 
 def test_when_pruning_is_due() -> None:
     assert not any(is_pruning_due(CONFIG, step) for step in range(20_000))
-    config = replace(CONFIG, prune_every=2000, prune_at=(70, 15_500), prune_fraction=0.5)
+    config = replace(CONFIG, prune_every=2000)
     due = [step for step in range(20_001) if is_pruning_due(config, step)]
-    assert due == [70, *range(2000, 15_000, 2000), 15_500, *range(16_000, 20_001, 2000)]
+    assert due == list(range(2000, 20_001, 2000))
 
 
 def needs(config: DensityConfig, step: int = 0) -> StatisticsNeeds:
@@ -191,8 +160,3 @@ def test_contributions_are_gathered_only_while_something_goes_by_them() -> None:
     assert last(replace(CONFIG, min_contribution=1.0)) == CONFIG.stop - 1
     assert last(replace(CONFIG, min_contribution=1.0, every=0)) == -1, "no pass would read them"
     assert last(replace(CONFIG, min_contribution=1.0, every=0, prune_every=100)) == 20_000
-    assert last(replace(CONFIG, prune_at=(900, 7000), prune_fraction=0.5)) == 7000
-    assert last(replace(CONFIG, prune_at=(900,), prune_fraction=0.5, min_contribution=1.0)) == CONFIG.stop - 1
-    assert not needs(CONFIG).agreement
-    assert needs(replace(CONFIG, views_agree=2)).agreement
-    assert not needs(replace(CONFIG, views_agree=2, every=0)).agreement

@@ -15,7 +15,7 @@ from tiny import write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
@@ -87,7 +87,7 @@ def trained(scene: Scene, device: Device, steps: int) -> tuple[Trainer, Juggler]
 
 
 def host(model: AnyGaussians) -> dict[str, NDArray[Any]]:
-    return {group: model[group].get() for group in GROUPS}
+    return {group: model[group].get() for group in PARAMETER_GROUPS}
 
 
 def test_rows_follow_the_plan_of_any_strategy(scene: Scene, default_device: Device) -> None:
@@ -117,7 +117,7 @@ def test_a_plan_after_the_gradient_changes_values_alone(scene: Scene, default_de
     plain._rearrange(plain.strategy.after_gradient(replace(plain._state(), step=6)))
     after = host(plain.parameters)
     before["opacity_logits"][2] -= 1
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         assert_same_bits(after[group], before[group], group)
         assert_same_bits(plain.first[group].get(), moments[group], group)
 
@@ -133,7 +133,7 @@ def test_its_state_is_in_the_checkpoint(scene: Scene, default_device: Device) ->
         again.train_step()
     assert isinstance(again.strategy, Juggler)
     assert_same_bits(again.strategy.ages, juggler.ages)
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         assert_same_bits(again.parameters[group].get(), whole.parameters[group].get(), group)
 
 

@@ -19,21 +19,21 @@ from same_bytes import (  # noqa: F401  # undisturbed is a fixture
 )
 from tiny import HEIGHT, WIDTH, short, write_scene
 
-from clsplat.camera import NEAR
+from clsplat.camera import DEFAULT_NEAR_PLANE
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.images.writing import write_image
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run
-from clsplat.scenes.depth import with_depths
-from clsplat.scenes.known_depth import KnownDepth
+from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.training.depth import Depths, weight_at
-from clsplat.training.health import Incident
-from clsplat.training.pending import VARIABLE
-from clsplat.training.repro import read_bundle, replay, write_bundle
+from clsplat.scenes.supervision.depth_samples import KnownDepth
+from clsplat.training.repro_bundle import read_bundle, replay, write_bundle
+from clsplat.training.stability.health import Incident
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
+from clsplat.training.supervision.depth_targets import DepthTargets, weight_at
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, depth="points", depth_weight=0.05)
@@ -85,15 +85,15 @@ def test_the_weight_falls_and_views_count_alike(scene: Scene) -> None:
     assert [weight_at(config, step) for step in (0, 500, 1000)] == pytest.approx([0.5, 0.05, 0.005])
     views = with_depths(scene, config.depth_use).train_views
     for size in (48, 24):
-        aims = Depths(config, views, 3.0).aims(0, views[0].camera.resized(size, size * 5 // 6), 500)
+        aims = DepthTargets(config, views, 3.0).aims(0, views[0].camera.resized(size, size * 5 // 6), 500)
         assert aims is not None
         assert aims.factor * aims.planes[1].sum() == pytest.approx(0.05 * 3.0)
     blind, camera = [replace(views[0], depth=None)], views[0].camera.resized(48, 40)
-    nothing = Depths(config, blind, 3.0).aims(0, camera, 1)
+    nothing = DepthTargets(config, blind, 3.0).aims(0, camera, 1)
     assert nothing is not None
     assert nothing.factor == 0
     assert not nothing.planes.any()
-    assert Depths(TrainConfig(), views, 3.0).aims(0, camera, 1) is None
+    assert DepthTargets(TrainConfig(), views, 3.0).aims(0, camera, 1) is None
 
 
 def test_under_a_mask_no_depth_counts(scene: Scene) -> None:
@@ -101,8 +101,8 @@ def test_under_a_mask_no_depth_counts(scene: Scene) -> None:
     views = with_depths(scene, config.depth_use).train_views
     camera, photograph = views[0].camera, np.ones((HEIGHT, WIDTH, 5), np.uint8)
     photograph[: HEIGHT // 2, :, 4] = 0
-    whole = Depths(config, views, 3.0).aims(0, camera, 500)
-    masked = Depths(config, views, 3.0).aims(0, camera, 500, photograph)
+    whole = DepthTargets(config, views, 3.0).aims(0, camera, 500)
+    masked = DepthTargets(config, views, 3.0).aims(0, camera, 500, photograph)
     assert whole is not None
     assert masked is not None
     assert not masked.planes[:, : HEIGHT // 2].any()
@@ -119,7 +119,9 @@ def test_a_step_counts_no_depth_under_its_mask(folder: Path, default_device: Dev
         write_image(masked / "masks" / path.name, mask)
     config = short(iterations=20, depth="maps", masks="ignore", warmup=())
     scene = with_depths(load_scene(masked, masks=config.mask_use), config.depth_use)
-    depth = Trainer(scene, config, default_device)._sample().known["depth"]
+    trainer = Trainer(scene, config, default_device)
+    (inputs,) = trainer.depths.join([trainer._view_inputs(0)], 1, 1)
+    depth = inputs.depth
     assert not depth.planes[1, : HEIGHT // 2].any()
     assert depth.planes[1].any()
 
@@ -133,7 +135,7 @@ def test_a_damaged_map_says_nothing(scene: Scene, tmp_path: Path) -> None:
     np.save(tmp_path / "some.npy", values)
     views[0] = replace(views[0], depth=KnownDepth(np.empty((0, 3)), np.empty(0), tmp_path / "some.npy"))
     with np.errstate(over="raise"):
-        aims = Depths(config, views, 3.0).aims(0, views[0].camera, 1)
+        aims = DepthTargets(config, views, 3.0).aims(0, views[0].camera, 1)
     assert aims is not None
     assert np.isfinite(aims.planes).all()
     assert np.count_nonzero(aims.planes[1]) == WIDTH
@@ -151,7 +153,10 @@ def test_depths_of_a_scene_in_small_units(scene: Scene) -> None:
         for view in with_depths(scene, CONFIG.depth_use).train_views
     ]
     config, camera = replace(CONFIG, depth_weight=1.0), views[0].camera
-    known = [Depths(config, views, 3.0 * part, near).aims(0, camera, 1) for near in (NEAR, part * scene.near)]
+    known = [
+        DepthTargets(config, views, 3.0 * part, near).aims(0, camera, 1)
+        for near in (DEFAULT_NEAR_PLANE, part * scene.near)
+    ]
     assert known[0] is not None
     assert known[1] is not None
     assert not known[0].planes[1].any()
@@ -181,7 +186,7 @@ def test_by_capacity_the_same_bytes(
     undisturbed: bytes,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv(VARIABLE, "1")
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     assert model_bytes(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
@@ -204,11 +209,11 @@ def test_a_bundle_has_the_depths(scene: Scene, default_device: Device, tmp_path:
     trainer.settle()
     incident = Incident(12, 0, trainer.views[0].name, "loss", 1, "nothing", np.zeros(3, np.float32))
     bundle = read_bundle(write_bundle(tmp_path, trainer, incident))
-    assert bundle.depth is not None
-    wanted = trainer.depths.aims(0, bundle.camera, 12)
+    got, wanted = bundle.inputs.depth, trainer.depths.aims(0, bundle.inputs.camera, 12)
+    assert got is not None
     assert wanted is not None
-    np.testing.assert_array_equal(bundle.depth.planes, wanted.planes)
-    assert bundle.depth.factor == wanted.factor
+    np.testing.assert_array_equal(got.planes, wanted.planes)
+    assert got.factor == wanted.factor
     assert not any(replay(bundle, default_device).values())
 
 

@@ -24,12 +24,12 @@ from clsplat.images.reading import read_image
 from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
+from clsplat.scenes.analysis.visible_points import VisiblePoints
 from clsplat.scenes.loading import load_scene
-from clsplat.scenes.looked import Looked
 from clsplat.scenes.scene import Scene, View
-from clsplat.training import gains
-from clsplat.training.gains import GainsOfAll
-from clsplat.training.photographs import Photographs
+from clsplat.training.appearance import exposure as gains
+from clsplat.training.appearance.exposure import GainsOfAll
+from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 EXPOSED = replace(CONFIG, appearance="exposure")
@@ -56,7 +56,7 @@ def test_gains_begin_where_the_points_have_them(
     """By EXIF, which tells nothing here, for photographs of which the points tell nothing."""
     first, second, *others = (view.name for view in scene.train_views)
     told = {first: np.array([1.0, 0.5, 0.0]), second: np.array([-1.0, 0.25, 0.0])}
-    monkeypatch.setattr(Looked, "exposures", told)
+    monkeypatch.setattr(VisiblePoints, "exposures", told)
     arrays = GainsOfAll(EXPOSED, default_device, scene).arrays()
     start = np.array([told[first], told[second], *(np.zeros(3) for _ in others)])
     # rounded to a 1024th
@@ -73,10 +73,10 @@ def test_gains_that_points_tell_are_held_there(
     one they go where the loss is least."""
     truth = dict.fromkeys((view.name for view in scene.train_views), np.zeros(3))
     truth |= {scene.train_views[0].name: np.full(3, 0.5), scene.train_views[1].name: np.full(3, -0.5)}
-    monkeypatch.setattr(Looked, "exposures", truth)
+    monkeypatch.setattr(VisiblePoints, "exposures", truth)
     moved = {}
     for pulls in ((0.0, 0.0), (1e3, 0.0), (0.0, 1e3)):
-        for name, pull in zip(("PULL", "COMMON"), pulls, strict=True):
+        for name, pull in zip(("VIEW_PULL_WEIGHT", "NEIGHBOUR_PULL_WEIGHT"), pulls, strict=True):
             monkeypatch.setattr(gains, name, pull)
         trainer = Trainer(scene, EXPOSED, default_device)
         for _ in range(30):
@@ -89,14 +89,14 @@ def test_gains_that_points_tell_are_held_there(
 
 def exposed(monkeypatch: pytest.MonkeyPatch, logs: np.ndarray) -> None:
     """Let photographs be float, of these exposures (photographs,)."""
-    plain = Photographs.load
+    plain = ImageCache.load
 
-    def load(self: Photographs, index: int, factor: float) -> np.ndarray:
+    def load(self: ImageCache, index: int, factor: float) -> np.ndarray:
         image = plain(self, index, factor)
         values = image / np.float32(255) if image.dtype == np.uint8 else image
         return np.ascontiguousarray(values * np.float32(2.0 ** logs[index]), np.float32)
 
-    monkeypatch.setattr(Photographs, "load", load)
+    monkeypatch.setattr(ImageCache, "load", load)
 
 
 def test_exposures_that_are_known_change_no_bit(
@@ -111,7 +111,7 @@ def test_exposures_that_are_known_change_no_bit(
         with monkeypatch.context() as patch:
             exposed(patch, logs)
             told = {view.name: np.full(3, log) for view, log in zip(scene.train_views, logs, strict=True)}
-            patch.setattr(Looked, "exposures", told)
+            patch.setattr(VisiblePoints, "exposures", told)
             trainer = Trainer(scene, replace(EXPOSED, batch=len(truth)), default_device)
             trainer.train_step()
             arrays.append(trainer.checkpoint()[0])

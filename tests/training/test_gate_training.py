@@ -10,21 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from held_out import psnr_of
 from same_bytes import gone_on, model_bytes
 from tiny import short, write_scene
 
 from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
-from clsplat.evaluation.held_out import evaluate
+from clsplat.evaluation.held_out import EvaluatedModel, evaluate
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.renderer import Renderer
 from clsplat.report.figures import read_figures
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
+from clsplat.training.cameras.poses import Poses
 from clsplat.training.loop import StepReport
-from clsplat.training.poses import Poses
 from clsplat.training.trainer import Trainer
 
 FAST = OptimiserConfig(means_rate=5e-3, sh_dc_rate=0.02, scales_rate=0.02, opacities_rate=0.1)
@@ -171,9 +172,11 @@ def test_the_measure_is_that_of_an_evaluation(tmp_path: Path, default_device: De
     config: TrainConfig = replace(CONFIG, background=background)
     trainer, renderer = Trainer(scene, config, default_device), Renderer(default_device)
     behind, model = background_colour(background), trainer.gaussians()
-    found = trainer.judges.psnr(trainer, [view.camera for view in scene.test_views])
-    settings = {"step": None, "gaussians": 0, "seconds": None}
+    found = psnr_of(trainer, [view.camera for view in scene.test_views])
     result = evaluate(
-        lambda view: renderer.render(model, view.camera, behind).image, scene.test_views, behind, **settings
+        lambda view: renderer.render(model, view.camera, behind).image,
+        scene.test_views,
+        behind,
+        model=EvaluatedModel(None, 0, None),
     )
     assert found == pytest.approx(result["mean"]["psnr"], abs=1e-4)  # pixels of 8 bits are floats there

@@ -10,14 +10,15 @@ from tiny import write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.gaussians import GROUPS
-from clsplat.rendering.rasterizer import Frame, Rasterizer
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.stages.loss import Loss
 from clsplat.stages.project import Slots
-from clsplat.training.step import GradientStep, StepProbe, StepRows, slot_fields
+from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields
+from clsplat.training.step.inputs import StepRows, ViewInputs
 from clsplat.training.trainer import Trainer
 
 CONFIG = TrainConfig(iterations=9, warmup=(), sh_degree=1)
@@ -29,7 +30,7 @@ class Witness(StepProbe):
     def __init__(self) -> None:
         self.stages: list[str] = []
 
-    def forward(self, frame: Frame) -> None:
+    def forward(self, frame: ForwardPass) -> None:
         del frame
         self.stages.append("forward")
 
@@ -44,7 +45,7 @@ class Witness(StepProbe):
     def before_rows(self, rows: StepRows) -> None:
         self.stages.append("before_rows")
         if rows.gradients is not None:
-            self.gradients = {group: rows.gradients[group].get() for group in GROUPS}
+            self.gradients = {group: rows.gradients[group].get() for group in PARAMETER_GROUPS}
         self.means, self.first = rows.parameters["means"].get(), rows.first["means"].get()
 
     def after_rows(self, rows: StepRows) -> None:
@@ -74,16 +75,16 @@ def test_a_trainer_s_step_is_a_gradient_step(scene: Scene, default_device: Devic
     photograph, witness = by_hand.photographs.load(view, 1.0), Witness()
     background = np.zeros(3, np.float32)
     camera = by_hand.local(by_hand.views[view].camera)
-    result = step.run(model, photograph, camera, background, witness, gradients)
+    result = step.run(model, ViewInputs(view, photograph, camera, background), witness, gradients)
     assert witness.stages == ["forward", "loss", "pair_gradients", "before_rows", "after_rows"]
     assert_same_bits(witness.means, before, "Adam comes after the probe")
     assert not witness.first.any()
     assert witness.screen.any()
     assert np.isfinite(result.read()).all()
     for kind in ("parameters", "first", "second"):
-        for group in GROUPS:
+        for group in PARAMETER_GROUPS:
             got, wanted = getattr(by_hand, kind)[group].get(), getattr(trainer, kind)[group].get()
             assert_same_bits(got, wanted, f"{kind} {group}")
     if gradients is not None:
         assert witness.gradients["means"].any()
-        assert all(not gradients[group].get().any() for group in GROUPS), "Adam leaves them zero"
+        assert all(not gradients[group].get().any() for group in PARAMETER_GROUPS), "Adam leaves them zero"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Splits along the longest axis, and edges that choose them: the formulas, and that they repeat to the last byte."""
+"""Splits along the longest axis: the formulas, and that they repeat to the last byte."""
 
 from __future__ import annotations
 
@@ -13,21 +13,14 @@ from same_bytes import check_in_less_memory, model_bytes, stopped_at
 from scipy.spatial.transform import Rotation
 from tiny import short, write_scene
 
-from clsplat.config.training import DensityConfig
 from clsplat.device.context import Device
-from clsplat.errors import InputError
-from clsplat.reference.render import render_grad
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.training.density.adaptive import edge_scores, long_halves
-from clsplat.training.edges import edge_contributions, edge_strength
-from clsplat.training.pending import VARIABLE
+from clsplat.training.density.adaptive import long_halves
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
-CONFIG = short(
-    iterations=48,
-    density={"growth": "budget", "max_gaussians": 120, "long_axis": True, "edge_views": 2, "gradient_threshold": 1e-6},
-)
+CONFIG = short(iterations=48, density={"growth": "budget", "max_gaussians": 120, "long_axis": True})
 
 
 @pytest.fixture(scope="module")
@@ -62,41 +55,6 @@ def test_extreme_opacities_stay_finite(logit: float) -> None:
     assert halves["opacity_logits"][0] == pytest.approx(np.log(0.6) + logit if logit < 0 else np.log(1.5), rel=1e-6)
 
 
-def test_draws_follow_the_edges_and_spare_the_unwanted() -> None:
-    edges, rng = np.array([1.0, 3.0, 0.0, 5.0], np.float32), np.random.default_rng(0)
-    scores = np.array([1e-4, 2e-4, 3e-4, -1.0], np.float32)
-    drawn = [edge_scores(scores, edges, rng) for _ in range(4000)]
-    assert all(one[3] == -1 and one[2] == 0 for one in drawn)
-    share = np.mean([one.argmax() == 1 for one in drawn])
-    assert share == pytest.approx(0.75, abs=4 * np.sqrt(0.75 * 0.25 / 4000))
-
-
-def test_edge_strength() -> None:
-    photograph = np.zeros((6, 8, 5), np.uint8)
-    photograph[:, 4:, :3] = 200
-    photograph[..., 4] = 255
-    photograph[0, :, 4] = 0
-    photograph[0, :, :3] = 0  # as what is masked is, which has an outline then
-    expected = np.zeros((6, 8))
-    expected[2:, 3:5] = 1
-    np.testing.assert_array_equal(edge_strength(photograph), expected)
-    assert not edge_strength(np.full((6, 8, 3), 7, np.uint8)).any()
-    assert edge_strength(np.zeros((1, 8, 3), np.uint8)).shape == (1, 8)
-
-
-def test_contributions_to_edges_are_those_of_the_twin(scene: Scene, default_device: Device) -> None:
-    """The gradient by colour of a picture that is weighed by the edges."""
-    trainer = Trainer(scene, CONFIG, default_device)
-    found = edge_contributions(trainer, 100)
-    model, expected = trainer.gaussians(), np.zeros(trainer.parameters.count)
-    for view in range(len(trainer.views)):
-        photograph = trainer.photographs.load(view, trainer.sizes.factor(1))
-        camera = trainer.camera(view, photograph.shape[1], photograph.shape[0])
-        weights = np.repeat(edge_strength(photograph)[:, :, None], 3, axis=2).astype(np.float64)
-        expected += render_grad(model, camera, weights).colors[:, 0]
-    assert np.linalg.norm(found - expected) <= 1e-4 * np.linalg.norm(expected)
-
-
 @pytest.mark.parametrize("step", quick([7, 15, 16, 20, 40], 16, 40))
 def test_stopping_and_going_on_gives_the_same_bytes(
     step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
@@ -107,7 +65,7 @@ def test_stopping_and_going_on_gives_the_same_bytes(
 def test_by_capacity_the_same_bytes(
     scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(VARIABLE, "1")
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     assert model_bytes(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
@@ -125,15 +83,3 @@ def test_it_grows_by_splits_alone(scene: Scene, default_device: Device) -> None:
     for _ in range(20):
         trainer.train_step()
     assert trainer.parameters.count > before
-
-
-@pytest.mark.parametrize(
-    ("settings", "name"),
-    [
-        ({"edge_views": 2}, "--density.edge-views 2"),
-        ({"edge_views": -1}, "--density.edge-views -1"),
-    ],
-)
-def test_settings_that_are_never_used(settings: dict[str, object], name: str) -> None:
-    with pytest.raises(InputError, match=name):
-        DensityConfig(**settings).check()  # type: ignore[arg-type]

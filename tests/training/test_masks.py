@@ -19,9 +19,9 @@ from clsplat.api import train
 from clsplat.config.masks import MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.device.layout import SlotFields
 from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
+from clsplat.layouts.columns import SlotFields
 from clsplat.reference.blend import blend
 from clsplat.reference.loss import alpha_loss, masked_l1_dssim
 from clsplat.reference.project import project
@@ -30,8 +30,9 @@ from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians
 from clsplat.stages.loss import loss
+from clsplat.stages.loss_terms import AlphaTerm
 from clsplat.stages.target import target
-from clsplat.training.photographs import kept_pixels
+from clsplat.training.supervision.image_cache import kept_pixels
 
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
@@ -50,8 +51,9 @@ def masked_step(device: Device, subject: tuple[Any, Any], image: np.ndarray, wei
     made, fields = Pipeline.run(device, subject), SlotFields(contributions=True)
     frame, rasterizer = made.frame, made.rasterizer
     planes = target(device, rasterizer.work, image, frame.background, frame.blended, alpha=weight > 0)
-    size, how = (made.camera.width, made.camera.height), {"kept": kept_pixels(image), "alpha_weight": weight}
-    result = loss(device, rasterizer.work, frame.blended.image, planes, *size, 0.2, blended=frame.blended, **how)
+    size, how = (made.camera.width, made.camera.height), {"kept": kept_pixels(image), "blended": frame.blended}
+    terms = (AlphaTerm(weight),) if weight else ()
+    result = loss(device, rasterizer.work, frame.blended.image, planes, *size, 0.2, terms=terms, **how)
     gradients = allocate_gaussians(device, made.gaussians.count, made.gaussians.coefficients, zero=True)
     screen = rasterizer.backward(made.gaussians, frame, result.gradient, gradients, fields=fields)
     assert screen.contributions is not None

@@ -20,14 +20,14 @@ from clsplat.arrays import Float32
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.training.density import HALVED, RowPlan
+from clsplat.training.density import SPLIT_GROUPS, RowPlan
 from clsplat.training.density.adaptive import long_halves
-from clsplat.training.density.mcmc import MOST, Mcmc, draw, last_growth, shared, strongest, wanted
-from clsplat.training.pending import VARIABLE
+from clsplat.training.density.mcmc import MAX_GAUSSIANS_PER_PLACE, Mcmc, draw, last_growth, shared, strongest, wanted
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
 GROWN = 150
@@ -47,7 +47,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 @pytest.mark.parametrize("opacity", [0.006, 0.1, 0.5, 0.99, 1 - 1e-7])
-@pytest.mark.parametrize("number", [1, 2, 3, 10, MOST])
+@pytest.mark.parametrize("number", [1, 2, 3, 10, MAX_GAUSSIANS_PER_PLACE])
 def test_shares_of_opacity_and_scale(opacity: float, number: int) -> None:
     """The published double sum, and as much of the light that passes."""
     parts, by = shared(np.array([opacity]), np.array([number]), 1e-9)
@@ -107,7 +107,9 @@ def planned(trainer: Trainer) -> tuple[RowPlan, dict[str, dict[str, Float32]], d
     """The plan, and all models' groups before and after it. What is not fresh keeps its moments, the rest has none."""
 
     def looked_at() -> dict[str, dict[str, Float32]]:
-        return {kind: {group: model[group].get() for group in GROUPS} for kind, model in trainer.models().items()}
+        return {
+            kind: {group: model[group].get() for group in PARAMETER_GROUPS} for kind, model in trainer.models().items()
+        }
 
     before = looked_at()
     plan = trainer.strategy.before_step(trainer._state())
@@ -117,7 +119,7 @@ def planned(trainer: Trainer) -> tuple[RowPlan, dict[str, dict[str, Float32]], d
         assert_same_bits(after["parameters"][group], before["parameters"][group][plan.rows], group)
     same = np.flatnonzero(~plan.fresh)
     for kind in ("first", "second"):
-        for group in GROUPS:
+        for group in PARAMETER_GROUPS:
             assert not after[kind][group][plan.fresh].any()
             assert_same_bits(after[kind][group][same], before[kind][group][same], group)
     assert not trainer.statistics.radii.get().any()
@@ -140,7 +142,7 @@ def test_halves_of_the_strongest_take_the_rows_of_the_dead_and_new_ones(scene: S
     scores = sums / np.maximum(seen, 1)
     assert sorted(scores[split]) == sorted(np.sort(scores[stay])[-len(split) :])
     assert_same_bits(np.flatnonzero(plan.fresh), np.sort(np.concatenate([split.astype(np.int64), second])), "fresh")
-    halves = long_halves({group: before["parameters"][group][split] for group in (*HALVED, "opacity_logits")})
+    halves = long_halves({group: before["parameters"][group][split] for group in (*SPLIT_GROUPS, "opacity_logits")})
     for group, values in halves.items():
         assert_same_bits(after["parameters"][group][np.concatenate([split, second])], values, group)
         whole = np.setdiff1d(stay, split)
@@ -258,7 +260,7 @@ def test_by_capacity_the_same_bytes(scene: Scene, default_device: Device, monkey
     """A step that has stopped adds no noise, and the one that is made again has its own."""
     ends = []
     for capacity in (False, True):
-        monkeypatch.setenv(VARIABLE, "01"[capacity])
+        monkeypatch.setenv(BY_CAPACITY_VARIABLE, "01"[capacity])
         trainer = Trainer(scene, CONFIG, default_device)
         real = trainer.pending.room
         monkeypatch.setattr(

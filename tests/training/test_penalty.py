@@ -11,11 +11,11 @@ import pytest
 from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
 from tiny import short, write_scene
 
-from clsplat.config.exploring import Exploration
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
+from clsplat.optimisation.step_noise import Exploration
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.density.choice import strategy_of

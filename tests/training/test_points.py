@@ -13,7 +13,7 @@ from ring import write_cloud
 from tiny import CONFIG, FEW, hidden_model, write_scene
 
 from clsplat.cli.main import main
-from clsplat.config.points import SKY_RADIUS
+from clsplat.config.points import SKY_RADIUS_RATIO
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -21,7 +21,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.training.density.adaptive import Adaptive
 from clsplat.training.density.choice import strategy_of
-from clsplat.training.loop import begin
+from clsplat.training.preparation import begin
 from clsplat.training.trainer import Trainer
 
 WORDS = ("--iterations", "4", "--density.every", "0", "--resolution", "24")
@@ -99,7 +99,7 @@ def test_colours_come_from_the_photographs(scene: Path, cloud: Path) -> None:
 def test_a_sky_is_not_pruned_for_its_size(default_device: Device, scene: Path) -> None:
     strategy = strategy_of(replace(CONFIG, sky=100))
     assert isinstance(strategy, Adaptive)
-    assert strategy.config.max_world_fraction == pytest.approx(SKY_RADIUS * CONFIG.density.max_world_fraction)
+    assert strategy.config.max_world_fraction == pytest.approx(SKY_RADIUS_RATIO * CONFIG.density.max_world_fraction)
     assert strategy_of(TrainConfig()).config == TrainConfig().density  # type: ignore[attr-defined]
     read = load_scene(scene)
     config = replace(CONFIG, sky=100, iterations=30)

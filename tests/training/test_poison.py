@@ -19,16 +19,17 @@ from tiny import HEIGHT, WIDTH, short, write_scene
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
-from clsplat.device.layout import SPLAT
 from clsplat.errors import InputError
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.images.writing import write_image
-from clsplat.scenes.depth import with_depths
+from clsplat.layouts.columns import SPLAT
+from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import allocate_gaussians
-from clsplat.training import step as step_module
-from clsplat.training.step import GradientStep, StepRows
+from clsplat.training.step import gradient_step as step_module
+from clsplat.training.step.gradient_step import GradientStep
+from clsplat.training.step.inputs import StepRows
 from clsplat.training.trainer import Trainer
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -102,9 +103,9 @@ EVERYTHING = short(
     iterations=24,
     warmup=(2, 4),
     sh_degree_every=8,
-    density={"start": 5, "every": 4, "min_contribution": 0.05, "views_agree": 2, "absolute_gradients": True},
+    density={"start": 5, "every": 4, "min_contribution": 0.05, "absolute_gradients": True},
 )
-"""Growth of every array, contributions and agreement, two SH degrees, an opacity reset."""
+"""Growth of every array, contributions, two SH degrees, an opacity reset."""
 
 
 EXPLORING = short(
@@ -216,7 +217,7 @@ def put(array: DeviceArray, value: float, row: int = ROW) -> None:
 
 def rows_of(trainer: Trainer) -> dict[str, np.ndarray]:
     """Parameters of all Gaussians but the poisoned one."""
-    return {group: np.delete(trainer.parameters[group].get(), ROW, axis=0) for group in GROUPS}
+    return {group: np.delete(trainer.parameters[group].get(), ROW, axis=0) for group in PARAMETER_GROUPS}
 
 
 def assert_well(trainer: Trainer) -> None:
@@ -237,7 +238,7 @@ def assert_others_alike(one: Trainer, other: Trainer) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sparse", [False, True])
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", PARAMETER_GROUPS)
 def test_broken_parameters_are_not_drawn_and_removed(
     scene: Scene, default_device: Device, group: str, sparse: bool
 ) -> None:
@@ -262,7 +263,7 @@ def test_broken_parameters_are_not_drawn_and_removed(
         assert_well(poisoned)
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", PARAMETER_GROUPS)
 def test_garbage_in_parameters_spoils_nothing_else(scene: Scene, default_device: Device, group: str) -> None:
     for value in GARBAGE:
         trainer = started(scene, default_device)
@@ -281,7 +282,7 @@ def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: s
 
     def looked_at(self: GradientStep, *arguments: Any, **named: Any) -> object:
         monkeypatch.setattr(GradientStep, "run", run)
-        return run(self, *arguments, gradients, **named)
+        return run(self, *arguments[:3], gradients, **named)
 
     def poisoned(self: GradientStep, rows: StepRows) -> None:
         if self.device.only_tries:
@@ -290,13 +291,13 @@ def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: s
         put(gradients[group], value)
         monkeypatch.setattr(GradientStep, "update", update)
         update(self, rows)
-        assert not any(gradients[each].get().any() for each in GROUPS)
+        assert not any(gradients[each].get().any() for each in PARAMETER_GROUPS)
 
     monkeypatch.setattr(GradientStep, "run", looked_at)
     monkeypatch.setattr(GradientStep, "update", poisoned)
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", PARAMETER_GROUPS)
 def test_a_broken_gradient_costs_its_gaussian_alone(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch, group: str
 ) -> None:
@@ -314,12 +315,12 @@ def test_a_broken_gradient_costs_its_gaussian_alone(
         assert (incident.stage, incident.count) == ("adam" if value == 1e30 else "project_grad", 1)
         assert poisoned.parameters.count == 39
         assert_others_alike(plain, plain)
-        for each in GROUPS:
+        for each in PARAMETER_GROUPS:
             assert_same_bits(poisoned.parameters[each].get(), rows_of(plain)[each], each)
         assert_well(poisoned)
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", PARAMETER_GROUPS)
 @pytest.mark.parametrize("which", ["first", "second"])
 def test_broken_moments_begin_again(scene: Scene, default_device: Device, which: str, group: str) -> None:
     for value in (*BROKEN, -5.0):
@@ -341,7 +342,7 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
         assert_well(poisoned)
 
 
-@pytest.mark.parametrize("group", GROUPS)
+@pytest.mark.parametrize("group", PARAMETER_GROUPS)
 @pytest.mark.parametrize("which", ["first", "second"])
 def test_garbage_in_moments_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
     for value in GARBAGE:
@@ -355,12 +356,12 @@ def test_garbage_in_moments_spoils_nothing_else(scene: Scene, default_device: De
         assert_well(poisoned)
 
 
-STATISTICS = ("gradient_sums", "seen", "radii", "agreeing", "current_totals", "current_largest", "whole_totals")
+STATISTICS = ("gradient_sums", "seen", "radii", "current_totals", "current_largest", "whole_totals")
 
 
 @pytest.mark.parametrize("name", STATISTICS)
 def test_spoilt_statistics_leave_a_sound_model(scene: Scene, default_device: Device, name: str) -> None:
-    density = {"start": 2, "every": 4, "views_agree": 2, "min_contribution": 0.05, "max_screen_radius": 30.0}
+    density = {"start": 2, "every": 4, "min_contribution": 0.05, "max_screen_radius": 30.0}
     for value in (*BROKEN, *GARBAGE):
         trainer = started(scene, default_device, quiet(density=density))
         put(trainer.statistics.named()[name], value)

@@ -133,7 +133,7 @@ def test_an_infinite_scale_spoils_nothing(device: Device, model: Gaussians, log_
 def test_opacities_about_the_least_visible_one(device: Device, default_device: Device, model: Gaussians) -> None:
     """Under it the logarithm of what is left of the extent would be negative."""
     least = -np.log(np.float64(254.0))
-    ways = (None, BenchSwitches(opacity_cull=False), BenchSwitches(extent="constant"))
+    ways = (None, BenchSwitches(extent="constant"))
     for logit in (-np.inf, np.nan, -100.0, -20.0, least - 1e-3):
         for config in ways if device is default_device else ways[:1]:  # each is a build
             assert_as_if_absent(device, with_row(model, 7, opacity_logits=logit), 7, config)

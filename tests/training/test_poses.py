@@ -26,10 +26,10 @@ from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
-from clsplat.training.cameras import aligned
-from clsplat.training.gate import drift
-from clsplat.training.poses import Poses, axes_of, descend
-from clsplat.training.refined import doubt_poses
+from clsplat.training.cameras.export import doubt_poses
+from clsplat.training.cameras.poses import Poses, axes_of, descend
+from clsplat.training.cameras.validation_gate import drift
+from clsplat.training.held_out_alignment import aligned
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, refine_poses=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import bench_guards
 import numpy as np
 import pytest
 from calls import Capture
@@ -25,18 +25,24 @@ from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.source import kernel_source
 from clsplat.errors import ClsplatError, InputError
-from clsplat.gaussians import GROUPS, SH_LIMIT, group_shapes
+from clsplat.gaussians import MAX_SH_COEFFICIENT, PARAMETER_GROUPS, group_shapes
+from clsplat.runs.checkpoints import read_checkpoint, write_checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.spherical_harmonics import sh_basis
-from clsplat.training import repro
-from clsplat.training.health import PATIENCE, RETURNS, SMALLER, WINDOW, Patience, examine, finite_or_zero, lost
+from clsplat.training import repro_bundle
+from clsplat.training.stability.health import (
+    MAX_CHECKPOINT_RETURNS,
+    MAX_TROUBLED_STEPS,
+    RETURN_RATE_FACTOR,
+    TROUBLE_WINDOW_STEPS,
+    RetryBudget,
+    examine,
+    finite_or_zero,
+    lost,
+)
 from clsplat.training.trainer import Trainer
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
-
-import bench_guards
 
 CHECKED = short(checkpoint_every=5)
 
@@ -88,7 +94,7 @@ def test_what_is_broken_and_what_is_refused() -> None:
     parameters, first, second = model(), model(), model()
     assert not np.any(examine(parameters, first, second))
     parameters["means"][1, 2] = np.nan
-    parameters["sh_rest"][2, 1, 0] = -SH_LIMIT
+    parameters["sh_rest"][2, 1, 0] = -MAX_SH_COEFFICIENT
     parameters["means"][3] = 1e18  # far away, but a place
     first["sh_dc"][4, 1] = np.inf
     second["opacity_logits"][5] = np.nan
@@ -101,20 +107,20 @@ def test_what_is_broken_and_what_is_refused() -> None:
 
 
 def test_patience() -> None:
-    patience = Patience()
-    for index in range(PATIENCE - 1):
+    patience = RetryBudget()
+    for index in range(MAX_TROUBLED_STEPS - 1):
         patience.note(10 * index + 1)
         patience.note(10 * index + 1)  # the same step
         assert not patience.over
-    patience.note(WINDOW + 1)  # the first is forgotten by now
+    patience.note(TROUBLE_WINDOW_STEPS + 1)  # the first is forgotten by now
     assert not patience.over
-    patience.note(WINDOW + 2)
+    patience.note(TROUBLE_WINDOW_STEPS + 2)
     assert patience.over
-    for index in range(RETURNS):
+    for index in range(MAX_CHECKPOINT_RETURNS):
         assert not patience.spent
         patience = patience.after_return()
         assert not patience.over
-        assert patience.rate_factor == SMALLER ** (index + 1)
+        assert patience.rate_factor == RETURN_RATE_FACTOR ** (index + 1)
     assert patience.spent
     patience.note(7, lost=True)
     assert patience.over
@@ -126,7 +132,7 @@ def test_what_is_not_drawn_for_its_colour_is_over_the_limit() -> None:
     most = np.abs(sh_basis(directions, 3)).sum(axis=1).max()
     limit = re.search(r"#define COLOUR_LIMIT (\S+)f", kernel_source("project"))
     assert limit is not None
-    assert 0.5 + most * SH_LIMIT < float(limit[1])
+    assert 0.5 + most * MAX_SH_COEFFICIENT < float(limit[1])
 
 
 # Training goes on
@@ -246,18 +252,18 @@ def test_what_cannot_be_helped_stops_with_a_bundle(scene: Scene, default_device:
     assert caught.value.exit_status == 1
     message = re.fullmatch(
         r"step (\d+), view (\S+), stage adam: .*, and 3 returns with smaller steps did not help: (\S+) reproduces it "
-        r"\(python -m clsplat\.training\.repro\)",
+        r"\(python -m clsplat\.training\.repro_bundle\)",
         str(caught.value),
     )
     assert message is not None
-    assert len([line for line in lines if "back to" in line]) == RETURNS
-    bundle = repro.read_bundle(Path(message[3]))
+    assert len([line for line in lines if "back to" in line]) == MAX_CHECKPOINT_RETURNS
+    bundle = repro_bundle.read_bundle(Path(message[3]))
     assert bundle.record["reproduced"]
     assert bundle.config == config
     assert bundle.record["device"]["name"] == default_device.name
     assert bundle.record["versions"].keys() == {"clsplat", "numpy", "pyopencl", "python", "system"}
-    counts = repro.replay(bundle, default_device)
-    assert repro.first_trouble(counts) == "adam"
+    counts = repro_bundle.replay(bundle, default_device)
+    assert repro_bundle.first_trouble(counts) == "adam"
     assert sum(counts.values()) == counts["adam"] > 0
     # and the run can be put right
     Run.create(run.path, CONFIG, overwrite=True)
@@ -272,17 +278,16 @@ def test_a_bundle_has_no_more_than_it_needs(
     with heard(), pytest.raises(ClsplatError), spoilt(lambda trainer: trainer.step > 5, "log_scales", value=np.inf):
         train(scene, config, device=default_device, run=run)
     (path,) = run.path.glob("trouble-step-*.npz")
-    bundle = repro.read_bundle(path)
+    bundle = repro_bundle.read_bundle(path)
     kept, of = bundle.record["of"]
     assert kept == 1 < of
     assert {model.count for model in bundle.models.values()} == {1}
-    assert bundle.photograph.shape[:2] == (bundle.camera.height, bundle.camera.width)
     assert path.stat().st_size < 50_000
-    assert repro.main([str(path)]) == 0
+    assert repro_bundle.main([str(path)]) == 0
     out = capsys.readouterr().out
     assert "first in parameters" in out
     assert f"1 of {of} Gaussians" in out
-    assert repro.main([str(path), "--json"]) == 0
+    assert repro_bundle.main([str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["stage"] == "parameters"
 
 
@@ -296,10 +301,10 @@ def test_a_bundle_of_a_sound_step_says_so(
     trainer.watch.loss_failed()
     trainer.mend()
     assert trainer.watch.latest is not None
-    path = repro.write_bundle(tmp_path, trainer, trainer.watch.latest)
-    assert repro.read_bundle(path).record["of"] == [40, 40]
-    assert not repro.read_bundle(path).record["reproduced"]
-    assert repro.main([str(path)]) == 1
+    path = repro_bundle.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    assert repro_bundle.read_bundle(path).record["of"] == [40, 40]
+    assert not repro_bundle.read_bundle(path).record["reproduced"]
+    assert repro_bundle.main([str(path)]) == 1
     assert "all is well on this device" in capsys.readouterr().out
 
 
@@ -311,29 +316,26 @@ def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
     trainer.watch.loss_failed()
     trainer.mend()
     assert trainer.watch.latest is not None
-    path = repro.write_bundle(tmp_path, trainer, trainer.watch.latest)
-    with np.load(path) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    record = json.loads(arrays[repro.RECORD].tobytes())
+    path = repro_bundle.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    saved = read_checkpoint(path)
     earlier = "[train.rasterizer]\nsh_angle = 1.5\nrow_skip = false"
-    record["settings"] = record["settings"].replace("[train.rasterizer]", earlier)
-    arrays[repro.RECORD] = np.frombuffer(json.dumps(record).encode(), np.uint8)
-    np.savez(path, allow_pickle=False, **arrays)
+    settings = saved.state["settings"].replace("[train.rasterizer]", earlier)
+    write_checkpoint(path, saved.step, saved.arrays, {**saved.state, "settings": settings})
     with pytest.warns(UserWarning, match=r"sh_angle = 1\.5, train\.rasterizer\.row_skip = False$") as told:
-        assert repro.read_bundle(path).config == CONFIG
+        assert repro_bundle.read_bundle(path).config == CONFIG
     assert len(told) == 1
 
 
 def test_what_is_no_bundle_is_named(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "some.npz"
-    assert repro.main([str(path)]) == 2
+    assert repro_bundle.main([str(path)]) == 2
     assert f"{path}: no such file" in capsys.readouterr().err
     np.savez(path, a=np.zeros(3))
     with pytest.raises(InputError, match="not a bundle"):
-        repro.read_bundle(path)
+        repro_bundle.read_bundle(path)
     path.write_bytes(b"PK")
     with pytest.raises(InputError, match="not a bundle"):
-        repro.read_bundle(path)
+        repro_bundle.read_bundle(path)
 
 
 def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device: Device) -> None:
@@ -347,7 +349,7 @@ def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device:
 
 @pytest.mark.slow
 def test_kernels_without_checks_have_the_same_bits_and_no_checks(scene: Scene, default_device: Device) -> None:
-    """What `tools/bench_guards.py` compares with."""
+    """What `tools/bench/bench_guards.py` compares with."""
     trainers = [Trainer(scene, CONFIG, each) for each in (default_device, unguarded(default_device))]
     for trainer in trainers:
         for _ in range(20):
@@ -385,4 +387,4 @@ def test_rates_are_the_settings_where_nothing_happened(scene: Scene, default_dev
     trainer = Trainer(scene, CONFIG, default_device)
     trainer.step = 1
     assert trainer.rates()["sh_dc"] == TrainConfig().optimiser.sh_dc_rate
-    assert all(group in trainer.rates() for group in GROUPS)
+    assert all(group in trainer.rates() for group in PARAMETER_GROUPS)

@@ -21,10 +21,10 @@ from clsplat.errors import InputError
 from clsplat.evaluation.metrics import psnr
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
-from clsplat.scenes.data_set import Lens
+from clsplat.scenes.dataset import Lens
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
-from clsplat.training.lenses import RefinedLenses
+from clsplat.training.cameras.intrinsics import RefinedLenses
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, refine_lenses=True)

@@ -17,31 +17,31 @@ from tiny import short, write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import Workspace, upload
+from clsplat.device.command_buffer import CHECK_TAPES, CommandBuffer
+from clsplat.device.command_buffer import TAPES_VARIABLE as TAPES
 from clsplat.device.context import Device
-from clsplat.device.tape import CHECK, Tape
-from clsplat.device.tape import VARIABLE as TAPES
 from clsplat.errors import InputError
 from clsplat.images.reading import read_image
 from clsplat.images.writing import write_image
-from clsplat.scenes.depth import with_depths
+from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages import project
 from clsplat.stages.scan import scan
-from clsplat.training.pending import VARIABLE
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
 PLAIN = short(iterations=60, density={"min_contribution": 0.01})
 MCMC = {"growth": "mcmc", "max_gaussians": 150, "min_opacity": 0.03, "max_screen_radius": 30.0}
 CONFIGS = {
     "plain": PLAIN,
-    "frequency": short(iterations=60, warmup="frequency", frequency_steps=12, background="random"),
+    "background": short(iterations=60, background="random"),
     "thinning": replace(PLAIN, thinning=0.5),
     "exposure": replace(PLAIN, appearance="exposure"),
     "ppisp": replace(PLAIN, appearance="ppisp"),
     "grid": replace(PLAIN, appearance="grid"),
     "MCMC": short(iterations=60, density=MCMC),
-    "long axis": short(density={"growth": "budget", "max_gaussians": 120, "long_axis": True, "edge_views": 2}),
+    "long axis": short(density={"growth": "budget", "max_gaussians": 120, "long_axis": True}),
     "antialiased": replace(PLAIN, antialiased=True),
     "ignored": replace(PLAIN, masks="ignore"),
     "transparent": replace(PLAIN, masks="transparent"),
@@ -75,7 +75,7 @@ Result = tuple[Mapping[str, NDArray[Any]], list[tuple[float, float]], int]
 
 def trained(scene: Scene, config: TrainConfig, device: Device, monkeypatch: pytest.MonkeyPatch, **how: str) -> Result:
     """The arrays of a checkpoint after a training, its losses, and how many steps were made again."""
-    for name, value in ((VARIABLE, how.get("capacity", "1")), (TAPES, how["tapes"])):
+    for name, value in ((BY_CAPACITY_VARIABLE, how.get("capacity", "1")), (TAPES, how["tapes"])):
         monkeypatch.setenv(name, value)
     trainer, losses = Trainer(scene, config, device), []
     real = trainer.pending.room
@@ -112,9 +112,9 @@ def test_every_setting_has_its_bytes(
     scene = with_depths(load_scene(folder, masks=config.mask_use), config.depth_use)
     group = default_device.with_shape(lanes=1, items=64)
     for name, calls in (("set", replayed), ("check", checked)):
-        real = getattr(Tape, name)
-        monkeypatch.setattr(Tape, name, lambda *given, real=real, calls=calls: (calls.append(1), real(*given)))
-    for device, uses in ((default_device, ("0", "1", CHECK)), (group, ("1",))):
+        real = getattr(CommandBuffer, name)
+        monkeypatch.setattr(CommandBuffer, name, lambda *given, real=real, calls=calls: (calls.append(1), real(*given)))
+    for device, uses in ((default_device, ("0", "1", CHECK_TAPES)), (group, ("1",))):
         exact = trained(scene, config, device, monkeypatch, capacity="0", tapes="0")
         for use in uses:
             replayed.clear(), checked.clear()
@@ -122,7 +122,7 @@ def test_every_setting_has_its_bytes(
             assert_alike(exact, other)
             assert (other[2] > 0) == (config.batch == 1)
             assert (len(replayed) > 20) == (use == "1" and config.batch == 1)
-            assert (len(checked) > 20) == (use == CHECK and config.batch == 1)
+            assert (len(checked) > 20) == (use == CHECK_TAPES and config.batch == 1)
 
 
 @pytest.mark.parametrize("batch", [1, 2])
@@ -131,7 +131,7 @@ def test_a_step_with_exact_counts_makes_no_tape(
 ) -> None:
     """Its arrays are new each time: a tape would never be used, and its kernel objects take the host a millisecond."""
     made: list[int] = []
-    monkeypatch.setattr(Tape, "add_launch", lambda *_: made.append(1))
+    monkeypatch.setattr(CommandBuffer, "add_launch", lambda *_: made.append(1))
     config = replace(PLAIN, batch=batch, iterations=6)
     trained(load_scene(folder), config, default_device, monkeypatch, capacity="0", tapes="1")
     assert not made
@@ -140,20 +140,20 @@ def test_a_step_with_exact_counts_makes_no_tape(
 def test_a_number_that_is_not_declared_is_found(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(project, "Anew", float)
+    monkeypatch.setattr(project, "LaunchParameter", float)
     monkeypatch.setattr(project, "step_numbers", real := project.step_numbers)
-    monkeypatch.setattr("clsplat.training.step.step_numbers", lambda *given: real(*given)[:0])
+    monkeypatch.setattr("clsplat.training.step.gradient_step.step_numbers", lambda *given: real(*given)[:0])
     with pytest.raises(AssertionError, match="project_step on a tape has other arguments than now"):
-        trained(load_scene(folder), PLAIN, default_device, monkeypatch, tapes=CHECK)
+        trained(load_scene(folder), PLAIN, default_device, monkeypatch, tapes=CHECK_TAPES)
 
 
 def test_a_number_that_is_not_given_is_found(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = project.step_numbers
-    monkeypatch.setattr("clsplat.training.step.step_numbers", lambda *given: (*real(*given)[:-1], 0.5))
+    monkeypatch.setattr("clsplat.training.step.gradient_step.step_numbers", lambda *given: (*real(*given)[:-1], 0.5))
     with pytest.raises(AssertionError, match="numbers given to a tape are"):
-        trained(load_scene(folder), PLAIN, default_device, monkeypatch, tapes=CHECK)
+        trained(load_scene(folder), PLAIN, default_device, monkeypatch, tapes=CHECK_TAPES)
 
 
 def test_another_word_than_those_is_refused(

@@ -21,7 +21,7 @@ from clsplat.api import train
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError, InputError
-from clsplat.gaussians import GROUPS
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
@@ -43,7 +43,7 @@ def alpha_scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 def host(gaussians: DeviceGaussians) -> dict[str, np.ndarray]:
-    return {group: gaussians[group].get() for group in GROUPS}
+    return {group: gaussians[group].get() for group in PARAMETER_GROUPS}
 
 
 def quiet(iterations: int, **changes: Any) -> TrainConfig:
@@ -268,7 +268,7 @@ def test_pictures_and_render_have_one_background(
     for pictures, fits in ((alpha_scene, True), (scene, background == "black")):
         trainer = Trainer(pictures, config, default_device)
         for _ in range(4):
-            trainer._set_parameters(upload_gaussians(default_device, hidden_model()))
+            trainer.model.set(upload_gaussians(default_device, hidden_model()))
             value = trainer.train_step().read()[0]
             seen.add(tuple(trainer.background.tolist()))
             # 8 bits: 1/510 at most in colour and in alpha, and what that makes of SSIM; else a background is off
@@ -339,7 +339,7 @@ def test_the_means_rate_falls_exponentially(scene: Scene, default_device: Device
         trainer.step = step
         rates.append(trainer.rates()["means"] / scene.extent)
     np.testing.assert_allclose(rates, [1e-2, 1e-3, 1e-4, 1e-4])
-    assert set(trainer.rates()) == set(GROUPS)
+    assert set(trainer.rates()) == set(PARAMETER_GROUPS)
 
 
 def test_every_rate_falls_in_the_cooldown(scene: Scene, default_device: Device) -> None:
@@ -350,7 +350,7 @@ def test_every_rate_falls_in_the_cooldown(scene: Scene, default_device: Device) 
         for trainer in trainers:
             trainer.step = step
         full, got = (trainer.rates() for trainer in trainers)
-        np.testing.assert_allclose([got[group] / full[group] for group in GROUPS], wanted)
+        np.testing.assert_allclose([got[group] / full[group] for group in PARAMETER_GROUPS], wanted)
 
 
 def trained_to(scene: Scene, device: Device, step: int, config: TrainConfig = CONFIG) -> Trainer:
@@ -380,12 +380,12 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
     assert (~fresh).any()
     for kind in ("first", "second"):
         after = host(getattr(trainer, kind))
-        for group in GROUPS:
+        for group in PARAMETER_GROUPS:
             assert before[kind][group].any(), f"{kind} {group}: nothing to move"
             assert_same_bits(after[group][~fresh], before[kind][group][rows[~fresh]], f"{kind} {group}")
             assert not after[group][fresh].any(), f"{kind} {group}: a fresh row has moments"
     after = host(trainer.parameters)
-    for group in GROUPS:
+    for group in PARAMETER_GROUPS:
         moved = split if group in ("means", "log_scales") else np.zeros_like(split)
         assert_same_bits(after[group][~moved], before["parameters"][group][rows[~moved]], group)
         if moved.any():
@@ -415,7 +415,7 @@ def test_an_opacity_reset_forgets_the_moments_of_opacity_alone(scene: Scene, def
         relative=1e-6,
     )
     for kind, values in after.items():
-        for group in GROUPS:
+        for group in PARAMETER_GROUPS:
             if group != "opacity_logits":
                 assert_same_bits(values[group], before[kind][group], f"{kind} {group}")
             elif kind != "parameters":

@@ -21,7 +21,7 @@ from tiny import CONFIG
 from viewer_browser import clsplat
 
 from clsplat.cli.main import main, parse
-from clsplat.cli.train import Train
+from clsplat.cli.train import TrainVerb
 from clsplat.errors import InputError
 from clsplat.images.colour import LINEAR, comment
 from clsplat.runs.run import Run
@@ -219,7 +219,7 @@ def test_what_makes_no_sense_is_a_line(model: Path) -> None:
     assert (process.returncode, out) == (0, "")
     lines = err.splitlines()
     assert len(lines) == 4, "one for each message"
-    assert all(line.startswith("clsplat: warning: a page sent what makes no sense here: ") for line in lines)
+    assert all(line.startswith("clsplat: warning: a page sent an invalid message: ") for line in lines)
 
 
 @posix
@@ -234,14 +234,14 @@ def test_ctrl_c_ends_it(model: Path) -> None:
 
 def test_the_flags_of_a_trainings_page(tmp_path: Path) -> None:
     plain = parse(["train", "scene", "-o", "run"])
-    assert isinstance(plain, Train)
+    assert isinstance(plain, TrainVerb)
     assert not plain.view
     for more in ([], ["--preset", "fast"], ["--schedule", "short"]):
         verb = parse(["train", "scene", "-o", "run", "--view", "--port", "81", "--host", "::1", *more])
-        assert isinstance(verb, Train)
+        assert isinstance(verb, TrainVerb)
         assert (verb.view, verb.page.port, verb.page.host) == (True, 81, "::1")
     run = tmp_path / "run"
     Run.create(run, CONFIG, scene=tmp_path)
     verb = parse(["train", "-o", str(run), "--resume", "--view", "--paths", str(tmp_path)])
-    assert isinstance(verb, Train)
+    assert isinstance(verb, TrainVerb)
     assert (verb.view, verb.resume, verb.page.paths, verb.config) == (True, True, tmp_path, CONFIG)

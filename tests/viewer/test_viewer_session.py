@@ -22,8 +22,8 @@ from clsplat.rotations import quaternion_of
 from clsplat.shots import choose_shot
 from clsplat.shots.viewpoints import extent_of
 from clsplat.viewer.appearance import (
-    LARGEST_OPACITY,
-    SCALE,
+    MAX_EDITED_OPACITY,
+    VIRIDIS_RGB,
     Look,
     alpha_picture,
     colour_picture,
@@ -32,9 +32,19 @@ from clsplat.viewer.appearance import (
     edited,
     read_look,
 )
-from clsplat.viewer.path_recorder import MOST_KEYS, add_key, path_document, save_path
-from clsplat.viewer.pose import WIDEST, Pose, fitted, looking, read_pose, start_of
-from clsplat.viewer.refinement import PATIENCE, SETTLE, SMALLEST, START, TARGET, Level, Refinement, Share, next_scale
+from clsplat.viewer.path_recorder import MAX_KEY_FRAMES, add_key, path_document, save_path
+from clsplat.viewer.pose import MAX_START_FOV_Y_RADIANS, Pose, fitted, looking, read_pose, start_of
+from clsplat.viewer.refinement import (
+    FIRST_SETTLE_SECONDS,
+    MAX_UNPREPARED_EXACT_SECONDS,
+    MIN_MOTION_SCALE,
+    MOTION_PICTURE_SECONDS,
+    SETTLE_SECONDS_RANGE,
+    Level,
+    Refinement,
+    Share,
+    next_scale,
+)
 from clsplat.viewer.scheduler import Viewer, Viewing
 
 ZERO = np.zeros(3)
@@ -137,7 +147,7 @@ def test_an_upright_page_shows_all_of_a_model_without_cameras() -> None:
         pixels = seen[:, :2] / seen[:, 2:] * camera.fx
         inside = (abs(pixels[:, 0]) < width / 2) & (abs(pixels[:, 1]) < height / 2) & (seen[:, 2] > 0)
         assert inside.mean() > (0.95 if height < 3 * width else 0.8), (width, height)
-    assert start.fov_on(1, 1000) == WIDEST
+    assert start.fov_on(1, 1000) == MAX_START_FOV_Y_RADIANS
 
 
 def test_a_picture_of_an_upright_page_is_no_wider_than_the_page() -> None:
@@ -198,9 +208,9 @@ def test_coarse_in_motion_exact_at_rest() -> None:
     assert level is not None and not level.exact and level.scale < 1
     shown(refinement, level, 0.05, 1.05)
     assert refinement.due(1.1) is None
-    assert refinement.wait(1.1) == pytest.approx(SETTLE[0] - 0.1)
-    assert refinement.due(1.0 + SETTLE[0]) == Level(1.0, exact=True)
-    assert refinement.wait(1.0 + SETTLE[0]) == 0
+    assert refinement.wait(1.1) == pytest.approx(SETTLE_SECONDS_RANGE[0] - 0.1)
+    assert refinement.due(1.0 + SETTLE_SECONDS_RANGE[0]) == Level(1.0, exact=True)
+    assert refinement.wait(1.0 + SETTLE_SECONDS_RANGE[0]) == 0
     shown(refinement, Level(1.0, exact=True), 0.3, 1.5)
     assert refinement.due(100.0) is None
     assert refinement.wait(100.0) is None
@@ -217,19 +227,19 @@ def test_a_camera_that_jumps_is_not_at_rest_between_two_jumps() -> None:
         refinement.changed(now)
         shown(refinement, Level(0.25, exact=False), 0.01, now)
     assert refinement.due(now + 0.5) is None
-    assert refinement.due(now + SETTLE[1]) == Level(1.0, exact=True)
+    assert refinement.due(now + SETTLE_SECONDS_RANGE[1]) == Level(1.0, exact=True)
     for _ in range(20):
         now += 0.02
         refinement.changed(now)
         shown(refinement, Level(0.25, exact=False), 0.01, now)
-    assert refinement.due(now + SETTLE[0]) == Level(1.0, exact=True)
+    assert refinement.due(now + SETTLE_SECONDS_RANGE[0]) == Level(1.0, exact=True)
 
 
 def test_the_first_exact_picture_leaves_the_browser_some_time() -> None:
     refinement = Refinement(0.0)
     shown(refinement, Level(0.25, exact=False), 0.01, 0.0)
-    assert refinement.due(START - 0.01) is None
-    assert refinement.due(START) == Level(1.0, exact=True)
+    assert refinement.due(FIRST_SETTLE_SECONDS - 0.01) is None
+    assert refinement.due(FIRST_SETTLE_SECONDS) == Level(1.0, exact=True)
 
 
 def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:
@@ -246,13 +256,13 @@ def test_what_changes_while_a_picture_is_made_is_shown_next() -> None:
 def test_a_slow_exact_picture_is_led_up_to() -> None:
     refinement = Refinement(0.0)
     refinement.scale = 0.2
-    shown(refinement, Level(0.2, exact=False), 2 * PATIENCE, 0.0)
+    shown(refinement, Level(0.2, exact=False), 2 * MAX_UNPREPARED_EXACT_SECONDS, 0.0)
     refinement.changed(0.0)
-    shown(refinement, Level(0.2, exact=False), 2 * PATIENCE, 0.0)
+    shown(refinement, Level(0.2, exact=False), 2 * MAX_UNPREPARED_EXACT_SECONDS, 0.0)
     seen = []
     while (level := refinement.due(10.0)) is not None:
         seen.append(level)
-        shown(refinement, level, 2 * PATIENCE, 10.0)
+        shown(refinement, level, 2 * MAX_UNPREPARED_EXACT_SECONDS, 10.0)
     assert seen == [Level(0.4, exact=False), Level(0.8, exact=False), Level(1.0, exact=True)]
 
 
@@ -270,14 +280,14 @@ def test_the_pace_finds_the_size_that_takes_the_time(fixed: float) -> None:
     scale = Refinement(0.0).scale
     for _ in range(40):
         scale = next_scale(scale, fixed + 0.4 * scale**2)
-    assert fixed + 0.4 * scale**2 == pytest.approx(TARGET, rel=0.05)
+    assert fixed + 0.4 * scale**2 == pytest.approx(MOTION_PICTURE_SECONDS, rel=0.05)
 
 
 def test_the_pace_stays_in_its_range() -> None:
     scale = Refinement(0.0).scale
     for _ in range(50):
         scale = next_scale(scale, 10.0)
-    assert scale == SMALLEST
+    assert scale == MIN_MOTION_SCALE
     for _ in range(50):
         scale = next_scale(scale, 0.0)
     assert scale == 1.0
@@ -330,7 +340,7 @@ def test_edits() -> None:
     np.testing.assert_allclose(faint, opacity(model.opacity_logits) / 2, rtol=1e-5)
     strong = edited(model, Look(opacity=3.0)).opacity_logits
     assert np.isfinite(strong).all()
-    assert opacity(strong).max() == pytest.approx(LARGEST_OPACITY, rel=1e-5)
+    assert opacity(strong).max() == pytest.approx(MAX_EDITED_OPACITY, rel=1e-5)
     assert np.isfinite(edited(model, Look(opacity=0.0)).opacity_logits).all()
 
     half = edited(model, Look(crop=(10.0, -1e9, -1e9, 1e9, 1e9, 1e9)))
@@ -359,15 +369,15 @@ def test_pictures() -> None:
     picture, text = depth_picture(depth, alpha)
     brightness = picture.sum(axis=2)[0]
     assert brightness[0] > brightness[1] > brightness[2] > brightness[3] == 0
-    np.testing.assert_array_equal(picture[0, 0], SCALE[-1])
+    np.testing.assert_array_equal(picture[0, 0], VIRIDIS_RGB[-1])
     assert text == "depth 1.04 (bright) to 2.96"
     nothing, text = depth_picture(depth, np.zeros_like(alpha))
     assert (nothing == 0).all()
     assert text == "nothing is seen"
 
     counts, text = count_picture(np.array([[0, 5, 10]], np.int32))
-    assert counts[0, 0].tolist() == SCALE[0].tolist()
-    assert counts[0, 2].tolist() == SCALE[-1].tolist()
+    assert counts[0, 0].tolist() == VIRIDIS_RGB[0].tolist()
+    assert counts[0, 2].tolist() == VIRIDIS_RGB[-1].tolist()
     assert text.endswith("10 at most")
     assert count_picture(np.zeros((2, 2), np.int32))[0].shape == (2, 2, 3)
 
@@ -441,7 +451,7 @@ def test_numbers_that_make_no_path(size: tuple[int, int], numbers: dict[str, flo
 
 def test_too_many_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     keys = recorded(0.0)
-    keys *= MOST_KEYS
+    keys *= MAX_KEY_FRAMES
     with pytest.raises(InputError, match="10,000"):
         add_key(keys, pose())
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Axes of the formats, to ours and back, and transforms of nodes."""
+"""Axis conventions of the formats, conversion to and from ours, and node transforms."""
 
 from __future__ import annotations
 
@@ -13,24 +13,27 @@ from clsplat.spherical_harmonics import sh_basis
 
 Signs = tuple[int, int, int]
 
-UP_BACK: Signs = (1, -1, -1)
-"""Between our x right, y down, z forward and x right, y up, z backward (RUB), either way: half a turn about x."""
-LEFT_UP: Signs = (-1, -1, 1)
-"""Between ours and x left, y up, z forward (LUF), either way: half a turn about z."""
+RUB_SIGNS: Signs = (1, -1, -1)
+"""Signs between our x right, y down, z forward and x right, y up, z backward (RUB), either way: half a turn about x."""
+LUF_SIGNS: Signs = (-1, -1, 1)
+"""Signs between our axes and x left, y up, z forward (LUF), either way: half a turn about z."""
 
-SLACK = 1e-4
-"""Most that a node's axes may be off right angles or equal lengths: matrices are written with few digits."""
+NODE_SIMILARITY_TOLERANCE = 1e-4
+"""Tolerance of a node's axes against right angles and equal lengths; matrices are written with few digits."""
 
 
 def sh_signs(signs: Signs) -> Float32:
-    """(16,): what the coefficients are multiplied by when axes change their sign."""
-    direction = np.array([[1.0, 2.0, 4.0]]) / 21**0.5  # where none of them is 0
+    """Factors (16,) of the SH coefficients when axes change sign."""
+    direction = np.array([[1.0, 2.0, 4.0]]) / 21**0.5  # no basis function is 0 there
     return np.asarray(np.sign(sh_basis(direction, 3) * sh_basis(direction * signs, 3))[0], np.float32)
 
 
 def quaternion_signs(signs: Signs) -> Float32:
-    """(4,), for w x y z, when axes change their sign: of the world and of the Gaussian alike, which is the same
-    ellipsoid as turning it, and exact. Right for a mirrored axis too."""
+    """Factors (4,) of quaternions w x y z when axes change sign.
+
+    The axes of the world and of the Gaussian change together. The ellipsoid is the same as after a rotation, and exact.
+    This holds for a mirrored axis too.
+    """
     handedness = int(np.prod(signs))
     return np.array([1, *(handedness * sign for sign in signs)], np.float32)
 
@@ -44,11 +47,13 @@ def flip(gaussians: Gaussians, signs: Signs) -> None:
 
 
 def place(gaussians: Gaussians, matrix: Float64, where: str) -> Gaussians:
-    """Moved by the matrix (4, 4) of a node (`edit.transform`). Raises InputError, which begins with `where`, for a
-    matrix that Gaussians and their colours cannot follow."""
+    """Transform a model by the matrix (4, 4) of a node (`edit.transform`).
+
+    Raises InputError, prefixed with `where`, if Gaussians and their colours cannot follow the matrix.
+    """
     if np.array_equal(matrix, np.eye(4)):
         return gaussians
     try:
-        return transform(gaussians, matrix, slack=SLACK)
+        return transform(gaussians, matrix, slack=NODE_SIMILARITY_TOLERANCE)
     except InputError as error:
         raise InputError(f"{where}: has {error}") from None

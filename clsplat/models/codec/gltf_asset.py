@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Contents of a glTF file: its JSON, the nodes of its scene, and the arrays of its buffers, as they lie in the file.
+"""Contents of a glTF file: its JSON, the nodes of its scene, and the arrays of its buffers as stored.
 
-Everything that the file says is checked before it is used; a buffer is the .glb's own, a file in the same folder or
-below it, or a data: URI.
+Everything in the file is checked before use. A buffer is the .glb's own, a file in the same folder or below it, or a
+data: URI.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import numbers
 from clsplat.errors import InputError
-from clsplat.files import MAX_DOCUMENT, open_input, parse_json, read_document
+from clsplat.files.documents import MAX_DOCUMENT_BYTES, open_input, parse_json, read_document
 
-EXTENSION = "KHR_gaussian_splatting"
+GAUSSIAN_EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
 SPZ_EXTENSIONS = (SPZ_EXTENSION, "KHR_gaussian_splatting_compression_spz")
-"""Names of the extension; the second is in the draft's own example."""
-UNDERSTOOD = (EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit")
-COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
+"""Names of the SPZ extension; the draft's own example uses the second."""
+SUPPORTED_EXTENSIONS = (GAUSSIAN_EXTENSION, *SPZ_EXTENSIONS, "KHR_mesh_quantization", "KHR_materials_unlit")
+GLTF_COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")
 
-JSON_CHUNK, BIN_CHUNK = 0x4E4F534A, 0x004E4942
-COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-MAX_NODES, MAX_PRIMITIVES = 100_000, 4096
-"""Limits of a scene; the second counts the primitives that have Gaussians: more are a bomb, which may be one mesh in
-many nodes."""
+GLB_JSON_CHUNK, GLB_BIN_CHUNK = 0x4E4F534A, 0x004E4942
+COMPONENT_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+ACCESSOR_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+MAX_SCENE_NODES, MAX_GAUSSIAN_PRIMITIVES = 100_000, 4096
+"""Limits of a scene's nodes, and of its primitives with Gaussians. A decompression bomb may repeat one mesh in many
+nodes."""
 
 Array = NDArray[Any]
 
 
 @dataclass
 class Asset:
-    """A file: its JSON, and what its buffers are, as far as they were needed."""
+    """An opened glTF file: its JSON, and the buffers that were needed so far."""
 
     path: Path
     document: dict[str, Any]
     binary: tuple[int, int] | None = None
-    """Start of the .glb's own buffer in the file, and its length."""
+    """Offset and length of the .glb's own buffer in the file."""
     size: int = 0
     buffers: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
     total: int = 0
@@ -74,7 +74,7 @@ class Asset:
             raise InputError(f"{path}: glTF version {version!r}, expected 2.0")
         required = document.get("extensionsRequired", [])
         if (
-            unknown := [name for name in required if name not in UNDERSTOOD]
+            unknown := [name for name in required if name not in SUPPORTED_EXTENSIONS]
             if isinstance(required, list)
             else [required]
         ):
@@ -82,23 +82,23 @@ class Asset:
         return asset
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
-        """An object of one of the document's lists."""
+        """Object at an index of one of the document's lists."""
         items = self.document.get(kind)
         if not isinstance(items, list) or not isinstance(index, int) or not 0 <= index < len(items):
             raise InputError(f"{self.path}: {kind} has no {index!r}; is it damaged?")
-        if not isinstance(items[index], dict):
+        item = items[index]
+        if not isinstance(item, dict):
             raise InputError(f"{self.path}: {kind} {index} is no object; is it damaged?")
-        result: dict[str, Any] = items[index]
-        return result
+        return item
 
     def integer(self, holder: dict[str, Any], key: str, default: int | None = None) -> int:
         value = holder.get(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 62:
-            raise InputError(f"{self.path}: {key} is {str(value)[:40]!r}, expected a number from 0 on")
+            raise InputError(f"{self.path}: {key} is {str(value)[:40]!r}, expected a number of at least 0")
         return value
 
     def primitives(self) -> Iterator[tuple[str, NDArray[np.float64], dict[str, Any]]]:
-        """The primitives of Gaussians in the default scene: name, the node's matrix in the world, and the primitive."""
+        """Primitives of Gaussians in the default scene: name, matrix from the node to the world, and primitive."""
         nodes = self.document.get("nodes", [])
         if "scenes" in self.document:
             roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
@@ -111,9 +111,9 @@ class Asset:
             index, parent = todo.popleft()
             node = self.item("nodes", index)
             assert isinstance(index, int)
-            if index in seen or len(seen) >= MAX_NODES:
+            if index in seen or len(seen) >= MAX_SCENE_NODES:
                 raise InputError(
-                    f"{self.path}: node {index} is there twice, expected a tree of up to {MAX_NODES} nodes"
+                    f"{self.path}: node {index} is there twice, expected a tree of up to {MAX_SCENE_NODES} nodes"
                 )
             seen.add(index)
             matrix = parent @ self.matrix(node, index)
@@ -121,10 +121,12 @@ class Asset:
             if "mesh" not in node:
                 continue
             for place, primitive in enumerate(_list(self.item("meshes", node["mesh"]).get("primitives", []))):
-                if isinstance(primitive, dict) and EXTENSION in as_object(primitive.get("extensions")):
+                if isinstance(primitive, dict) and GAUSSIAN_EXTENSION in as_object(primitive.get("extensions")):
                     count += 1
-                    if count > MAX_PRIMITIVES:
-                        raise InputError(f"{self.path}: has more than {MAX_PRIMITIVES} primitives of Gaussians")
+                    if count > MAX_GAUSSIAN_PRIMITIVES:
+                        raise InputError(
+                            f"{self.path}: has more than {MAX_GAUSSIAN_PRIMITIVES} primitives of Gaussians"
+                        )
                     yield f"primitive {place} of node {index}", matrix, primitive
 
     def matrix(self, node: dict[str, Any], index: int) -> NDArray[np.float64]:
@@ -147,15 +149,15 @@ class Asset:
         return result
 
     def accessor(self, index: object, width: int, semantic: str) -> Array:
-        """(count, width), as it lies in the file."""
+        """Values (count, width) of an accessor, as stored in the file."""
         said = self.item("accessors", index)
-        kind = COMPONENTS.get(self.integer(said, "componentType"))
+        kind = COMPONENT_DTYPES.get(self.integer(said, "componentType"))
         count, offset = self.integer(said, "count"), self.integer(said, "byteOffset", 0)
         if kind is None:
             found = str(said["componentType"])[:20]
-            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126 but 5124")
-        if WIDTHS.get(str(said.get("type"))) != width:
-            expected = next(name for name, numbers in WIDTHS.items() if numbers == width)
+            raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126, not 5124")
+        if ACCESSOR_WIDTHS.get(str(said.get("type"))) != width:
+            expected = next(name for name, numbers in ACCESSOR_WIDTHS.items() if numbers == width)
             raise InputError(
                 f"{self.path}: {semantic} is of the type {str(said.get('type'))[:20]}, expected {expected}"
             )
@@ -172,7 +174,7 @@ class Asset:
         return values.view(_Normalised) if said.get("normalized") is True and item.kind != "f" else values
 
     def view(self, index: object) -> NDArray[np.uint8]:
-        """The bytes of a buffer view."""
+        """Bytes of a buffer view."""
         said = self.item("bufferViews", index)
         if "EXT_meshopt_compression" in as_object(said.get("extensions", {})):
             raise InputError(f"{self.path}: is compressed with EXT_meshopt_compression, which is not supported")
@@ -190,7 +192,7 @@ class Asset:
             length = self.integer(said, "byteLength")
             if "uri" not in said:
                 if self.binary is None or index != 0:
-                    raise InputError(f"{self.path}: buffer {index} has no place, expected a uri or the .glb's own")
+                    raise InputError(f"{self.path}: buffer {index} has no data, expected a uri or the .glb's own")
                 data = _map(self.path, *self.binary)
             else:
                 data = self.outside(str(said["uri"]))
@@ -200,7 +202,7 @@ class Asset:
         return self.buffers[index]
 
     def outside(self, uri: str) -> NDArray[np.uint8]:
-        """A data: URI, or a file in the same folder or below it."""
+        """Bytes of a data: URI, or of a file in the same folder or below it."""
         if uri.startswith("data:"):
             try:
                 return np.frombuffer(base64.b64decode(uri.partition(";base64,")[2], validate=True), np.uint8)
@@ -212,7 +214,7 @@ class Asset:
             folder = Path(os.path.realpath(self.path)).parent
             file = Path(os.path.realpath(folder / name))
             inside = not parts.scheme and not parts.netloc and name and file.is_relative_to(folder)
-        except ValueError:  # a zero byte in the name, or brackets that are no address
+        except ValueError:  # a zero byte in the name, or brackets around an invalid address
             inside = False
         if not inside:
             raise InputError(f"{self.path}: has its buffer in {uri[:80]!r}, expected a file beside it")
@@ -222,16 +224,16 @@ class Asset:
 
 
 def sh_attributes(degree: int) -> list[str]:
-    """The attributes of one degree's coefficients, in our order."""
-    return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
+    """Attribute names of one degree's coefficients, in our order."""
+    return [f"{GAUSSIAN_EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
 class _Normalised(np.ndarray[Any, Any]):
-    """Integers that stand for fractions of their largest."""
+    """Integers that encode fractions of their maximum."""
 
 
 def real(values: Array) -> NDArray[np.float32]:
-    """Floats; of normalised integers, their fractions of the largest."""
+    """Values as float32; normalised integers become fractions of their maximum."""
     floats = np.asarray(values).astype(np.float32)
     if isinstance(values, _Normalised):
         floats = np.maximum(floats / np.float32(np.iinfo(values.dtype).max), np.float32(-1))
@@ -243,19 +245,19 @@ def _map(path: Path, start: int, size: int) -> NDArray[np.uint8]:
         return np.empty(0, np.uint8)
     try:
         return np.memmap(path, np.uint8, "r", start, (size,))
-    except OSError as error:  # more than there is room for in addresses
+    except OSError as error:  # larger than the address space
         raise InputError(f"{path}: {size} bytes cannot be read ({error.strerror})") from None
 
 
 def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, int] | None]:
-    """The JSON of a .glb, and where its buffer is."""
+    """JSON of a .glb, and offset and length of its buffer."""
     head = file.read(16)
     if len(head) < 16:
         raise InputError(f"{path}: truncated: {size} bytes, expected a .glb")
     version, _, length, kind = struct.unpack("<IIII", head)
-    if version != 2 or kind != JSON_CHUNK:
+    if version != 2 or kind != GLB_JSON_CHUNK:
         raise InputError(f"{path}: .glb of version {version} with a first chunk {kind:#x}, expected version 2 and JSON")
-    if length > min(MAX_DOCUMENT, size - 20):
+    if length > min(MAX_DOCUMENT_BYTES, size - 20):
         raise InputError(f"{path}: truncated: its JSON has {length} bytes, {size - 20} are there")
     text = file.read(length)
     head = file.read(8)
@@ -263,7 +265,7 @@ def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, in
         return text, None
     have, kind = struct.unpack("<II", head)
     start = 20 + length + 8
-    if kind != BIN_CHUNK:
+    if kind != GLB_BIN_CHUNK:
         return text, None
     if have > size - start:
         raise InputError(f"{path}: truncated: its buffer has {have} bytes, {size - start} are there")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Few values that stand for many: codebooks of numbers and palettes of vectors. Deterministic."""
+"""Vector quantisation: codebooks of numbers and palettes of vectors. Deterministic."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from scipy import sparse
 
 from clsplat.arrays import Float32
 
-SAMPLES = 1 << 16
-LLOYD_STEPS = 20
-TILE = 64
-"""Vectors, and centres, of products that are made at once."""
-SPREAD_ROWS, POWER_STEPS = 128, 30
-"""Vectors that the direction of most variance is taken from, and steps towards it."""
+CODEBOOK_SAMPLES = 1 << 16
+LLOYD_ITERATIONS = 20
+DISTANCE_TILE_ROWS = 64
+"""Vectors, and centres, in one block of the distance computation."""
+PRINCIPAL_AXIS_SAMPLES, POWER_ITERATIONS = 128, 30
+"""Sampled vectors, and power iterations, for the direction of largest variance."""
 
 
 def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
-    """(size,), ascending, with little squared error when each value counts as the nearest.
+    """Codebook (size,), ascending, with a small squared error when each value takes its nearest entry.
 
-    Where there are more values than entries: first as many entries along the sorted values as the cube root of their
-    density asks for, which is the best for many entries (Panter and Dite 1951), then Lloyd's steps.
+    With more distinct values than entries, the density of the first entries is the cube root of the values' density.
+    That is optimal for many entries (Panter and Dite 1951). Lloyd iterations follow.
     """
     ordered = np.sort(values.ravel())
-    distinct = np.unique(ordered) if len(ordered) <= SAMPLES else _thinned(ordered)
+    distinct = np.unique(ordered) if len(ordered) <= CODEBOOK_SAMPLES else _thinned(ordered)
     if len(distinct) <= size:
         return np.pad(distinct, (0, size - len(distinct)), mode="edge").astype(np.float32)
     samples = _thinned(ordered).astype(np.float64)
     wanted = np.cumsum(np.concatenate([[0.0], np.diff(samples) ** (2 / 3)]))
     entries = np.interp((np.arange(size) + 0.5) / size * wanted[-1], wanted, samples)
-    for _ in range(LLOYD_STEPS):
+    for _ in range(LLOYD_ITERATIONS):
         index = nearest(entries, samples)
         count = np.bincount(index, minlength=size)
         total = np.bincount(index, samples, minlength=size)
@@ -42,25 +42,26 @@ def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
 
 
 def _thinned(ordered: Float32) -> Float32:
-    """Evenly many of sorted values, with both ends."""
-    if len(ordered) <= SAMPLES:
+    """Evenly spaced samples of sorted values, both ends included."""
+    if len(ordered) <= CODEBOOK_SAMPLES:
         return ordered
-    return ordered[np.linspace(0, len(ordered) - 1, SAMPLES).round().astype(np.int64)]
+    return ordered[np.linspace(0, len(ordered) - 1, CODEBOOK_SAMPLES).round().astype(np.int64)]
 
 
 def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDArray[np.intp]:
-    """The index of the nearest of ascending entries, in the shape of values."""
+    """Index of the nearest entry of each value, in the shape of `values`; entries ascend."""
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values)
 
 
 def palette(
     vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
 ) -> tuple[Float32, NDArray[np.int64]]:
-    """Up to `size` vectors, and which of them stands for each: (n, d) -> (size, d), (n,). progress: called with the
-    part of them that has been found.
+    """Palette of up to `size` vectors, and the entry of each vector: (n, d) -> (size, d), (n,).
 
-    k-means in two levels: clusters, and in each of them a share of the palette by its squared error, so that the work
-    is n d sqrt(size) and not n d size.
+    Two-level k-means: clusters first, and in each a share of the palette that grows with its squared error. The cost is
+    n d sqrt(size) instead of n d size.
+
+    progress: called with the finished fraction.
     """
     count, width = vectors.shape
     size = min(size, count)
@@ -72,7 +73,7 @@ def palette(
     errors = np.array(
         [vectors[rows].var(axis=0, dtype=np.float64).sum() * len(rows) if len(rows) else 0 for rows in members]
     )
-    # vectors of more dimensions than clusters have structure: between a share by count and one by error
+    # high-dimensional clusters have structure: the geometric mean of shares by count and by error
     weights = np.sqrt(errors * [len(rows) for rows in members])
     shares = np.floor(weights / max(weights.sum(), 1e-30) * (size - coarse)).astype(np.int64) + 1
     centres, labels = [], np.empty(count, np.int64)
@@ -91,15 +92,18 @@ def palette(
 
 
 def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDArray[np.int64]]:
-    """Lloyd's steps on a sample where there are many, from a beginning spread along the direction of most variance. A
-    centre that no vector is left for stays where it is."""
+    """Lloyd iterations, on a sample if there are many vectors. The first centres lie along the direction of largest
+    variance.
+
+    A centre without vectors stays where it is.
+    """
     if size <= 1 or not np.ptp(vectors, axis=0).any():
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64
         )
-    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # far from 0 float32 would have no digits left
+    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # far from 0, float32 would lose its digits
     centred = vectors - middle
-    sample = centred[:: max(1, len(vectors) // max(SAMPLES, 8 * size))]
+    sample = centred[:: max(1, len(vectors) // max(CODEBOOK_SAMPLES, 8 * size))]
     order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")
     centres = sample[order[((np.arange(size) + 0.5) / size * len(order)).astype(np.int64)]]
     before: NDArray[np.int64] | None = None
@@ -116,27 +120,32 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
 
 
 def _direction(vectors: Float32) -> Float32:
-    """(d,) of most variance of vectors around 0, by power iteration: near is enough."""
-    rows = vectors[:: max(1, len(vectors) // SPREAD_ROWS)][:SPREAD_ROWS]
+    """Direction (d,) of the largest variance of vectors around 0, by power iteration; an approximation suffices."""
+    rows = vectors[:: max(1, len(vectors) // PRINCIPAL_AXIS_SAMPLES)][:PRINCIPAL_AXIS_SAMPLES]
     spread = (rows.T @ rows).astype(np.float64)
     axis = spread[np.diagonal(spread).argmax()]
-    for _ in range(POWER_STEPS):
+    for _ in range(POWER_ITERATIONS):
         axis = spread @ (axis / max(np.linalg.norm(axis), 1e-300))
     return np.asarray(axis / max(np.linalg.norm(axis), 1e-300), np.float32)
 
 
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
-    """Index of the nearest centre of each vector, by |c|^2 / 2 - v c: half of the squared distance, less a number of
-    v's alone. The tiles are too small for a library's threads: these wait for each other longer than they work, several
-    times so on a busy machine."""
+    """Index of each vector's nearest centre, by |c|^2 / 2 - v c: half the squared distance, less a term of v alone.
+
+    The tiles are too small for a library's threads, which would wait for each other longer than they work. On a busy
+    machine that took several times as long.
+    """
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
-    columns = [(slice(start, start + TILE), centres[start : start + TILE].T) for start in range(0, len(centres), TILE)]
+    columns = [
+        (slice(start, start + DISTANCE_TILE_ROWS), centres[start : start + DISTANCE_TILE_ROWS].T)
+        for start in range(0, len(centres), DISTANCE_TILE_ROWS)
+    ]
     labels = np.empty(len(vectors), np.int64)
-    scores = np.empty((TILE, len(centres)), np.float32)
-    for start in range(0, len(vectors), TILE):
-        rows = vectors[start : start + TILE]
+    scores = np.empty((DISTANCE_TILE_ROWS, len(centres)), np.float32)
+    for start in range(0, len(vectors), DISTANCE_TILE_ROWS):
+        rows = vectors[start : start + DISTANCE_TILE_ROWS]
         products = scores[: len(rows)]
         for at, part in columns:
             np.matmul(rows, part, out=products[:, at])
-        labels[start : start + TILE] = np.subtract(halves, products, out=products).argmin(axis=1)
+        labels[start : start + DISTANCE_TILE_ROWS] = np.subtract(halves, products, out=products).argmin(axis=1)
     return labels

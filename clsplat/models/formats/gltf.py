@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""glTF 2.0 with KHR_gaussian_splatting: .glb, or .gltf with a .bin beside it.
+"""glTF 2.0 with KHR_gaussian_splatting: .glb, or .gltf with a .bin file.
 
 Specifications: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and for Gaussians
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting (ratified).
 
-- Frame: x left, y up, z forward, as the base specification says; ours is half a turn about z away. What is written has
-  that turn in its values, not in a node, as not every viewer turns spherical harmonics with their node; an `origin` is
-  the node's translation. What is read goes through the nodes' transforms.
-- Values are float32: linear scales, opacities in [0, 1], unit quaternions x y z w; SH coefficients in an attribute
-  each, order and signs as ours. Normalised integers are read too. COLOR_0 is there for viewers that draw points, in
-  linear light as glTF wants it.
-- Colour space: srgb_rec709_display, unless told that the model was trained in linear light (lin_rec709_display).
-- Compression: KHR_gaussian_splatting_compression_spz_2, a draft, has an SPZ file in a buffer view, by its text in
-  version 2 and to be unpacked into glTF's frame. It is read, and written when asked for.
+- Frame: x left, y up, z forward, as the base specification says; half a turn about z from ours. Written values include
+  that turn, and no node has it, as not every viewer turns spherical harmonics with their node. An `origin` becomes the
+  node's translation. When reading, the nodes' transforms are applied.
+- Values are float32: linear scales, opacities in [0, 1], unit quaternions x y z w. Each SH coefficient has an
+  attribute, with our order and signs. Normalised integers are read too. COLOR_0 is for viewers that draw points, in
+  linear light as glTF requires.
+- Colour space: srgb_rec709_display by default, or lin_rec709_display for a model trained in linear light.
+- Compression: the draft KHR_gaussian_splatting_compression_spz_2 stores an SPZ file in a buffer view. Its text says
+  version 2, to be unpacked into glTF's frame. It is read, and written on request.
 
-The container is a JSON object and arrays at offsets, which are read here as they lie in the file: libraries for it load
-files whole, and trust what they say.
+The container, a JSON object and arrays at offsets, is parsed here, in place. Libraries for it load whole files and
+trust their contents.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from typing import Any
 import numpy as np
 
 from clsplat.errors import InputError, warn
-from clsplat.files import atomic_write, atomic_writer
+from clsplat.files.atomic import atomic_write, atomic_writer
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.colour import srgb_to_linear
 from clsplat.models.codec import axes, values
-from clsplat.models.codec.axes import LEFT_UP
+from clsplat.models.codec.axes import LUF_SIGNS
 from clsplat.models.codec.gltf_asset import (
-    BIN_CHUNK,
-    COLOR_SPACES,
-    EXTENSION,
-    JSON_CHUNK,
+    ACCESSOR_WIDTHS,
+    GAUSSIAN_EXTENSION,
+    GLB_BIN_CHUNK,
+    GLB_JSON_CHUNK,
+    GLTF_COLOR_SPACES,
     SPZ_EXTENSION,
     SPZ_EXTENSIONS,
-    WIDTHS,
     Array,
     Asset,
     as_object,
@@ -53,19 +53,19 @@ from clsplat.models.codec.gltf_asset import (
 )
 from clsplat.models.edit import merge
 from clsplat.models.formats import spz
-from clsplat.spherical_harmonics import C0
+from clsplat.spherical_harmonics import SH_C0
 
 GLB_MAGIC = 0x46546C67
-FLOAT32, UINT16 = 5126, 5123
-LARGEST_GLB = (1 << 32) - 1
-LOGS_WRITER, LOGS_UNTIL = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
-"""A program whose files, of versions before that, have logs in place of scales."""
+FLOAT32_COMPONENT, UINT16_COMPONENT = 5126, 5123
+MAX_GLB_BYTES = (1 << 32) - 1
+LOG_SCALE_WRITER, LOG_SCALE_WRITER_FIXED_VERSION = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
+"""A program whose files before that version store logs instead of scales."""
 Rows = Callable[[slice], Array]
-"""An attribute: what gives some of its rows."""
+"""An attribute: a function that returns some of its rows."""
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as a .glb; a .gltf has JSON's beginning and nothing else."""
+    """True if a file begins as a .glb, or as JSON, which is all that a .gltf begins with."""
     return head[:4] == b"glTF" or head.lstrip()[:1] == b"{"
 
 
@@ -73,50 +73,50 @@ def describe(path: Path) -> dict[str, Any]:
     """Colour space and compression in the extension of the first primitive that has it."""
     asset = Asset.open(path)
     for _, _, primitive in asset.primitives():
-        said = as_object(primitive["extensions"][EXTENSION])
+        said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
         compression = next((name for name in SPZ_EXTENSIONS if name in as_object(said.get("extensions"))), "none")
         return {"color_space": str(said.get("colorSpace", "")), "compression": compression}
     return {}
 
 
 def side_files(path: Path) -> list[Path]:
-    """The .bin of a .gltf."""
+    """The .bin file of a .gltf."""
     return [path.with_suffix(".bin")] if path.suffix.lower() == ".gltf" else []
 
 
 def read(path: Path) -> Gaussians:
     """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # all of them are counted first
+    primitives = list(asset.primitives())  # counts them before anything is read
     if not primitives:
-        raise InputError(f"{path}: has no primitive with {EXTENSION} in its scene, expected at least one")
+        raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
     parts = [_gaussians(asset, name, primitive, scaled) for name, _, primitive in primitives]
     if scaled:
         values.all_to_log_scales(scaled, _writer_of_logs(asset))
-    # the node's matrix is in glTF's frame, the Gaussians are in ours already
-    turn = np.diag([*LEFT_UP, 1.0])
+    # the node's matrix is in glTF's frame, the Gaussians already in ours
+    turn = np.diag([*LUF_SIGNS, 1.0])
     placed = zip(parts, primitives, strict=True)
     return merge([axes.place(part, turn @ matrix @ turn, f"{path}: {name}") for part, (name, matrix, _) in placed])
 
 
 def _writer_of_logs(asset: Asset) -> str:
-    """The program that wrote the file, if it is one that wrote logs of scales; else an empty text."""
+    """The program that wrote the file if it is known to write logs of scales; otherwise an empty text."""
     generator = str(as_object(asset.document.get("asset")).get("generator", ""))[:80]
-    match = LOGS_WRITER.fullmatch(generator.strip())
-    return generator if match and (int(match[1]), int(match[2])) < LOGS_UNTIL else ""
+    match = LOG_SCALE_WRITER.fullmatch(generator.strip())
+    return generator if match and (int(match[1]), int(match[2])) < LOG_SCALE_WRITER_FIXED_VERSION else ""
 
 
 def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[tuple[str, Gaussians]]) -> Gaussians:
-    """The primitive's Gaussians in our frame; those with scales in place of logs are added to `scaled`."""
-    said = as_object(primitive["extensions"][EXTENSION])
-    kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", COLOR_SPACES[0])
+    """The primitive's Gaussians in our frame; if their scales are not logs yet, they are appended to `scaled`."""
+    said = as_object(primitive["extensions"][GAUSSIAN_EXTENSION])
+    kernel, space = said.get("kernel", "ellipse"), said.get("colorSpace", GLTF_COLOR_SPACES[0])
     if kernel != "ellipse":
         warn(
             f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse; it is drawn as one, as the "
             "extension says of kernels that a reader does not know"
         )
-    if space != COLOR_SPACES[0]:
+    if space != GLTF_COLOR_SPACES[0]:
         warn(f"{asset.path}: the colours are in {str(space)[:40]}, kept as they are")
     nested = as_object(said.get("extensions", {}))
     for extension in SPZ_EXTENSIONS:
@@ -129,7 +129,7 @@ def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[
 
 
 def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussians:
-    """Its scales are not logs yet."""
+    """The Gaussians of a primitive's attributes; their scales are not logs yet."""
 
     def array(semantic: str, width: int) -> Array:
         if semantic not in indices:
@@ -144,7 +144,7 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
     names = [sh_attributes(degree) for degree in range(MAX_SH_DEGREE + 1)]
     degree = max((degree for degree in range(4) if indices.keys() & set(names[degree])), default=0)
     widths = {"ROTATION": 4, "SCALE": 3, "OPACITY": 1}
-    rotation, scale, opacity = (array(f"{EXTENSION}:{key}", width) for key, width in widths.items())
+    rotation, scale, opacity = (array(f"{GAUSSIAN_EXTENSION}:{key}", width) for key, width in widths.items())
     coefficients = [array(semantic, 3) for band in names[: degree + 1] for semantic in band]
     for attribute in (rotation, scale, opacity, *coefficients):
         if len(attribute) != count:
@@ -157,20 +157,20 @@ def _from_attributes(asset: Asset, name: str, indices: dict[str, Any]) -> Gaussi
         result.opacity_logits[rows] = values.logits_of(real(opacity[rows])[:, 0], where, rows.start)
         for index, coefficient in enumerate(coefficients):
             result.sh[rows, index] = real(coefficient[rows])
-    axes.flip(result, LEFT_UP)
+    axes.flip(result, LUF_SIGNS)
     return result
 
 
 def write(
-    path: Path, gaussians: Gaussians, *, spz_compression: bool = False, color_space: str = COLOR_SPACES[0]
+    path: Path, gaussians: Gaussians, *, spz_compression: bool = False, color_space: str = GLTF_COLOR_SPACES[0]
 ) -> None:
-    """Write a .glb, or a .gltf and the .bin with its buffer, which is there before the .gltf is; atomically, each.
+    """Write a .glb, or a .gltf and a .bin with its buffer. Each file is atomic; the .bin comes first.
 
-    spz_compression: by the draft KHR_gaussian_splatting_compression_spz_2, which few viewers read. Raises InputError
-    for values that are not finite, and a .glb of more than 4 GiB.
+    spz_compression: use the draft KHR_gaussian_splatting_compression_spz_2, which few viewers read.
+    Raises InputError for non-finite values, and for a .glb of more than 4 GiB.
     """
-    if color_space not in COLOR_SPACES:
-        raise ValueError(f"color_space {color_space!r}: expected {' or '.join(COLOR_SPACES)}")
+    if color_space not in GLTF_COLOR_SPACES:
+        raise ValueError(f"color_space {color_space!r}: expected {' or '.join(GLTF_COLOR_SPACES)}")
     values.check_writable(path, gaussians, least=1)
     document, contents = _document(path, gaussians, spz_compression, color_space)
     length = sum(view["byteLength"] for view in document["bufferViews"])
@@ -186,47 +186,47 @@ def write(
     text += b" " * (-len(text) % 4)
     padded = length + -length % 4
     total = 28 + len(text) + padded
-    if total > LARGEST_GLB:
+    if total > MAX_GLB_BYTES:
         raise InputError(f"{path}: a .glb holds 4 GiB at most, {total} bytes would be needed; write a .gltf")
     with atomic_writer(path, total) as file:
-        file.write(struct.pack("<IIIII", GLB_MAGIC, 2, total, len(text), JSON_CHUNK) + text)
-        file.write(struct.pack("<II", padded, BIN_CHUNK))
+        file.write(struct.pack("<IIIII", GLB_MAGIC, 2, total, len(text), GLB_JSON_CHUNK) + text)
+        file.write(struct.pack("<II", padded, GLB_BIN_CHUNK))
         file.writelines(contents)
         file.write(bytes(padded - length))
 
 
 def _attributes(gaussians: Gaussians, color_space: str) -> dict[str, Rows]:
-    """The attributes by name, in the order of the buffer and in glTF's frame."""
+    """Attributes by name, in the order of the buffer and in glTF's frame."""
 
     def rotation(rows: slice) -> Array:
-        unit = values.unit_quaternions(gaussians.quaternions[rows]) * axes.quaternion_signs(LEFT_UP)
+        unit = values.unit_quaternions(gaussians.quaternions[rows]) * axes.quaternion_signs(LUF_SIGNS)
         return unit[:, [1, 2, 3, 0]].astype(np.float32)
 
     def opacity(rows: slice) -> Array:
         return values.opacities(gaussians.opacity_logits[rows])
 
     def coefficient(index: int) -> Rows:
-        return lambda rows: gaussians.sh[rows, index] * axes.sh_signs(LEFT_UP)[index]
+        return lambda rows: gaussians.sh[rows, index] * axes.sh_signs(LUF_SIGNS)[index]
 
     def color(rows: slice) -> Array:
-        colors = np.clip(gaussians.sh[rows, 0] * np.float32(C0) + np.float32(0.5), 0, 1)
-        if color_space == COLOR_SPACES[0]:
+        colors = np.clip(gaussians.sh[rows, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
+        if color_space == GLTF_COLOR_SPACES[0]:
             colors = srgb_to_linear(colors)
         return np.asarray(np.rint(np.column_stack([colors, opacity(rows)]) * 65535), np.uint16)
 
     coefficients = [name for degree in range(gaussians.sh_degree + 1) for name in sh_attributes(degree)]
     return {
-        "POSITION": lambda rows: gaussians.means[rows] * np.array(LEFT_UP, np.float32),
-        f"{EXTENSION}:ROTATION": rotation,
-        f"{EXTENSION}:SCALE": lambda rows: np.exp(np.clip(gaussians.log_scales[rows], -103.0, 88.0)),
-        f"{EXTENSION}:OPACITY": lambda rows: opacity(rows).astype(np.float32),
+        "POSITION": lambda rows: gaussians.means[rows] * np.array(LUF_SIGNS, np.float32),
+        f"{GAUSSIAN_EXTENSION}:ROTATION": rotation,
+        f"{GAUSSIAN_EXTENSION}:SCALE": lambda rows: np.exp(np.clip(gaussians.log_scales[rows], -103.0, 88.0)),
+        f"{GAUSSIAN_EXTENSION}:OPACITY": lambda rows: opacity(rows).astype(np.float32),
         **{name: coefficient(index) for index, name in enumerate(coefficients)},
         "COLOR_0": color,
     }
 
 
 def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
-    """The attributes one after another."""
+    """Bytes of the attributes, one attribute after another."""
     for rows_of in attributes:
         for rows in values.row_blocks(count):
             block = rows_of(rows)
@@ -236,34 +236,34 @@ def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
-    """The JSON but for its buffers, and the contents of the one buffer."""
+    """The JSON without its buffers, and the contents of the single buffer."""
     count = len(gaussians)
     attributes = _attributes(gaussians, color_space)
     samples = {name: rows_of(slice(0, 1)) for name, rows_of in attributes.items()}
-    kinds = {width: kind for kind, width in WIDTHS.items()}
-    corners = [gaussians.means.min(axis=0) * LEFT_UP, gaussians.means.max(axis=0) * LEFT_UP]
+    kinds = {width: kind for kind, width in ACCESSOR_WIDTHS.items()}
+    corners = [gaussians.means.min(axis=0) * LUF_SIGNS, gaussians.means.max(axis=0) * LUF_SIGNS]
     bounds = {"min": np.minimum(*corners).tolist(), "max": np.maximum(*corners).tolist()}
     accessors: list[dict[str, Any]] = []
     for index, (name, sample) in enumerate(samples.items()):
-        component = UINT16 if name == "COLOR_0" else FLOAT32
+        component = UINT16_COMPONENT if name == "COLOR_0" else FLOAT32_COMPONENT
         accessor: dict[str, Any] = {"componentType": component, "count": count, "type": kinds[sample.size]}
         accessor |= {} if spz_compression else {"bufferView": index}
         accessor |= bounds if name == "POSITION" else {}
-        accessor |= {"normalized": True} if component == UINT16 else {}
+        accessor |= {"normalized": True} if component == UINT16_COMPONENT else {}
         accessors.append(accessor)
     said: dict[str, Any] = {"kernel": "ellipse", "colorSpace": color_space}
     places = {name: index for index, name in enumerate(attributes)}
     node: dict[str, Any] = {"mesh": 0}
     if gaussians.origin.any():
-        node["translation"] = (gaussians.origin * LEFT_UP).tolist()
-    used = [EXTENSION]
+        node["translation"] = (gaussians.origin * LUF_SIGNS).tolist()
+    used = [GAUSSIAN_EXTENSION]
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "clsplat"},
         "extensionsUsed": used,
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
-        "meshes": [{"primitives": [{"attributes": places, "mode": 0, "extensions": {EXTENSION: said}}]}],
+        "meshes": [{"primitives": [{"attributes": places, "mode": 0, "extensions": {GAUSSIAN_EXTENSION: said}}]}],
         "accessors": accessors,
     }
     contents: Iterable[bytes | memoryview]
@@ -286,7 +286,7 @@ def _document(
 
 
 def _spz_blob(path: Path, gaussians: Gaussians) -> bytes:
-    """Its means count from the node."""
+    """The model as an SPZ file, with means relative to the node."""
     local = replace(gaussians, origin=np.zeros(3))
     blob = io.BytesIO()
     spz.write_to(blob, local, spz.header_for(path, local, 2))

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""mkkellogg's .ksplat, read only, version 0.1, compression levels 0, 1 and 2.
+"""mkkellogg's .ksplat, version 0.1, compression levels 0, 1 and 2; read only.
 
-https://github.com/mkkellogg/GaussianSplats3D (src/loaders/SplatBuffer.js). Little-endian: a header of 4096 bytes, one
-of 1024 for each section, then the sections, each the lengths of its partly filled buckets, the buckets' centres and the
-Gaussians. A Gaussian: position; scale, standard deviations, not logs; quaternion w x y z; red, green, blue, opacity in
-bytes; SH above degree 0, by degree, in each channel-major. The frame and the signs of SH are the PLY's. Level 0 has
-float32; level 1 half floats, and positions in 16 bits around their bucket's centre; level 2 the same, but SH in bytes
-between the two bounds of the header.
+https://github.com/mkkellogg/GaussianSplats3D (src/loaders/SplatBuffer.js). Little-endian. A header of 4096 bytes, a
+header of 1024 bytes for each section, then the sections. A section has the lengths of its partly filled buckets, the
+buckets' centres and the Gaussians.
+
+- A Gaussian: position, scale, quaternion w x y z, bytes of red, green, blue and opacity, and higher SH.
+- Scales are standard deviations, not logs. SH above degree 0 are stored by degree, channel-major in each.
+- The frame and the signs of SH are the PLY's.
+- Level 0: float32.
+- Level 1: half floats, and positions in 16 bits around their bucket's centre.
+- Level 2: as level 1, but SH in bytes between the header's two bounds.
 """
 
 from __future__ import annotations
@@ -20,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.errors import InputError
-from clsplat.files import open_input
+from clsplat.files.documents import open_input
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values as packing
 
-HEADER = np.dtype(
+KSPLAT_HEADER = np.dtype(
     {
         "names": ["major", "minor", "sections", "count", "level", "least_sh", "largest_sh"],
         "formats": ["u1", "u1", "<u4", "<u4", "<u2", "<f4", "<f4"],
@@ -32,7 +36,7 @@ HEADER = np.dtype(
         "itemsize": 4096,
     }
 )
-SECTION = np.dtype(
+KSPLAT_SECTION_HEADER = np.dtype(
     {
         "names": ["count", "room", "bucket_size", "buckets", "block",
                   "bucket_bytes", "range", "full", "partial", "degree"],
@@ -41,18 +45,25 @@ SECTION = np.dtype(
         "itemsize": 1024,
     }
 )  # fmt: skip
-BUCKET_BYTES = 12
-DEFAULT_RANGE = 32767
-DEFAULT_SH = 1.5
-"""Value that 0 stands for in the header."""
-SH_BYTES = (0, 9, 24, 45)
-_POSITION, _FLOAT, _SH = ("<f4", "<u2", "<u2"), ("<f4", "<f2", "<f2"), ("<f4", "<f2", "u1")
+BUCKET_CENTRE_BYTES = 12
+DEFAULT_POSITION_RANGE = 32767
+DEFAULT_SH_BOUND = 1.5
+"""Bound of SH if the header stores 0."""
+SH_VALUES_BY_DEGREE = (0, 9, 24, 45)
+_POSITION_DTYPES, _FLOAT_DTYPES, _SH_DTYPES = ("<f4", "<u2", "<u2"), ("<f4", "<f2", "<f2"), ("<f4", "<f2", "u1")
 
 
 @dataclass(frozen=True)
 class Section:
-    """count Gaussians from byte `start` on, of type `kind`; centres (count of buckets, 3) and ends, the first Gaussian
-    behind each bucket, are None at level 0; step: world units of a position's 1, around `middle`."""
+    """Place and encoding of a section's Gaussians.
+
+    count: number of Gaussians.
+    start: byte offset of the first.
+    kind: dtype of a record.
+    step: world units of one unit of a stored position, relative to `middle`.
+    centres: (buckets, 3); None at level 0.
+    ends: index of the first Gaussian after each bucket; None at level 0.
+    """
 
     count: int
     start: int
@@ -65,13 +76,15 @@ class Section:
 
 
 def read(path: Path) -> Gaussians:
-    """Read it. Raises InputError: another version or level, truncated, counts that do not fit each other, a few
-    negative scales."""
+    """Read the file.
+
+    Raises InputError for another version or level, a truncated file, inconsistent counts, and a few negative scales.
+    """
     with open_input(path, "a .ksplat file") as file:
         size = os.fstat(file.fileno()).st_size
-        if size < HEADER.itemsize:
-            raise InputError(f"{path}: truncated: has {size} bytes, expected a header of {HEADER.itemsize}")
-        header = packing.read_rows(file, HEADER, 1, path)[0]
+        if size < KSPLAT_HEADER.itemsize:
+            raise InputError(f"{path}: truncated: has {size} bytes, expected a header of {KSPLAT_HEADER.itemsize}")
+        header = packing.read_rows(file, KSPLAT_HEADER, 1, path)[0]
         if header["major"] != 0 or header["minor"] < 1 or header["level"] > 2:
             version = f"version {header['major']}.{header['minor']}, compression level {header['level']}"
             raise InputError(f"{path}: {version}, expected a .ksplat of version 0.1, level 0, 1 or 2")
@@ -82,7 +95,7 @@ def read(path: Path) -> Gaussians:
         degree = max(section.degree for section in sections if section.count)
         gaussians = packing.empty(count, degree)
         gaussians.sh[:, 1:] = 0
-        low, high = float(header["least_sh"]) or -DEFAULT_SH, float(header["largest_sh"]) or DEFAULT_SH
+        low, high = float(header["least_sh"]) or -DEFAULT_SH_BOUND, float(header["largest_sh"]) or DEFAULT_SH_BOUND
         first = 0
         for section in sections:
             file.seek(section.start)
@@ -104,21 +117,21 @@ def read(path: Path) -> Gaussians:
 def describe(path: Path) -> dict[str, Any]:
     """The format's part of `clsplat info`: version and compression level."""
     with open_input(path, "a .ksplat file") as file:
-        header = packing.read_rows(file, HEADER, 1, path)[0]
+        header = packing.read_rows(file, KSPLAT_HEADER, 1, path)[0]
     return {"version": f"{header['major']}.{header['minor']}", "level": int(header["level"])}
 
 
 def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) -> list[Section]:
-    """All of them, checked against the file's size."""
-    at = HEADER.itemsize + sections * SECTION.itemsize
+    """All sections, checked against the file's size."""
+    at = KSPLAT_HEADER.itemsize + sections * KSPLAT_SECTION_HEADER.itemsize
     if size < at:
         raise InputError(f"{path}: truncated: {sections} sections need {at} bytes, {size} are there")
     result = []
-    for index, fields in enumerate(packing.read_rows(file, SECTION, sections, path)):
-        head = {name: fields[name].item() for name in SECTION.names or ()}
+    for index, fields in enumerate(packing.read_rows(file, KSPLAT_SECTION_HEADER, sections, path)):
+        head = {name: fields[name].item() for name in KSPLAT_SECTION_HEADER.names or ()}
         name = f"{path}: section {index}"
-        if head["degree"] >= len(SH_BYTES):
-            raise InputError(f"{name} has SH of degree {head['degree']}, expected 0 to {len(SH_BYTES) - 1}")
+        if head["degree"] >= len(SH_VALUES_BY_DEGREE):
+            raise InputError(f"{name} has SH of degree {head['degree']}, expected 0 to {len(SH_VALUES_BY_DEGREE) - 1}")
         kind = _record(level, head["degree"])
         lengths, buckets = 4 * head["partial"], head["bucket_bytes"] * head["buckets"]
         start = at + lengths + buckets
@@ -127,13 +140,13 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
             raise InputError(f"{name} ends at byte {end} with {head['count']} Gaussians, {size} bytes are there")
         centres = ends = None
         if level:
-            if head["buckets"] and head["bucket_bytes"] != BUCKET_BYTES:
-                raise InputError(f"{name} has buckets of {head['bucket_bytes']} bytes, expected {BUCKET_BYTES}")
+            if head["buckets"] and head["bucket_bytes"] != BUCKET_CENTRE_BYTES:
+                raise InputError(f"{name} has buckets of {head['bucket_bytes']} bytes, expected {BUCKET_CENTRE_BYTES}")
             file.seek(at)
             partial = packing.read_rows(file, np.dtype("<u4"), head["partial"], path).astype(np.int64)
             centres = packing.read_rows(file, np.dtype("<f4"), 3 * head["buckets"], path).reshape(-1, 3)
             ends = _ends(head, partial, name)
-        scale_range = head["range"] or DEFAULT_RANGE
+        scale_range = head["range"] or DEFAULT_POSITION_RANGE
         step = head["block"] / 2 / scale_range
         result.append(Section(head["count"], start, kind, head["degree"], step, scale_range, centres, ends))
         at = end
@@ -143,17 +156,18 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
 def _record(level: int, degree: int) -> np.dtype[Any]:
     return np.dtype(
         [
-            ("means", _POSITION[level], 3),
-            ("scales", _FLOAT[level], 3),
-            ("quaternions", _FLOAT[level], 4),
+            ("means", _POSITION_DTYPES[level], 3),
+            ("scales", _FLOAT_DTYPES[level], 3),
+            ("quaternions", _FLOAT_DTYPES[level], 4),
             ("rgba", "u1", 4),
-            ("sh", _SH[level], (SH_BYTES[degree],)),
+            ("sh", _SH_DTYPES[level], (SH_VALUES_BY_DEGREE[degree],)),
         ]
     )
 
 
 def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArray[np.int64]:
-    """The first Gaussian behind each bucket, the full ones first. Raises InputError where they are not all in one."""
+    """Index of the first Gaussian after each bucket, full buckets first. Raises InputError if the buckets hold too
+    few."""
     full = head["full"]
     if full + len(partial) > head["buckets"]:
         raise InputError(
@@ -178,6 +192,6 @@ def _higher_sh(gaussians: Gaussians, rows: slice, degree: int, stored: NDArray[A
     if stored.dtype == np.uint8:
         values = np.float32(ends[0]) + values / np.float32(255) * np.float32(ends[1] - ends[0])
     for band in range(1, degree + 1):
-        at, width = SH_BYTES[band - 1], 2 * band + 1
+        at, width = SH_VALUES_BY_DEGREE[band - 1], 2 * band + 1
         part = values[:, at : at + 3 * width].reshape(-1, 3, width)
         gaussians.sh[rows, band**2 : (band + 1) ** 2] = part.transpose(0, 2, 1)

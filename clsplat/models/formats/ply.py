@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 3DGS model file: a PLY with one vertex a Gaussian, as the paper's authors wrote it and every tool reads it.
+"""The 3DGS model file: a PLY with one vertex a Gaussian, as written by the paper's authors and read by every tool.
 
 https://github.com/graphdeco-inria/gaussian-splatting (scene/gaussian_model.py, save_ply).
 Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
-coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so that reading or writing
-costs the model's own memory and little more.
+coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so reading or writing takes
+little more than the model's own memory.
 
-Means that count from elsewhere than the world's origin are written in the world, as every tool expects, which rounds
-them; and once more as they are, in an element behind the vertices, with their origin in a comment. Other tools pass
-over both.
+Means relative to another origin are written in world coordinates, which rounds them, as every tool expects. The exact
+means follow in a second element, with their origin in a comment. Other tools ignore both.
 """
 
 from __future__ import annotations
@@ -25,65 +24,69 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.camera import NEAR
+from clsplat.camera import DEFAULT_NEAR_PLANE
 from clsplat.config.checks import misfit
 from clsplat.errors import InputError, examples, warn
-from clsplat.files import atomic_writer, open_input
+from clsplat.files.atomic import atomic_writer
+from clsplat.files.documents import open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values
 from clsplat.models.codec.ply_file import (
-    ALONG_RAYS,
-    MIP,
-    NEAR_PLANE,
-    ORIGIN,
+    ALONG_RAYS_COMMENT,
+    ANTIALIASED_COMMENT,
+    NEAR_PLANE_COMMENT,
+    ORIGIN_COMMENT,
     Block,
     Element,
-    Header,
+    PlyHeader,
     read_header,
     read_vertices,
 )
 from clsplat.models.codec.soundness import finite_rows, mend
-from clsplat.models.codec.values import BLOCK_ROWS
+from clsplat.models.codec.values import IO_BLOCK_ROWS
 from clsplat.models.edit import take
 
-__all__ = ["Element", "Header", "read_header", "read_vertices"]
-"""Of `codec.ply_file`, for readers of other PLYs."""
+__all__ = ["Element", "PlyHeader", "read_header", "read_vertices"]
+"""Re-exported from `codec.ply_file` for readers of other PLYs."""
 
-POSITION = ("x", "y", "z")
-DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-SCALE = ("scale_0", "scale_1", "scale_2")
-ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-FILTER = "filter_3D"
-"""Mip-splatting's property: what its renderer adds to the scales."""
-LOCAL = "clsplat_local"
-"""The element that has the means as they count from the origin."""
-RGB = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Names of colours, in any case, in place of DC, where there is no view dependence: nerfstudio's export, and files of
-points."""
-REQUIRED = (*POSITION, *DC, "opacity", *SCALE, *ROTATION)
+POSITION_PROPERTIES = ("x", "y", "z")
+DC_PROPERTIES = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALE_PROPERTIES = ("scale_0", "scale_1", "scale_2")
+ROTATION_PROPERTIES = ("rot_0", "rot_1", "rot_2", "rot_3")
+MIP_FILTER_PROPERTY = "filter_3D"
+"""Mip-Splatting's property, which its renderer adds to the scales."""
+LOCAL_MEANS_ELEMENT = "clsplat_local"
+"""Element with the means relative to the origin."""
+RGB_PROPERTY_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+"""Property names of colours without view dependence, in any case, instead of DC: nerfstudio's export, and point
+files."""
+REQUIRED_PLY_PROPERTIES = (*POSITION_PROPERTIES, *DC_PROPERTIES, "opacity", *SCALE_PROPERTIES, *ROTATION_PROPERTIES)
 
 
 def recognises(head: bytes) -> bool:
-    """A PLY that is not the compressed one."""
+    """True for a PLY that is not a compressed one."""
     return head.startswith(b"ply") and b"packed_position" not in head.partition(b"end_header")[0]
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
 
-    SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45); of degree 4 (72) the fourth is left out, with a
-    warning. Without scale_2, as 2DGS writes them, Gaussians are flat; colours by a name of RGB may stand in for f_dc,
-    their range told by their values (`values.full_scale`). Other properties are ignored; FILTER, and bytes after the
-    data, give a warning. Raises InputError, one line with the path: not a PLY, truncated, a property missing, no
-    Gaussians, no such file.
+    - SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45). Degree 4 (72) loses its fourth band, with a
+      warning.
+    - Without scale_2, as 2DGS writes them, Gaussians are flat.
+    - Colours named as in RGB may replace f_dc; their values give their range (`values.full_scale`).
+    - Other properties are ignored. MIP_FILTER_PROPERTY, and bytes after the data, give a warning.
+
+    Raises InputError, one line with the path, if the file is missing, truncated, not a PLY, lacks a property or has no
+    Gaussians.
     """
     path = Path(path)
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
         vertex = header.vertex
         rest = _check_properties(header)
-        if FILTER in dict(vertex.properties):
-            warn(f"{path}: {FILTER}, mip-splatting's filter, is ignored; fuse it first")
+        if MIP_FILTER_PROPERTY in dict(vertex.properties):
+            warn(f"{path}: {MIP_FILTER_PROPERTY}, mip-splatting's filter, is ignored; fuse it first")
         if vertex.count == 0:
             raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
         gaussians = _assemble(read_vertices(file, header, "Gaussian"), vertex.count, rest)
@@ -95,8 +98,10 @@ def read(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
-    """(n,): a property of each Gaussian that holds whole numbers, without those that `soundness.sound` leaves out.
-    Raises InputError as `read`, and for a property that is not there or holds others."""
+    """An integer property of each Gaussian, (n,), without the Gaussians that `soundness.sound` leaves out.
+
+    Raises InputError like `read`, and for a property that is missing or has other values.
+    """
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
         kinds = dict(header.vertex.properties)
@@ -115,8 +120,10 @@ def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
 
 
 def blocks(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians in the file's order, some rows at a time, in the world, each block with the file's origin; values
-    that are not finite are passed on, and colours by a name of RGB as they are. Raises InputError as `read`."""
+    """Gaussians in the file's order and in world coordinates, some rows at a time, each block with the file's origin.
+
+    Non-finite values, and colours named as in RGB, are passed through unchanged. Raises InputError like `read`.
+    """
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
         rest = _check_properties(header)
@@ -130,12 +137,11 @@ def blocks(path: Path) -> Iterator[Gaussians]:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The format's part of `clsplat info`: encoding, comments, properties that are ignored, `near`, `antialiased`,
-    `by_rays`."""
+    """The format's part of `clsplat info`: encoding, comments, ignored properties, `near`, `antialiased`, `by_rays`."""
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
     properties = header.vertex.properties
-    known = {*REQUIRED, *_colour_names(header.vertex), "nx", "ny", "nz"}
+    known = {*REQUIRED_PLY_PROPERTIES, *_colour_names(header.vertex), "nx", "ny", "nz"}
     ignored = [name for name, _ in properties if name not in known and not name.startswith("f_rest_")]
     described = {"encoding": header.format, "comments": header.comments, "ignored": ignored, "near": header.near}
     return described | {"antialiased": header.is_antialiased(), "by_rays": header.by_rays}
@@ -148,11 +154,12 @@ def write(
     sh_degree: int | None = None,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write a binary little-endian 3DGS PLY of float32, atomically; the same Gaussians give the same bytes.
+    """Write a binary little-endian 3DGS PLY of float32, atomically; equal Gaussians give equal bytes.
 
-    sh_degree: pad with zero coefficients up to this degree; the model's own where it is not given. comments: lines of
-    the header, such as `colour.comment`. Raises ValueError where the degree is lower than the model's, a comment is no
-    line of ASCII, or an array is not as `Gaussians` says; InputError for values that are not finite.
+    sh_degree: pad with zero coefficients up to this degree; the model's own by default.
+    comments: lines for the header, such as `colour.comment`.
+    Raises ValueError if the degree is lower than the model's, a comment is not a line of ASCII, or an array is not as
+    `Gaussians` requires. Raises InputError for non-finite values.
     """
     check_comments(comments)
     values.check_writable(Path(path), gaussians)
@@ -161,20 +168,22 @@ def write(
         raise ValueError(f"sh_degree {degree}: expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
     stored, padded = gaussians.sh.shape[1] - 1, (degree + 1) ** 2 - 1
     rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
-    names = [*POSITION, "nx", "ny", "nz", *DC, *rest_names, "opacity", *SCALE, *ROTATION]
+    names = [
+        *POSITION_PROPERTIES,
+        "nx",
+        "ny",
+        "nz",
+        *DC_PROPERTIES,
+        *rest_names,
+        "opacity",
+        *SCALE_PROPERTIES,
+        *ROTATION_PROPERTIES,
+    ]
     far, count = bool(gaussians.origin.any()), len(gaussians)
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
-    lines += [" ".join([*ORIGIN, *(repr(float(value)) for value in gaussians.origin)])] if far else []
-    lines += [" ".join([*NEAR_PLANE, repr(float(gaussians.near))])] if gaussians.near != NEAR else []
-    lines += [" ".join(MIP)] if gaussians.antialiased else []
-    lines += [" ".join(ALONG_RAYS)] if gaussians.by_rays else []
-    lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
-    lines += [f"element {LOCAL} {count}", *(f"property float {name}" for name in POSITION)] if far else []
-    lines += ["end_header", ""]
-    head = "\n".join(lines).encode("ascii")
+    head = _header(gaussians, names, comments)
     with atomic_writer(path, len(head) + 4 * count * (len(names) + (3 if far else 0))) as file:
         file.write(head)
-        for rows in values.row_blocks(count, BLOCK_ROWS):
+        for rows in values.row_blocks(count, IO_BLOCK_ROWS):
             sh = gaussians.sh[rows]
             block = np.zeros((len(sh), len(names)), "<f4")
             block[:, 0:3] = gaussians.means[rows] + gaussians.origin if far else gaussians.means[rows]
@@ -189,16 +198,36 @@ def write(
             file.write(np.ascontiguousarray(gaussians.means, "<f4").data)
 
 
+def _header(gaussians: Gaussians, names: Sequence[str], comments: Sequence[str]) -> bytes:
+    """Header of a written file, to its last line. names: properties of a Gaussian."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    far, count = bool(gaussians.origin.any()), len(gaussians)
+    if far:
+        lines.append(" ".join([*ORIGIN_COMMENT, *(repr(float(value)) for value in gaussians.origin)]))
+    if gaussians.near != DEFAULT_NEAR_PLANE:
+        lines.append(" ".join([*NEAR_PLANE_COMMENT, repr(float(gaussians.near))]))
+    if gaussians.antialiased:
+        lines.append(" ".join(ANTIALIASED_COMMENT))
+    if gaussians.by_rays:
+        lines.append(" ".join(ALONG_RAYS_COMMENT))
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
+    if far:
+        lines.append(f"element {LOCAL_MEANS_ELEMENT} {count}")
+        lines += [f"property float {name}" for name in POSITION_PROPERTIES]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
+
+
 def check_comments(comments: Sequence[str]) -> None:
-    """Raise ValueError for one that is no line of ASCII."""
+    """Raise ValueError for a comment that is not a line of ASCII."""
     for line in comments:
         if not (line.isascii() and line.isprintable()):
             raise ValueError(f"comment {line!r}: expected one line of ASCII")
 
 
-def _local_means(file: BinaryIO, header: Header) -> Float32 | None:
-    """The element LOCAL, if it is right behind the vertices. Raises InputError where it is cut."""
-    wanted = Element(LOCAL, header.vertex.count, [(name, "f4") for name in POSITION])
+def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
+    """Means of the element LOCAL_MEANS_ELEMENT, if it follows the vertices directly. Raises InputError if it is
+    truncated."""
+    wanted = Element(LOCAL_MEANS_ELEMENT, header.vertex.count, [(name, "f4") for name in POSITION_PROPERTIES])
     behind = len(header.before) + 1
     if header.format == "ascii" or header.elements[behind : behind + 1] != [wanted]:
         return None
@@ -207,13 +236,15 @@ def _local_means(file: BinaryIO, header: Header) -> Float32 | None:
     need = wanted.count * row.itemsize
     data = file.read(need)
     if len(data) != need:
-        raise InputError(f"{header.path}: truncated: element {LOCAL} needs {need} bytes, {len(data)} are there")
+        raise InputError(
+            f"{header.path}: truncated: element {LOCAL_MEANS_ELEMENT} needs {need} bytes, {len(data)} are there"
+        )
     rows = np.frombuffer(data, row)
-    return np.stack([rows[name] for name in POSITION], axis=1).astype(np.float32)
+    return np.stack([rows[name] for name in POSITION_PROPERTIES], axis=1).astype(np.float32)
 
 
 def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
-    """Have the means count from the origin: as they were written, unless the vertices were moved since."""
+    """Make the means relative to the origin: exactly as written, unless another tool moved the vertices since."""
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         means = (world - origin).astype(np.float32)
@@ -224,15 +255,19 @@ def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, pa
     gaussians.origin, gaussians.means = origin, np.ascontiguousarray(means)
 
 
-def _check_properties(header: Header) -> int:
-    """The number of f_rest properties. Raises InputError where the layout is not a 3DGS model's."""
+def _check_properties(header: PlyHeader) -> int:
+    """Number of f_rest properties. Raises InputError if the layout is not a 3DGS model's."""
     path, names = header.path, [name for name, _ in header.vertex.properties]
-    missing = [name for name in REQUIRED if name not in names and name != SCALE[2]]
-    if _colour_names(header.vertex) != DC:
-        missing = [name for name in missing if name not in DC]
+    missing = [name for name in REQUIRED_PLY_PROPERTIES if name not in names and name != SCALE_PROPERTIES[2]]
+    if _colour_names(header.vertex) != DC_PROPERTIES:
+        missing = [name for name in missing if name not in DC_PROPERTIES]
     if missing:
         noun = "property" if len(missing) == 1 else "properties"
-        colours = f" with {DC[0]} to {DC[-1][-1]}, or {' '.join(RGB[0])}" if {*DC} <= {*missing} else ""
+        colours = (
+            f" with {DC_PROPERTIES[0]} to {DC_PROPERTIES[-1][-1]}, or {' '.join(RGB_PROPERTY_NAMES[0])}"
+            if {*DC_PROPERTIES} <= {*missing}
+            else ""
+        )
         raise InputError(f"{path}: PLY lacks the {noun} {examples(missing)}, expected a 3DGS model{colours}")
     rest = sum(name.startswith("f_rest_") for name in names)
     counts = [3 * (degree * (degree + 2)) for degree in range(MAX_SH_DEGREE + 2)]
@@ -248,40 +283,42 @@ def _check_properties(header: Header) -> int:
 
 
 def _degree(rest: int) -> int:
-    """The degree of SH that is kept of a file with so many f_rest properties."""
+    """SH degree kept from a file with this number of f_rest properties."""
     return min(isqrt(1 + rest // 3) - 1, MAX_SH_DEGREE)
 
 
 def _colour_names(vertex: Element) -> tuple[str, ...]:
-    """The properties that colours are read from: DC, unless there are none of them but others."""
+    """Properties to read colours from: DC, unless the file has none of these but colours by another name."""
     names = [name for name, _ in vertex.properties]
-    return _rgb_names(names) or DC if set(DC).isdisjoint(names) else DC
+    return _rgb_names(names) or DC_PROPERTIES if set(DC_PROPERTIES).isdisjoint(names) else DC_PROPERTIES
 
 
 def _rgb_names(names: Iterable[str]) -> tuple[str, ...]:
-    """The properties among these that are colours by a name of RGB, as they are spelt there; none without all three."""
+    """Properties among `names` that match an entry of RGB, as spelt in the file; empty unless all three are there."""
     spelt = {name.lower(): name for name in names}
-    return next((tuple(spelt[name] for name in rgb) for rgb in RGB if spelt.keys() >= {*rgb}), ())
+    return next((tuple(spelt[name] for name in rgb) for rgb in RGB_PROPERTY_NAMES if spelt.keys() >= {*rgb}), ())
 
 
 def _take_colours(gaussians: Gaussians, vertex: Element) -> None:
-    """Make SH coefficients of colours that were read in their place."""
-    if (names := _colour_names(vertex)) != DC:
+    """Turn colours that were read in place of f_dc into SH coefficients."""
+    if (names := _colour_names(vertex)) != DC_PROPERTIES:
         kinds = {np.dtype(kind) for name, kind in vertex.properties if name in names}
         whole = all(kind.kind in "iu" for kind in kinds)
         levels = gaussians.sh[:, 0]
-        finite = levels[np.isfinite(levels)]  # text may have others for whole numbers too
+        finite = levels[np.isfinite(levels)]  # ascii may have non-finite values for integers too
         kind = np.dtype("u1") if kinds == {np.dtype("u1")} else np.dtype("i8")
-        with np.errstate(invalid="ignore"):  # of numbers that are none of the type
+        with np.errstate(invalid="ignore"):  # numbers that do not fit the type
             white = values.full_scale(finite.astype(kind) if whole else finite)
         gaussians.sh[:, 0] = values.coefficients(levels / white)
 
 
 def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
-    """The place in the arrays of each property that is kept."""
+    """Destination in the model's arrays of each property that is kept."""
     columns: dict[str, NDArray[Any]] = {"opacity": gaussians.opacity_logits}
     arrays = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh[:, 0])
-    for names, array in zip((POSITION, SCALE, ROTATION, DC), arrays, strict=True):
+    for names, array in zip(
+        (POSITION_PROPERTIES, SCALE_PROPERTIES, ROTATION_PROPERTIES, DC_PROPERTIES), arrays, strict=True
+    ):
         columns |= {name: array[:, index] for index, name in enumerate(names)}
     for channel in range(3):
         for index in range(1, gaussians.sh.shape[1]):
@@ -290,20 +327,20 @@ def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
 
 
 def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
-    """Write a block into as many Gaussians. A double beyond float32 becomes infinite."""
+    """Write a block into as many Gaussians. A double beyond the range of float32 becomes infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         for name, column in _columns(gaussians, rest).items():
             if name in block:
                 column[:] = block[name]
-    if SCALE[2] not in block:  # 2DGS: flat
-        gaussians.log_scales[:, 2] = np.log(values.LEAST_SCALE)
-    if DC[0] not in block:
+    if SCALE_PROPERTIES[2] not in block:  # 2DGS: flat
+        gaussians.log_scales[:, 2] = np.log(values.MIN_SCALE)
+    if DC_PROPERTIES[0] not in block:
         gaussians.sh[:, 0] = np.stack([block[name] for name in _rgb_names(block)], axis=1)
 
 
 def _assemble(blocks: Iterator[Block], count: int, rest: int) -> Gaussians:
-    """Gather the blocks."""
-    first = next(blocks)  # before anything is allocated: an ascii file's count is only a claim
+    """Gather the blocks into one model."""
+    first = next(blocks)  # before anything is allocated: the count of an ascii file is unchecked
     result = values.empty(count, _degree(rest))
     start = 0
     for block in chain([first], blocks):

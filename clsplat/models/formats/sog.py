@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SOG, PlayCanvas's models in pictures: meta.json with lossless WebP beside it, or all of it in a .sog archive (zip).
+"""SOG, PlayCanvas's models as images: meta.json with lossless WebP files, or a .sog archive (zip) of these.
 
-Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2; version 1,
-without a number in meta.json, is read as https://github.com/playcanvas/splat-transform does).
+Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2). Version 1,
+without a number in meta.json, is read as in https://github.com/playcanvas/splat-transform.
 
-- Frame: as ours (that of the PLY). A pixel is a Gaussian, row by row from the top.
+- Frame: as ours and the PLY's. Each pixel is a Gaussian, row by row from the top.
 - means_l, means_u: low and high bytes of 16 bits between an axis's smallest and largest sign(x) ln(1 + |x|).
-- quats: w x y z, the largest component left out, 252 + its index in alpha, the others in steps of 1/180.
-- scales, sh0: bytes of a codebook of 256 natural logs, and of as many SH coefficients 0; alpha is the opacity in steps
-  of 1/255, and where it is 0 the colours are lost.
-- shN: a palette of up to 65,536 sets of coefficients, which are bytes of a third codebook; order and signs as ours.
-- Version 1 has ranges, cut in 255 steps, instead of codebooks, and opacity as a logit.
+- quats: w x y z without the largest component, whose index plus 252 is in alpha; the others in steps of 1/180.
+- scales: indices into a codebook of 256 natural logs.
+- sh0: indices into a codebook of 256 SH coefficients 0. Alpha is the opacity in steps of 1/255; an opacity of 0 loses
+  the colours.
+- shN: a palette of up to 65,536 sets of coefficients, each an index into a third codebook; order and signs as ours.
+- Version 1 has ranges in 255 steps instead of codebooks, and opacity as a logit.
 """
 
 from __future__ import annotations
@@ -32,18 +33,9 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64, numbers
 from clsplat.errors import InputError, plain, warn
-from clsplat.files import (
-    MAX_DOCUMENT,
-    atomic_write,
-    atomic_writer,
-    is_file,
-    native_name,
-    open_input,
-    parse_json,
-    read_document,
-    scratch_folder,
-    write_error,
-)
+from clsplat.files.atomic import atomic_write, atomic_writer, scratch_folder, write_error
+from clsplat.files.documents import MAX_DOCUMENT_BYTES, is_file, open_input, parse_json, read_document
+from clsplat.files.names import native_name
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.images.reading import error_of, one_line, open_image
 from clsplat.models.codec import antialias
@@ -53,47 +45,47 @@ from clsplat.progress import Progress, no_progress
 
 Bytes = NDArray[np.uint8]
 PictureFile = Callable[[str, int], Path]
-"""Gives the file of a picture by its name, and by the most bytes that it may have in an archive."""
+"""Function that returns an image's file, given its name and the most bytes that it may have in an archive."""
 
-META = "meta.json"
-PICTURES = ("means", "quats", "scales", "sh0", "shN")
-"""Beginnings of the pictures' names."""
-SH_PICTURES = ("shN_centroids.webp", "shN_labels.webp")
-MAX_PALETTE = 1 << 16
+SOG_META_FILE = "meta.json"
+SOG_IMAGE_PREFIXES = ("means", "quats", "scales", "sh0", "shN")
+"""Prefixes of the image names."""
+SH_IMAGE_FILES = ("shN_centroids.webp", "shN_labels.webp")
+MAX_PALETTE_ENTRIES = 1 << 16
 PALETTE_COLUMNS = 64
-LARGEST_TAG = 252
-FREE_BYTES = 16 << 20
-"""Bytes that a picture in an archive may have; beyond that 8 for each Gaussian, twice what its pixels have."""
+QUATERNION_TAG_BASE = 252
+MAX_UNCHECKED_IMAGE_BYTES = 16 << 20
+"""Bytes that an image in an archive may have, plus 8 for each Gaussian: twice its raw pixel."""
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as an archive, or as JSON."""
+    """True if a file begins as an archive or as JSON."""
     return head.startswith(b"PK\x03\x04") or head.lstrip()[:1] == b"{"
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Version and antialiasing in meta.json."""
+    """Version and antialiasing from meta.json."""
     with _opened(path) as (file, meta, _):
         return {"version": meta.get("version", 1), "antialiased": _is_antialiased(file, meta)}
 
 
 def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
-    """True if meta.json says so, as `antialias` or as `model`. Warns where they contradict each other, or are not
+    """True if meta.json says so, in `antialias` or `model`. Warns if they contradict each other or are not
     understood."""
     said = antialias.of_object(meta)
     if said.warning:
-        warn(f"{path}: {META} {said.warning}")
+        warn(f"{path}: {SOG_META_FILE} {said.warning}")
     return said.antialiased
 
 
 def side_files(path: Path) -> list[Path]:
-    """The pictures of a meta.json."""
-    pictures = sorted(path.parent.glob("*.webp")) if path.name == META else []
-    return [picture for picture in pictures if picture.stem.partition("_")[0] in PICTURES]
+    """Images of a meta.json."""
+    pictures = sorted(path.parent.glob("*.webp")) if path.name == SOG_META_FILE else []
+    return [picture for picture in pictures if picture.stem.partition("_")[0] in SOG_IMAGE_PREFIXES]
 
 
 def read(path: Path) -> Gaussians:
-    """Read a .sog, or a meta.json with its pictures, or the folder that has them. Raises InputError."""
+    """Read a .sog, a meta.json with its images, or the folder that holds them. Raises InputError."""
     with _opened(path) as opened:
         meta = _Meta(*opened)
         model = meta.gaussians()
@@ -103,9 +95,9 @@ def read(path: Path) -> Gaussians:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Path, dict[str, Any], PictureFile]]:
-    """The file that messages name, what meta.json says, and what makes a picture's name a file."""
+    """Context with the file to name in messages, the parsed meta.json, and the function that locates an image."""
     if path.is_dir() or path.name.lower().endswith(".json"):
-        path = path / META if path.is_dir() else path
+        path = path / SOG_META_FILE if path.is_dir() else path
         yield path, _parsed(path, read_document(path, "SOG's meta.json")), partial(_beside, path)
         return
     with open_input(path, "a .sog archive") as file, scratch_folder(0) as folder:
@@ -116,14 +108,16 @@ def _opened(path: Path) -> Iterator[tuple[Path, dict[str, Any], PictureFile]]:
         with archive:
             members = _members(archive)
             unpacked = partial(_unpacked, path, archive, members, folder / "file.webp")
-            yield path, _parsed(path, unpacked(META, MAX_DOCUMENT).read_bytes()), unpacked
+            yield path, _parsed(path, unpacked(SOG_META_FILE, MAX_DOCUMENT_BYTES).read_bytes()), unpacked
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, str]:
-    """The names of the files beside META, which may be in a folder of the archive, by what they are in the archive."""
+    """Names of the archive's files relative to the folder of SOG_META_FILE, mapped to their names in the archive."""
     whole = [name.replace("\\", "/") for name in archive.namelist()]
-    metas = sorted((name for name in whole if name.rpartition("/")[2] == META), key=lambda name: name.count("/"))
-    folder = metas[0].removesuffix(META) if metas else ""
+    metas = sorted(
+        (name for name in whole if name.rpartition("/")[2] == SOG_META_FILE), key=lambda name: name.count("/")
+    )
+    folder = metas[0].removesuffix(SOG_META_FILE) if metas else ""
     names = zip(whole, archive.namelist(), strict=True)
     return {name.removeprefix(folder): stored for name, stored in names if name.startswith(folder)}
 
@@ -133,7 +127,7 @@ def _names(folder: Path) -> list[str]:
 
 
 def _spelt(name: str, names: Iterable[str]) -> str:
-    """The name, or the only one among these that is it but for the case, as Windows and macOS find files."""
+    """The name, or the single one of `names` that differs only in case, as Windows and macOS find files."""
     names = list(names)
     alike = [other for other in names if other.lower() == name.lower()] if name not in names else []
     return alike[0] if len(alike) == 1 else name
@@ -143,18 +137,18 @@ def _parsed(path: Path, text: str | bytes) -> dict[str, Any]:
     try:
         meta = parse_json(text)
     except ValueError as error:
-        raise InputError(f"{path}: {META} does not parse ({error})") from None
+        raise InputError(f"{path}: {SOG_META_FILE} does not parse ({error})") from None
     if not isinstance(meta, dict) or "means" not in meta:
-        raise InputError(f"{path}: {META} has no means, expected that of a SOG model")
+        raise InputError(f"{path}: {SOG_META_FILE} has no means, expected a SOG model's")
     return meta
 
 
 def _beside(path: Path, name: str, _limit: int) -> Path:
-    """A picture beside a meta.json."""
+    """An image in the folder of a meta.json."""
     folder = Path(os.path.realpath(path)).parent
     try:
         picture = Path(os.path.realpath(folder / name))
-    except ValueError:  # a zero byte
+    except ValueError:  # a zero byte in the name
         picture = folder
     if picture.parent != folder:
         raise InputError(f"{path}: has a picture {name[:80]!r}, expected one beside it")
@@ -168,7 +162,7 @@ def _beside(path: Path, name: str, _limit: int) -> Path:
 def _unpacked(
     path: Path, archive: zipfile.ZipFile, members: dict[str, str], target: Path, name: str, limit: int
 ) -> Path:
-    """A file in a .sog, of at most so many bytes, unpacked to the target; members: as of `_members`."""
+    """A file of a .sog, at most `limit` bytes long, unpacked to `target`; members: as `_members` returns them."""
     spelt = _spelt(name, members)
     try:
         with archive.open(members.get(spelt, spelt)) as source, target.open("wb") as file:
@@ -179,7 +173,7 @@ def _unpacked(
                     raise InputError(f"{path}: {plain(name)[:80]} has more than {limit} bytes unpacked")
                 try:
                     file.write(block)
-                    file.flush()  # here and not at the end, where it would seem that reading failed
+                    file.flush()  # a write error at the end would look like a read error
                 except OSError as error:
                     raise write_error(target, error) from None
     except KeyError:
@@ -190,19 +184,21 @@ def _unpacked(
 
 
 class _Meta:
-    """meta.json, and what it leads to."""
+    """Parsed meta.json, and access to the data that it refers to."""
 
     def __init__(self, path: Path, meta: dict[str, Any], file: PictureFile) -> None:
         self.path, self.meta, self.file = path, meta, file
         self.version = meta.get("version", 1)
         if self.version not in (1, 2):
             found = json.dumps(self.version)[:20]
-            raise InputError(f"{self.path}: SOG version {found} in {META}, expected the number 1 or 2")
+            raise InputError(f"{self.path}: SOG version {found} in {SOG_META_FILE}, expected the number 1 or 2")
         shape = self.section("means").get("shape", [0])
         count = meta.get("count") if self.version == 2 else shape[0] if isinstance(shape, list) and shape else 0
         if self.version == 2 and (not isinstance(count, int) or isinstance(count, bool)):
             found = f"the count {json.dumps(count)[:20]}" if "count" in meta else "no count"
-            raise InputError(f"{self.path}: {META} has {found}, expected the number of Gaussians, a whole number")
+            raise InputError(
+                f"{self.path}: {SOG_META_FILE} has {found}, expected the number of Gaussians, a whole number"
+            )
         if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count < 1 << 32:
             raise InputError(f"{self.path}: has {str(count)[:20]} Gaussians, expected 1 to {(1 << 32) - 1}")
         self.count = count
@@ -210,15 +206,17 @@ class _Meta:
     def section(self, name: str) -> dict[str, Any]:
         value = self.meta.get(name)
         if not isinstance(value, dict):
-            raise InputError(f"{self.path}: {META} has no {name}")
+            raise InputError(f"{self.path}: {SOG_META_FILE} has no {name}")
         return value
 
     def numbers(self, section: str, key: str, least: int, most: int) -> NDArray[np.float64]:
-        """A list of numbers. null stands for what JSON has no number for: of scales, which are logs, for -inf, the
-        scale 0; else for NaN."""
-        where = f"{self.path}: {key} of {section} in {META}"
+        """A list of `least` to `most` numbers.
+
+        JSON has no infinity, so null stands for -inf in scales, which are logs: the scale 0. Elsewhere it is NaN.
+        """
+        where = f"{self.path}: {key} of {section} in {SOG_META_FILE}"
         if key not in self.section(section):
-            raise InputError(f"{self.path}: {section} in {META} has no {key}")
+            raise InputError(f"{self.path}: {section} in {SOG_META_FILE} has no {key}")
         value = self.section(section)[key]
         value = value if isinstance(value, list) else [value]
         count = f"{least}" if least == most else f"{least} to {most}"
@@ -236,12 +234,12 @@ class _Meta:
         return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:
-        """(height, width, channels) of the bytes, with room for every Gaussian, or `least` pixels."""
+        """Bytes (height, width, channels) of an image with a pixel for every Gaussian, or with `least` pixels."""
         names = self.section(section).get("files")
         if not isinstance(names, list) or len(names) <= index or not isinstance(names[index], str):
-            raise InputError(f"{self.path}: {section} in {META} has no file {index}")
+            raise InputError(f"{self.path}: {section} in {SOG_META_FILE} has no file {index}")
         least = self.count if least is None else least
-        file = self.file(names[index], FREE_BYTES + 8 * least)
+        file = self.file(names[index], MAX_UNCHECKED_IMAGE_BYTES + 8 * least)
         try:
             source = open_image(file)
             spec = source.spec()
@@ -258,7 +256,7 @@ class _Meta:
                 raise InputError(f"{file}: does not decode: {one_line(reason)}")
         except InputError as error:
             before, unpacked, after = str(error).partition(plain(str(file)))
-            # the decoder's own words may have its name too
+            # the decoder's message may contain the file's name too
             named = f"{self.path}: {names[index][:80]}" + after.replace(unpacked, names[index][:80]) if unpacked else ""
             raise InputError(before + named) from None
         return np.asarray(decoded).reshape(spec.height, spec.width, -1)[:, :, :channels]
@@ -283,8 +281,8 @@ class _Meta:
     def means(self) -> Float32:
         fine, coarse = (self.pixels("means", index, 3).astype(np.uint16) for index in (0, 1))
         low, high = (self.numbers("means", key, 3, 3) for key in ("mins", "maxs"))
-        if not max(np.abs(low).max(), np.abs(high).max()) < 88:  # beyond, exp leaves float32
-            raise InputError(f"{self.path}: mins and maxs of means in {META} are too large")
+        if not max(np.abs(low).max(), np.abs(high).max()) < 88:  # beyond 88, exp overflows float32
+            raise InputError(f"{self.path}: mins and maxs of means in {SOG_META_FILE} are too large")
         folded = low + (high - low) * ((coarse << 8 | fine) / 65535)
         return (np.sign(folded) * np.expm1(np.abs(folded))).astype(np.float32)
 
@@ -299,21 +297,22 @@ class _Meta:
         width = {"scales": (3, 3), "sh0": (4, 4), "shN": (1, 1)}[section]
         low, high = (self.numbers(section, key, *width)[:3] for key in ("mins", "maxs"))
         part = values / 255
-        with np.errstate(invalid="ignore"):  # of infinite bounds
+        with np.errstate(invalid="ignore"):  # infinite bounds
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
     def tell_of_nulls(self, entries: Float32, indices: Bytes) -> None:
-        """Warn of null among the numbers of the scales' codebook: sorted, as they are, -inf would be the first."""
+        """Warn of null in the codebook of scales, unless it comes first: entries ascend, so -inf would be first."""
         null = np.isinf(entries)
         if (count := int(null.sum())) and null[int((~null).argmax()) :].any():
             users = int(null[indices].any(axis=1).sum())
             warn(
-                f"{self.path}: codebook of scales in {META} has null in place of {count} of {len(entries)} numbers, "
+                f"{self.path}: codebook of scales in {SOG_META_FILE} has null in place of {count} of {len(entries)} "
+                "numbers, "
                 f"which {users:,} of {self.count:,} Gaussians use as a scale of 0; is the model that it is of damaged?"
             )
 
     def rest(self) -> Float32:
-        """Coefficients above 0, (n, K - 1, 3)."""
+        """SH coefficients above degree 0, (n, K - 1, 3)."""
         labels = self.pixels("shN", 1, 2).astype(np.uint32)
         label = labels[:, 0] | labels[:, 1] << 8
         needed = int(label.max()) + 1
@@ -330,26 +329,28 @@ class _Meta:
 
 
 def _unpacked_quaternions(pixels: Bytes) -> Float32:
-    tag = pixels[:, 3].astype(np.int64) - LARGEST_TAG
+    tag = pixels[:, 3].astype(np.int64) - QUATERNION_TAG_BASE
     three = (pixels[:, :3] * np.float32(2 / 255) - np.float32(1)) * np.float32(0.5**0.5)
     result = packing.restore_largest(np.maximum(tag, 0), three)
-    result[tag < 0] = (1, 0, 0, 0)  # no rotation, like the other reader
+    result[tag < 0] = (1, 0, 0, 0)  # no rotation, as in splat-transform
     return result
 
 
 def write(
     path: Path, gaussians: Gaussians, *, iterations: int = 10, sort: bool = False, progress: Progress = no_progress
 ) -> None:
-    """Write version 2: a .sog archive, or a meta.json with its pictures beside it, which are there before it is.
+    """Write version 2: a .sog archive, or a meta.json with its images in the same folder, images first.
 
-    iterations: of k-means for the palette. sort: by place (Morton's order), so that the pictures compress better; the
-    Gaussians come back in that order. progress: called with what is made, and the part of it. Means count from the
-    world's origin: far from it they lose more. The same Gaussians give the same values. Raises InputError for values
-    that are not finite.
+    iterations: of k-means for the palette.
+    sort: order the Gaussians by position (Morton order), so that the images compress better. They are read back in that
+      order.
+    progress: called with the current task and its finished fraction.
+    Means are relative to the world's origin, and lose more far from it. Equal Gaussians give equal values. Raises
+    InputError for non-finite values.
     """
     packing.check_writable(path, gaussians, least=1)
-    # more bytes than the pictures have: the encoder of WebP crashes where there is no room
-    room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE) + (1 << 16)
+    # an upper bound: the WebP encoder crashes if the disk is full
+    room = 24 * len(gaussians) + 64 * min(len(gaussians), MAX_PALETTE_ENTRIES) + (1 << 16)
     with scratch_folder(room) as folder:
         order = packing.morton_order(gaussians.means) if sort else slice(None)
         meta = _pictures(folder, gaussians, order, iterations, progress)
@@ -359,18 +360,18 @@ def write(
             for picture in files:
                 atomic_write(path.with_name(picture.name), picture.read_bytes())
             atomic_write(path, text)
-            for name in {*SH_PICTURES} - {picture.name for picture in files}:  # of a model that had more SH
+            for name in {*SH_IMAGE_FILES} - {picture.name for picture in files}:  # left over from a model with more SH
                 path.with_name(name).unlink(missing_ok=True)
             return
         total = sum(picture.stat().st_size for picture in files)
         with atomic_writer(path, total) as file, zipfile.ZipFile(file, "w") as archive:  # stored: WebP is compressed
-            archive.writestr(zipfile.ZipInfo(META), text)
+            archive.writestr(zipfile.ZipInfo(SOG_META_FILE), text)
             for picture in files:
                 archive.writestr(zipfile.ZipInfo(picture.name), picture.read_bytes())
 
 
 def _pictures(folder: Path, gaussians: Gaussians, order: Any, iterations: int, progress: Progress) -> dict[str, Any]:
-    """Write them, and give meta.json."""
+    """Write the images, and return the contents of meta.json."""
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)
     height = 4 * math.ceil(count / width / 4)
@@ -420,7 +421,7 @@ def _palette(
     progress: Progress,
 ) -> dict[str, Any]:
     count, width = rest.shape[:2]
-    size = min(MAX_PALETTE, 1 << (count.bit_length() - 1))
+    size = min(MAX_PALETTE_ENTRIES, 1 << (count.bit_length() - 1))
     stage = f"SOG: {size:,} sets of SH coefficients for {count:,} Gaussians"
     progress(stage, 0.0)
     sets, labels = palette(rest.reshape(count, -1), size, iterations, lambda part: progress(stage, part))
@@ -428,7 +429,7 @@ def _palette(
     rows = -(-size // PALETTE_COLUMNS)
     table = np.zeros((rows * PALETTE_COLUMNS, width, 3), np.uint8)
     table[:size] = _indices(entries, sets).reshape(size, width, 3)
-    centroids, marks = SH_PICTURES
+    centroids, marks = SH_IMAGE_FILES
     _write_webp(folder / centroids, table.reshape(rows, PALETTE_COLUMNS * width, 3))
     halves = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1).astype(np.uint8)
     files = [centroids, picture(marks, [halves])]
@@ -442,7 +443,7 @@ def _indices(entries: Float32, values: Float32) -> Bytes:
 def _packed_quaternions(unit: Float64) -> Bytes:
     largest, three = packing.leave_out_largest(unit)
     steps = np.rint(np.clip(three * 2**0.5 * 0.5 + 0.5, 0, 1) * 255)
-    return np.column_stack([steps, largest + LARGEST_TAG]).astype(np.uint8)
+    return np.column_stack([steps, largest + QUATERNION_TAG_BASE]).astype(np.uint8)
 
 
 def _write_webp(path: Path, pixels: Bytes) -> None:

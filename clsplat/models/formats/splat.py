@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """antimatter15's .splat: 32 bytes a Gaussian, little-endian, no header.
 
-https://github.com/antimatter15/splat (convert.py and main.js). A record: position, 3 float32, in the frame of the PLY;
-scale, 3 float32, standard deviations, not logs; red, green, blue, opacity, 4 bytes; quaternion w x y z, 4 bytes,
-128 (q + 1) of a unit one. Colour is that of SH coefficient 0, cut to 0 to 1: there are no further coefficients.
-The order is ours: other writers sort by size and opacity.
+https://github.com/antimatter15/splat (convert.py and main.js). A record:
+
+- position: 3 float32, in the frame of the PLY.
+- scale: 3 float32, standard deviations, not logs.
+- red, green, blue, opacity: 4 bytes. The colour is SH coefficient 0's, clamped to 0 to 1; there are no other
+  coefficients.
+- quaternion: w x y z in 4 bytes, 128 (q + 1) of a unit one.
+
+The Gaussians keep our order; other writers sort them by size and opacity.
 """
 
 from __future__ import annotations
@@ -16,29 +21,30 @@ from typing import Any
 import numpy as np
 
 from clsplat.errors import InputError
-from clsplat.files import atomic_writer, open_input
+from clsplat.files.atomic import atomic_writer
+from clsplat.files.documents import open_input
 from clsplat.gaussians import Gaussians
 from clsplat.models.codec import values
-from clsplat.models.codec.values import BLOCK_ROWS
+from clsplat.models.codec.values import IO_BLOCK_ROWS
 
-UNIT_SLACK = 0.1
-"""Bytes make unit quaternions longer by 0.02 at most."""
+UNIT_QUATERNION_TOLERANCE = 0.1
+"""Tolerance of a quaternion's length; rounding to bytes makes unit quaternions at most 0.02 longer."""
 
-ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quaternions", "u1", 4)])
+SPLAT_RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quaternions", "u1", 4)])
 
 
 def read(path: Path) -> Gaussians:
-    """Read it. Raises InputError: no whole number of records, none, a few negative scales."""
+    """Read the file. Raises InputError for a partial record, no records, or a few negative scales."""
     with open_input(path, "a .splat file") as file:
         size = os.fstat(file.fileno()).st_size
-        count, over = divmod(size, ROW.itemsize)
+        count, over = divmod(size, SPLAT_RECORD.itemsize)
         if over or not count:
-            raise InputError(f"{path}: has {size} bytes, expected some Gaussians of {ROW.itemsize} bytes each")
-        _check_first(values.read_rows(file, ROW, min(BLOCK_ROWS, count), path), path)
+            raise InputError(f"{path}: has {size} bytes, expected some Gaussians of {SPLAT_RECORD.itemsize} bytes each")
+        _check_first(values.read_rows(file, SPLAT_RECORD, min(IO_BLOCK_ROWS, count), path), path)
         file.seek(0)
         result = values.empty(count, 0)
         for rows in values.row_blocks(count):
-            block = values.read_rows(file, ROW, rows.stop - rows.start, path)
+            block = values.read_rows(file, SPLAT_RECORD, rows.stop - rows.start, path)
             result.means[rows] = block["means"]
             result.log_scales[rows] = block["scales"]
             result.sh[rows, 0] = values.coefficients(block["rgba"][:, :3] / 255)
@@ -49,20 +55,20 @@ def read(path: Path) -> Gaussians:
 
 
 def _check_first(block: Any, path: Path) -> None:
-    """Raise InputError where most of these have no rotation: there is no header to tell what else this might be."""
+    """Raise InputError if most of these records have no valid rotation; the format has no header to check."""
     lengths = np.linalg.norm(block["quaternions"].astype(np.float32) / 128 - 1, axis=1)
-    if np.median(lengths) > 1 + UNIT_SLACK:
+    if np.median(lengths) > 1 + UNIT_QUATERNION_TOLERANCE:
         raise InputError(f"{path}: not a .splat file (rotations of length {np.median(lengths):.2f}, expected 1)")
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Write it, atomically."""
+    """Write the file atomically."""
     values.check_writable(path, gaussians)
-    with atomic_writer(path, ROW.itemsize * len(gaussians)) as file:
+    with atomic_writer(path, SPLAT_RECORD.itemsize * len(gaussians)) as file:
         for rows in values.row_blocks(len(gaussians)):
-            block: Any = np.empty(rows.stop - rows.start, ROW)
+            block: Any = np.empty(rows.stop - rows.start, SPLAT_RECORD)
             block["means"] = values.world_means(gaussians, rows)
-            with np.errstate(over="ignore"):  # a scale beyond float32 is cut
+            with np.errstate(over="ignore"):  # a scale beyond float32 is clamped
                 scales = np.exp(gaussians.log_scales[rows].astype(np.float64))
             block["scales"] = np.minimum(scales, np.finfo(np.float32).max)
             block["rgba"][:, :3] = values.to_bytes(values.colours(gaussians.sh[rows, 0]))

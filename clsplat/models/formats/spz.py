@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """SPZ, Niantic's compressed models: versions 2, 3 (gzip) and 4 (a Zstandard stream for each attribute).
 
-Specification: https://github.com/nianticlabs/spz (README.md and src/cc/load-spz.cc). Attributes one after another, each
-for all Gaussians: positions, alphas, colours, scales, rotations, spherical harmonics.
+Specification: https://github.com/nianticlabs/spz (README.md and src/cc/load-spz.cc). Attributes are stored one after
+another, each for all Gaussians: positions, alphas, colours, scales, rotations, spherical harmonics.
 
-- Frame: x right, y up, z backward (RUB); an extension of Adobe's may name another, which is honoured. Ours is half a
-  turn about x away. Other extensions are passed over.
+- Frame: x right, y up, z backward (RUB), half a turn about x from ours. An extension of Adobe's may set another frame;
+  other extensions are ignored.
 - Positions: 24-bit fixed point with `fractional_bits` after the point.
-- Alphas: opacity in steps of 1/255. Colours: SH coefficient 0 in steps of 1/38.25, within +-3.33.
+- Alphas: opacity in steps of 1/255.
+- Colours: SH coefficient 0 in steps of 1/38.25, within +-3.33.
 - Scales: natural logs in steps of 1/16, -10 to 5.94.
-- Rotations: x y z w. Version 2: x y z in steps of 1/127.5 where w is positive. From version 3: the largest component is
-  left out, its index in 2 bits, the others in 10 (a sign, and steps of 1/723).
-- SH: order and signs as ours, red green blue of each coefficient together, in steps of 1/128 within +-1, of which
-  writers keep fewer bits so that they compress.
+- Rotations: x y z w. Version 2 stores x y z in steps of 1/127.5, with w positive. Later versions leave out the largest
+  component and store its index in 2 bits. The others take 10 bits each: a sign, and steps of 1/723.
+- SH: order and signs as ours, red green blue of each coefficient together, in steps of 1/128 within +-1. Writers keep
+  fewer bits for better compression.
 """
 
 from __future__ import annotations
@@ -32,37 +33,41 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.errors import InputError, warn
-from clsplat.files import atomic_writer, open_input
+from clsplat.files.atomic import atomic_writer
+from clsplat.files.documents import open_input
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
 from clsplat.models.codec import values
-from clsplat.models.codec.axes import UP_BACK, Signs, flip, quaternion_signs, sh_signs
+from clsplat.models.codec.axes import RUB_SIGNS, Signs, flip, quaternion_signs, sh_signs
 
-MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
+SPZ_MAGIC, GZIP_MAGIC = b"NGSP", b"\x1f\x8b"
 Bytes = NDArray[np.uint8]
 Stream = Any
-"""A file, or a reader of gzip or Zstandard."""
-VERSIONS = (2, 3, 4)
-DEFAULT_VERSION = 3
-"""Version that most readers of the web take (docs/formats.md); the format's library and splat-transform write 4."""
-SH_BITS = (6, 6)
-"""Bits of band 1, and of those above. The format's library keeps 5 and 4: files a fifth smaller, and a trained model of
-strong view dependence 11 dB worse, at 36 (docs/formats.md). Readers need not know."""
-ANTIALIASED, HAS_EXTENSIONS = 1, 2
-COORDINATE_SYSTEM = 0xADBE0003
-FRAMES: tuple[Signs, ...] = (
-    *(UP_BACK, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), UP_BACK),  # unspecified, LDB, RDB, LUB, RUB
+"""A file, or a gzip or Zstandard reader."""
+SPZ_VERSIONS = (2, 3, 4)
+DEFAULT_SPZ_VERSION = 3
+"""Version that most web readers accept (docs/formats.md); the format's library and splat-transform write 4."""
+DEFAULT_SH_BITS = (6, 6)
+"""Bits of band 1, and of the higher bands. Readers need not know them.
+
+The format's library keeps 5 and 4 bits. Its files are a fifth smaller, but a trained model with strong view dependence
+is 11 dB worse, at 36 dB (docs/formats.md).
+"""
+ANTIALIASED_FLAG, EXTENSIONS_FLAG = 1, 2
+COORDINATE_SYSTEM_EXTENSION = 0xADBE0003
+COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
+    *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # unspecified, LDB, RDB, LUB, RUB
     *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
 )
-"""Between ours and each value of that extension; those after these have z up."""
-MAX_EXTENSIONS = 1 << 20
-MAX_WINDOW = 1 << 27
-"""Bytes that a Zstandard frame may have the decoder keep: the library's own limit."""
-COLOUR_SCALE = 0.15 * 255
-ROOT_HALF = 0.5**0.5
+"""Signs between our axes and each value of the coordinate system extension; larger values have z up."""
+MAX_EXTENSION_BYTES = 1 << 20
+MAX_ZSTD_WINDOW_BYTES = 1 << 27
+"""Bytes that a Zstandard frame may make the decoder keep; the library's own limit."""
+COLOUR_STEPS_PER_UNIT = 0.15 * 255
+SQRT_HALF = 0.5**0.5
 
 
 @dataclass(frozen=True)
-class Header:
+class SpzHeader:
     version: int
     count: int
     degree: int
@@ -73,7 +78,7 @@ class Header:
 
     @property
     def widths(self) -> dict[str, int]:
-        """Bytes that a Gaussian has of each attribute, in the file's order."""
+        """Bytes of each attribute of a Gaussian, in the file's order."""
         rest = 3 * (self.degree * (self.degree + 2))
         rotations = 3 if self.version == 2 else 4
         widths = {"positions": 9, "alphas": 1, "colours": 3, "scales": 3, "rotations": rotations}
@@ -81,20 +86,20 @@ class Header:
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as one of this format."""
-    if head[:2] != GZIP:
-        return head.startswith(MAGIC)
+    """True if a file begins as an SPZ file."""
+    if head[:2] != GZIP_MAGIC:
+        return head.startswith(SPZ_MAGIC)
     try:
-        return zlib.decompressobj(31).decompress(head, 4) == MAGIC
+        return zlib.decompressobj(31).decompress(head, 4) == SPZ_MAGIC
     except zlib.error:
         return False
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Version, bits after the point and antialiasing in the header."""
+    """Version, fractional bits and antialiasing from the header."""
     with open_input(path, "an SPZ file") as file:
         header, _ = _open(file, os.fstat(file.fileno()).st_size, path)
-    antialiased = bool(header.flags & ANTIALIASED)
+    antialiased = bool(header.flags & ANTIALIASED_FLAG)
     return {"version": header.version, "fractional_bits": header.fractional_bits, "antialiased": antialiased}
 
 
@@ -105,60 +110,60 @@ def read(path: Path) -> Gaussians:
 
 
 def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
-    """Read what an SPZ file of `size` bytes has from the beginning of `file`; `path` is for messages."""
+    """Read the contents of an SPZ file of `size` bytes from the start of `file`; `path` is for messages."""
     header, stream = _open(file, size, path)
     values.require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
         warn(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out")
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
-    result.antialiased = bool(header.flags & ANTIALIASED)
+    result.antialiased = bool(header.flags & ANTIALIASED_FLAG)
     if header.version == 4:
-        signs = _frame(file.read(header.table - 32), path) if header.flags & HAS_EXTENSIONS else UP_BACK
+        signs = _frame(file.read(header.table - 32), path) if header.flags & EXTENSIONS_FLAG else RUB_SIGNS
         _unpack(_zstd_streams(file, header, size, path), header, signs, result, path)
         return result
     assert stream is not None
-    _unpack(((name, stream) for name in header.widths), header, UP_BACK, result, path)
+    _unpack(((name, stream) for name in header.widths), header, RUB_SIGNS, result, path)
     behind = _rest(stream, path)
-    if len(behind) > MAX_EXTENSIONS and isinstance(stream, gzip.GzipFile):
+    if len(behind) > MAX_EXTENSION_BYTES and isinstance(stream, gzip.GzipFile):
         raise InputError(
-            f"{path}: unpacks to more than {header.count} Gaussians: over {MAX_EXTENSIONS} bytes follow, expected "
+            f"{path}: unpacks to more than {header.count} Gaussians: over {MAX_EXTENSION_BYTES} bytes follow, expected "
             "extensions at most; is it damaged?"
         )
-    if header.flags & HAS_EXTENSIONS and (signs := _frame(behind, path)) != UP_BACK:
-        flip(result, (signs[0] * UP_BACK[0], signs[1] * UP_BACK[1], signs[2] * UP_BACK[2]))
-    elif behind and not header.flags & HAS_EXTENSIONS:
+    if header.flags & EXTENSIONS_FLAG and (signs := _frame(behind, path)) != RUB_SIGNS:
+        flip(result, (signs[0] * RUB_SIGNS[0], signs[1] * RUB_SIGNS[1], signs[2] * RUB_SIGNS[2]))
+    elif behind and not header.flags & EXTENSIONS_FLAG:
         warn(f"{path}: bytes after the last Gaussian ignored")
     return result
 
 
-def _open(file: BinaryIO, size: int, path: Path) -> tuple[Header, Any]:
-    """The header; and up to version 3 what is to be read on from, behind it."""
+def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
+    """Header, and for versions up to 3 the stream of the data after it."""
     head = file.read(32)
-    if head[:4] == MAGIC and head[4:8] == struct.pack("<I", 4):
+    if head[:4] == SPZ_MAGIC and head[4:8] == struct.pack("<I", 4):
         if len(head) < 32:
             raise InputError(f"{path}: truncated: {len(head)} bytes, expected a header of 32")
-        header = Header(4, *struct.unpack("<IBBBBI", head[8:20]))
+        header = SpzHeader(4, *struct.unpack("<IBBBBI", head[8:20]))
         _check(header, path)
         expected = len(header.widths)
         if header.streams != expected:
             raise InputError(f"{path}: SPZ has {header.streams} streams, expected {expected}")
-        if not 32 <= header.table <= min(32 + MAX_EXTENSIONS, size - 16 * expected):
+        if not 32 <= header.table <= min(32 + MAX_EXTENSION_BYTES, size - 16 * expected):
             raise InputError(f"{path}: SPZ's table of streams is at byte {header.table} of {size}; is it damaged?")
         return header, None
-    if head[:2] != GZIP and head[:4] != MAGIC:
+    if head[:2] != GZIP_MAGIC and head[:4] != SPZ_MAGIC:
         raise InputError(f"{path}: not an SPZ file (it begins with neither gzip's signature nor NGSP)")
     file.seek(0)
-    stream = gzip.GzipFile(fileobj=file, mode="rb") if head[:2] == GZIP else file
+    stream = gzip.GzipFile(fileobj=file, mode="rb") if head[:2] == GZIP_MAGIC else file
     start = _next(stream, 16, path, "the header")
-    if start[:4] != MAGIC:
+    if start[:4] != SPZ_MAGIC:
         raise InputError(f"{path}: not an SPZ file (a gzip file of something else)")
-    header = Header(*struct.unpack("<IIBBB", start[4:15]))
+    header = SpzHeader(*struct.unpack("<IIBBB", start[4:15]))
     _check(header, path)
     return header, stream
 
 
-def _check(header: Header, path: Path) -> None:
-    if header.version not in VERSIONS:
+def _check(header: SpzHeader, path: Path) -> None:
+    if header.version not in SPZ_VERSIONS:
         raise InputError(f"{path}: SPZ version {header.version}, expected 2, 3 or 4")
     if header.degree > 4:
         raise InputError(f"{path}: SPZ has SH of degree {header.degree}, expected 0 to 4")
@@ -167,26 +172,26 @@ def _check(header: Header, path: Path) -> None:
 
 
 def _frame(extensions: bytes, path: Path) -> Signs:
-    """The signs of the axes. An extension is its type and its length, 32 bits each, and then its bytes."""
+    """Signs of the axes. An extension is its type and length, 32 bits each, followed by its bytes."""
     at, system = 0, b""
     while len(extensions) - at >= 8:
         kind, length = struct.unpack_from("<II", extensions, at)
         if length > len(extensions) - at - 8:
             raise InputError(f"{path}: truncated: SPZ extension {kind:#x} of {length} bytes")
         at += 8 + length
-        if kind == COORDINATE_SYSTEM:
+        if kind == COORDINATE_SYSTEM_EXTENSION:
             system = extensions[at - length : at]
     if len(system) != 4:
-        return UP_BACK
+        return RUB_SIGNS
     (value,) = struct.unpack("<I", system)
-    if value >= len(FRAMES):
+    if value >= len(COORDINATE_SYSTEM_SIGNS):
         raise InputError(f"{path}: SPZ in the coordinate system {value}, expected one with y up or down (0 to 8)")
-    return FRAMES[value]
+    return COORDINATE_SYSTEM_SIGNS[value]
 
 
 @dataclass
 class _Slice:
-    """The next `left` bytes of a file."""
+    """Reader of the next `left` bytes of a file."""
 
     file: BinaryIO
     left: int
@@ -197,7 +202,7 @@ class _Slice:
         return data
 
 
-def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iterator[tuple[str, Stream]]:
+def _zstd_streams(file: BinaryIO, header: SpzHeader, size: int, path: Path) -> Iterator[tuple[str, Stream]]:
     import zstandard
 
     file.seek(header.table)
@@ -211,7 +216,7 @@ def _zstd_streams(file: BinaryIO, header: Header, size: int, path: Path) -> Iter
             raise InputError(f"{path}: {name} have {unpacked} bytes unpacked, expected {wanted}")
         file.seek(at)
         at += packed
-        decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_ZSTD_WINDOW_BYTES)
         source: Any = _Slice(file, packed)
         with decompressor.stream_reader(source, read_size=1 << 18) as stream:
             yield name, stream
@@ -230,9 +235,9 @@ def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
 
 
 def _rest(stream: Any, path: Path) -> bytes:
-    """The bytes after the Gaussians, one more than MAX_EXTENSIONS at most; gzip checks its sum at the end."""
+    """Bytes after the Gaussians, at most MAX_EXTENSION_BYTES + 1; gzip verifies its checksum at the end."""
     with _decompressing(path, "at its end"):
-        return bytes(stream.read(MAX_EXTENSIONS + 1))
+        return bytes(stream.read(MAX_EXTENSION_BYTES + 1))
 
 
 @contextmanager
@@ -248,10 +253,12 @@ def _decompressing(path: Path, place: str) -> Iterator[None]:
         raise InputError(f"{path}: does not decompress {place} ({error}); is it damaged?") from None
 
 
-def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs, result: Gaussians, path: Path) -> None:
+def _unpack(
+    streams: Iterator[tuple[str, Stream]], header: SpzHeader, signs: Signs, result: Gaussians, path: Path
+) -> None:
     alpha_logits = values.byte_logits()
     means_factor = np.array(signs, np.float32) * np.float32(0.5**header.fractional_bits)
-    # as wide as the array: NumPy is several times slower where the last axis is short
+    # full width: NumPy is several times slower if the last axis is short
     sh_factor = np.repeat(sh_signs(signs)[1 : result.sh.shape[1], None] / np.float32(128), 3, axis=1)
     for name, stream in streams:
         width = header.widths[name]
@@ -264,7 +271,7 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
                 case "alphas":
                     result.opacity_logits[rows] = alpha_logits[block[:, 0]]
                 case "colours":
-                    result.sh[rows, 0] = (block - np.float32(127.5)) * np.float32(1 / COLOUR_SCALE)
+                    result.sh[rows, 0] = (block - np.float32(127.5)) * np.float32(1 / COLOUR_STEPS_PER_UNIT)
                 case "scales":
                     result.log_scales[rows] = block * np.float32(1 / 16) - np.float32(10)
                 case "rotations":
@@ -278,14 +285,14 @@ def _unpack(streams: Iterator[tuple[str, Stream]], header: Header, signs: Signs,
 
 
 def _fixed(block: Bytes) -> Float32:
-    """Signed integers of 24 bits, (n, 9) -> (n, 3)."""
+    """Signed 24-bit integers, (n, 9) bytes -> (n, 3)."""
     wide = np.zeros((len(block), 3, 4), np.uint8)
     wide[:, :, 1:] = block.reshape(-1, 3, 3)
     return (wide.view("<i4")[:, :, 0] >> 8).astype(np.float32)
 
 
 def _first_three(block: Bytes) -> Float32:
-    """Version 2: (n, 3) of x y z -> (n, 4) quaternions w x y z."""
+    """Version 2: x y z (n, 3) -> quaternions w x y z (n, 4)."""
     result = np.empty((len(block), 4), np.float32)
     result[:, 1:] = block * np.float32(1 / 127.5) - np.float32(1)
     result[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(result[:, 1:]).sum(axis=1)))
@@ -293,10 +300,10 @@ def _first_three(block: Bytes) -> Float32:
 
 
 def _smallest_three(block: Bytes) -> Float32:
-    """Quaternions w x y z, (n, 4), from bytes (n, 4) of version 3 and later."""
+    """Version 3 and later: bytes (n, 4) -> quaternions w x y z (n, 4)."""
     packed = np.ascontiguousarray(block).view("<u4")[:, 0]
     fields = packed[:, None] >> np.array([20, 10, 0], np.uint32)
-    three = (fields & 511).astype(np.float32) * np.float32(ROOT_HALF / 511)
+    three = (fields & 511).astype(np.float32) * np.float32(SQRT_HALF / 511)
     three = np.where(fields & 512, -three, three)
     return values.restore_largest(packed >> 30, three)[:, [3, 0, 1, 2]]  # from x y z w
 
@@ -305,18 +312,19 @@ def write(
     path: Path,
     gaussians: Gaussians,
     *,
-    version: int = DEFAULT_VERSION,
+    version: int = DEFAULT_SPZ_VERSION,
     fractional_bits: int | None = None,
-    sh_bits: tuple[int, int] = SH_BITS,
+    sh_bits: tuple[int, int] = DEFAULT_SH_BITS,
 ) -> None:
-    """Write an SPZ file, atomically; the same Gaussians give the same bytes.
+    """Write an SPZ file, atomically; equal Gaussians give equal bytes.
 
-    fractional_bits: of positions; by default 12, like the format's library, more for a model so small that this would
-    be coarse, fewer for one that does not fit. sh_bits: of band 1 and of those above, 1 to 8. Means count from the
-    world's origin: far from it they lose more. Raises InputError for values that are not finite or positions that no
-    number of bits holds, ValueError for settings out of range.
+    fractional_bits: of positions. The default is 12, like the format's library; more for a model so small that 12 would
+      be coarse, fewer for one that does not fit.
+    sh_bits: bits of band 1 and of the higher bands, 1 to 8.
+    Means are relative to the world's origin, and lose more far from it. Raises InputError for non-finite values and for
+    positions that fit no number of bits. Raises ValueError for settings out of range.
     """
-    if version not in VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
+    if version not in SPZ_VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
         raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
     values.check_writable(path, gaussians, least=1)
     header = header_for(path, gaussians, version, fractional_bits)
@@ -324,10 +332,13 @@ def write(
         write_to(file, gaussians, header, sh_bits)
 
 
-def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> Header:
-    """The header for `write_to`, of at least one Gaussian. The bits after the point are as many as asked for, if the
-    positions fit; or by the model's size, without its farthest hundredth. Raises InputError for positions that do not
-    fit."""
+def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> SpzHeader:
+    """Header for `write_to`, for at least one Gaussian.
+
+    fractional_bits: the default follows the model's size, without its farthest hundredth, within the range of the
+      positions.
+    Raises InputError if the positions do not fit.
+    """
     low, high = (
         values.world_means(gaussians, rows) for rows in (gaussians.means.argmin(axis=0), gaussians.means.argmax(axis=0))
     )
@@ -343,20 +354,22 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
         )
     if bits is None:
         spread = np.quantile(np.abs(gaussians.means - np.median(gaussians.means, axis=0)).max(axis=1), 0.99)
-        # 2^-12 for a model of 16 units; the same share of a smaller one
+        # 2^-12 for a model of 16 units; in proportion for a smaller one
         bits = min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
     elif bits < 0:
         raise ValueError(f"fractional_bits {bits}: expected 0 to 23")
-    flags = ANTIALIASED if gaussians.antialiased else 0
-    return Header(version, len(gaussians), gaussians.sh_degree, bits, flags)
+    flags = ANTIALIASED_FLAG if gaussians.antialiased else 0
+    return SpzHeader(version, len(gaussians), gaussians.sh_degree, bits, flags)
 
 
-def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int] = SH_BITS) -> None:
-    """Write what an SPZ file has into a file that can seek, from where it is."""
+def write_to(
+    file: BinaryIO, gaussians: Gaussians, header: SpzHeader, sh_bits: tuple[int, int] = DEFAULT_SH_BITS
+) -> None:
+    """Write the contents of an SPZ file at the current position of a seekable file."""
     if header.version < 4:
         fields = (header.version, header.count, header.degree, header.fractional_bits, header.flags, 0)
         with gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0) as stream:
-            stream.write(MAGIC + struct.pack("<IIBBBB", *fields))
+            stream.write(SPZ_MAGIC + struct.pack("<IIBBBB", *fields))
             for name in header.widths:
                 _pack(name, gaussians, header, sh_bits, stream.write)
         return
@@ -364,7 +377,7 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
 
     names = list(header.widths)
     numbers = (4, header.count, header.degree, header.fractional_bits, header.flags, len(names), 32)
-    file.write(MAGIC + struct.pack("<IIBBBBI12x", *numbers))
+    file.write(SPZ_MAGIC + struct.pack("<IIBBBBI12x", *numbers))
     table = file.tell()
     file.write(bytes(16 * len(names)))
     sizes = b""
@@ -381,21 +394,21 @@ def write_to(file: BinaryIO, gaussians: Gaussians, header: Header, sh_bits: tupl
 
 
 def _pack(
-    name: str, gaussians: Gaussians, header: Header, sh_bits: tuple[int, int], write: Callable[[bytes], object]
+    name: str, gaussians: Gaussians, header: SpzHeader, sh_bits: tuple[int, int], write: Callable[[bytes], object]
 ) -> None:
     for rows in values.row_blocks(header.count):
         match name:
             case "positions":
-                data = _to_fixed(values.world_means(gaussians, rows) * UP_BACK * 2.0**header.fractional_bits)
+                data = _to_fixed(values.world_means(gaussians, rows) * RUB_SIGNS * 2.0**header.fractional_bits)
             case "alphas":
                 data = values.to_bytes(values.opacities(gaussians.opacity_logits[rows]))
             case "colours":
-                data = _to_byte(gaussians.sh[rows, 0] * np.float32(COLOUR_SCALE) + np.float32(127.5))
+                data = _to_byte(gaussians.sh[rows, 0] * np.float32(COLOUR_STEPS_PER_UNIT) + np.float32(127.5))
             case "scales":
                 data = _to_byte((gaussians.log_scales[rows] + np.float32(10)) * np.float32(16))
             case "rotations":
                 unit = values.unit_quaternions(gaussians.quaternions[rows]).astype(np.float32)
-                unit *= quaternion_signs(UP_BACK)
+                unit *= quaternion_signs(RUB_SIGNS)
                 data = _to_first_three(unit) if header.version == 2 else _to_smallest_three(unit)
             case _:
                 data = _to_sh(gaussians.sh[rows, 1:], sh_bits)
@@ -403,37 +416,40 @@ def _pack(
 
 
 def _to_byte(steps: Float32) -> Bytes:
-    """To the nearest from 0 to 255."""
+    """Round to the nearest whole number from 0 to 255."""
     return np.asarray(np.clip(np.floor(steps + np.float32(0.5)), 0, 255).astype(np.uint8))
 
 
 def _to_fixed(steps: Float64) -> Bytes:
-    """(n, 3) that fit into 24 bits -> (n, 3, 3), the low bytes first."""
+    """24-bit values (n, 3) -> bytes (n, 3, 3), low byte first."""
     return np.rint(steps).astype("<i4")[:, :, None].view(np.uint8)[:, :, :3]
 
 
 def _to_first_three(unit: Float32) -> Bytes:
-    """Bytes (n, 3) of unit quaternions (n, 4), w x y z."""
+    """Unit quaternions w x y z (n, 4) -> bytes (n, 3), version 2."""
     unit = np.where(unit[:, :1] < 0, -unit, unit)
     return _to_byte(unit[:, 1:] * np.float32(127.5) + np.float32(127.5))
 
 
 def _to_smallest_three(unit: Float32) -> Bytes:
-    """Bytes (4 n,) of unit quaternions (n, 4), w x y z."""
+    """Unit quaternions w x y z (n, 4) -> bytes (4 n,), version 3 and later."""
     q = unit[:, [1, 2, 3, 0]]
     largest = np.abs(q).argmax(axis=1)
     negate = np.take_along_axis(q, largest[:, None], axis=1) < 0
-    magnitude = np.minimum(np.floor(np.abs(q) * np.float32(511 / ROOT_HALF) + np.float32(0.5)), 511).astype(np.uint32)
+    magnitude = np.minimum(np.floor(np.abs(q) * np.float32(511 / SQRT_HALF) + np.float32(0.5)), 511).astype(np.uint32)
     fields = magnitude | (((q < 0) ^ negate).astype(np.uint32) << 9)
-    three = np.take_along_axis(fields, values.OTHERS[largest], axis=1)
+    three = np.take_along_axis(fields, values.OTHER_QUATERNION_COMPONENTS[largest], axis=1)
     packed = largest.astype(np.uint32) << 30 | three[:, 0] << 20 | three[:, 1] << 10 | three[:, 2]
     return np.asarray(packed.astype("<u4").view(np.uint8))
 
 
 def _to_sh(rest: Float32, sh_bits: tuple[int, int]) -> Bytes:
-    """Bytes of coefficients (n, K - 1, 3) in our frame. sh_bits: bits that band 1, and those above, keep."""
+    """Bytes of coefficients (n, K - 1, 3) in our frame.
+
+    sh_bits: bits kept of band 1 and of the higher bands.
+    """
     coefficients = rest.shape[1]
     steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]
-    signs = sh_signs(UP_BACK)[1 : coefficients + 1, None]
+    signs = sh_signs(RUB_SIGNS)[1 : coefficients + 1, None]
     codes = np.clip(rest * (signs * np.float32(128)) + np.float32(128.5), 0, 256).astype(np.int16)
     return np.asarray(np.minimum((codes + steps // 2) & -steps, 255).astype(np.uint8))  # steps are powers of two

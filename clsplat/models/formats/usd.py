@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """OpenUSD's ParticleField3DGaussianSplat, through usd-core (an optional extra): .usd, .usda, .usdc and .usdz.
 
-Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html, in OpenUSD from
-26.03; a release without the schema writes the same prim with the same attributes.
+Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_gaussian_splat.html, in OpenUSD since
+26.03. A release without the schema writes the same prim with the same attributes.
 
-- Frame: the numbers in the stage are the model's world, as they are for cameras (clsplat/shots/usd.py): the world is
-  not turned to the stage's upAxis, nor scaled to its metersPerUnit. What is read goes through the prims' transforms. An
-  `origin` is the translation of the prim above.
-- Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions, SH coefficients by
-  Gaussian, order and signs as ours.
+- Frame: the stage's numbers are the model's world, as for cameras (clsplat/shots/readers/usd.py). The world is neither
+  turned to the stage's upAxis nor scaled to its metersPerUnit. When reading, the prims' transforms are applied. An
+  `origin` becomes the translation of the parent prim.
+- Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions. SH coefficients are
+  stored by Gaussian; order and signs as ours.
 - Hints: perspective projection, sorted by depth along the camera's axis, as this renderer does.
-- Colours: of the colour space that the SH coefficients, their prim or what it is in name; sRGB, as 3DGS trains them,
-  where none does. A prim without SH has primvars:displayColor, linear where nothing else is named, and displayOpacity
-  where it lacks opacities.
+- Colours: in the colour space named by the SH coefficients, their prim or a prim above; sRGB, as 3DGS trains, by
+  default.
+- A prim without SH has primvars:displayColor, linear by default, and displayOpacity if it lacks opacities.
 """
 
 from __future__ import annotations
@@ -32,21 +32,29 @@ import numpy as np
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError, examples, warn
-from clsplat.files import atomic_writer, native_name, open_input, scratch_folder
+from clsplat.files.atomic import atomic_writer, scratch_folder
+from clsplat.files.documents import open_input
+from clsplat.files.names import native_name
 from clsplat.gaussians import MAX_SH_DEGREE, Gaussians
-from clsplat.images.colour import INTEROP, LINEAR, SRGB, linear_to_srgb, srgb_to_linear
+from clsplat.images.colour import COLOR_INTEROP_IDS, LINEAR, SRGB, linear_to_srgb, srgb_to_linear
 from clsplat.models.codec import axes
 from clsplat.models.codec import values as packing
 from clsplat.models.edit import merge
-from clsplat.models.formats.usd_places import Place, find_places
+from clsplat.models.formats.usd_places import UsdPlacement, find_places
 
-TYPE = "ParticleField3DGaussianSplat"
-TYPES = (TYPE, "ParticleField_3DGaussianSplat")
-"""The second is what a draft, and Nuke 17.0, called it."""
-COEFFICIENTS, DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
-MOST_LEVELS = 5000
-"""Braces in a text: under 20,000 levels of prims USD's stack of 8 MiB is enough."""
-WORLD, PRIM = "/World", "/World/Gaussians"
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+"""File name extensions of USD stages."""
+GAUSSIAN_PRIM_TYPE = "ParticleField3DGaussianSplat"
+GAUSSIAN_PRIM_TYPES = (GAUSSIAN_PRIM_TYPE, "ParticleField_3DGaussianSplat")
+"""The second is the name in a draft and in Nuke 17.0."""
+SH_COEFFICIENTS_ATTRIBUTE, SH_DEGREE_ATTRIBUTE = (
+    "radiance:sphericalHarmonicsCoefficients",
+    "radiance:sphericalHarmonicsDegree",
+)
+MAX_TEXT_BRACES = 5000
+"""Most opening braces in a text file that is read without a trial process. USD's stack of 8 MiB suffices for under
+20,000 levels of prims."""
+WORLD_PRIM_PATH, GAUSSIANS_PRIM_PATH = "/World", "/World/Gaussians"
 
 
 def _require_pxr(path: Path) -> None:
@@ -57,14 +65,17 @@ def _require_pxr(path: Path) -> None:
 
 
 def recognises(head: bytes) -> bool:
-    """True if a file begins as text or binary of USD, or as an archive, which a .usdz is."""
+    """True if a file begins as USD text, USD binary, or an archive, such as .usdz."""
     return head.startswith((b"#usda", b"PXR-USDC", b"PK\x03\x04"))
 
 
 def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **arguments: Any) -> None:
-    """Raise InputError where there is no usd-core or no such file, and where a process that makes the `call`
-    (MODULE:FUNCTION, with the path and these arguments) does not live to its end: USD's library follows what a damaged
-    binary file says to anywhere, and so deep into a file that its stack ends."""
+    """Raise InputError if usd-core or the file is missing, or if reading the file crashes a separate process.
+
+    USD's library may follow invalid offsets of a damaged binary file anywhere, or recurse until its stack overflows.
+
+    call: MODULE:FUNCTION to run in that process, with the path and `arguments`.
+    """
     _require_pxr(path)
     with open_input(path, "a USD stage") as file:
         alone, status = _stands_alone(file), os.fstat(file.fileno())
@@ -74,13 +85,13 @@ def survive(path: Path, call: str = "clsplat.models.formats.usd:read_here", **ar
 
 
 def _stands_alone(file: BinaryIO) -> bool:
-    """True if the file is text that refers to no other file, of few levels: USD reads that without harm."""
+    """True if the file is text, refers to no other file and has few levels, so that USD reads it safely."""
     if file.read(5) != b"#usda":
         return False
     levels = 0
     while block := file.read(1 << 20):
         levels += block.count(b"{")
-        if b"@" in block or levels > MOST_LEVELS:
+        if b"@" in block or levels > MAX_TEXT_BRACES:
             return False
     return True
 
@@ -94,11 +105,11 @@ def _lives(call: str, arguments: str, path: str, *_: int) -> bool:
     )
     words = [sys.executable, "-c", code, path, arguments]
     done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-    return done.returncode in (0, 1)  # 1: an error, which this process will find itself
+    return done.returncode in (0, 1)  # 1: an exception, which this process will meet itself
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """The stage's axes and units, which move nothing here."""
+    """The stage's up axis and units; neither changes the model here."""
     survive(path)
     stage = _open(path)
     from pxr import UsdGeom
@@ -109,7 +120,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Raises InputError for what USD's bindings raise for the names and values of a damaged file."""
+    """Turn errors that USD's bindings raise for damaged names and values into InputError."""
     from pxr import Tf
 
     try:
@@ -119,7 +130,7 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
-    """The stage of this name. Raises InputError about the path."""
+    """Open a stage by name. Raises InputError about the path."""
     from pxr import Tf, Usd
 
     with suppress(Tf.ErrorException):
@@ -129,14 +140,14 @@ def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
 
 
 def _open(path: Path) -> Any:
-    """The stage, without payloads, all of whose layers are in the file's folder or below it."""
+    """The stage, without payloads. Raises InputError unless all its layers are in the file's folder or below it."""
     from pxr import Ar, Usd, UsdUtils
 
-    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # takes what USD would print
+    diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # swallows the diagnostics that USD would print
     stage = open_stage(path, os.path.realpath(path), Usd.Stage.LoadNone)
     folder = Path(os.path.realpath(path)).parent
     for layer in stage.GetUsedLayers():
-        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # of a layer in a .usdz, the .usdz
+        file = Ar.SplitPackageRelativePathOuter(layer.realPath)[0]  # for a layer in a .usdz, the .usdz
         if file and not Path(os.path.realpath(file)).is_relative_to(folder):
             raise InputError(f"{path}: refers to {layer.realPath}, expected layers in the same folder or below it")
     del diagnostics
@@ -144,13 +155,13 @@ def _open(path: Path) -> Any:
 
 
 def read(path: Path) -> Gaussians:
-    """Read every prim of Gaussians of a stage, at its first time, as one model. Raises InputError."""
+    """Read all prims of Gaussians of a stage, at its first time, as one model. Raises InputError."""
     survive(path)
     return read_here(path)
 
 
 def read_here(path: Path) -> Gaussians:
-    """`read` of a file that is known not to end the process."""
+    """`read` in this process, for a file that does not crash USD."""
     stage = _open(path)
     from pxr import Usd
 
@@ -172,18 +183,21 @@ def read_here(path: Path) -> Gaussians:
     return merge(parts)
 
 
-def splats_of(path: Path, stage: Any) -> tuple[list[Place], list[str]]:
-    """The prims of Gaussians as they are drawn, those of instances too; and what else is to be drawn (`find_places`).
-    Raises InputError for a stage without any."""
-    places, left = find_places(stage, path, TYPES)
+def splats_of(path: Path, stage: Any) -> tuple[list[UsdPlacement], list[str]]:
+    """Prims of Gaussians as drawn, including instances, and descriptions of prims that are not drawn here
+    (`find_places`).
+
+    Raises InputError for a stage without any Gaussians.
+    """
+    places, left = find_places(stage, path, GAUSSIAN_PRIM_TYPES)
     if not places:
         nothing = f"; not drawn: {examples(left)}" if left else ""
-        raise InputError(f"{path}: has no {TYPE} in it that is drawn, expected at least one{nothing}")
+        raise InputError(f"{path}: has no {GAUSSIAN_PRIM_TYPE} in it that is drawn, expected at least one{nothing}")
     return places, left
 
 
 def recorded_space(path: Path) -> str:
-    """The colour space of a stage's Gaussians. Raises InputError."""
+    """Colour space of a stage's Gaussians. Raises InputError."""
     survive(path)
     stage = _open(path)
     with readable(path):
@@ -191,8 +205,9 @@ def recorded_space(path: Path) -> str:
 
 
 def space_of(path: Path, prims: Sequence[Any]) -> str:
-    """The colour space of the prims with SH, by our names; sRGB where none has any. Raises InputError for several."""
-    spaces: dict[str, Any] = {}
+    """Our name for the colour space of the prims with SH; sRGB if no prim has SH. Raises InputError if there are
+    several."""
+    spaces: dict[str, object] = {}
     for prim in prims:
         if attribute := _coefficients(prim):
             spaces.setdefault(_space(attribute, SRGB), prim.GetPath())
@@ -203,23 +218,23 @@ def space_of(path: Path, prims: Sequence[Any]) -> str:
 
 
 def _coefficients(prim: Any) -> Any:
-    """The attribute of the SH coefficients, None where it has no value."""
-    attributes = (prim.GetAttribute(name) for name in (COEFFICIENTS, f"{COEFFICIENTS}h"))
+    """Attribute of the SH coefficients; None if it has no value."""
+    attributes = (prim.GetAttribute(name) for name in (SH_COEFFICIENTS_ATTRIBUTE, f"{SH_COEFFICIENTS_ATTRIBUTE}h"))
     return next((attribute for attribute in attributes if attribute and attribute.HasValue()), None)
 
 
 def _space(attribute: Any, usual: str) -> str:
-    """The colour space of an attribute by our name: that which it names itself, or the nearest prim around it."""
+    """Our name for an attribute's colour space, which the attribute or the nearest prim above it names."""
     name, prim = str(attribute.GetColorSpace() if attribute.HasColorSpace() else ""), attribute.GetPrim()
     while not name and prim and not prim.IsPseudoRoot():
         given = prim.GetAttribute("colorSpace:name")
         name, prim = str((given.Get() if given else None) or ""), prim.GetParent()
-    ours = {theirs: known for known, theirs in INTEROP.items()}
+    ours = {theirs: known for known, theirs in COLOR_INTEROP_IDS.items()}
     return {**ours, "srgb_rec709_display": SRGB}.get(name, name or usual)
 
 
 def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int | None) -> Float32 | None:
-    """(count, width), from the attribute of floats or that of halves; None where neither has a value."""
+    """Values (count, width) of the float or half attribute; None if neither has a value."""
     for key in (name, f"{name}h"):
         attribute = prim.GetAttribute(key)
         value = attribute.Get(time) if attribute else None
@@ -236,8 +251,11 @@ def _array(where: str, prim: Any, name: str, time: Any, width: int, count: int |
 
 
 def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussians:
-    """The Gaussians of a prim in its own coordinates; space: of colours, to which those of a prim without SH are
-    converted. Raises InputError, which begins with `where`."""
+    """Gaussians of a prim in its own coordinates.
+
+    space: colour space to which displayColor is converted if the prim has no SH.
+    Raises InputError, prefixed with `where`.
+    """
     means = _array(where, prim, "positions", time, 3, None)
     if means is None or not len(means):
         raise InputError(f"{where}: has no positions, expected at least one")
@@ -248,7 +266,7 @@ def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussia
         array = _array(where, prim, name, time, len(default), count)
         return np.tile(np.array(default, np.float32), (count, 1)) if array is None else array
 
-    # what the schema says where an attribute is absent: no rotation, unit scale, opaque
+    # the schema's defaults: no rotation, unit scale, opaque
     quaternions = np.ascontiguousarray(optional("orientations", 0, 0, 0, 1)[:, [3, 0, 1, 2]])
     scales = optional("scales", 1, 1, 1)
     shown = _array(where, prim, "opacities", time, 1, count)
@@ -261,14 +279,14 @@ def gaussians_of(where: str, prim: Any, time: Any, space: str = SRGB) -> Gaussia
 
 
 def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
-    """(count, K, 3)."""
-    degree = prim.GetAttribute(DEGREE).Get() if prim.GetAttribute(DEGREE) else 3
+    """SH coefficients (count, K, 3)."""
+    degree = prim.GetAttribute(SH_DEGREE_ATTRIBUTE).Get() if prim.GetAttribute(SH_DEGREE_ATTRIBUTE) else 3
     if not isinstance(degree, int) or not 0 <= degree <= 16:
-        raise InputError(f"{where}: {DEGREE} is {degree!r}, expected 0 to {MAX_SH_DEGREE}")
+        raise InputError(f"{where}: {SH_DEGREE_ATTRIBUTE} is {degree!r}, expected 0 to {MAX_SH_DEGREE}")
     coefficients = (degree + 1) ** 2
-    sh = _array(where, prim, COEFFICIENTS, time, 3, count * coefficients)
+    sh = _array(where, prim, SH_COEFFICIENTS_ATTRIBUTE, time, 3, count * coefficients)
     if sh is None:
-        raise InputError(f"{where}: lacks {COEFFICIENTS}")
+        raise InputError(f"{where}: lacks {SH_COEFFICIENTS_ATTRIBUTE}")
     sh = sh.reshape(count, coefficients, 3)
     if degree > MAX_SH_DEGREE:
         warn(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out")
@@ -277,8 +295,10 @@ def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
 
 
 def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
-    """(count, 1, 3), of a prim without SH: its displayColor in the space, or grey. Raises InputError for a space that
-    colours are not converted to."""
+    """SH coefficients (count, 1, 3) of a prim without SH: its displayColor in the given space, or grey.
+
+    Raises InputError if the colours cannot be converted to that space.
+    """
     colour = _primvar(where, prim, "primvars:displayColor", time, 3, count)
     if colour is None:
         return np.zeros((count, 1, 3), np.float32)
@@ -286,13 +306,13 @@ def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
     if own != space:
         convert = {(LINEAR, SRGB): linear_to_srgb, (SRGB, LINEAR): srgb_to_linear}.get((own, space))
         if convert is None:
-            raise InputError(f"{where}: has displayColor of {own}, expected {space} as the other Gaussians are of")
+            raise InputError(f"{where}: has displayColor of {own}, expected {space}, as the other Gaussians have")
         colour = convert(colour)
     return np.asarray(packing.coefficients(colour)[:, None], np.float32)
 
 
 def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int) -> Float32 | None:
-    """(count, width): a value for each Gaussian, or one for all of them; None where there is none."""
+    """Values (count, width), one for each Gaussian or one for all; None if there are none."""
     attribute = prim.GetAttribute(name)
     value = attribute.Get(time) if attribute else None
     if value is None or not len(value):
@@ -304,10 +324,10 @@ def _primvar(where: str, prim: Any, name: str, time: Any, width: int, count: int
 
 
 def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_unit: float = 1.0) -> None:
-    """Write a stage with one prim, atomically; .usd in binary.
+    """Write a stage with one prim, atomically; .usd is written as binary.
 
-    up_axis, Y or Z, and meters_per_unit: what the stage says of the model's world, which stays as it is. Raises
-    InputError for values that are not finite, and where usd-core is not installed.
+    up_axis, meters_per_unit: recorded in the stage; the model's coordinates do not change. The up axis is Y or Z.
+    Raises InputError for non-finite values, and if usd-core is not installed.
     """
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
         raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
@@ -336,11 +356,11 @@ def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: flo
 
     UsdGeom.SetStageUpAxis(stage, up_axis)
     UsdGeom.SetStageMetersPerUnit(stage, meters_per_unit)
-    world = UsdGeom.Xform.Define(stage, WORLD)
+    world = UsdGeom.Xform.Define(stage, WORLD_PRIM_PATH)
     stage.SetDefaultPrim(world.GetPrim())
     if gaussians.origin.any():
         world.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*gaussians.origin.tolist()))
-    prim = stage.DefinePrim(PRIM, TYPE)
+    prim = stage.DefinePrim(GAUSSIANS_PRIM_PATH, GAUSSIAN_PRIM_TYPE)
     types = Sdf.ValueTypeNames
     scales = np.exp(np.clip(gaussians.log_scales, -103.0, 88.0))
     unit = packing.unit_quaternions(gaussians.quaternions).astype(np.float32)
@@ -352,12 +372,12 @@ def _author(stage: Any, gaussians: Gaussians, up_axis: str, meters_per_unit: flo
         ("orientations", types.QuatfArray, Vt.QuatfArray, unit[:, [1, 2, 3, 0]]),
         ("scales", types.Float3Array, vectors, scales),
         ("opacities", types.FloatArray, floats, packing.opacities(gaussians.opacity_logits).astype(np.float32)),
-        (COEFFICIENTS, types.Float3Array, vectors, gaussians.sh.reshape(-1, 3)),
+        (SH_COEFFICIENTS_ATTRIBUTE, types.Float3Array, vectors, gaussians.sh.reshape(-1, 3)),
         ("extent", types.Float3Array, vectors, extent.astype(np.float32)),
     ):
         attribute = prim.CreateAttribute(name, kind, custom=False)
         attribute.Set(array.FromNumpy(np.ascontiguousarray(values)))
     uniform = Sdf.VariabilityUniform
-    prim.CreateAttribute(DEGREE, types.Int, False, uniform).Set(gaussians.sh_degree)
+    prim.CreateAttribute(SH_DEGREE_ATTRIBUTE, types.Int, False, uniform).Set(gaussians.sh_degree)
     prim.CreateAttribute("projectionModeHint", types.Token, False, uniform).Set("perspective")
     prim.CreateAttribute("sortingModeHint", types.Token, False, uniform).Set("zDepth")

@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a USD stage draws its Gaussians: each prim in its own place, and once for each instance of a PointInstancer.
+"""Placements of the Gaussians in a USD stage: each prim once, and once for each instance of a PointInstancer.
 
-As USD's own renderers do: what is below an instancer is drawn for its instances alone; a prototype may lie elsewhere,
-and is then drawn there too; an instance has the local transform of its prototype's prim, and of the visibility that of
-the prims from there on, with the instancer's. Instances keep their number, or their id where the instancer has ids.
-Between time samples USD interpolates, or follows the velocities.
+USD's own renderers follow the same rules:
+
+- Prims below an instancer are drawn only as its instances. A prototype outside the instancer is also drawn in its own
+  place.
+- An instance has the local transform of its prototype's prim. It is visible if the instancer and all prims from the
+  prototype down to the Gaussians are visible.
+- Instances keep their number, or their id if the instancer has ids.
+- Between time samples USD interpolates, or follows the velocities.
 """
 
 from __future__ import annotations
@@ -21,36 +25,39 @@ import numpy as np
 from clsplat.arrays import Float64
 from clsplat.errors import InputError
 
-MOST_PLACES = 1_000_000
-"""Prims of Gaussians that a stage may place; more are a slip, or a file that is to fill the memory."""
-_KEPT = 16
-"""Times of which an instancer's places are held."""
-_MOVING = ("positions", "orientations", "orientationsf", "scales")
-_SPEEDS = ("velocities", "angularVelocities")
-_CHOSEN = ("protoIndices", "ids", "invisibleIds")
+MAX_PLACED_PRIMS = 1_000_000
+"""Most prims of Gaussians that a stage may place; more are a mistake or an attempt to exhaust memory."""
+_MAX_CACHED_TIMES = 16
+"""Times for which an instancer's transforms are cached."""
+_TRANSFORM_ATTRIBUTES = ("positions", "orientations", "orientationsf", "scales")
+_VELOCITY_ATTRIBUTES = ("velocities", "angularVelocities")
+_MEMBERSHIP_ATTRIBUTES = ("protoIndices", "ids", "invisibleIds")
 
 Key = tuple[int, int]
-"""Of an instance: its id, or number, and that of its prototype."""
+"""Instance of an instancer: its id or number, and the index of its prototype."""
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """A prim of Gaussians as it is drawn once. name: its path, of an instance INSTANCER[ID] with the path below the
-    prototype; seat: the instance that it is in."""
+class UsdPlacement:
+    """One drawing of a prim of Gaussians.
+
+    name: the prim's path; for an instance INSTANCER[ID] and the path below the prototype.
+    seat: the instance that contains it.
+    """
 
     prim: Any
     name: str
     seat: Seat | None = None
 
     def at(self, code: Any) -> tuple[Float64, bool]:
-        """The matrix (4, 4) from the prim to the world, and whether it is seen, at a time code. Raises InputError."""
+        """Matrix (4, 4) from the prim to the world, and visibility, at a time code. Raises InputError."""
         matrix, shown = _seated(self.prim, self.seat, code)
-        # USD's vectors are rows, so its matrices are the transposes of ours
+        # USD multiplies row vectors: its matrices are transposes of ours
         return np.array(matrix, np.float64).T, shown
 
     @property
     def is_drawn(self) -> bool:
-        """True unless its purpose, or that of an instancer that it is in, is that of a proxy or a guide."""
+        """True unless the purpose of the prim, or of an instancer that contains it, is proxy or guide."""
         seat, drawn = self.seat, _for_render(self.prim)
         while seat is not None and drawn:
             instances = seat.instances
@@ -59,15 +66,17 @@ class Place:
 
     @property
     def moves(self) -> bool:
-        """True if its transform or its visibility may change over time."""
+        """True if its transform or visibility may change over time."""
         if self.seat is None:
             return any(map(_varies, _above(self.prim, None)))
         return self.seat.instances.moves or any(map(_varies, _above(self.prim, self.seat.root)))
 
     @property
     def reach(self) -> tuple[float, float] | None:
-        """The first and the last time at which its transform has a value, or that of what it is in; all times where an
-        instancer has velocities."""
+        """First and last time of the transforms of the prim and its parents; all times if an instancer has velocities.
+
+        None if no transform has a value over time.
+        """
         times = [time for prim in _above(self.prim, self.seat and self.seat.root) for time in _samples_of(prim)]
         seat = self.seat
         while seat is not None:
@@ -78,7 +87,10 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """An instance; root: the prim of its prototype."""
+    """An instance of a prototype.
+
+    root: the prim of the prototype.
+    """
 
     instances: Instances
     key: Key
@@ -86,11 +98,15 @@ class Seat:
 
 
 class Instances:
-    """The instances of a PointInstancer, which may be in an instance itself."""
+    """The instances of a PointInstancer, which may itself be in an instance."""
 
     def __init__(self, prim: Any, name: str, where: str, seat: Seat | None) -> None:
-        """name: its path, or as `Place.name`; where: begins errors. Raises InputError for prototypes that are not
-        there."""
+        """Read the prototypes of an instancer.
+
+        name: its path, or a name as in `UsdPlacement`.
+        where: prefix of errors.
+        Raises InputError for missing prototypes.
+        """
         from pxr import UsdGeom
 
         self.prim, self.name, self.where, self.seat = prim, name, f"{where}: {name}", seat
@@ -107,27 +123,32 @@ class Instances:
 
     @property
     def keys(self) -> list[Key]:
-        """All instances that there are at any time, in the order of their first."""
+        """All instances that exist at any time, in order of first appearance."""
         return list(dict.fromkeys(key for keys in self._there for key in keys))
 
     @property
     def reach(self) -> list[float]:
-        """Times that say where the instances are."""
-        moved = [time for name in _MOVING for time in self._samples(name)]
+        """Times at which the instances have transforms."""
+        moved = [time for name in _TRANSFORM_ATTRIBUTES for time in self._samples(name)]
         own = moved + [time for prim in _above(self.prim, self.seat and self.seat.root) for time in _samples_of(prim)]
-        return [-math.inf, math.inf, *own] if moved and any(map(self._has, _SPEEDS)) else own
+        return [-math.inf, math.inf, *own] if moved and any(map(self._has, _VELOCITY_ATTRIBUTES)) else own
 
     @property
     def moves(self) -> bool:
         """True if an instance may move, appear or vanish."""
-        if any(self._samples(name) for name in (*_MOVING, *_SPEEDS, *_CHOSEN)):
+        if any(
+            self._samples(name) for name in (*_TRANSFORM_ATTRIBUTES, *_VELOCITY_ATTRIBUTES, *_MEMBERSHIP_ATTRIBUTES)
+        ):
             return True
         above = _above(self.prim, self.seat and self.seat.root)
         return any(map(_varies, above)) or (self.seat is not None and self.seat.instances.moves)
 
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
-        """USD's matrix from the prototype's parent to the world, and whether the instance is seen. One that is not
-        there at the time is where it last was, or will be, and is not seen. Raises InputError."""
+        """USD's matrix from the prototype's parent to the world, and visibility of the instance.
+
+        An instance that does not exist at the time has its last matrix, or else its next, and is invisible. Raises
+        InputError.
+        """
         places, hidden = self._at(code)
         if key in places:
             return places[key], key not in hidden
@@ -137,10 +158,10 @@ class Instances:
         return self._at(_code(self._times[there]))[0][key], False
 
     def _at(self, code: Any) -> tuple[dict[Key, Any], frozenset[Key]]:
-        """Matrices of the instances, and those that are hidden."""
+        """Matrices of the instances, and the set of hidden instances."""
         time = code.GetValue()
         if time not in self._known:
-            if len(self._known) >= _KEPT:
+            if len(self._known) >= _MAX_CACHED_TIMES:
                 self._known.clear()
             self._known[time] = self._made(code)
         return self._known[time]
@@ -161,11 +182,10 @@ class Instances:
         return places, frozenset(hidden)
 
     def _own(self, code: Any) -> list[Any]:
-        """USD's matrices of the instances in the instancer, of its positions, orientations and scales; none where USD
-        finds their numbers to differ.
+        """USD's matrices of the instances, relative to the instancer, from its positions, orientations and scales.
 
-        Turns are those of the quaternions as xformOp:orient takes them: ComputeInstanceTransformsAtTime shears by what
-        they are off the length of 1, which halves always are.
+        Empty if USD finds arrays of different lengths. Rotations are computed from the quaternions as xformOp:orient
+        does. ComputeInstanceTransformsAtTime would shear if a length is not exactly 1, and with halves it never is.
         """
         from pxr import Gf, UsdGeom
 
@@ -191,7 +211,7 @@ class Instances:
         return attribute.Get(code) if attribute else None
 
     def _keys(self, time: float) -> dict[Key, None]:
-        """The instances at a time, in their order."""
+        """Instances at a time, in their order."""
         code = _code(time)
         indices = [int(index) for index in self._instancer.GetProtoIndicesAttr().Get(code) or ()]
         if wrong := [index for index in indices if not 0 <= index < len(self.roots)]:
@@ -200,7 +220,7 @@ class Instances:
                 f"{len(self.roots)} prototypes"
             )
         ids = [int(number) for number in self._instancer.GetIdsAttr().Get(code) or ()]
-        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # as USD does, which takes no ids then
+        if len(ids) != len(indices) or len(set(ids)) != len(ids):  # USD ignores ids then too
             ids = list(range(len(indices)))
         return dict.fromkeys(zip(ids, indices, strict=True))
 
@@ -213,23 +233,35 @@ class Instances:
         return bool(attribute and attribute.HasAuthoredValue())
 
     def _first(self) -> float:
-        """The first time that has a value of the instances; 0 where they have values of no time."""
-        return min((time for name in (*_MOVING, *_CHOSEN) for time in self._samples(name)), default=0.0)
+        """First time at which the instances have a value; 0 if their values do not depend on time."""
+        return min(
+            (time for name in (*_TRANSFORM_ATTRIBUTES, *_MEMBERSHIP_ATTRIBUTES) for time in self._samples(name)),
+            default=0.0,
+        )
 
 
 @dataclass
-class _Found:
-    """Findings in a stage. where: begins errors; unused, shapes: prims that are not drawn, with why, by paths."""
+class _StageFindings:
+    """Findings in a stage.
+
+    where: prefix of errors.
+    unused, shapes: prims that are not drawn, by path, each with a description.
+    """
 
     where: str
     kinds: Collection[str]
-    places: list[Place] = field(default_factory=list)
+    places: list[UsdPlacement] = field(default_factory=list)
     unused: dict[str, str] = field(default_factory=dict)
     shapes: dict[str, str] = field(default_factory=dict)
 
     def walk(self, prims: Any, root: Any, seat: Seat | None, name: str, chain: tuple[Any, ...]) -> None:
-        """Take the prims. root: of the prototype that they are of; name: of the instance; chain: paths of the
-        instancers that they are in. Raises InputError."""
+        """Collect the Gaussians among the prims.
+
+        root: prim of their prototype.
+        name: name of the instance.
+        chain: paths of the instancers that contain them.
+        Raises InputError.
+        """
         from pxr import UsdGeom
 
         for prim in prims:
@@ -239,9 +271,11 @@ class _Found:
                 prims.PruneChildren()
                 self._take_instances(Instances(prim, own, self.where, seat), chain)
             elif prim.GetTypeName() in self.kinds:
-                self.places.append(Place(prim, own, seat))
-                if len(self.places) > MOST_PLACES:
-                    raise InputError(f"{self.where}: places over {MOST_PLACES:,} prims of Gaussians, expected less")
+                self.places.append(UsdPlacement(prim, own, seat))
+                if len(self.places) > MAX_PLACED_PRIMS:
+                    raise InputError(
+                        f"{self.where}: places over {MAX_PLACED_PRIMS:,} prims of Gaussians, expected fewer"
+                    )
             elif _is_visible_shape(prim):
                 self.shapes[str(path)] = f"{path} ({prim.GetTypeName()})"
 
@@ -250,7 +284,7 @@ class _Found:
 
         path = instances.prim.GetPath()
         if path in chain:
-            raise InputError(f"{instances.where}: is in a prototype of its own, expected one that it is not in")
+            raise InputError(f"{instances.where}: is inside its own prototype, expected one outside it")
         used, empty = set(), set()
         for number, index in instances.keys:
             root, count = instances.roots[index], len(self.places)
@@ -260,19 +294,22 @@ class _Found:
             prims, seat = iter(Usd.PrimRange(root, _of_prototypes())), Seat(instances, (number, index), root)
             self.walk(prims, root, seat, f"{instances.name}[{number}]", (*chain, path))
             if len(self.places) == count:
-                empty.add(index)  # no Gaussians in it, nor in its other instances
+                empty.add(index)  # no Gaussians here, nor in other instances of the prototype
         for prim in (prim for top in (instances.prim, *instances.roots) for prim in Usd.PrimRange(top, _of_classes())):
             own = prim.GetPath()
             if prim.GetTypeName() in self.kinds and (prim.IsAbstract() or not any(map(own.HasPrefix, used))):
                 self.unused[str(own)] = f"{own} (which no instance of {path} draws)"
 
 
-def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[Place], list[str]]:
-    """All prims of these kinds as they are drawn, in the stage's order; and what else a renderer of all of USD would
-    draw, or could not, with why. Raises InputError, which begins with `where`."""
+def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list[UsdPlacement], list[str]]:
+    """All prims of these types as drawn, in the stage's order, and descriptions of the prims that are not drawn here.
+
+    The descriptions cover prims that a full USD renderer would draw or could not open. Raises InputError, prefixed with
+    `where`.
+    """
     from pxr import Usd
 
-    found = _Found(str(where), kinds)
+    found = _StageFindings(str(where), kinds)
     found.walk(iter(stage.Traverse(Usd.TraverseInstanceProxies())), None, None, "", ())
     drawn = {str(place.prim.GetPath()) for place in found.places}
     unused = [text for path, text in found.unused.items() if path not in drawn]
@@ -280,7 +317,7 @@ def find_places(stage: Any, where: object, kinds: Collection[str]) -> tuple[list
 
 
 def _lost(stage: Any) -> list[str]:
-    """Prims that refer to what cannot be opened, each with the file."""
+    """Prims that refer to files which cannot be opened, each with the file."""
     lines = []
     for error in stage.GetCompositionErrors():
         if type(error).__name__ in ("ErrorInvalidAssetPath", "ErrorInvalidSublayerPath"):
@@ -290,14 +327,14 @@ def _lost(stage: Any) -> list[str]:
 
 
 def _of_prototypes() -> Any:
-    """USD's predicate of what is drawn of a prototype, which need not be defined."""
+    """USD's predicate for the drawn prims of a prototype, which may be undefined."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract)
 
 
 def _of_classes() -> Any:
-    """The predicate with classes, of which nothing is drawn."""
+    """USD's predicate that includes classes, which are never drawn."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
@@ -310,7 +347,7 @@ def _code(time: float) -> Any:
 
 
 def _above(prim: Any, root: Any) -> Iterator[Any]:
-    """The prim and what it is in, up to the root, or all."""
+    """The prim and its ancestors, up to `root` or to the top."""
     while prim and not prim.IsPseudoRoot():
         yield prim
         if root and prim == root:
@@ -319,7 +356,7 @@ def _above(prim: Any, root: Any) -> Iterator[Any]:
 
 
 def _seated(prim: Any, seat: Seat | None, code: Any) -> tuple[Any, bool]:
-    """USD's matrix from the prim to the world, and whether it is seen."""
+    """USD's matrix from the prim to the world, and visibility."""
     from pxr import UsdGeom
 
     cache = UsdGeom.XformCache(code)
@@ -342,7 +379,7 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """The turn of USD's matrix of a scale and a turn that may be sheared a little: the nearest that is none."""
+    """Rotation in USD's matrix of a scale and a slightly sheared rotation: the nearest true rotation."""
     from pxr import Gf
 
     rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]
@@ -365,7 +402,7 @@ def _for_render(prim: Any) -> bool:
 
 
 def _is_visible_shape(prim: Any) -> bool:
-    """True for meshes, curves, points, volumes and other particles that are for renders, and seen."""
+    """True for visible meshes, curves, points, volumes and other particles with a render purpose."""
     from pxr import Usd, UsdGeom
 
     if not (prim.IsA(UsdGeom.Gprim) or str(prim.GetTypeName()).startswith("ParticleField")):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A .zip that holds one model, as a download does: which of its files that is, and unpacking it.
+"""A .zip download that holds one model: finding the model among its files, and unpacking it.
 
-https://pkware.cachefly.net/webdocs/casestudies/APPNOTE.TXT has the format. What Finder and Explorer add (__MACOSX,
-hidden files) does not count; of several files with a model's name those whose beginning says that they have no
-Gaussians do not. A model of several files has them in one folder of the archive, which is unpacked with it.
+Format: https://pkware.cachefly.net/webdocs/casestudies/APPNOTE.TXT. Files added by Finder and Explorer (__MACOSX,
+hidden files) are ignored. If several files have a model's name, those whose beginning shows no Gaussians are ignored
+too. A model of several files has them in one folder of the archive, which is unpacked as a whole.
 """
 
 from __future__ import annotations
@@ -19,33 +19,39 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from clsplat.errors import InputError, examples, plain, warn
-from clsplat.files import open_input, scratch_folder, write_error
+from clsplat.files.atomic import scratch_folder, write_error
+from clsplat.files.documents import open_input
 from clsplat.gaussians import Gaussians
 
-MAX_MEMBERS = 100_000
-FREE_BYTES = 64 << 20
-MOST_RATIO = 100
-"""Bytes that are unpacked at most: these, or so many for each byte of the archive. A PLY all of whose spherical
-harmonics are 0 has some 5; deflate's own limit, and a bomb, 1032."""
-FILE = b"PK\x03\x04"
-"""The first bytes of an archive that has a file."""
-ADDED = "__MACOSX"
-HEAD_BYTES = 16 << 20
-"""Of a file that tell whether it has Gaussians: a whole JSON, and the header of any PLY."""
-ENCRYPTED = 1
-"""Of the flags of a file."""
+MAX_ARCHIVE_FILES = 100_000
+MAX_UNCHECKED_UNPACKED_BYTES = 64 << 20
+MAX_UNPACK_RATIO = 100
+"""Limits of the bytes unpacked: the larger of MAX_UNCHECKED_UNPACKED_BYTES and this many for each byte of the archive.
+
+A PLY whose spherical harmonics are all 0 has a ratio of about 5. The limit of deflate, which a bomb reaches, is 1032.
+"""
+ZIP_FILE_MAGIC = b"PK\x03\x04"
+"""First bytes of an archive that contains a file."""
+MACOS_METADATA_FOLDER = "__MACOSX"
+ZIP_MEMBER_HEAD_BYTES = 16 << 20
+"""Bytes of a file that show if it has Gaussians: a whole JSON, and the header of any PLY."""
+ENCRYPTED_FLAG = 1
+"""Bit in the flags of a file."""
 
 
 def recognises(head: bytes) -> bool:
     """True if a file begins as an archive."""
-    return head.startswith((FILE, b"PK\x05\x06"))  # the second of one without files
+    return head.startswith((ZIP_FILE_MAGIC, b"PK\x05\x06"))  # the second: an archive without files
 
 
 @dataclass(frozen=True)
 class Inside:
-    """The row of the table of formats that is the model's in an archive. is_model_name: True for the name of one;
-    has_gaussians: False for a file of that name whose first bytes have none of what says so; resolve: the model's file
-    and its row, a `Format`."""
+    """Access to the model in an archive, for its row in the table of formats.
+
+    is_model_name: True for a model's file name.
+    has_gaussians: False for such a file if its first bytes show no Gaussians.
+    resolve: the model's file and its row, a `Format`.
+    """
 
     is_model_name: Callable[[Path], bool]
     has_gaussians: Callable[[Path, bytes], bool]
@@ -53,29 +59,30 @@ class Inside:
 
     @contextmanager
     def model(self, path: Path) -> Iterator[tuple[Path, Any]]:
-        """The model's file, which is there for as long, and its row. Raises InputError as `unpacked`."""
+        """Context with the unpacked model's file, removed afterwards, and its row. Raises InputError like
+        `unpacked`."""
         with unpacked(path, self) as model:
             yield self.resolve(model)
 
     def read(self, path: Path) -> Gaussians:
-        """Read the model. Raises InputError as `unpacked`, and as the model's own format."""
+        """Read the model. Raises InputError like `unpacked` and the model's own format."""
         with self.model(path) as (file, row):
             gaussians: Gaussians = row.read(file)
         return gaussians
 
     def describe(self, path: Path) -> dict[str, Any]:
-        """The model's part of `clsplat info`, with its format and what that loses."""
+        """The model's part of `clsplat info`, with its format and the format's losses."""
         with self.model(path) as (file, row):
             return {"format": f"{row.name} in a .zip", "loses": row.loses, **row.describe(file)}
 
     def space(self, path: Path) -> str:
-        """The space of the model's colours."""
+        """Colour space of the model."""
         with self.model(path) as (file, row):
             space: str = row.space(file)
         return space
 
     def names(self, path: Path) -> list[str]:
-        """The names of the files that may be its model; none where there are none, or the archive is damaged."""
+        """Names of the files that may be the model; empty if there are none or the archive is damaged."""
         try:
             with _opened(path) as archive:
                 return [_parts(member)[-1] for member in _models_in(archive, self)]
@@ -85,15 +92,20 @@ class Inside:
 
 @contextmanager
 def unpacked(path: Path, inside: Inside) -> Iterator[Path]:
-    """The model in the archive, as a file that is there for as long; warnings and errors that name that file name the
-    archive and its file in it. Raises InputError: no archive, damaged, encrypted, too large unpacked, no model or
-    several."""
+    """Context with the model unpacked to a file, which is removed afterwards.
+
+    Warnings and errors about that file name the archive and the member. Raises InputError if the archive is damaged,
+    encrypted, too large unpacked, or does not hold exactly one model.
+    """
     with ExitStack() as stack:
         with _opened(path) as archive:
             model = _model_in(path, archive, inside)
             folder = _parts(model)[:-1]
             beside = [member for member in archive.infolist() if _parts(member)[:-1] == folder]
-            total, limit = sum(member.file_size for member in beside), max(FREE_BYTES, MOST_RATIO * path.stat().st_size)
+            total, limit = (
+                sum(member.file_size for member in beside),
+                max(MAX_UNCHECKED_UNPACKED_BYTES, MAX_UNPACK_RATIO * path.stat().st_size),
+            )
             if total > limit:
                 raise InputError(f"{path}: has {total:,} bytes unpacked, expected at most {limit:,}; unpack it first")
             scratch = stack.enter_context(scratch_folder(total))
@@ -104,28 +116,28 @@ def unpacked(path: Path, inside: Inside) -> Iterator[Path]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The archive. Raises InputError for one that is damaged or encrypted, here and where it is read."""
+    """The archive. Raises InputError if it is damaged or encrypted, also while it is read."""
     with open_input(path, "a .zip archive") as file:
         try:
             with zipfile.ZipFile(file) as archive:
-                if len(archive.infolist()) > MAX_MEMBERS:
-                    raise InputError(f"{path}: has more than {MAX_MEMBERS:,} files, expected one model")
+                if len(archive.infolist()) > MAX_ARCHIVE_FILES:
+                    raise InputError(f"{path}: has more than {MAX_ARCHIVE_FILES:,} files, expected one model")
                 yield archive
         except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, ValueError, RuntimeError) as error:
             raise InputError(f"{path}: does not unpack ({plain(str(error))[:120]}); is it damaged?") from None
 
 
 def _parts(member: zipfile.ZipInfo) -> tuple[str, ...]:
-    """The folders and the name of a file in an archive."""
+    """Folders and name of a file in an archive."""
     return PurePosixPath(member.filename.replace("\\", "/")).parts
 
 
 def _models_in(archive: zipfile.ZipFile, inside: Inside) -> list[zipfile.ZipInfo]:
-    """The files with a model's name; of several those that have Gaussians by their beginning, if any do."""
+    """Files with a model's name; if there are several, those whose beginning shows Gaussians, if any."""
     models = []
     for member in archive.infolist():
         parts = _parts(member)
-        added = any(part.startswith(".") or part == ADDED for part in parts)
+        added = any(part.startswith(".") or part == MACOS_METADATA_FOLDER for part in parts)
         if parts and not (added or member.is_dir()) and inside.is_model_name(Path(parts[-1])):
             models.append(member)
     if len(models) < 2:
@@ -134,38 +146,39 @@ def _models_in(archive: zipfile.ZipFile, inside: Inside) -> list[zipfile.ZipInfo
 
 
 def _has_gaussians(archive: zipfile.ZipFile, member: zipfile.ZipInfo, inside: Inside) -> bool:
-    if member.flag_bits & ENCRYPTED:
+    if member.flag_bits & ENCRYPTED_FLAG:
         return True
     with archive.open(member) as file:
-        return inside.has_gaussians(Path(_parts(member)[-1]), file.read(HEAD_BYTES))
+        return inside.has_gaussians(Path(_parts(member)[-1]), file.read(ZIP_MEMBER_HEAD_BYTES))
 
 
 def _model_in(path: Path, archive: zipfile.ZipFile, inside: Inside) -> zipfile.ZipInfo:
-    """The only model. Raises InputError for none, for several, which it names, and for one that is encrypted."""
+    """The only model. Raises InputError if there is none, if there are several, which it names, or if it is
+    encrypted."""
     models = _models_in(archive, inside)
     if len(models) != 1:
         names = f" ({examples(member.filename[:80] for member in models)})" if models else ""
         raise InputError(f"{path}: holds {len(models)} model files{names}, expected one; unpack it first")
-    if models[0].flag_bits & ENCRYPTED:
+    if models[0].flag_bits & ENCRYPTED_FLAG:
         raise InputError(f"{path}: is encrypted, expected a .zip without a password; unpack it first")
     return models[0]
 
 
 def _unpack(archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path) -> None:
-    if member.is_dir() or member.flag_bits & ENCRYPTED:
+    if member.is_dir() or member.flag_bits & ENCRYPTED_FLAG:
         return
     target = folder / _parts(member)[-1]
     with archive.open(member) as source, target.open("wb") as file:
-        while block := source.read(1 << 20):  # no more than the archive says that the file has
+        while block := source.read(1 << 20):  # zipfile stops at the size that the archive states
             try:
                 file.write(block)
-                file.flush()  # here and not at the end, where it would seem that reading failed
+                file.flush()  # a write error at the end would look like a read error
             except OSError as error:
                 raise write_error(target, error) from None
 
 
 def _renamed(model: Path, name: str) -> Iterator[Path]:
-    """Give the model; in warnings and InputErrors of what is done with it, `name` stands for it."""
+    """Yield the model's path; warnings and InputErrors raised meanwhile show `name` instead of it."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Density control: strategies decide which Gaussians are copied, dropped and changed. Policy only, without OpenCL."""
+"""Density control: strategies decide which Gaussians to copy, remove and change. Policy only, without OpenCL."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
-from clsplat.config.exploring import Exploration
-from clsplat.config.marking import MarkRules
+from clsplat.optimisation.density_rules import MarkRules
+from clsplat.optimisation.step_noise import Exploration
 
 
 @dataclass(frozen=True, eq=False)
 class StatisticsNeeds:
-    """Statistics that a strategy goes by.
+    """Statistics that a strategy needs.
 
-    gradients: sums of the gradients on the screen, views and radii; absolute: sums of the gradients' absolute values by
-    pixel (AbsGS); agreement: the number of views with a gradient of at least `threshold`; contributions: shares in the
-    pictures of an epoch.
+    gradients: sums of screen-space gradients, number of views, and radii.
+    absolute: sums of the absolute per-pixel gradients (AbsGS).
+    contributions: shares in the pictures of an epoch.
     """
 
     gradients: bool = False
     absolute: bool = False
-    agreement: bool = False
-    threshold: float = 0.0
     contributions: bool = False
 
 
 class RowList(Protocol):
-    """Rows of a model as they are to become, wherever the list is. halves: how many, at its end, are halves: first
-    those of every Gaussian that is split, then as many of the same."""
+    """Rows of a model after density control, on the device or the host.
+
+    halves: number of halves at the end: first one half of each split Gaussian, then the other halves.
+    """
 
     @property
     def count(self) -> int:
@@ -45,29 +45,31 @@ class RowList(Protocol):
 
 
 class Marker(Protocol):
-    """Comparisons of every Gaussian of a model with rules, where its arrays are."""
+    """Marks the Gaussians of a model by rules, on the device or host of its arrays."""
 
     def scores(self, rules: MarkRules) -> Float32:
-        """Mean gradients (n,) of what may be densified, less than 0 for the rest."""
+        """Mean gradients (n,) of the Gaussians that may be densified; negative for the rest."""
 
-    def rows(self, rules: MarkRules, scores: Float32 | None = None) -> RowList:
-        """List of the rows as they become by the rules: those that stay, clones, first and second halves. scores (n,):
-        in place of those that `scores` has."""
+    def rows(self, rules: MarkRules) -> RowList:
+        """List the rows that the rules produce: kept ones, clones, first and second halves."""
 
 
 class HostCopy(Protocol):
     """An array on the device or the host."""
 
     def get(self) -> NDArray[Any]:
-        """A copy on the host."""
+        """Copy on the host."""
 
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
-    """The model of `count` Gaussians after `step` steps, as a strategy sees it. extent: the scene's, in world units;
-    parameters by group; statistics by the names that they have in a checkpoint; marker: compares them with rules;
-    edges: of so many training views drawn at random, what each Gaussian (n,) adds to the photographs' edges, in
-    pixels."""
+    """A strategy's view of the model, of `count` Gaussians after `step` steps.
+
+    extent: the scene's, in world units.
+    parameters: by group.
+    statistics: by their names in a checkpoint.
+    marker: compares Gaussians with rules.
+    """
 
     count: int
     step: int
@@ -76,29 +78,33 @@ class ModelState:
     statistics: Mapping[str, HostCopy]
     rng: np.random.Generator
     marker: Marker
-    edges: Callable[[int], Float32] | None = None
 
 
 def penalties(opacity: float, scale: float, count: int, extent: float) -> Exploration:
-    """Weights of the sums over the Gaussians in view, by those of the means over all `count`; scales count in parts of
-    the scene's extent (docs/gradients.md, (91))."""
+    """Weights of the sums over the Gaussians in view, from weights of the means over all `count`.
+
+    Scales are relative to the scene's extent (docs/gradients.md, (91)).
+    """
     return Exploration(opacity=opacity / count, scale=scale / (3 * count * extent))
 
 
-HALVED = ("means", "quaternions", "log_scales")
-"""Groups that halves are made by, if no others are told."""
+SPLIT_GROUPS = ("means", "quaternions", "log_scales")
+"""Parameter groups that halves are computed from, by default."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowPlan:
-    """The rows of the model as they are to become.
+    """Planned rows of the model.
 
-    rows (m,) uint32: the row that each is a copy of, None if all stay; fresh (m,) bool: rows whose moments start at
-    zero and whose contributions are not known; listed: in place of both, what the model's marker has listed; values: by
-    parameter group, the indices of rows that change, counted as they are then, and what they become (k, ...); halves:
-    what becomes of a list's halves, by the groups `halved` of what is split; changes: by group, what becomes of
-    all of it; restarted: groups whose moments start at zero in every row. new_statistics: all but contributions start
-    from zero; forget_contributions: of no row they are known.
+    rows: (m,) uint32, the source row of each; None if all stay.
+    fresh: (m,) bool, rows whose moments start at zero and whose contributions are unknown.
+    listed: the list of the model's marker, instead of `rows` and `fresh`.
+    values: by parameter group, indices of the new rows that change, and their values (k, ...).
+    halves: computes the values of a list's halves from the groups `halved` of the split Gaussians.
+    changes: by group, computes new values for all rows.
+    restarted: groups whose moments start at zero in every row.
+    new_statistics: all statistics except contributions start from zero.
+    forget_contributions: contributions become unknown in every row.
     """
 
     rows: NDArray[np.uint32] | None = None
@@ -106,7 +112,7 @@ class RowPlan:
     listed: RowList | None = None
     values: Mapping[str, tuple[NDArray[Any], Float32]] = field(default_factory=dict)
     halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]] | None = None
-    halved: tuple[str, ...] = HALVED
+    halved: tuple[str, ...] = SPLIT_GROUPS
     changes: Mapping[str, Callable[[Float32], Float32]] = field(default_factory=dict)
     restarted: tuple[str, ...] = ()
     new_statistics: bool = False
@@ -114,39 +120,45 @@ class RowPlan:
 
 
 class Strategy:
-    """Density control of one training. A strategy defines `needs`, `is_due` and `before_step`, and of the others what
-    it has a use for."""
+    """Density control of one training. A strategy defines `needs`, `is_due` and `before_step`; the other methods are
+    optional."""
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Statistics that this step, from 1, has to gather; of step 0: that any step has to."""
+        """Statistics that this step has to gather.
+
+        step: from 1; 0 for the statistics that any step needs.
+        """
         raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
-        """True if `before_step` may have a plan after `step` steps: then the model is looked through first."""
+        """True if `before_step` may have a plan after `step` steps. The model is then repaired first."""
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
-        """The plan after `model.step` steps, which is carried out as the next one begins."""
+        """Plan after `model.step` steps, which is carried out when the next step begins."""
         raise NotImplementedError
 
     def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
-        """The plan at the end of step number `model.step`, behind Adam's."""
+        """Plan at the end of step number `model.step`, after Adam's step."""
         return None
 
     def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration | None:  # noqa: ARG002
-        """Penalties and noise of step number `step`, of `count` Gaussians; means_rate, extent: world units."""
+        """Penalties and noise of step number `step`, of `count` Gaussians.
+
+        means_rate, extent: world units.
+        """
         return None
 
     def at_end(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002
-        """The plan for a model whose training is over."""
+        """Plan for a model at the end of its training."""
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:
-        """Row j of the model is now what row rows[j] was, by a plan of this strategy or because others were broken."""
+        """Note that row j of the model is now the old row rows[j]. The cause is this strategy's plan, or a repair."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The strategy's own state by name, for a checkpoint."""
+        """State of the strategy by name, for a checkpoint."""
         return {}
 
     def load(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Take the state that a checkpoint has."""
+        """Load the state from a checkpoint."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The strategy that the settings name."""
+"""Choice of the density control strategy."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from clsplat.config.points import SKY_RADIUS
+from clsplat.config.points import SKY_RADIUS_RATIO
 from clsplat.config.training import TrainConfig
 from clsplat.training.density import Strategy
 from clsplat.training.density.adaptive import Adaptive
@@ -13,10 +13,10 @@ from clsplat.training.density.mcmc import Mcmc
 
 
 def strategy_of(config: TrainConfig) -> Strategy:
-    """A new one, for one training."""
+    """New strategy for one training."""
     if config.density.growth == "mcmc":
         return Mcmc(config)
-    if config.sky:  # else the sky's Gaussians would all be pruned for their size
-        size = config.density.max_world_fraction * SKY_RADIUS
+    if config.sky:  # otherwise all of the sky's Gaussians would be pruned for their size
+        size = config.density.max_world_fraction * SKY_RADIUS_RATIO
         config = replace(config, density=replace(config.density, max_world_fraction=size))
     return Adaptive(config)

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Density control as sampling (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo"): dead
-Gaussians move to live ones, the model grows to a given number, and noise explores. It grows by halving what has the
-largest gradients, which is not as published (docs/decisions/0029-mcmc-grows-by-halves.md). Policy only: no device."""
+"""Density control as sampling: dead Gaussians move to live ones, the model grows to a given number, and noise explores.
+
+Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The model grows by halving the Gaussians
+with the largest gradients, which is not as published (docs/decisions/0029-mcmc-grows-by-halves.md). Policy only: no
+device.
+"""
 
 from __future__ import annotations
 
@@ -14,32 +17,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
-from clsplat.config.exploring import Exploration, step_key
-from clsplat.config.marking import MarkRules
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
-from clsplat.training.density import HALVED, ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
+from clsplat.optimisation.density_rules import MarkRules
+from clsplat.optimisation.step_noise import Exploration, step_key
+from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
 from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 
-MOST = 51
-"""Gaussians that share the place of one, at most."""
-OPAQUE = 1 - 1e-7
-"""Opacity that is counted as no more than this, and from which on a logit has no room left in float32."""
-DRAWN = 1 / 255
-"""Opacity up to which a Gaussian is in no picture."""
-EVERY = MarkRules(gradient=-inf, large=-inf)
-"""Rules by which every Gaussian has its mean gradient for a score."""
+MAX_GAUSSIANS_PER_PLACE = 51
+"""Maximum number of Gaussians that share the place of one."""
+MAX_SHARED_OPACITY = 1 - 1e-7
+"""Upper limit of opacities in computations, where a float32 logit has no precision left."""
+MIN_DRAWN_OPACITY = 1 / 255
+"""Opacity up to which a Gaussian is invisible in every picture."""
+SCORE_ALL_RULES = MarkRules(gradient=-inf, large=-inf)
+"""Rules that score every Gaussian by its mean gradient."""
 
 
 class Mcmc(Strategy):
-    """Relocation and growth each `every` steps, noise and penalties each step, and a model without what is never drawn
-    at the end."""
+    """Relocation and growth every `every` steps, noise and penalties each step, and removal of invisible Gaussians at
+    the end."""
 
     def __init__(self, config: TrainConfig) -> None:
         self.train, self.config = config, config.density
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Gradients as long as the model grows or Gaussians move."""
+        """Gradients while the model grows or Gaussians move."""
         config = self.config
         return StatisticsNeeds(gradients=step < config.stop, absolute=config.absolute_gradients)
 
@@ -48,8 +51,10 @@ class Mcmc(Strategy):
         return is_due(self.config, step)
 
     def before_step(self, model: ModelState) -> RowPlan:
-        """Halve the Gaussians with the largest gradients; second halves take the rows of the dead, then new ones. A
-        Gaussian is dead if nearly transparent, without a rotation, or too large on the screen."""
+        """Halve the Gaussians with the largest gradients. Second halves take the rows of the dead, then new ones.
+
+        A Gaussian is dead if nearly transparent, without a rotation, or too large on the screen.
+        """
         config = self.config
         stored = model.parameters["opacity_logits"].get()
         opacities = 1 / (1 + np.exp(-stored.astype(np.float64)))
@@ -65,13 +70,13 @@ class Mcmc(Strategy):
         more, places = wanted(config, model.step, model.count) - model.count, np.flatnonzero(dead)
         if len(places) + more == 0:
             return RowPlan(new_statistics=True)
-        scores = model.marker.scores(EVERY)
+        scores = model.marker.scores(SCORE_ALL_RULES)
         scores[dead] = 0
         split = strongest(scores, len(places) + more)
         places, left = places[: len(split)], places[len(split) :]
         rows = np.concatenate([np.arange(model.count), split[len(places) :]])
         rows[places] = split[: len(places)]
-        groups = {group: model.parameters[group].get()[rows] for group in (*HALVED, "opacity_logits")}
+        groups = {group: model.parameters[group].get()[rows] for group in (*SPLIT_GROUPS, "opacity_logits")}
         halves = np.concatenate([split, places, np.arange(model.count, len(rows))])
         for group, parts in long_halves({group: whole[split] for group, whole in groups.items()}).items():
             groups[group][halves] = parts
@@ -86,8 +91,11 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Move the dead that are left, as published: to the places of others, drawn by their opacities.
-        `groups` and `rows` become as they are then; the rows that change."""
+        """Move the remaining dead as published: to the places of others, drawn by their opacities.
+
+        groups, rows: updated in place.
+        Returns the rows that change.
+        """
         if len(left) == 0:
             return left
         least, spread = self.config.min_opacity, self.config.spread
@@ -96,7 +104,7 @@ class Mcmc(Strategy):
         opacities[left] = 0
         parents = draw(opacities, len(left), rng)
         own, total = np.unique(parents, return_counts=True)
-        opacities[own], by = shared(opacities[own], np.minimum(total + 1, MOST), least)
+        opacities[own], by = shared(opacities[own], np.minimum(total + 1, MAX_GAUSSIANS_PER_PLACE), least)
         log_scales[own] += by[:, None]
         opacities[left], log_scales[left] = opacities[parents], log_scales[parents]
         rows[left] = rows[parents]
@@ -109,7 +117,7 @@ class Mcmc(Strategy):
         return changed
 
     def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration:
-        """Penalties whatever the step, noise until the cooldown begins; in units in which the scene's extent is 1."""
+        """Penalties at any step, noise until the cooldown; in units in which the scene's extent is 1."""
         config, train = self.config, self.train
         cools = step > train.iterations - train.optimiser.cooldown
         return replace(
@@ -120,9 +128,9 @@ class Mcmc(Strategy):
         )
 
     def at_end(self, model: ModelState) -> RowPlan | None:
-        """Drop what is drawn in no picture."""
+        """Drop Gaussians that are invisible in every picture."""
         logits = model.parameters["opacity_logits"].get().astype(np.float64)
-        drawn = 1 / (1 + np.exp(-logits)) > DRAWN
+        drawn = 1 / (1 + np.exp(-logits)) > MIN_DRAWN_OPACITY
         return None if drawn.all() or not drawn.any() else RowPlan(rows=np.flatnonzero(drawn).astype(np.uint32))
 
 
@@ -132,44 +140,53 @@ def last_growth(config: DensityConfig) -> int:
 
 
 def wanted(config: DensityConfig, step: int, count: int) -> int:
-    """Number of Gaussians after this step's growth, when there are `count` before it: it grows by the same part each
-    time, so that the last growth reaches the cap."""
+    """Number of Gaussians after this step's growth, from `count` before it.
+
+    The number grows by the same factor each time, so that the last growth reaches the cap.
+    """
     left = max(last_growth(config) - step, 0) // config.every + 1
     factor: float = (config.max_gaussians / count) ** (1 / left)
     return max(round(factor * count), count)
 
 
 def strongest(scores: Float32, count: int) -> NDArray[np.int64]:
-    """Indices of the largest scores, in order of the rows: `count` of them, or all that are over 0."""
+    """Indices of the largest scores, in order of the rows: `count` of them, or all positive ones if there are fewer."""
     order = np.argsort(-scores, kind="stable")[:count]
     return np.sort(order[scores[order] > 0])
 
 
 def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Indices (count,) drawn with replacement, each as likely as its weight."""
+    """Indices (count,) drawn with replacement, with probabilities proportional to the weights."""
     sums = np.cumsum(weights)
     found: NDArray[np.int64] = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
-    last = int(np.flatnonzero(weights)[-1])  # a product that was rounded up to the sum is of this one
+    last = int(np.flatnonzero(weights)[-1])  # a product that was rounded up to the sum belongs to this one
     found[found > last] = last
     return found
 
 
 def shared(opacities: Float64, numbers: NDArray[np.int64], least: float) -> tuple[Float64, Float64]:
-    """Opacity of each of `numbers` Gaussians that together look like one of `opacities`, and what is added to its log
-    scales: docs/gradients.md, (94). All (n,)."""
-    whole = np.minimum(opacities, OPAQUE)
-    parts = np.clip(-np.expm1(np.log1p(-whole) / numbers), least, OPAQUE)
-    powers = np.arange(1, MOST + 1)
+    """Opacities of Gaussians that together replace one, and the increments of their log scales: docs/gradients.md,
+    (94).
+
+    opacities: of the replaced ones.
+    numbers: how many replace each.
+    least: lower limit of the new opacities.
+    All arrays are (n,).
+    """
+    whole = np.minimum(opacities, MAX_SHARED_OPACITY)
+    parts = np.clip(-np.expm1(np.log1p(-whole) / numbers), least, MAX_SHARED_OPACITY)
+    powers = np.arange(1, MAX_GAUSSIANS_PER_PLACE + 1)
     terms = parts[:, None] ** powers * _factors()[numbers]
     return parts, np.log(whole / terms.sum(axis=1))
 
 
 @cache
 def _factors() -> Float64:
-    """(-1)^(j - 1) C(N, j) / sqrt(j) at row N and column j - 1, (MOST + 1, MOST)."""
-    rows = np.zeros((MOST + 1, MOST))
+    """(-1)^(j - 1) C(N, j) / sqrt(j) at row N and column j - 1, (MAX_GAUSSIANS_PER_PLACE + 1,
+    MAX_GAUSSIANS_PER_PLACE)."""
+    rows = np.zeros((MAX_GAUSSIANS_PER_PLACE + 1, MAX_GAUSSIANS_PER_PLACE))
     binomials = [1.0]
-    for number in range(1, MOST + 1):
+    for number in range(1, MAX_GAUSSIANS_PER_PLACE + 1):
         inner = [a + b for a, b in pairwise(binomials)]
         binomials = [1.0, *inner, 1.0]
         j = np.arange(1, number + 1)

@@ -13,9 +13,13 @@ import hashlib
 import os
 import sys
 import time
+from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
+from typing import Any, NoReturn
 
 
 def _numbered(text: str, name: str, file: Path) -> tuple[int, bool]:
@@ -28,12 +32,12 @@ def _numbered(text: str, name: str, file: Path) -> tuple[int, bool]:
     return known.index(line) + 1, is_new
 
 
-def _die(words):
+def _die(words: str) -> NoReturn:
     print(f"driver ERROR: {words}", file=sys.stderr, flush=True)
     os.abort()
 
 
-def _end_badly(how):
+def _end_badly(how: str) -> None:
     if how in ("abort", "once"):
         _die("cannot select")
     if how == "hang":
@@ -44,16 +48,16 @@ def _end_badly(how):
         raise MemoryError
 
 
-def _misbehave(cl):
+def _misbehave(cl: Any) -> None:
     how, first, last, file = os.environ["CLSPLAT_STAND_IN"].split(" ", 3)
     real_build, real_kernels = cl.Program.build, cl.Program.all_kernels
-    texts = {}
+    texts: dict[Any, str] = {}
 
-    def is_doomed(text, name):
+    def is_doomed(text: str, name: str) -> bool:
         number, is_new = _numbered(text, name, Path(file))
         return int(first) <= number <= int(last) and (is_new or how != "once")
 
-    def build(self, options=(), *args, **kwargs):
+    def build(self: Any, options: Sequence[str] = (), *args: Any, **kwargs: Any) -> Any:
         if not hasattr(self, "_source"):
             raise cl.Error("this driver takes no binaries")
         text = " ".join(options) + self._source
@@ -67,18 +71,18 @@ def _misbehave(cl):
     class Launched:
         """A kernel whose launch may abort."""
 
-        def __init__(self, kernel, text):
+        def __init__(self, kernel: Any, text: str) -> None:
             self._kernel, self._text = kernel, text
 
-        def __call__(self, *arguments):
+        def __call__(self, *arguments: Any) -> Any:
             if is_doomed(self._text, self._kernel.function_name):
                 _die("cannot generate code")
             return self._kernel(*arguments)
 
-        def __getattr__(self, name):
+        def __getattr__(self, name: str) -> Any:
             return getattr(self._kernel, name)
 
-    def all_kernels(self):
+    def all_kernels(self: Any) -> list[Any]:
         kernels = real_kernels(self)
         return [Launched(kernel, texts[self]) for kernel in kernels] if how == "launch" else kernels
 
@@ -88,18 +92,19 @@ def _misbehave(cl):
 class _Finder(MetaPathFinder):
     """Changes pyopencl when it is imported."""
 
-    def find_spec(self, name, *_):
+    def find_spec(self, name: str, *_: object) -> ModuleSpec | None:
         if name != "pyopencl":
             return None
         sys.meta_path.remove(self)
         spec = find_spec(name)
+        assert spec is not None and spec.loader is not None
         run = spec.loader.exec_module
 
-        def exec_module(module):
+        def exec_module(module: ModuleType) -> None:
             run(module)
             _misbehave(module)
 
-        spec.loader.exec_module = exec_module
+        vars(spec.loader)["exec_module"] = exec_module
         return spec
 
 

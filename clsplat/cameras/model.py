@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The base of a camera model, and the names of lenses that it takes.
+
+Equation numbers refer to docs/cameras.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+from clsplat.arrays import Bool, Float64
+
+
+class Intrinsics(Protocol):
+    """The values of a `Camera` that its model reads."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def fx(self) -> float: ...
+    @property
+    def fy(self) -> float: ...
+    @property
+    def cx(self) -> float: ...
+    @property
+    def cy(self) -> float: ...
+    @property
+    def near(self) -> float: ...
+    @property
+    def far(self) -> float: ...
+    @property
+    def radial(self) -> tuple[float, float, float, float]: ...
+    @property
+    def fold(self) -> tuple[float, float]: ...
+    @property
+    def frustum_limits(self) -> Float64: ...
+
+
+class LensModel(NamedTuple):
+    """A lens of photographs.
+
+    name: COLMAP's, if COLMAP has it.
+    coefficients: number of distortion coefficients that `Camera.radial` takes.
+    with_two: the model with two focal lengths that replaces a model with one, "" for none.
+    with_two_coefficients: number of its coefficients; the model's own are the first.
+    is_colmap: False for a lens of clsplat's own. Its parameters are the width and height of a panorama, otherwise fx,
+        fy, cx and cy.
+    """
+
+    name: str
+    coefficients: int = 0
+    with_two: str = ""
+    with_two_coefficients: int = 0
+    is_colmap: bool = True
+
+
+class PlaneProjection(NamedTuple):
+    """The linearised projection of points (N, 3) on an image plane.
+
+    ratios: (N, 2), as in the Jacobian.
+    unclamped: (N, 2), where the ratios follow the point.
+    jacobian: (N, 2, 3).
+    """
+
+    ratios: Float64
+    unclamped: Bool
+    jacobian: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """A camera model: a row of `clsplat.camera.CAMERA_MODELS`. Its kernels are a header of kernels/shared/camera/.
+
+    projection: its name in `Camera.projection` and in camera files.
+    option: the field of `Camera` that selects it among the models of its projection; "" for the usual one.
+    defines: build defines of its kernels. With RAYS a Gaussian is evaluated along the ray of each pixel.
+    lenses: lenses whose photographs it shows, as they are or undistorted.
+    transforms: values of `camera_model` in a transforms.json.
+    nerfstudio: values of `camera_type` in nerfstudio's camera paths.
+    usd: values of a USD camera's `projection`.
+    gsplat: its name in gsplat, "" for none.
+    ewa: build define of the kernels with gsplat's projection.
+    """
+
+    projection: str
+    option: str = ""
+    defines: Mapping[str, object] = field(default_factory=dict)
+    lenses: tuple[LensModel, ...] = ()
+    transforms: tuple[str, ...] = ()
+    nerfstudio: tuple[str, ...] = ()
+    usd: tuple[str, ...] = ()
+    gsplat: str = ""
+    ewa: str = ""
+
+    flat: ClassVar[bool] = True
+    """True if it has an image plane. Near and far planes and the depths in files then are z, otherwise distances."""
+    is_pinhole: ClassVar[bool] = False
+    """True if the image is linear in x/z and y/z, as in an undistorted photograph."""
+    parallel: ClassVar[bool] = False
+    """True if its rays are parallel: a focal length is pixels per world unit, and there is no angle of view."""
+    wraps: ClassVar[bool] = False
+    """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
+    self_tested: ClassVar[bool] = True
+    """True if the self-test has a picture of it, where Gaussians are evaluated along rays."""
+    without_motion: ClassVar[str] = ""
+    """The reason why it has no channel `motion`, and the alternatives; "" if it has one."""
+    focal_keys: ClassVar[tuple[str, ...]] = ("fov_x", "fov_y")
+    """Properties of a clsplat camera file that give a focal length, other than fx and fy."""
+    whole_angles: ClassVar[tuple[float, float]] = (360.0, 180.0)
+    """For panoramas: degrees across and down of a whole picture."""
+
+    @property
+    def along_rays(self) -> bool:
+        """True if a Gaussian is evaluated along the ray of each pixel; the order of Gaussians is by distance then.
+
+        Otherwise it is an ellipse on the image plane, and the order is by z.
+        """
+        return "RAYS" in self.defines
+
+    @property
+    def named(self) -> str:
+        """The projection with its article, for messages."""
+        return f"{'an' if self.projection[0] in 'aeiou' else 'a'} {self.projection}"
+
+    def focal_length(self, fov: float, size: float) -> float:
+        """Pixels per unit of the projected coordinates if `size` pixels show the angle fov, radians: eq. (7).
+
+        Raises ValueError for an angle that cannot be shown.
+        """
+        if not 0 < fov <= 2 * math.pi * (1 + 1e-12):
+            raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and at most 360")
+        return size / fov
+
+    def wide_focal(self, width: int) -> float:
+        """A focal length for the self-test: `width` pixels show most directions of the model."""
+        return 0.25 * width
+
+    def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:  # noqa: ARG002
+        """The largest angle from the axis that it shows, in radians, and its radius there in focal lengths."""
+        return math.pi, math.pi
+
+    def turn(self, view: Intrinsics) -> float:
+        """Pixels of a whole turn of a panorama; infinite for other models."""
+        return 2 * math.pi * view.fx if self.wraps else math.inf
+
+    def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
+        """Move u (N,) of a panorama by whole turns to within half a turn of the image's middle: eq. (6).
+
+        So a panorama of a whole turn has every u in [0, width), for any cx.
+        """
+        if not self.wraps:
+            return u
+        turn = self.turn(view)
+        low = 0.5 * (view.width - turn)
+        moved: Float64 = low + np.mod(u - low, turn)
+        return np.where(moved >= low + turn, low, moved)  # np.mod of a tiny negative number rounds up to `turn` itself
+
+    def whole(self, width: int, height: int) -> tuple[float, float, float, float]:
+        """For panoramas: fx, fy, cx and cy of a picture that shows all directions once."""
+        raise NotImplementedError(self.projection)
+
+    def is_whole(self, view: Intrinsics) -> bool:  # noqa: ARG002
+        """True if the picture shows all directions once, by longitude and latitude, the axis in the middle."""
+        return False
+
+    def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:
+        """OpenEXR's projection (4, 4) for row vectors, y up, by the display window's size; None without a plane."""
+        raise NotImplementedError(self.projection)
+
+    def rays_of(self, view: Intrinsics, a: Float64, b: Float64) -> tuple[Float64, Float64]:
+        """Origins (N, 3) and unit directions (N, 3) in the camera's axes of pixels, which are a and b (N,) focal
+        lengths from the principal point. NaN for a pixel without a ray."""
+        raise NotImplementedError(self.projection)
+
+    def places_of(self, view: Intrinsics, points: Float64) -> tuple[Float64, Float64, Float64]:
+        """Distances a and b (N,) from the principal point, in focal lengths, and depths (N,), of points (N, 3) in the
+        camera's axes. NaN for a point without a pixel."""
+        raise NotImplementedError(self.projection)
+
+    def shows(self, view: Intrinsics, points: Float64) -> Bool:  # noqa: ARG002
+        """True for points (N, 3) in the camera's axes whose direction may be in a picture, (N,)."""
+        return np.ones(len(points), np.bool_)
+
+    def pixel_widths(self, view: Intrinsics, points: Float64) -> Float64:
+        """A pixel's width (N,) at points (N, 3) in the camera's axes, world units; infinite where they are not seen.
+
+        Eq. (88) of docs/gradients.md.
+        """
+        z, (low, high) = points[:, 2], view.frustum_limits
+        with np.errstate(all="ignore"):
+            ratios = points[:, :2] / points[:, 2:]
+        seen = (z > view.near) & ((ratios > low) & (ratios < high)).all(axis=1)
+        return np.where(seen, z / max(view.fx, view.fy), np.inf)
+
+    # On an image plane, for models without RAYS.
+
+    def divisors(self, z: Float64) -> Float64:
+        """Divisors (N,) of x and y in the image position, by z (N,)."""
+        raise NotImplementedError(self.projection)
+
+    def projected(self, view: Intrinsics, points: Float64) -> PlaneProjection:
+        """The projection of points (N, 3) in the camera's axes."""
+        raise NotImplementedError(self.projection)
+
+    def mean_grad(
+        self, view: Intrinsics, points: Float64, plane: PlaneProjection, d_jacobian: Float64, d_means2d: Float64
+    ) -> Float64:
+        """The gradient (N, 3) by points (N, 3), from those by the Jacobian (N, 2, 3) and the image position (N, 2)."""
+        raise NotImplementedError(self.projection)
+
+    # On the planes that touch the sphere of directions, for models with RAYS.
+
+    def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
+        """Eqs. (9), (10): right, down (N, 3), and a pixel's size on the tangent plane, (N, 2, 2), columns by u and
+        v."""
+        raise NotImplementedError(self.projection)
+
+    def low_pass_grad(self, view: Intrinsics, directions: Float64, gradients: Float64, low_pass: float) -> Float64:
+        """Eqs. (26) to (28), B: the gradient of the low-pass term by a step of the mean's direction, (N, 2).
+
+        The step is along the plane's axes.
+
+        gradients: (N, 2, 2), by the covariance.
+        low_pass: in square pixels.
+        """
+        raise NotImplementedError(self.projection)

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`clsplat render --dry-run`: the plan as text and as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from clsplat.cli.render.job import Job, frames_there
+from clsplat.config.channels import light_and_rest
+from clsplat.config.pictures import DEFAULT_VIDEO_FPS
+from clsplat.device.context import open_device
+from clsplat.errors import amount, examples
+from clsplat.frame.deep import deep_rows
+from clsplat.frame.draw import feature_floats, on_tiles
+from clsplat.frame.samples import finer
+from clsplat.frame.strips import strip_rows
+from clsplat.frame.window import crop
+from clsplat.rendering.memory_needs import plan_frame
+from clsplat.rendering.memory_plan import Plan
+from clsplat.rendering.renderer import held_sh
+from clsplat.sequence import workers
+from clsplat.sequence.task import picture_camera, sampling_of, straight_camera
+from clsplat.shots.frame_numbers import ranges
+from clsplat.stages.deep import DEEP_FLOATS
+from clsplat.stages.holdout import HELD_PIXEL_BYTES
+
+
+@dataclass(frozen=True)
+class DevicePlan:
+    """Memory plan of a device for the frame that needs most memory.
+
+    strips: number of strips that a frame is rendered in.
+    """
+
+    device: str
+    plan: Plan
+    strips: int
+
+
+def dry_run(job: Job, *, as_json: bool) -> int:
+    """Print the plan. Raises DeviceError, and CapacityError if a frame does not fit."""
+    plans = [] if job.on_farm else [_device_plan(job, selector) for selector in job.devices]
+    document = _document(job, plans)
+    print(json.dumps(document, indent=2) if as_json else "\n".join(_lines(job, document, plans)))
+    return 0
+
+
+def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
+    """The plan as data, for --json."""
+    tasks, options = job.tasks, job.options
+    skipped = frames_there(job)
+    writers, waiting = workers.frames_ahead(tasks, options, len(job.devices))
+    model, output = job.spaces
+    frames = []
+    for task in tasks:
+        camera = picture_camera(task, options)
+        frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
+        frame |= {"width": camera.width, "height": camera.height, "skipped": task.key in skipped}
+        if task.holdout is not None:
+            frame["holdout"] = str(task.holdout)
+        if window := camera.window:
+            frame["window"] = [window.x, window.y, window.width, window.height]
+        if task.eye and task.right is None:
+            frame["eye"] = task.eye
+        frames.append(frame)
+    return {
+        "model": str(job.model),
+        "digest": job.digest,
+        "gaussians": job.cast.count,
+        "channels": list(options.channels),
+        "deep_bins": options.deep.bins if options.deep else 0,
+        "model_colorspace": model,
+        "colorspace": output,
+        "samples": max(sampling_of(task, options).pictures for task in tasks),
+        "supersample": options.pictures.framing.supersample,
+        **({"fps": job.video.fps or DEFAULT_VIDEO_FPS} if job.is_video else {}),
+        "frames": frames,
+        "devices": [
+            {
+                "device": device.device,
+                "needed": device.plan.need.total,
+                "allowed": device.plan.allowed,
+                "pieces": any(device.plan.pieces),
+                "strips": device.strips,
+            }
+            for device in plans
+        ],
+        "host_bytes": waiting * max(workers.frame_bytes(task, options) for task in tasks),
+        "writers": writers,
+    }
+
+
+def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> Iterator[str]:
+    """The plan as lines of text."""
+    frames = document["frames"]
+    paths = dict.fromkeys((frames[0]["path"], frames[-1]["path"]))
+    spaces = dict.fromkeys((document["model_colorspace"], document["colorspace"]))
+    deep = f" in {document['deep_bins']} slices by depth" if document["deep_bins"] else ""
+    yield f"model     {document['model']}: {document['gaussians']:,} Gaussians, SHA-256 {document['digest'][:12]}"
+    yield f"frames    {len(frames)}: {ranges(sorted({frame['frame'] for frame in frames}))}; {examples(_sizes(frames))}"
+    yield f"files     {' to '.join(paths)}"
+    if job.is_video:
+        from clsplat.images.video import rate_of
+
+        yield f"video     {rate_of(document['fps'])} frames a second"
+    yield f"channels  {', '.join(document['channels'])}{deep}"
+    yield f"colour    {' to '.join(spaces)}"
+    if (held := job.tasks[0].holdout) is not None:
+        yield f"holdout   {' to '.join(dict.fromkeys((str(held), str(job.tasks[-1].holdout))))}"
+    if samples := _samples(job):
+        yield f"samples   {samples}"
+    for device in plans:
+        strips = f"; {device.strips} strips a frame" if device.strips > 1 else ""
+        yield f"device    {device.device}: {device.plan}{strips}"
+    yield f"host      about {amount(document['host_bytes'])} for frames that wait to be written"
+    if job.skip_existing:
+        skipped = [frame["frame"] for frame in frames if frame["skipped"]]
+        yield f"skipped   {len(skipped)}" + (f": {ranges(sorted(set(skipped)))}" if skipped else "")
+
+
+def _device_plan(job: Job, selector: str | None) -> DevicePlan:
+    """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
+    device, options = open_device(selector, job.memory_limit), job.options
+    framing, names = options.pictures.framing, set(options.channels)
+    gaussians = job.cast.at(job.tasks[0].number)
+    floats, moved = held_sh(gaussians, job.rasterizer).floats, job.cast.tracks is not None and "motion" in names
+    features, samples = feature_floats(names), max(sampling_of(task, options).pictures for task in job.tasks)
+    plans = []
+    cameras = [straight_camera(task, options) for task in job.tasks]
+    for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
+        if options.deep:
+            bins, planes = options.deep.bins, 4 * DEEP_FLOATS * options.deep.bins
+            rows = deep_rows(device, camera, bins, samples)
+        else:
+            planes = HELD_PIXEL_BYTES if options.holdout is not None else 0
+            rows = strip_rows(device, camera, options.channels, framing, planes)
+        strip = crop(camera, 0, 0, camera.width, rows) if rows < camera.height else camera
+        drawn = [(strip, features)]
+        if framing.supersample > 1 and light_and_rest(names)[0]:
+            drawn.append((finer(strip, framing), feature_floats(light_and_rest(names)[0])))
+        for part, floats_beside in drawn:
+            sizes = (on_tiles(part)[0], job.rasterizer, floats_beside, planes)
+            plan = plan_frame(device, len(gaussians), floats, *sizes, moved)
+            plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
+    return max(plans, key=lambda device: device.plan.need.total)
+
+
+def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
+    """Distinct sizes of the pictures, and the frames that contain them."""
+    sizes = {(frame["width"], frame["height"], tuple(frame.get("window", ()))) for frame in frames}
+    texts = []
+    for width, height, window in sorted(sizes):
+        place = " at {},{} of {}x{}".format(*window) if window else ""
+        texts.append(f"{width}x{height}{place}")
+    return texts
+
+
+def _samples(job: Job) -> str:
+    sampling, framing = sampling_of(job.tasks[0], job.options), job.options.pictures.framing
+    words = [f"{sampling.samples} frames for one" if sampling.on else ""]
+    if sampling.moves:
+        opens, closes = sampling.shutter
+        words.append(f"shutter from {opens:g} to {closes:g} frames")
+    words.append(f"lens in focus at {sampling.focus:g}" if sampling.has_lens else "")
+    words.append(
+        f"{framing.supersample}x{framing.supersample} a pixel, {framing.filter}" if framing.supersample > 1 else ""
+    )
+    return ", ".join(word for word in words if word)

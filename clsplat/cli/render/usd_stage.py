@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings that a job takes from a USD stage, unless a flag of `clsplat render` overrides them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import ceil
+
+from clsplat.camera import Camera
+from clsplat.config.pictures import FramingConfig
+from clsplat.errors import InputError
+from clsplat.sequence.task import RenderOptions, Task
+from clsplat.shots import Shot
+from clsplat.shots.readers.usd_settings import FULL_DATA_WINDOW, window_named
+
+_STAGE_FLOAT32_TOLERANCE = 1e-6
+"""Tolerance for equal fractions of a frame: a stage stores them in float32."""
+_PIXEL_CENTRE_TOLERANCE_PX = 1e-3
+"""Tolerance in pixels for an edge on a pixel's centre: the float32 precision in a picture 16384 pixels wide."""
+
+
+def with_stage(
+    options: RenderOptions, source: object, shot: Shot, tasks: Sequence[Task]
+) -> tuple[RenderOptions, tuple[str, ...]]:
+    """Options with the stage's data window and the first frame's shutter and lens, and the stage settings not applied.
+
+    Raises InputError for a data window without a pixel.
+    """
+    pictures, unapplied = options.pictures, (*_lens_unapplied(options, tasks), *_shape_unsaid(tasks[0]))
+    if (
+        pictures.framing.region == ""
+        and pictures.framing.overscan == "0"
+        and shot.window not in (None, FULL_DATA_WINDOW)
+    ):
+        assert shot.window is not None
+        framing = _framing(pictures.framing, source, shot.window, tasks[0].camera)
+        if framing is None:
+            unapplied += window_named(shot.window)
+        else:
+            pictures = replace(pictures, framing=framing)
+    return replace(options, pictures=replace(pictures, sampling=tasks[0].sampling or pictures.sampling)), unapplied
+
+
+def _shape_unsaid(task: Task) -> tuple[str, ...]:
+    """Report a stage's pixel aspect ratio if the file format cannot store it and shows square pixels."""
+    shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
+    if task.optics is None or kind == ".exr" or abs(shape - 1) < _STAGE_FLOAT32_TOLERANCE:
+        return ()
+    return (f"pixelAspectRatio ({shape:g}) in {kind} files, which show square pixels",)
+
+
+def _framing(
+    framing: FramingConfig, source: object, window: tuple[float, float, float, float], camera: Camera
+) -> FramingConfig | None:
+    """The framing with a data window as region or as overscan of the camera's frame. It contains the pixels whose
+    centres it covers.
+
+    None if the window extends beyond the frame but is no overscan.
+    """
+    left, bottom, right, top = window
+    width, height = camera.width, camera.height
+    if min(left, bottom, 1 - right, 1 - top) >= -_STAGE_FLOAT32_TOLERANCE:
+        edges = (left * width, (1 - top) * height, right * width, (1 - bottom) * height)
+        x, y, end_x, end_y = (max(ceil(edge - 0.5 - _PIXEL_CENTRE_TOLERANCE_PX), 0) for edge in edges)
+        if x >= end_x or y >= end_y:
+            raise InputError(
+                f"{source}: {window_named(window)[0]} holds no pixel of {width}x{height}, expected one; or give "
+                "--region"
+            )
+        return replace(framing, region=f"{x},{y},{end_x - x},{end_y - y}")
+    shares = (-left, -bottom, right - 1, top - 1)
+    if max(shares) - min(shares) < _STAGE_FLOAT32_TOLERANCE and max(shares) <= 1:
+        return replace(framing, overscan=f"{100 * shares[0]:.5g}%")
+    return None
+
+
+def _lens_unapplied(options: RenderOptions, tasks: Sequence[Task]) -> tuple[str, ...]:
+    """Report the stage's lens if no flag overrides it and no picture shows it.
+
+    The lens lacks a focus distance then, or the camera is orthographic.
+    """
+    flags = options.pictures.sampling
+    if flags.aperture is not None or flags.f_stop is not None:
+        return ()
+    for task in tasks:
+        if task.optics and task.optics.f_stop and not (task.sampling and task.sampling.has_lens):
+            return tuple(replace(task.optics, shutter=(0.0, 0.0)).named())
+    return ()

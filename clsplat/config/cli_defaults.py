@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Defaults shared by several verbs, or by a verb and the package."""
+
+from __future__ import annotations
+
+TEST_EVERY = 8
+VIEWER_HOST, VIEWER_PORT = "127.0.0.1", 8080
+"""Address and port of the viewer's server."""
+DEMO_ITERATIONS = 2000
+"""Steps of `clsplat demo`, about a minute on two cores."""

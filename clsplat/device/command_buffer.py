@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tapes: recorded command buffers, which put work on a device's queue again without the Python code that made it.
+
+CLSPLAT_TAPES=0 disables replay. CLSPLAT_TAPES=check launches everything as usual, and compares it with the tape if
+there is one: an argument that differs and was not declared as `LaunchParameter` is an error.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+
+from clsplat.device.profile import Calls
+from clsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from clsplat.device.program import Kernel
+
+TAPES_VARIABLE = "CLSPLAT_TAPES"
+CHECK_TAPES = "check"
+
+
+class LaunchParameter(float):
+    """A float argument of a launch that each replay sets again."""
+
+
+class AnewWord(int):
+    """An unsigned 32-bit argument of a launch that each replay sets again."""
+
+
+def asked() -> str:
+    """The use of tapes: 1, 0 or CHECK_TAPES. Raises InputError."""
+    value = os.environ.get(TAPES_VARIABLE) or "1"
+    if value not in ("0", "1", CHECK_TAPES):
+        raise InputError(f"{TAPES_VARIABLE}={value}: expected 1, 0 or {CHECK_TAPES}")
+    return value
+
+
+def typed(value: Any) -> Any:
+    """A kernel argument with an explicit type: whole numbers become uint32, other numbers float32."""
+    if isinstance(value, int):
+        return np.uint32(value)
+    return np.float32(value) if isinstance(value, float) else value
+
+
+def described(value: Any) -> object:
+    """A comparable form of an argument: equal for two arguments that give the kernel the same value."""
+    value = typed(value)
+    if isinstance(value, cl.MemoryObjectHolder):
+        return value.int_ptr
+    return value.size if isinstance(value, cl.LocalMemory) else (value.dtype.str, value.tobytes())
+
+
+class CommandBuffer:
+    """Launches, fills and copies to the host, in order.
+
+    entries: functions that put them on the queue, each with its kernel if it is a launch.
+    calls: the number of calls of each kind.
+    anew: a setter and an argument index for each argument that a replay sets again.
+    reads: the entries that copy to the host.
+
+    Each launch has its own kernel object, whose other arguments stay set. The object is left to other tapes afterwards,
+    because pyopencl takes at least 0.2 ms to make one. A tape keeps no buffer alive: its owner must drop it before a
+    buffer may be freed.
+    """
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[Kernel | None, Callable[[], Any]]] = []
+        self.calls = Calls()
+        self.anew: list[tuple[Callable[[int, Any], None], int]] = []
+        self.reads: list[Callable[[], Any]] = []
+        self._owned: list[tuple[Kernel, cl.Kernel]] = []
+        self._described: list[tuple[object, ...]] = []
+        self._numbers: list[float] = []
+
+    def __del__(self) -> None:
+        for kernel, own in self._owned:
+            kernel.spare.append(own)
+
+    def add_fill(self, fill: Callable[[], Any], *description: object) -> None:
+        """Append a fill."""
+        self.entries.append((None, fill))
+        self._described.append(("a fill", *description))
+
+    def add_read(self, read: Callable[[], Any], *description: object) -> None:
+        """Append a copy to the host."""
+        self.entries.append((None, read))
+        self.reads.append(read)
+        self._described.append(("a copy to the host", *description))
+
+    def add_launch(
+        self,
+        queue: cl.CommandQueue,
+        kernel: Kernel,
+        size: tuple[int, ...],
+        local: tuple[int, ...] | None,
+        values: Sequence[Any],
+    ) -> None:
+        """Append a launch that has just been made."""
+        own = kernel.spare.pop() if kernel.spare else cl.Kernel(kernel.program, kernel.name)
+        self._owned.append((kernel, own))
+        description = []
+        for index, value in enumerate(values):
+            own.set_arg(index, typed(value))
+            if given := isinstance(value, (LaunchParameter, AnewWord)):
+                set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # takes a tenth of the time: no type check
+                self.anew.append((set_bytes, index))
+                self._numbers.append(value)
+            description.append(None if given else described(value))
+        self.entries.append((kernel, partial(cl.enqueue_nd_range_kernel, queue, own, size, local)))
+        self._described.append((kernel.name, kernel.variant, size, local, *description))
+
+    def set(self, numbers: Iterable[float]) -> None:
+        """Set the arguments that each replay sets again."""
+        for (set_bytes, index), number in zip(self.anew, numbers, strict=True):
+            set_bytes(index, typed(number))
+
+    def check(self, fresh: CommandBuffer, numbers: Sequence[float]) -> None:
+        """Raise AssertionError if a replay with these numbers would put anything different from `fresh` on the
+        queue."""
+        assert len(self._described) == len(fresh._described), "a tape is longer or shorter than what was made now"
+        for one, other in zip(self._described, fresh._described, strict=True):
+            assert len(one) == len(other), f"{one[0]} on a tape has another number of arguments than now"
+            differing = [place for place, pair in enumerate(zip(one, other, strict=True)) if pair[0] != pair[1]]
+            assert not differing, f"{one[0]} on a tape has other arguments than now: {[p - 4 for p in differing]}"
+        given, made = ([described(number) for number in each] for each in (numbers, fresh._numbers))
+        assert given == made, f"numbers given to a tape are {list(numbers)}, launched {fresh._numbers}"
+
+    def is_all_of(self, calls: Calls) -> bool:
+        """Store the counts of calls since the recording began.
+
+        Returns False if some of them are not on the tape: a write, or a call for which the host waited.
+        """
+        self.calls = calls
+        return len(self.entries) == calls.launches + calls.fills + calls.reads == calls.total

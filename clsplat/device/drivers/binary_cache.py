@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cache of built programs, for a driver that has no cache of its own and builds everything again in each process.
+
+A file begins with a digest of its contents, as a driver may crash on a truncated binary. Its name is a digest of
+everything the binary depends on: the text, the options, the driver and its settings, and the processor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyopencl as cl
+
+from clsplat.device.drivers.cpu_name import features
+from clsplat.device.drivers.driver_records import cache_folder
+from clsplat.device.drivers.quirks import TARGET_VARIABLE_PREFIX, wants_cache
+from clsplat.files.atomic import atomic_write
+
+MAX_BINARY_CACHE_BYTES = 256 << 20
+"""Limit of all files together; the oldest are removed. A binary takes 30 to 500 KB, all tests together 90 MB."""
+
+BINARIES_VARIABLE = "CLSPLAT_BINARIES"
+"""Environment variable that names another folder for the cache."""
+
+
+def folder() -> Path:
+    """The folder of the cached binaries."""
+    return Path(os.environ.get(BINARIES_VARIABLE, "").strip() or cache_folder() / "binaries")
+
+
+def _path(device: cl.Device, digest: str) -> Path:
+    settings = sorted(
+        f"{name}={value}" for name, value in os.environ.items() if name.startswith(TARGET_VARIABLE_PREFIX)
+    )
+    driver = (device.name, device.platform.version, device.driver_version)
+    # a processor's name is not enough: several machines may share a home
+    processor = " ".join((platform.machine(), platform.processor(), *sorted(features())))
+    key = "\0".join((digest, *driver, processor, *settings))
+    return folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.bin"
+
+
+def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[str]) -> cl.Program | None:
+    """The saved program for a variant's digest; None if there is none, or it cannot be used any more."""
+    if not wants_cache(device):
+        return None
+    path = _path(device, digest)
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    binary = content[32:]
+    if hashlib.sha256(binary).digest() != content[:32]:
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # so that the least recently used files are removed first
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            program = cl.Program(context, [device], [binary]).build(options=list(options))
+            return program if program.num_kernels else None
+    except cl.Error:
+        return None
+
+
+def save(device: cl.Device, digest: str, program: cl.Program) -> None:
+    """Save a program that has kernels. An unwritable folder is no error: the next process builds again."""
+    if not wants_cache(device):
+        return
+    try:
+        binary = program.get_info(cl.program_info.BINARIES)[0]
+        path = _path(device, digest)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(path, hashlib.sha256(binary).digest() + binary)
+        _make_room(path.parent)
+    except (OSError, cl.Error):
+        return
+
+
+def _make_room(place: Path) -> None:
+    """Remove the oldest files beyond MAX_BINARY_CACHE_BYTES."""
+    files = []
+    for entry in os.scandir(place):
+        if not re.fullmatch(r"[0-9a-f]{32}\.bin", entry.name):  # CLSPLAT_BINARIES may name a folder of other files
+            continue
+        with contextlib.suppress(OSError):  # another process may remove files too
+            status = entry.stat()
+            files.append((status.st_mtime, status.st_size, entry.path))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
+        if total <= MAX_BINARY_CACHE_BYTES:
+            return
+        with contextlib.suppress(OSError):
+            Path(path).unlink()
+        total -= size

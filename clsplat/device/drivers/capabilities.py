@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Traits of a device that select an algorithm, and CLSPLAT_PRETEND, which overrides them.
+
+It tests the code paths of a GPU, a small device and a plain compiler on machines that have none.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from clsplat.device.drivers.quirks import kind_of
+from clsplat.errors import DeviceError
+
+if TYPE_CHECKING:
+    import pyopencl as cl
+
+PRETEND_VARIABLE = "CLSPLAT_PRETEND"
+"""Environment variable with the traits to pretend for every device, separated by commas."""
+
+
+@dataclass(frozen=True)
+class Traits:
+    """The kind, limits and arithmetic of a device.
+
+    kind: cpu, gpu or other.
+    group: the most work-items of a group.
+    local_memory, allocation: the most bytes of a group's local memory and of a buffer.
+    exact_division: the device supports correctly rounded division and square roots.
+    contraction: the device may be probed for fused multiply-adds.
+    """
+
+    kind: str
+    group: int
+    local_memory: int
+    allocation: int
+    exact_division: bool = True
+    contraction: bool = True
+
+
+_TRAITS_BY_WORD: dict[str, dict[str, Any]] = {
+    "gpu": {"kind": "gpu"},
+    "no-exact-division": {"exact_division": False},
+    "no-contraction": {"contraction": False},
+}
+"""Traits by the word that pretends them."""
+_LIMIT_FIELDS = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
+"""Limits by the name that pretends a lower one."""
+
+
+def pretended() -> str:
+    """The value of CLSPLAT_PRETEND, or an empty string."""
+    return os.environ.get(PRETEND_VARIABLE, "")
+
+
+def traits_of(device: cl.Device) -> Traits:
+    """The traits of a device, with the changes of CLSPLAT_PRETEND. Raises DeviceError if that is invalid."""
+    from pyopencl import device_fp_config
+
+    exact = bool(device.single_fp_config & device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)
+    group, local, allocation = (
+        int(limit) for limit in (device.max_work_group_size, device.local_mem_size, device.max_mem_alloc_size)
+    )
+    traits = Traits(kind_of(device), group, local, allocation, exact_division=exact)
+    for part in filter(None, pretended().split(",")):
+        name, _, number = part.strip().partition("=")
+        if name in _TRAITS_BY_WORD and not number:
+            traits = replace(traits, **_TRAITS_BY_WORD[name])
+        elif name in _LIMIT_FIELDS and number.isascii() and number.isdigit() and int(number) > 0:
+            limit = _LIMIT_FIELDS[name]
+            traits = replace(traits, **{limit: min(getattr(traits, limit), int(number))})
+        else:
+            raise DeviceError(
+                f"{PRETEND_VARIABLE}={pretended()}: {part.strip()!r} is none of {', '.join(_TRAITS_BY_WORD)}, "
+                f"{', '.join(f'{size}=NUMBER' for size in _LIMIT_FIELDS)}"
+            )
+    return traits

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Findings about an installation: the machine's GPUs, driver files and devices, and advice if one is missing.
+
+Each check runs in its own process, as loading a driver may crash it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from clsplat.device.drivers.quirks import GPU_MAKERS_BY_PCI_VENDOR, driver_advice, driver_files, gpu_advice, of_maker
+from clsplat.device.drivers.worker_process import patience, python_module
+
+_PCI_DISPLAY_CLASS = "0x03"
+"""Beginning of a display controller's class code on the PCI bus."""
+_LOAD_LIBRARY_CODE = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"
+
+
+def _last_line(result: subprocess.CompletedProcess[str]) -> str:
+    """The reason why a process failed: the last line of its errors, or its exit status."""
+    line = (result.stderr.strip().splitlines() or [f"status {result.returncode}"])[-1]
+    return line.removeprefix("OSError: ").removeprefix("clsplat: error: ")
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """A line about a part of the installation.
+
+    state: ok, note (no action needed) or missing.
+    advice: an action to take, or empty.
+    """
+
+    part: str
+    state: Literal["ok", "note", "missing"]
+    text: str
+    advice: str = ""
+
+
+def families() -> list[str]:
+    """This Linux distribution and the ones it is like, as named in os-release; empty on other systems."""
+    if platform.system() != "Linux":
+        return []
+    try:
+        release = platform.freedesktop_os_release()
+    except OSError:
+        return ["unknown"]
+    return [release.get("ID", "unknown"), *release.get("ID_LIKE", "").split()]
+
+
+def gpus(bus: Path = Path("/sys/bus/pci/devices")) -> list[str]:
+    """The makers of this machine's GPUs, each once; empty if the system does not list its PCI bus as Linux does."""
+    makers = []
+    for folder in sorted(bus.glob("*")):
+        try:
+            kind, number = ((folder / name).read_text(encoding="utf-8").strip() for name in ("class", "vendor"))
+        except OSError:
+            continue
+        if kind.startswith(_PCI_DISPLAY_CLASS) and (maker := GPU_MAKERS_BY_PCI_VENDOR.get(int(number, 16))):
+            makers.append(maker)
+    return list(dict.fromkeys(makers))
+
+
+def driver_findings(files: Iterable[Path]) -> list[Diagnostic]:
+    """A line for each .icd file: whether its library can be loaded."""
+    return [_driver(path) for path in files]
+
+
+def _driver(path: Path) -> Diagnostic:
+    try:
+        library = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        return Diagnostic("driver", "note", f"{path}: cannot be read ({error})")
+    name = str(path.parent / library) if (path.parent / library).is_file() else library
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", _LOAD_LIBRARY_CODE, name],
+            capture_output=True,
+            text=True,
+            timeout=patience(),
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return Diagnostic("driver", "note", f"{path}: {library} does not come back from being loaded", f"remove {path}")
+    if result.returncode == 0:
+        return Diagnostic("driver", "ok", f"{path}: {library}")
+    text = f"{path}: {library} cannot be loaded: {_last_line(result)}"
+    return Diagnostic("driver", "note", text, f"install it again, or remove {path}")
+
+
+def listed_devices() -> tuple[list[dict[str, Any]], str]:
+    """The devices that `clsplat devices --json` lists, and the reason if it failed, or an empty string."""
+    command = [*python_module("clsplat", "devices", "--json")]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=patience(), check=False)
+    except subprocess.TimeoutExpired:
+        return [], f"a driver does not come back within {patience():g} s"
+    if result.returncode == 0:
+        return json.loads(result.stdout[result.stdout.index("[") :]), ""
+    if result.returncode < 0:
+        return [], f"a driver took the process down (signal {-result.returncode})"
+    return [], _last_line(result)
+
+
+def device_findings(devices: Sequence[dict[str, Any]], trouble: str) -> list[Diagnostic]:
+    """A line for each device, or one line if there is none."""
+    if trouble or not devices:
+        return [Diagnostic("device", "missing", trouble or "no OpenCL device found", driver_advice())]
+    return [
+        Diagnostic("device", "ok", f"{info['index']}: {info['name']}, {info['version'].split('  ')[0]}")
+        for info in devices
+    ]
+
+
+def gpu_findings(makers: Sequence[str], devices: Sequence[dict[str, Any]]) -> list[Diagnostic]:
+    """A line for each GPU maker in this machine: whether OpenCL shows a GPU of that maker."""
+    findings = []
+    for maker in makers:
+        shown = any(info["kind"] == "gpu" and of_maker(info["platform"], info["name"], maker) for info in devices)
+        advice = "" if shown else gpu_advice(maker, families())
+        text = "shown by OpenCL" if shown else "in this machine, and no OpenCL driver shows it"
+        findings.append(Diagnostic("GPU", "ok" if shown else "note", f"{maker}: {text}", advice))
+    return findings
+
+
+def access_findings(nodes: Sequence[Path] | None = None) -> list[Diagnostic]:
+    """On Linux, a line for each GPU device node that this user may not open."""
+    if nodes is None:
+        nodes = [*Path("/dev/dri").glob("renderD*"), *(path for path in (Path("/dev/kfd"),) if path.exists())]
+    closed = [node for node in nodes if not os.access(node, os.R_OK | os.W_OK)]
+    advice = "add the user to the group render, and log in again"
+    return [Diagnostic("GPU", "note", f"{node}: may not be opened by this user", advice) for node in closed]
+
+
+def loader_finding() -> Diagnostic:
+    """A line about pyopencl, which includes the driver loader: whether it can be imported."""
+    code = "import pyopencl; print(pyopencl.VERSION_TEXT)"
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=patience(), check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Diagnostic("loader", "missing", f"pyopencl does not come back from its import within {patience():g} s")
+    if result.returncode == 0:
+        return Diagnostic("loader", "ok", f"pyopencl {result.stdout.strip()}")
+    text = f"pyopencl cannot be imported: {_last_line(result)}"
+    return Diagnostic("loader", "missing", text, "pip install --force-reinstall pyopencl")
+
+
+def findings() -> list[Diagnostic]:
+    """All findings."""
+    loader = loader_finding()
+    devices, trouble = listed_devices() if loader.state == "ok" else ([], "pyopencl is needed to find one")
+    return [
+        loader,
+        *driver_findings(driver_files()),
+        *device_findings(devices, trouble),
+        *gpu_findings(gpus(), devices),
+        *access_findings(),
+    ]

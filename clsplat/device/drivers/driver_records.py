@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Driver records in the user's cache: per driver and kernel shape, the tests and kernels that passed or failed.
+
+A record applies to one device, driver and set of kernels, so a new version of any of them is tested again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import warnings
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import pyopencl as cl
+
+from clsplat.device.drivers.capabilities import pretended
+from clsplat.device.source import kernel_root, kernel_source
+from clsplat.errors import reason_of
+from clsplat.files.atomic import atomic_write
+from clsplat.files.documents import parse_json
+from clsplat.files.locks import locked
+from clsplat.version import package_version
+
+BREAK_KERNEL_VARIABLE = "CLSPLAT_BREAK_KERNEL"
+"""Environment variable for the tests of `clsplat selftest` only. STEM: WORDS => WORDS replaces words in one kernel's
+text, to simulate a driver that miscompiles an operation."""
+MAX_DRIVER_RECORDS = 16
+"""The number of latest drivers and versions that are kept; each takes a few KiB."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The record of one driver in one shape.
+
+    stages: self-test stages that passed.
+    kernels: builds and launches that succeeded, named as in `sandbox`, with the salt that the kernel text needs.
+    failed: how the driver failed, or empty. None in an addition keeps the recorded failure.
+    trial: if a single kernel failed, its name and the input of `sandbox.again`.
+    """
+
+    stages: frozenset[str] = frozenset()
+    kernels: Mapping[str, str] = field(default_factory=dict)
+    failed: str | None = ""
+    trial: Mapping[str, Any] = field(default_factory=dict)
+
+
+def cache_folder() -> Path:
+    """Our folder in the user's cache; an unwritable path if the user has no home, as in some containers."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
+    except RuntimeError:
+        return Path(os.devnull) / "clsplat"
+
+
+def memory_path() -> Path:
+    """The file of the driver records."""
+    return cache_folder() / "drivers.json"
+
+
+@lru_cache(maxsize=4)
+def _kernels_digest(broken: str) -> str:
+    texts = "".join(kernel_source(path.stem) for path in sorted(kernel_root().glob("*.cl")))
+    return f"{zlib.crc32((texts + broken).encode()):08x}"
+
+
+def device_key(device: cl.Device) -> str:
+    """Key of a device and its driver, with any pretended traits."""
+    words = [device.name.strip(), device.platform.version.strip(), device.driver_version.strip()]
+    return " | ".join([*words, pretended()] if pretended() else words)
+
+
+def driver_key(device: cl.Device) -> str:
+    """Key of a record, except for the shape."""
+    kernels = _kernels_digest(os.environ.get(BREAK_KERNEL_VARIABLE, ""))
+    return f"{device_key(device)} | clsplat {package_version()} {kernels}"
+
+
+def _entry(value: object) -> Entry:
+    """Parse an entry of the file. An entry that clsplat did not write counts as absent."""
+    if not isinstance(value, dict):
+        return Entry()
+    stages, kernels, failed = value.get("stages", []), value.get("kernels", {}), value.get("failed", "")
+    trial = value.get("trial", {})
+    if not (isinstance(stages, list) and isinstance(kernels, dict) and isinstance(failed, str)):
+        return Entry()
+    if not all(isinstance(text, str) for text in (*stages, *kernels.values())):
+        return Entry()
+    return Entry(frozenset(stages), kernels, failed, trial if isinstance(trial, dict) else {})
+
+
+_RECORDS_LOCK = threading.Lock()
+"""Several devices may be at work at once."""
+_unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
+"""Additions that could not be written yet, by file: driver, shape and addition to the entry."""
+
+
+def _read() -> dict[str, Any]:
+    """The contents of the file, with the additions that are not written yet."""
+    try:
+        saved = parse_json(memory_path().read_bytes())
+    except (OSError, ValueError):
+        saved = {}
+    if not isinstance(saved, dict):
+        saved = {}
+    for addition in _unwritten.get(memory_path(), []):
+        _add(saved, *addition)
+    return saved
+
+
+def _add(saved: dict[str, Any], driver: str, shape: str, addition: Entry) -> None:
+    shapes = saved.pop(driver, None)
+    shapes = shapes if isinstance(shapes, dict) else {}
+    known = _entry(shapes.get(shape))
+    entry: dict[str, object] = {
+        "stages": sorted(known.stages | addition.stages),
+        "kernels": {**known.kernels, **addition.kernels},
+    }
+    last = known if addition.failed is None else addition
+    if last.failed:
+        entry |= {"failed": last.failed, **({"trial": last.trial} if last.trial else {})}
+    saved[driver] = {**shapes, shape: entry}
+
+
+def entries(device: cl.Device) -> dict[str, Entry]:
+    """All entries of the driver, by LANESxITEMS."""
+    shapes = _read().get(driver_key(device))
+    return {name: _entry(value) for name, value in shapes.items()} if isinstance(shapes, dict) else {}
+
+
+def remember(
+    device: cl.Device,
+    shape: str,
+    *,
+    stages: Iterable[str] = (),
+    kernels: Mapping[str, str] | None = None,
+    failed: str | None = None,
+    trial: Mapping[str, Any] | None = None,
+) -> None:
+    """Add to the driver's entry for a shape, LANESxITEMS.
+
+    failed: None keeps the recorded failure.
+    trial: see `Entry`.
+
+    An unwritable folder is a warning; until it is writable, each process tests everything again.
+    """
+    path = memory_path()
+    addition = Entry(frozenset(stages), kernels or {}, failed, trial or {})
+    with _RECORDS_LOCK:
+        _unwritten.setdefault(path, []).append((driver_key(device), shape, addition))
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with locked(path):
+                saved = _read()
+                for oldest in list(saved)[:-MAX_DRIVER_RECORDS]:
+                    del saved[oldest]
+                atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
+            del _unwritten[path]
+        except OSError as error:
+            tell_once(f"{path}: cannot be written ({reason_of(error)}), so that drivers are tested anew each time")
+
+
+@lru_cache(maxsize=8)
+def tell_once(text: str) -> None:
+    """Warn once per process."""
+    warnings.warn(text, stacklevel=2)

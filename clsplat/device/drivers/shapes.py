@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel shapes for a device: by rule, from `clsplat tune`, or from CLSPLAT_SHAPE."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pyopencl as cl
+
+from clsplat.device.drivers import driver_records
+from clsplat.device.drivers.capabilities import traits_of
+from clsplat.device.drivers.quirks import most_lanes, subgroup_ways, title
+from clsplat.device.drivers.worker_process import regardless
+from clsplat.errors import DeviceError, reason_of
+from clsplat.files.atomic import atomic_write
+from clsplat.files.documents import parse_json
+
+VECTOR_LANES = (1, 4, 8, 16)
+"""Allowed numbers of pixels per vector."""
+BY_GAUSSIAN_SHAPES = ((1, 32), (1, 64))
+"""Lanes and items of the shapes that also exist by Gaussian."""
+SUBGROUP_SHAPES = (*BY_GAUSSIAN_SHAPES, (1, 128), (1, 256))
+"""Lanes and items of the shapes that also exist with sub-groups."""
+_SHAPES_BY_SUFFIX = {"g": BY_GAUSSIAN_SHAPES, "s": SUBGROUP_SHAPES}
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The shape of the kernels for a device.
+
+    lanes: pixels per vector in the blend kernels (1 on GPUs).
+    items: work-items per work-group in kernels that co-operate (1 on CPUs, where a group is one sequential loop).
+    chunks: pieces that a scan or sort is divided into if `items` is 1.
+    by_gaussian: in the gradient of blending, an item takes one Gaussian and loops over the pixels, instead of the
+    reverse (docs/decisions/0023-a-group-shares-a-tile.md). It needs 1 lane and items as in BY_GAUSSIAN_SHAPES.
+    subgroups: items make these sums by exchange within sub-groups, to the same bits, with items as in SUBGROUP_SHAPES.
+    """
+
+    lanes: int
+    items: int
+    chunks: int
+    by_gaussian: bool = False
+    subgroups: bool = False
+
+    @property
+    def label(self) -> str:
+        """LANESxITEMS, the form that CLSPLAT_SHAPE takes; with suffix `g` by Gaussian, `s` with sub-groups."""
+        return f"{self.lanes}x{self.items}{'g' if self.by_gaussian else 's' if self.subgroups else ''}"
+
+    @property
+    def words(self) -> str:
+        """The label in words."""
+        form = ", by Gaussian" if self.by_gaussian else ", with sub-groups" if self.subgroups else ""
+        return f"{self.lanes} lanes x {self.items} items{form}"
+
+    def relabelled(self, label: str) -> Shape:
+        """A shape like this with another label. Raises ValueError if the label is invalid."""
+        match = re.fullmatch(r"(\d+)x(\d+)([gs]?)", label.strip())
+        lanes, items, form = (int(match[1]), int(match[2]), match[3]) if match else (0, 0, "")
+        if (
+            lanes not in VECTOR_LANES
+            or items < 1
+            or items & (items - 1)
+            or (form and (lanes, items) not in _SHAPES_BY_SUFFIX[form])
+        ):
+            raise ValueError(f"{label}: no shape")
+        return replace(self, lanes=lanes, items=items, by_gaussian=form == "g", subgroups=form == "s")
+
+    @property
+    def digit_bits(self) -> int:
+        """Bits of the radix sort's digit: its counters must fit in local memory."""
+        return 11 if self.items == 1 else 8
+
+    @property
+    def sort_items(self) -> int:
+        """Work-items of the radix sort's groups: with up to 256 of them its local sort fits in 32 KiB."""
+        return min(self.items, 256)
+
+    @property
+    def local_bytes(self) -> int:
+        """The most local memory that a group needs.
+
+        With one item it holds the sort's counters of wide digits. Otherwise it holds a tile of 16 keys an item, 16
+        counters of 16 bits and a sum for each item, padding between them, and a counter for each digit.
+        """
+        if self.items == 1:
+            return 32 << 10
+        words = 24 * self.sort_items
+        return 4 * (words + words // 32 + self.sort_items + (1 << self.digit_bits))
+
+
+def default_shape(device: cl.Device) -> Shape:
+    """The shape by device type and vector width; docs/decisions/0003-one-source-many-shapes.md explains the shapes."""
+    if traits_of(device).kind != "cpu":
+        items = next((n for n in (64, 32, 16) if n <= most_items(device)), 1)
+        return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
+    lanes = min(16 if device.native_vector_width_float >= 16 else 8, most_lanes(device))
+    return Shape(lanes=lanes, items=1 if lanes > 1 else 64, chunks=4 * device.max_compute_units)
+
+
+def most_items(device: cl.Device) -> int:
+    """The most work-items in a group of our kernels, by the device's limit and its local memory."""
+    traits = traits_of(device)
+    most = traits.group
+    while most > 1 and Shape(1, most, 1).local_bytes > traits.local_memory:
+        most //= 2
+    return most
+
+
+def candidates(device: cl.Device) -> list[Shape]:
+    """The shapes that are worth a trial, the default first."""
+    default = default_shape(device)
+    if traits_of(device).kind == "cpu":
+        others = [replace(default, lanes=lanes) for lanes in (16, 8)]
+    else:
+        others = [replace(default, items=items) for items in (32, 128, 256) if items <= most_items(device)]
+        forms = "gs" if subgroup_ways(device) else "g"
+        others += [
+            default.relabelled(f"{n}x{k}{form}")
+            for form in forms
+            for n, k in BY_GAUSSIAN_SHAPES
+            if k <= most_items(device)
+        ]
+    return [default, *(shape for shape in others if shape != default)]
+
+
+def asked_shape() -> str:
+    """The value of CLSPLAT_SHAPE, or an empty string. Raises DeviceError if it is invalid."""
+    text = os.environ.get("CLSPLAT_SHAPE", "")
+    if text and _parsed(text, Shape(1, 1, 1)) is None:
+        raise DeviceError(
+            f"CLSPLAT_SHAPE={text}: expected LANESxITEMS, such as 8x1 or 1x256; lanes are 1, 4, 8 or 16; a g behind "
+            f"{' and '.join(f'{lanes}x{items}' for lanes, items in BY_GAUSSIAN_SHAPES)} is for a gradient by "
+            "Gaussian, an s behind "
+            f"{', '.join(f'{lanes}x{items}' for lanes, items in SUBGROUP_SHAPES)} for sub-groups"
+        )
+    return text
+
+
+def wanted_shape(device: cl.Device) -> Shape:
+    """The shape that CLSPLAT_SHAPE requests, or the tuned one, or the default.
+
+    Raises DeviceError if CLSPLAT_SHAPE is invalid, or the device cannot run it.
+    """
+    default, text = default_shape(device), asked_shape()
+    shape = _parsed(text or saved_shapes().get(driver_records.device_key(device), ""), default)
+    lacking = shape is not None and shape.subgroups and not subgroup_ways(device)
+    if shape is None or (not text and (lacking or shape.items > most_items(device))):
+        return default
+    name, traits = device.name.strip(), traits_of(device)
+    if lacking:
+        raise DeviceError(
+            f"CLSPLAT_SHAPE={text}: {name} has no sub-groups whose items exchange values; expected a shape without the "
+            f"s, such as {text.strip()[:-1]}"
+        )
+    if shape.items > traits.group:
+        raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {traits.group} items in a work-group")
+    if shape.items > most_items(device):
+        raise DeviceError(
+            f"CLSPLAT_SHAPE={text}: {name} has {traits.local_memory >> 10} KiB of local memory, and a group of "
+            f"{shape.items} items needs {shape.local_bytes >> 10} KiB; expected at most {most_items(device)} items"
+        )
+    return shape
+
+
+def failures(device: cl.Device) -> dict[str, str]:
+    """Recorded failures of the driver by shape, LANESxITEMS. Empty with CLSPLAT_TRUST_DRIVER=1."""
+    if regardless():
+        return {}
+    return {label: entry.failed for label, entry in driver_records.entries(device).items() if entry.failed}
+
+
+def shape_of(device: cl.Device) -> tuple[Shape, str]:
+    """The shape of a device that is opened without an explicit one, and a warning or an empty string.
+
+    It is `wanted_shape`; if the driver has failed in that before, the first other shape without a recorded failure,
+    with a warning. Raises DeviceError like `wanted_shape`.
+    """
+    wanted, failed = wanted_shape(device), failures(device)
+    if wanted.label in failed:
+        for other in shapes_in_turn(device):
+            if other.label not in failed:
+                return other, instead(device, wanted, other, failed[wanted.label])
+    return wanted, ""  # if none is left, the error is raised when it fails again
+
+
+def shape_text(device: cl.Device) -> str:
+    """The shape in the list of devices, or a note that the device cannot take CLSPLAT_SHAPE."""
+    try:
+        shape, _ = shape_of(device)
+    except DeviceError:
+        return f"cannot take CLSPLAT_SHAPE={asked_shape()}"
+    return shape.words
+
+
+def shapes_in_turn(device: cl.Device) -> list[Shape]:
+    """The shapes to try, the default first: the candidates, then simpler ones that demand less of a compiler."""
+    first = candidates(device)
+    default = first[0]
+    smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
+    smaller += [replace(default, items=items) for items in (128, 64, 32) if items < default.items]
+    return [*first, *(shape for shape in smaller if shape not in first)]
+
+
+def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
+    """The warning that another shape is used."""
+    return (
+        f"{title(device)}: kernels in the shape {wanted.label} failed: {failure}; {other.label} is "
+        f"taken (clsplat selftest tries {wanted.label} anew)"
+    )
+
+
+def _parsed(text: str, default: Shape) -> Shape | None:
+    try:
+        return default.relabelled(text)
+    except ValueError:
+        return None
+
+
+def saved_path() -> Path:
+    """The file in which `clsplat tune` saves its results."""
+    return driver_records.cache_folder() / "shapes.json"
+
+
+def saved_shapes() -> dict[str, str]:
+    """LANESxITEMS by device and driver. An invalid file is ignored with a warning."""
+    path = saved_path()
+    try:
+        saved = parse_json(path.read_bytes())
+    except (FileNotFoundError, NotADirectoryError):  # the home may be a file, or missing
+        return {}
+    except OSError as error:
+        warnings.warn(f"{path}: cannot be read ({reason_of(error)}), so that no tuned shape is used", stacklevel=2)
+        return {}
+    except ValueError:
+        saved = None
+    if not isinstance(saved, dict) or not all(isinstance(value, str) for value in saved.values()):
+        warnings.warn(
+            f"{path}: is damaged, so that no tuned shape is used; clsplat tune writes the file anew", stacklevel=2
+        )
+        return {}
+    return saved
+
+
+def save_shape(device: cl.Device, shape: Shape | None) -> None:
+    """Save the shape for the device with its current driver; None removes the entry. Raises OSError."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        saved = saved_shapes()
+    saved.pop(driver_records.device_key(device), None)
+    if shape is not None:
+        saved[driver_records.device_key(device)] = shape.label
+    path = saved_path()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, (json.dumps(saved, indent=2, sort_keys=True) + "\n").encode())

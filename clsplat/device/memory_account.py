@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Account of a device's memory: bytes in use, and the limit."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from typing import Any
+
+from clsplat.errors import CapacityError, amount
+
+
+class Memory:
+    """The account of one device's buffers: `used` and `peak` bytes, and their `limit`, or None."""
+
+    def __init__(self, limit: int | None = None) -> None:
+        self.limit = limit
+        self.used = 0
+        self.peak = 0
+
+    def check(self, nbytes: int) -> None:
+        """Raise CapacityError if `nbytes` more would pass the limit."""
+        if self.limit is None or self.used + nbytes <= self.limit:
+            return
+        gc.collect()  # buffers that only an exception's traceback or a cycle holds are not in use
+        if self.used + nbytes > self.limit:
+            raise CapacityError(
+                f"--max-device-mem {amount(self.limit)} is too little: {amount(self.used)} of the device's memory are "
+                f"in use, and {amount(nbytes)} more are needed; allow more, or use a smaller resolution or fewer "
+                "Gaussians (--density.max-gaussians)"
+            )
+
+    def add(self, buffer: Any, nbytes: int) -> None:
+        """Count a buffer while the object lives."""
+        self.used += nbytes
+        self.peak = max(self.peak, self.used)
+        weakref.finalize(buffer, self._remove, nbytes).atexit = False
+
+    def _remove(self, nbytes: int) -> None:
+        self.used -= nbytes

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Uploads from pinned memory on a second queue, while the device works on earlier arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, allocate, pinned
+from clsplat.device.context import Device
+from clsplat.errors import CapacityError
+
+UPLOAD_RING_SLOTS = 3
+"""Arrays in flight: one for the current work, one for the work queued behind it, which may be replaced, and one that is
+being uploaded."""
+
+
+@dataclass(eq=False)
+class _Slot:
+    """Room on the device, and as much pinned memory on the host.
+
+    key: of the array that it holds.
+    arrived: its copy to the device.
+    used: the end of all work that was launched with it.
+    """
+
+    array: DeviceArray
+    host: NDArray[np.uint8]
+    key: object = None
+    held: DeviceArray | None = None
+    arrived: cl.Event | None = None
+    used: cl.Event | None = None
+
+
+class UploadRing:
+    """Room for UPLOAD_RING_SLOTS arrays of at most `nbytes` each. Raises CapacityError if the device has no room."""
+
+    def __init__(self, device: Device, nbytes: int) -> None:
+        self._device, self.nbytes = device, nbytes
+        arrays = [allocate(device, (nbytes,), np.uint8) for _ in range(UPLOAD_RING_SLOTS)]
+        try:
+            self._queue = cl.CommandQueue(device.context, device.cl_device)
+            hosts = [pinned(device, (nbytes,), np.uint8) for _ in range(UPLOAD_RING_SLOTS)]
+        except cl.Error as error:
+            raise CapacityError(f"{device.name}: no second queue, or no pinned memory ({error})") from None
+        self._slots = [_Slot(*pair) for pair in zip(arrays, hosts, strict=True)]
+        """The slots, the least recently sent or taken first."""
+
+    def begin(self, key: object, values: NDArray[Any]) -> None:
+        """Start to upload an array, for `take`; nothing if it is too large or already on its way."""
+        if values.nbytes > self.nbytes or any(slot.key == key for slot in self._slots):
+            return
+        done = cl.enqueue_marker(self._device.queue)
+        self._device.queue.flush()
+        for slot in self._slots:
+            if slot.held is not None and slot.used is None:
+                slot.used = done
+        slot = self._slots[0]
+        self._touch(slot)
+        if slot.arrived is not None:
+            slot.arrived.wait()  # sent a while ago: the pinned memory is free
+        host = slot.host[: values.nbytes].view(values.dtype).reshape(values.shape)
+        host[...] = values
+        slot.held, slot.key = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype), key
+        before = None if slot.used is None else [slot.used]
+        slot.arrived = cl.enqueue_copy(self._queue, slot.array.buffer, host, is_blocking=False, wait_for=before)
+        slot.used = None
+        self._queue.flush()
+        self._device.calls.writes += 1
+
+    def take(self, key: object) -> DeviceArray | None:
+        """An uploaded array, for work launched from now; None if it was not sent.
+
+        It is valid until UPLOAD_RING_SLOTS - 1 other arrays have been sent or taken after it.
+        """
+        for slot in self._slots:
+            if slot.key == key and slot.arrived is not None:
+                cl.enqueue_barrier(self._device.queue, wait_for=[slot.arrived])
+                slot.used = None
+                self._touch(slot)
+                return slot.held
+        return None
+
+    def _touch(self, slot: _Slot) -> None:
+        self._slots.remove(slot)
+        self._slots.append(slot)
+
+    @property
+    def taken(self) -> int:
+        """Bytes on the device."""
+        return UPLOAD_RING_SLOTS * self.nbytes

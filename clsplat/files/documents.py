@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files that are read: existence, digests, JSON."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from clsplat.errors import InputError, WriteError, reason_of
+
+MAX_DOCUMENT_BYTES = 32 << 20
+"""Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
+MAX_LFS_POINTER_BYTES = 1024
+"""First bytes, and most bytes, of the note that Git LFS leaves in place of a file
+(https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md)."""
+
+
+def digest(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of the file's content, in hexadecimal. Raises OSError."""
+    return _digest(path, hashlib.sha256())
+
+
+def short_digest(path: Path) -> str | None:
+    """BLAKE2b of 16 bytes of the file's content, in hexadecimal, which is quicker; None where there is no file."""
+    return _digest(path, hashlib.blake2b(digest_size=16)) if is_file(path) else None
+
+
+def _digest(path: str | os.PathLike[str], state: Any) -> str:
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            state.update(block)
+    digits: str = state.hexdigest()
+    return digits
+
+
+def is_file(path: str | os.PathLike[str]) -> bool:
+    """True if there is a regular file; False, and no exception, for a name that no file can have."""
+    try:
+        return stat.S_ISREG(Path(path).stat().st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+@contextmanager
+def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
+    """Open a file to read it.
+
+    `expected` ends the message of the InputError for one that is missing, a folder, or anything else that is no regular
+    file, such as a pipe, which may never be written to; for one that cannot be read; and for Git LFS's note in place of
+    one that was not fetched.
+    """
+    try:
+        status = path.stat()
+        mode = status.st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(f"{path}: is a folder, expected {expected}")
+        if not stat.S_ISREG(mode):
+            raise InputError(f"{path}: is no regular file, expected {expected}")
+        file = open(path, "rb")  # noqa: SIM115  # closed below
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file, expected {expected}") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
+        raise InputError(
+            f"{path}: cannot be read ({reason_of(error) if isinstance(error, OSError) else error}), expected {expected}"
+        ) from None
+    with file:
+        try:
+            if status.st_size < MAX_LFS_POINTER_BYTES:
+                if file.read(len(LFS_POINTER)) == LFS_POINTER:
+                    raise InputError(f"{path}: is Git LFS's note of a file that is not here; git lfs pull fetches it")
+                file.seek(0)
+            yield file
+        except WriteError:
+            raise
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({reason_of(error)}), expected {expected}") from None
+
+
+def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
+    """The text of a file in UTF-8 of at most `limit` bytes, without the mark of the byte order that editors on Windows
+    put before it. Raises InputError as `open_input`."""
+    with open_input(path, expected) as file:
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise InputError(f"{path}: has more than {limit >> 20} MiB, expected {expected}")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not text in UTF-8 (byte {error.start}), expected {expected}") from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in result if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:40]!r} is there twice")
+    return result
+
+
+def parse_json(text: str | bytes, *, once: bool = False) -> Any:
+    """The value. Raises ValueError for whatever does not parse, nested too deeply too. once: also for a key that an
+    object has twice, of which the last would count."""
+    try:
+        return json.loads(text, object_pairs_hook=_once if once else None)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names of files: those that some system refuses, and the two spellings of one file."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import unicodedata
+from pathlib import PurePath, PurePosixPath, PureWindowsPath
+
+from clsplat.errors import InputError
+
+ON_WINDOWS = os.name == "nt"
+CASE_INSENSITIVE_FILES = sys.platform in ("win32", "darwin")
+"""True if the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
+_FORBIDDEN_NAME_CHARACTERS = re.compile(r'[<>:"|?*\x00-\x1f]')
+_WINDOWS_DEVICE_NAME = re.compile(
+    r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE | re.DOTALL
+)
+
+
+def name_trouble(name: str, *, windows: bool = ON_WINDOWS) -> str | None:
+    """The reason that no file below a folder can be called `name`, with its sub-folders before slashes; None where one
+    can."""
+    pure: PurePath = PureWindowsPath(name) if windows else PurePosixPath(name)
+    if pure.anchor or ".." in pure.parts:
+        return "leads out of the output folder"
+    if not pure.name or "\0" in name:
+        return "is no name for a file"
+    if windows:
+        for part in pure.parts:
+            if character := _FORBIDDEN_NAME_CHARACTERS.search(part):
+                return f"has {character[0]!r} in it, which no name of a file on Windows may have"
+            if _WINDOWS_DEVICE_NAME.fullmatch(part):
+                return f"is a name that Windows keeps for a device ({part})"
+            if part[-1] in ". ":
+                return f"ends {part!r} with a dot or a space, which Windows drops"
+    return None
+
+
+def native_name(path: str | os.PathLike[str]) -> str:
+    """The name of a file for a library that takes names in UTF-8, whatever the locale says. Raises InputError."""
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeError:
+        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it") from None
+
+
+def identity(path: PurePath, *, ignores_case: bool = CASE_INSENSITIVE_FILES) -> str:
+    """Equal for two paths that the system takes for one file, whatever links there are."""
+    text = str(path)
+    return unicodedata.normalize("NFC", text).casefold() if ignores_case else text

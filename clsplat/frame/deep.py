@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deep pictures: rendered by the kernels, averaged over samples of shutter and lens, and warped (docs/pictures.md).
+
+A `DrawDeep` renders the slices of a camera's picture as planes (bins, DEEP_FLOATS, H, W): red, green and blue,
+premultiplied by alpha; alpha; depth. All are 0 behind a pixel's last slice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import reduce
+from itertools import islice
+
+import numpy as np
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.config.pictures import DEEP_MERGE_FLOATS, DEEP_STRIP_FLOATS
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.frame.draw import on_tiles
+from clsplat.frame.lens import Warp
+from clsplat.frame.strips import strips
+from clsplat.frame.window import reframed
+from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import DEEP_PICTURES, TILE
+from clsplat.rendering.memory_needs import frame_pixels
+from clsplat.rendering.renderer import Renderer
+from clsplat.stages.deep import DEEP_FLOATS
+from clsplat.stages.deep_merge import deep_merge, merge_bytes
+
+DrawDeep = Callable[[Camera], Float32]
+"""Function from a camera to its planes, which may be a view."""
+Convert = Callable[[Float32, Float32], Float32]
+"""Function from rgb (h, w, 3), and the alpha (h, w) that it is premultiplied by, to rgb in another space."""
+Weighted = tuple[Float32, Float32]
+"""Planes of a picture, and the weight of each of its pixels (H, W)."""
+_MERGE_MEMORY_DIVISOR = 16
+"""Divisor of the device's memory limit that gives a merge's share. Rendering uses the rest."""
+_WARP_BATCH_PIXELS = 1 << 14
+"""Pixels that are warped at once, to bound the host's memory."""
+
+
+def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
+    """Slices (bins, H, W, 5) of a camera's picture, which may be any window."""
+    larger, rows, columns = on_tiles(camera)
+    return renderer.render_deep(gaussians, larger, bins)[:, rows, columns]
+
+
+def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins: int) -> DrawDeep:
+    """A DrawDeep by the kernels.
+
+    gaussians: called when they are drawn, not before.
+    """
+    return lambda camera: render_deep(renderer, gaussians(), camera, bins).transpose(0, 3, 1, 2)
+
+
+def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> int:
+    """Rows of a deep picture's strips, in whole tiles, for `bins` slices.
+
+    pictures: number of pictures that each pixel is the mean of.
+    """
+    floats = DEEP_FLOATS * bins
+    most = DEEP_STRIP_FLOATS if pictures == 1 else DEEP_MERGE_FLOATS // min(pictures, DEEP_PICTURES)
+    pixels = min(most // floats, frame_pixels(device, planes=4 * floats))
+    return max(pixels // (camera.width + 2 * TILE) // TILE * TILE, TILE)  # with the padding of the first and last tile
+
+
+def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
+    """A DrawDeep of the same planes, in strips.
+
+    rows: rows of a strip, for a camera.
+    """
+    return lambda camera: np.concatenate([draw(strip) for strip in strips(camera, rows(camera))], axis=2)
+
+
+def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
+    """A DrawDeep of the same planes, with colours in another space."""
+
+    def drawn(camera: Camera) -> Float32:
+        planes = np.array(draw(camera))
+        alpha = planes[:, 3]
+        there = alpha > 0
+        # plane by plane: a quarter faster than masking three planes at once
+        rgb = np.stack([planes[:, channel][there] for channel in range(3)], axis=1)
+        converted = convert(rgb[None], alpha[there][None])[0]
+        for channel in range(3):
+            planes[:, channel][there] = converted[:, channel]
+        return planes
+
+    return drawn
+
+
+class Merge:
+    """Merges deep pictures by the weights of their pixels. Colours have to be linear."""
+
+    def __init__(self, device: Device, bins: int) -> None:
+        self.bins, self._device, self._work = bins, device, Workspace(device)
+        limit = min(device.budget // _MERGE_MEMORY_DIVISOR, device.max_allocation, 4 * DEEP_MERGE_FLOATS)
+        self._pixels = max(limit // merge_bytes(DEEP_PICTURES, bins), TILE)
+
+    def __call__(self, pictures: Iterable[Weighted]) -> Float32:
+        """The mean of at least one picture. The weights of a pixel add up to 1.
+
+        Pictures are merged in groups, and the results merged again, to limit the number of pictures held at once.
+        """
+        groups = list(self._groups(pictures))
+        return groups[0][0] if len(groups) == 1 else self(groups)
+
+    def _groups(self, pictures: Iterable[Weighted]) -> Iterator[Weighted]:
+        waiting = iter(pictures)
+        while group := list(islice(waiting, DEEP_PICTURES)):
+            whole = reduce(np.add, (weights for _, weights in group))
+            yield self._merged(group, np.where(whole > 0, whole, 1)), whole
+
+    def _merged(self, group: Sequence[Weighted], whole: Float32) -> Float32:
+        height, width = whole.shape
+        planes = np.empty((self.bins, DEEP_FLOATS, height * width), np.float32)
+        pictures = [picture.reshape(self.bins, DEEP_FLOATS, -1) for picture, _ in group]
+        weights = np.stack([(weight / whole).ravel() for _, weight in group])
+        for first in range(0, height * width, self._pixels):
+            some = slice(first, first + self._pixels)
+            together = np.stack([picture[:, :, some] for picture in pictures])
+            arrays = (upload(self._device, together), upload(self._device, np.ascontiguousarray(weights[:, some])))
+            planes[:, :, some] = deep_merge(self._device, self._work, *arrays).get()
+        return planes.reshape(self.bins, DEEP_FLOATS, height, width)
+
+
+def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
+    """A DrawDeep of the mean over samples. The camera that is drawn gives only size and window.
+
+    draws, cameras: for each sample, its DrawDeep and its camera of the whole frame.
+    """
+
+    def blurred(camera: Camera) -> Float32:
+        weight = np.full((camera.height, camera.width), 1 / len(cameras), np.float32)
+        drawn = (draw(reframed(sample, camera)) for draw, sample in zip(draws, cameras, strict=True))
+        return merge((planes, weight) for planes in drawn)
+
+    return blurred
+
+
+def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
+    """A DrawDeep of warped pictures. The camera that is drawn gives only size and window.
+
+    A pixel is the mean over `Warp.samples` by `Warp.samples` places, each a bilinear mix of the four pixels around. A
+    filter with negative weights cannot make slices. Where nothing is seen, there are no slices.
+    """
+
+    def bent(camera: Camera) -> Float32:
+        places, window = warp.of_window(camera)
+        if window is None or window.window is None:
+            return np.zeros((merge.bins, DEEP_FLOATS, camera.height, camera.width), np.float32)
+        straight, samples = draw(window), warp.samples
+        at = (places - (window.window.x, window.window.y)).reshape(camera.height, samples, camera.width, samples, 2)
+        step = max(_WARP_BATCH_PIXELS // camera.width, 1)
+        parts = [merge(_around(straight, at[top : top + step])) for top in range(0, camera.height, step)]
+        return np.concatenate(parts, axis=2)
+
+    return bent
+
+
+def _around(straight: Float32, places: Float64) -> Iterator[Weighted]:
+    """The four pixels around each place, with their bilinear weights.
+
+    places: (h, samples, w, samples, 2), NaN where nothing is seen.
+    """
+    height, width = straight.shape[2:]
+    samples = places.shape[1]
+    for down, across in np.ndindex(samples, samples):
+        place = places[:, down, :, across] - 0.5
+        there = ~np.isnan(place[..., 0])
+        first = np.floor(np.where(there[..., None], place, 0)).astype(np.int64)
+        part = np.where(there[..., None], place, 0) - first
+        for y, x in np.ndindex(2, 2):
+            rows, columns = np.clip(first[..., 1] + y, 0, height - 1), np.clip(first[..., 0] + x, 0, width - 1)
+            planes = straight[:, :, rows, columns]
+            planes[:, :, ~there] = 0
+            share = np.where(y, part[..., 1], 1 - part[..., 1]) * np.where(x, part[..., 0], 1 - part[..., 0])
+            yield planes, (share / samples**2).astype(np.float32)

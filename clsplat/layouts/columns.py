@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layouts that host and kernels share, declared once; kernels include them as `kernels/shared/layouts.h`.
+
+`python -m clsplat.layouts.columns > kernels/shared/layouts.h` generates that file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from clsplat.config.holdout import HOLDOUT_SURFACE_FIELDS
+from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS
+
+TILE = 16
+"""Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
+
+LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_COLUMNS = 2, 640, 32
+"""Block sizes of the loss kernel.
+
+LOSS_ROWS: rows that a group of one item processes together, as their windows share pixels.
+LOSS_COLUMNS: the most columns of its block.
+LOSS_GROUP_COLUMNS: the most columns of a block for a group of several items.
+
+Five fields of a block must fit in 32 KiB of local memory. A block has LOSS_ROWS rows, or with several items up to
+sixteen.
+"""
+
+LOSS_RING = 16
+"""Rows of derivatives that a group of one item keeps.
+
+It is a power of two, and at least the window's 11 plus LOSS_ROWS - 1, rounded up to a multiple of LOSS_ROWS.
+"""
+
+POSE_ROWS = 64
+"""Gaussians whose contributions to the gradient by a camera's pose are summed sequentially."""
+
+_TRANSFORM = (
+    *(f"R{row}{column}" for row in range(3) for column in range(3)),
+    *("T0", "T1", "T2"),
+    *("FX", "FY", "CX", "CY"),
+)
+
+_ROUNDED = (*_TRANSFORM, *("XMIN", "XMAX", "YMIN", "YMAX"), *("PX", "PY", "PZ"))
+
+_LENS = ("K1", "K2", "K3", "K4", "FOLD", "FOLD_RADIUS")
+
+CAMERA = (*_ROUNDED, "NEAR", "FAR", "HAND", "WINDOW_X", "WINDOW_Y", *_LENS, *(f"{name}_LOW" for name in _ROUNDED))
+"""The fields of a camera.
+
+In order:
+
+- `cam_from_world`, intrinsics, the limits of x/z and y/z in the Jacobian, and the camera's centre.
+- Near and far plane.
+- HAND: 1, or -1 if the rotation is a reflection.
+- The first pixel in its frame (`Camera.window`).
+- A fisheye's coefficients, and the largest angle and distance from the axis that it shows.
+- _LOW: the errors of rounding these to float32. With them a mean's place on the image is accurate to 1e-6 pixels, and a
+  needle's ellipse to 1e-4.
+"""
+
+_EWA_ROUNDED = (
+    *_TRANSFORM,
+    *("XMIN", "XMAX", "YMIN", "YMAX"),
+    *(f"N{row}{column}" for row in range(3) for column in range(3)),
+)
+
+EWA_CAMERA = (
+    *_EWA_ROUNDED,
+    *("NEAR", "FAR", "WIDTH", "HEIGHT", "EPS", "RADIUS_CLIP"),
+    *(f"{name}_LOW" for name in _EWA_ROUNDED),
+)
+"""The fields of a camera of `kernels/ewa.cl`.
+
+In order:
+
+- The view matrix, which may be any; intrinsics; the limits of x/z and y/z in the Jacobian; the cofactors of the
+  matrix's 3 x 3 part.
+- Near and far plane, the image's size, the low-pass in px^2, and the radius up to which Gaussians are culled.
+- _LOW: the errors of rounding to float32.
+"""
+
+EWA_GRADIENT = _TRANSFORM
+"""The fields of a camera by which `kernels/ewa_grad.cl` computes gradients."""
+
+SUM_ROWS = 64
+"""Neighbouring numbers that an item of `kernels/sums.cl` sums."""
+
+_SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
+"""The fields with the same meaning and place in SPLAT and RAY: blending reads them from either."""
+
+SPLAT = (
+    *("PIXEL_X", "PIXEL_Y", "SUB_X", "SUB_Y", "L11", "L12", "L22"),
+    *_SEEN,
+    *("HALF_W", "HALF_H", "INVERSE_L11", "UNUSED"),
+)
+"""A projected Gaussian in 64 bytes, a cache line.
+
+In order:
+
+- The mean in whole pixels, and the remainder.
+- L11 to L22: the whitening W of docs/gradients.md times sqrt(log2(e) / 2), so that log2(alpha) = LOG2O - u^2 - v^2.
+- Log of the opacity, colour, camera depth.
+- Half extents in pixels of the ellipse where alpha is 1/255.
+"""
+
+RAY = (
+    *("FX", "FY", "FZ", "UX", "UY", "UZ", "VX"),
+    *_SEEN,
+    *("VY", "VZ", "COLUMNS", "ROWS"),
+)
+assert len(RAY) == len(SPLAT), "they share the array"
+assert all(RAY.index(name) == SPLAT.index(name) for name in _SEEN), "blending reads either"
+"""A projected Gaussian of an equirectangular or fisheye camera.
+
+F: the mean's direction.
+U, V: a ray r in the camera has u = U.r / F.r and v = V.r / F.r, so that log2(alpha) = LOG2O - u^2 - v^2.
+DEPTH: the distance.
+COLUMNS, ROWS: the box in tiles, 16 bits each for the first and one past the last (kernels/shared/tile.h).
+"""
+
+SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
+"""Partial gradients of one (tile, Gaussian) pair; the last two only if absolute gradients are kept.
+
+If contributions are kept, the sum of the blending weights follows. If depths are compared, the gradient by nearness
+follows last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
+"""
+
+SLOT_PLAIN = SLOT.index("ABSX")
+
+REFUSED = ("parameters", "gradients", "moments", "steps")
+"""Reasons for which adam.cl refuses and counts an element's step."""
+
+COUNTED = ("VISIBLE", "PAIRS", "KEY_COMPLEMENT", "LARGEST_KEY")
+
+READBACK = (*COUNTED, "STOPPED", *(f"REFUSED_{reason.upper()}" for reason in REFUSED))
+"""Numbers that the host reads back from a forward pass in one copy.
+
+VISIBLE, PAIRS: totals of visible Gaussians and of pairs.
+KEY_COMPLEMENT, LARGEST_KEY: the complement of the smallest depth key, and the largest depth key.
+STOPPED: 1 after a pass by capacity has stopped (duplicate.cl).
+REFUSED_*: the refused steps that `adam` has counted.
+"""
+
+
+DEEP_SLICE = ("RED", "GREEN", "BLUE", "ALPHA", "DEPTH")
+"""A pixel's slice of a deep picture: colour, associated with alpha; alpha; and its depth."""
+
+DEEP_LEVELS = 64
+"""Number of levels of the slack with which a pixel's slices are cut."""
+
+DEEP_PICTURES = 16
+"""The most deep pictures that are merged at once."""
+
+
+@dataclass(frozen=True)
+class SlotFields:
+    """Fields of a slot in addition to the plain gradients.
+
+    absolute: absolute gradients (AbsGS).
+    contributions: the contribution to the image.
+    nearness: the gradient by nearness (one over the depth).
+    """
+
+    absolute: bool = False
+    contributions: bool = False
+    nearness: bool = False
+
+    @property
+    def floats(self) -> int:
+        """Floats from one slot to the next."""
+        return (len(SLOT) if self.absolute else SLOT_PLAIN) + self.contributions + self.nearness
+
+    @property
+    def defines(self) -> dict[str, object]:
+        """Defines for the kernels that write and read slots; empty for the plain slots."""
+        wanted = {
+            "ABSOLUTE_GRADIENTS": self.absolute,
+            "CONTRIBUTIONS": self.contributions,
+            "NEARNESS": self.nearness,
+        }
+        return {name: True for name, on in wanted.items() if on}
+
+
+PLAIN_SLOTS = SlotFields()
+WIDEST_SLOTS = SlotFields(absolute=True, contributions=True, nearness=True)
+
+
+def header() -> str:
+    """The text of `kernels/shared/layouts.h`."""
+    lines = ["// Layouts and constants that kernels share with Python: made by `python -m clsplat.layouts.columns`."]
+    lines += [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}", f"#define DEEP_LEVELS {DEEP_LEVELS}"]
+    lines.append(f"#define DEEP_PICTURES {DEEP_PICTURES}")
+    lines += [f"#define LOSS_ROWS {LOSS_ROWS}", f"#define LOSS_COLUMNS {LOSS_COLUMNS}"]
+    lines.append(f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}")
+    lines += [f"#define POSE_ROWS {POSE_ROWS}u", f"#define SUM_ROWS {SUM_ROWS}u"]
+    lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
+    layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK}
+    layouts |= {"DEEP": DEEP_SLICE, "HELD": HOLDOUT_SURFACE_FIELDS, "EWA": EWA_CAMERA, "BY_CAMERA": EWA_GRADIENT}
+    for prefix, fields in layouts.items():
+        lines += [f"#define {prefix}_{name} {offset}" for offset, name in enumerate(fields)]
+        lines.append(f"#define {prefix}_SIZE {len(fields)}")
+    lines.append(f"#define SLOT_PLAIN {SLOT_PLAIN}")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(header(), end="")

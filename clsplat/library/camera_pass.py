@@ -1,0 +1,330 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One camera's view of arrays of Gaussians: projection, colours and pixels, and the gradient back through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.device.buffers import DeviceArray, Hosted, from_host, hosted
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.library.checks import degree, floats, gradient
+from clsplat.library.pixels import PixelPass, screen_gaussians
+from clsplat.library.projection import GivenShapes, ProjectedView, full_gradient, hosted_gradients, image_gradients
+from clsplat.library.session import LibrarySession
+from clsplat.stages.ewa import EwaCamera, camera_gradients
+from clsplat.stages.harmonics import (
+    MAX_SH_BASIS_DEGREE,
+    Harmonics,
+    HarmonicsGradients,
+    centre_array,
+    harmonics,
+    harmonics_grad,
+)
+
+MIN_EXPECTED_DEPTH_ALPHA = np.float32(1e-10)
+"""Smallest alpha by which an expected depth is divided. It avoids a division by zero in empty pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """The checked arrays of a call of `rasterize`.
+
+    count: number of Gaussians.
+    cameras: number of cameras.
+    """
+
+    count: int
+    cameras: int
+    means: Float32
+    shapes: GivenShapes
+    opacities: Float32
+    colors: Float32
+    sh_degree: int | None
+
+    @classmethod
+    def checked(
+        cls,
+        means: ArrayLike,
+        quaternions: ArrayLike | None,
+        scales: ArrayLike | None,
+        covars: ArrayLike | None,
+        opacities: ArrayLike,
+        colors: ArrayLike,
+        sh_degree: int | None,
+        cameras: int,
+    ) -> Given:
+        """Check the arguments of a call. Raises InputError, which names the argument."""
+        centres = floats("means", means, ("N", 3))
+        n = len(centres)
+        shapes = GivenShapes.checked(n, covars, quaternions, scales)
+        covers = floats("opacities", opacities, (n,))
+        if sh_degree is None:
+            values = floats("colors", colors, (n, "D"), (cameras, n, "D"))
+        else:
+            sh_degree = degree("sh_degree", sh_degree, MAX_SH_BASIS_DEGREE, ", or None")
+            values = floats("colors", colors, (n, "K", 3), (cameras, n, "K", 3))
+            check_coefficients(sh_degree, values.shape[-2])
+        return cls(n, cameras, centres, shapes, covers, values, sh_degree)
+
+    @property
+    def channels(self) -> int:
+        """D, the number of blended values of a Gaussian without its depth."""
+        return int(self.colors.shape[-1])
+
+    @property
+    def by_camera(self) -> bool:
+        """True if each camera has colours of its own."""
+        return self.colors.ndim == (3 if self.sh_degree is None else 4)
+
+    def colors_of(self, camera: int) -> Float32:
+        """Colours (N, D) or SH coefficients (N, K, 3) for one camera."""
+        return self.colors[camera] if self.by_camera else self.colors
+
+
+def check_coefficients(sh_degree: int, found: int) -> None:
+    """Raise InputError if colors has fewer SH coefficients than the degree needs."""
+    if found < (wanted := (sh_degree + 1) ** 2):
+        raise InputError(f"colors has {found} SH coefficients, expected {wanted} or more for sh_degree {sh_degree}")
+
+
+class Gradients:
+    """Gradients of the arrays of a call, summed over the views."""
+
+    def __init__(self, given: Given, device: Device) -> None:
+        self.given = given
+        self.views = 0
+        self.room = hosted_gradients(device, given.count, covariances=given.shapes.covariances is not None)
+        self.opacities = np.zeros(given.count, np.float32)
+        self.colors = None if given.sh_degree is not None else np.zeros_like(given.colors)
+        self.coefficients: list[Hosted] = []
+        self.viewmats: list[Float64] = []
+        self.intrinsics: list[Float64] = []
+
+    def sh(self, device: Device) -> tuple[DeviceArray, bool]:
+        """The device array for a view's SH gradient, and True if it already holds the sum of earlier views."""
+        given = self.given
+        add = bool(self.coefficients) and not given.by_camera
+        if not add:
+            self.coefficients.append(hosted(device, given.colors.shape[-3:]))
+        return self.coefficients[-1].array, add
+
+    def by_name(self, *, cameras: bool) -> dict[str, Any]:
+        """The gradients on the host, under the argument names of `rasterize`."""
+        found = {name: one.get() for name, one in self.room.hosted.items()}
+        if self.given.shapes.covariance_layout == "full":
+            found["covars"] = full_gradient(found["covars"])
+        found["opacities"] = self.opacities
+        if self.colors is not None:
+            found["colors"] = self.colors
+        else:
+            each = [one.get() for one in self.coefficients]
+            found["colors"] = np.stack(each) if self.given.by_camera else each[0]
+        if cameras:
+            found |= {"viewmats": np.stack(self.viewmats), "intrinsics": np.stack(self.intrinsics)}
+        return found
+
+
+@dataclass(frozen=True)
+class PassSettings:
+    """Settings that all cameras of a call share.
+
+    mode: one of RASTERIZE_RENDER_MODES.
+    alpha_max: the cap of alpha.
+    compensated: multiply opacities by the compensation for the low-pass filter.
+    absolute: also keep absolute gradients.
+    differentiable: prepare for a gradient.
+    """
+
+    mode: str
+    alpha_max: float
+    compensated: bool = False
+    absolute: bool = False
+    differentiable: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGradients:
+    """Gradients of one view's blended values, on the host. None counts as 0.
+
+    on_image: by their names in `Ewa`, without the compensations.
+    opacities: (N,), of the compensated ones.
+    colors: (N, D).
+    """
+
+    on_image: dict[str, Float32]
+    opacities: Float32 | None = None
+    colors: Float32 | None = None
+
+
+class CameraPass:
+    """One camera's view of the Gaussians. It keeps the device memory for its gradient until it is dropped.
+
+    index: number of the camera.
+    background: (D,), or None.
+    """
+
+    def __init__(
+        self,
+        session: LibrarySession,
+        given: Given,
+        camera: EwaCamera,
+        index: int,
+        background: Float32 | None,
+        settings: PassSettings,
+    ) -> None:
+        self._session, self._given, self._camera, self._index = session, given, camera, index
+        self._settings, device = settings, session.device
+        self.with_depth, self.with_colours = settings.mode.endswith("D"), settings.mode.startswith("RGB")
+        with session.lock:
+            means, covers = from_host(device, given.means), from_host(device, given.opacities)
+            inputs = given.shapes.inputs(means, covers)
+            self.projected = ProjectedView(session, inputs, camera, compensated=settings.compensated)
+            self._colours: Float32 | Hosted = given.colors_of(index)
+            self._harmonics = None
+            if given.sh_degree is not None:
+                centre = centre_array(device, camera.position)
+                arrays = (means, from_host(device, self._colours))
+                self._harmonics = Harmonics(*arrays, given.sh_degree, self.projected.arrays.radii, centre)
+                self._colours = hosted(device, (given.count, 3))
+                harmonics(device, self._harmonics, self._colours.array)
+            factors = self.compensations
+            self.opacities: Float32 = given.opacities.copy() if factors is None else given.opacities * factors
+            """(N,), after compensation. It belongs to this call, even if the caller changes its own array."""
+            splats, blended = self.projected.arrays, self.opacities if settings.compensated else covers
+            flat = (splats.means2d, splats.conics, blended, self._values(), splats.depths, splats.radii)
+            view = (screen_gaussians(device, *flat), (camera.width, camera.height), self._behind(background))
+            self.pixels = PixelPass(session, *view, settings.alpha_max, backward=settings.differentiable)
+        self._has_background = background is not None
+
+    def _values(self) -> Float32 | DeviceArray:
+        """(N, X): the blended values, with the depth last."""
+        if not self.with_depth:
+            return self._colours.array if isinstance(self._colours, Hosted) else self._colours
+        depths = self.depths[:, None]
+        return np.concatenate([self.colors, depths], axis=1) if self.with_colours else depths
+
+    def _behind(self, background: Float32 | None) -> Float32 | None:
+        """(X,): the background, 0 for the depth channel."""
+        if background is None or not self.with_colours:
+            return None
+        return np.append(background, np.float32(0)) if self.with_depth else np.ascontiguousarray(background)
+
+    def splats(self, name: str) -> NDArray[Any]:
+        """An array of the projection, by its name in `Ewa`."""
+        with self._session.lock:
+            return self.projected.get(name)
+
+    @property
+    def depths(self) -> Float32:
+        """(N,)."""
+        return self.splats("depths")
+
+    @property
+    def compensations(self) -> Float32 | None:
+        """(N,), or None."""
+        return None if self.projected.arrays.compensations is None else self.splats("compensations")
+
+    @property
+    def colors(self) -> Float32:
+        """(N, D): the blended values without the depth."""
+        if not isinstance(self._colours, Hosted):
+            return self._colours
+        with self._session.lock:
+            return self._colours.get()
+
+    @cached_property
+    def alpha(self) -> Float32:
+        """(H, W)."""
+        return self.pixels.alpha
+
+    @cached_property
+    def image(self) -> Float32:
+        """(H, W, X)."""
+        image = self.pixels.image
+        if not self._settings.mode.endswith("ED"):
+            return image
+        image = image.copy()
+        image[:, :, -1] /= np.maximum(self.alpha, MIN_EXPECTED_DEPTH_ALPHA)
+        return image
+
+    def pixel_gradients(self, d_image: ArrayLike, d_alpha: ArrayLike | None) -> dict[str, Float32]:
+        """Gradients of this view for `Rasterization.vjp_pixels`."""
+        shape = (self._camera.height, self._camera.width)
+        by_image = gradient("d_images", d_image, self.image.shape)
+        assert by_image is not None, "`Rasterization.vjp_pixels` asks for one of each camera"
+        by_alpha = gradient("d_alphas", d_alpha, (*shape, 1))
+        by_alpha = None if by_alpha is None else by_alpha.reshape(shape)
+        if self._settings.mode.endswith("ED"):
+            left = np.maximum(self.alpha, MIN_EXPECTED_DEPTH_ALPHA)
+            by_depth = by_image[:, :, -1] / left
+            by_quotient = np.where(
+                self.alpha > MIN_EXPECTED_DEPTH_ALPHA, -by_depth * self.image[:, :, -1], np.float32(0)
+            )
+            by_image = np.concatenate([by_image[:, :, :-1], by_depth[:, :, None]], axis=2)
+            by_alpha = by_quotient if by_alpha is None else by_alpha + by_quotient
+        found = self.pixels.gradient(by_image, by_alpha, absolute=self._settings.absolute)
+        values = found.pop("colours")
+        if self.with_depth:
+            found["depths"] = np.ascontiguousarray(values[:, -1])
+        given = self._given
+        if not self.with_colours:
+            found["colors2d"] = np.zeros((given.count, given.channels), np.float32)
+        else:
+            found["colors2d"] = np.ascontiguousarray(values[:, :-1]) if self.with_depth else values
+        behind = found.pop("background", None)
+        if self._has_background:
+            zeros = np.zeros(given.channels, np.float32)
+            found["backgrounds"] = zeros if behind is None else behind[: given.channels]
+        return found
+
+    def add_gradients(self, gradients: Gradients, by: ViewGradients, *, cameras: bool) -> None:
+        """Propagate the gradients of the blended values, `by`, to the arguments, and add them to `gradients`."""
+        session, given, device = self._session, self._given, self._session.device
+        on_image, compensations = by.on_image, self.compensations
+        if by.opacities is not None:
+            gradients.opacities += by.opacities if compensations is None else by.opacities * compensations
+            if compensations is not None:
+                on_image = {**on_image, "compensations": by.opacities * given.opacities}
+        if gradients.colors is not None and by.colors is not None:
+            at = gradients.colors[self._index] if given.by_camera else gradients.colors
+            at += by.colors
+        with session.lock:
+            placed = image_gradients(device, on_image)
+            device.under_way.append(placed)  # host memory must live until the device has read it
+            room, add = gradients.room.arrays, gradients.views > 0
+            by_camera = self.projected.gradient(placed, room, add=add, by_camera=cameras)
+            by_centre = self._colours_back(gradients, room.means, by.colors, cameras=cameras)
+            gradients.views += 1
+            if by_camera is None:
+                return
+            viewmat, intrinsics = camera_gradients(by_camera.get())
+            if by_centre is not None:
+                viewmat += self._camera.position_gradient(by_centre.get().astype(np.float64))
+        gradients.viewmats.append(viewmat)
+        gradients.intrinsics.append(intrinsics)
+
+    def _colours_back(
+        self, gradients: Gradients, d_means: DeviceArray, by_colour: Float32 | None, *, cameras: bool
+    ) -> DeviceArray | None:
+        """Add the gradient of the SH coefficients, and its contribution to the means.
+
+        Returns the gradient of the camera's centre if `cameras` is set.
+        """
+        session, count = self._session, self._given.count
+        if self._harmonics is None:
+            return None
+        assert isinstance(self._colours, Hosted), "harmonics are made on the device"
+        placed = from_host(session.device, np.zeros((count, 3), np.float32) if by_colour is None else by_colour)
+        session.device.under_way.append(placed)
+        d_sh, add = gradients.sh(session.device)
+        colours, into = (self._harmonics, self._colours.array, placed), HarmonicsGradients(d_sh, d_means)
+        return harmonics_grad(
+            session.device, session.scratch, *colours, into, add=add, add_directions=True, by_centre=cameras
+        )

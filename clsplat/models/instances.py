@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models placed in a shot, merged into one model: position, opacity, colour and frame of each over time.
+
+They are merged before rendering, so that their Gaussians sort and blend as in a single model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import ceil
+from typing import Protocol
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.images.colour import REC709_LUMA_WEIGHTS
+from clsplat.models.codec.axes import NODE_SIMILARITY_TOLERANCE
+from clsplat.models.edit import decompose, faded, graded, merge, transform
+from clsplat.models.series import ModelSeries
+
+IDENTITY_ROWS = tuple(np.eye(4)[:3].ravel().tolist())
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Placement of a model at one time.
+
+    matrix: first three rows of the (4, 4) matrix from the model's world to the shot's.
+    opacity: factor from 0, hidden, to 1.
+    colour: empty, or the rows of (3, 4), a colour matrix and its offset column.
+    frame: frame to take from a `ModelSeries`; None for a static model.
+    """
+
+    matrix: tuple[float, ...] = IDENTITY_ROWS
+    opacity: float = 1.0
+    colour: tuple[float, ...] = ()
+    frame: float | None = None
+
+    @property
+    def transform(self) -> Float64:
+        """Matrix (4, 4) from the model's world to the shot's."""
+        return np.vstack([np.array(self.matrix).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
+
+    def within(self, outer: Placement) -> Placement:
+        """Placement in the world of `outer`, an enclosing group that is placed too."""
+        matrix = self.matrix
+        if outer.matrix != IDENTITY_ROWS:
+            matrix = rows_of(outer.transform @ self.transform)
+        colour = outer.colour or self.colour
+        if outer.colour and self.colour:
+            first, then = (np.array(rows).reshape(3, 4) for rows in (self.colour, outer.colour))
+            both = then[:, :3] @ first
+            both[:, 3] += then[:, 3]
+            colour = tuple(both.ravel().tolist())
+        return Placement(matrix, self.opacity * outer.opacity, colour, self.frame)
+
+
+State = tuple[Placement, ...]
+"""Placements of all models of a shot at one time."""
+
+
+class Track(Protocol):
+    """Placement of a model over time."""
+
+    def at(self, frame: float) -> Placement:
+        """Placement at a frame, which may be fractional. Raises InputError if it is invalid."""
+
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """First and last frame for which the source gives a placement; None for a static model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Changing:
+    """`Track` of a changing model, whose Gaussians are taken at the frame of its placement."""
+
+    inner: Track
+
+    def at(self, frame: float) -> Placement:
+        """Placement with the frame of the Gaussians."""
+        return replace(self.inner.at(frame), frame=float(frame))
+
+    @property
+    def reach(self) -> tuple[float, float] | None:
+        """Reach of the inner track."""
+        return self.inner.reach
+
+
+def rows_of(matrix: Float64) -> tuple[float, ...]:
+    """First three rows of (4, 4), flattened for `Placement.matrix`."""
+    return tuple(float(value) + 0.0 for value in matrix[:3].ravel())  # + 0.0 turns -0 into 0: one form for each state
+
+
+def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...]:
+    """Colour of a `Placement`: gain (3,), offset (3,), then saturation, as in ASC CDL without power. Empty for the
+    identity."""
+    if (gain == 1).all() and (offset == 0).all() and saturation == 1:
+        return ()
+    spread = saturation * np.eye(3) + (1 - saturation) * np.array(REC709_LUMA_WEIGHTS)
+    return tuple(np.column_stack([spread * gain, spread @ offset]).ravel().tolist())
+
+
+def checked(placement: Placement, where: str) -> Placement:
+    """The placement itself. Raises InputError, prefixed with `where`, if Gaussians cannot follow its transform."""
+    try:
+        decompose(placement.transform, NODE_SIMILARITY_TOLERANCE)
+    except InputError as error:
+        raise InputError(f"{where}: has {error}") from None
+    return placement
+
+
+def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
+    """Apply the placement to a model. Unchanged arrays keep their bits. Raises InputError like `edit.transform`."""
+    moved = gaussians
+    if placement.matrix != IDENTITY_ROWS:
+        moved = transform(gaussians, placement.transform, NODE_SIMILARITY_TOLERANCE)
+    if placement.colour:
+        rows = np.array(placement.colour).reshape(3, 4)
+        moved = graded(moved, rows[:, :3], rows[:, 3])
+    return faded(moved, placement.opacity)
+
+
+def gone_on(track: Track, frame: float, end: float) -> Placement:
+    """Placement of a track at a frame beyond `end`, the last or first frame of its reach; it continues its motion
+    there.
+
+    A fraction of a frame mirrors the motion just before the end. Each further whole frame repeats the last whole-frame
+    step. Cameras continue the same way (`shots.motion`). Opacity and colour come from the track itself. Raises
+    InputError for a transform that is no longer invertible.
+    """
+    if (reach := track.reach) is None or reach[0] <= frame <= reach[1]:
+        return track.at(frame)
+    way, place, now = (1 if frame > end else -1), track.at(frame), track.at(end)
+    steps = ceil(abs(frame - end)) - 1
+    matrix = _step(now, track.at(2 * end - (frame - steps * way))) @ now.transform
+    for _ in range(steps):
+        matrix = _step(now, track.at(end - way)) @ matrix
+    rows = now.matrix if np.array_equal(matrix, now.transform) else rows_of(matrix)
+    return checked(replace(place, matrix=rows), f"a model that goes on beyond frame {end:g}")
+
+
+def _step(now: Placement, before: Placement) -> Float64:
+    """Similarity (4, 4) from one placement to a later one, with exactly orthogonal axes."""
+    matrix = np.eye(4)
+    if now.matrix != before.matrix:
+        (scale, turn, shift), (scale_before, turn_before, shift_before) = (
+            decompose(placement.transform, NODE_SIMILARITY_TOLERANCE) for placement in (now, before)
+        )
+        matrix[:3, :3] = scale / scale_before * turn @ turn_before.T
+        matrix[:3, 3] = shift - matrix[:3, :3] @ shift_before
+    return matrix
+
+
+def kind_of(model: Gaussians | ModelSeries) -> Gaussians:
+    """The model itself, or for a `ModelSeries` an empty model with the same rendering flags."""
+    return model.kind if isinstance(model, ModelSeries) else model
+
+
+def near_of(models: Sequence[Gaussians | ModelSeries], state: State) -> float:
+    """Smallest near plane of the models in this state, hidden models included."""
+    return min(
+        model.near
+        if placement.matrix == IDENTITY_ROWS
+        else decompose(placement.transform, NODE_SIMILARITY_TOLERANCE)[0] * model.near
+        for model, placement in zip(map(kind_of, models), state, strict=True)
+    )
+
+
+class Ensemble:
+    """All models of a shot merged into one, for consecutive states; unchanged models are reused. Use it from one thread
+    only."""
+
+    def __init__(self, models: Sequence[Gaussians | ModelSeries]) -> None:
+        self.models = tuple(models)
+        self._placed: list[tuple[Placement, Gaussians] | None] = [None] * len(self.models)
+        self._last: tuple[State, Gaussians] | None = None
+
+    def at(self, state: State) -> Gaussians:
+        """Models in this state, merged in order. Hidden models stay in, so that each Gaussian keeps its row.
+
+        Asking for the same state again returns the same object.
+        """
+        if self._last is None or self._last[0] != state:
+            self._last = None  # frees its memory before the next is allocated
+            self._last = state, merge([self._one(index, placement) for index, placement in enumerate(state)])
+        return self._last[1]
+
+    def moved(self, state: State, after: State) -> Gaussians | None:
+        """Gaussians of `state` with their means in the state `after`; None if nothing moves."""
+        if [(now.matrix, now.frame) for now in state] == [(then.matrix, then.frame) for then in after]:
+            return None
+        moved = []
+        for model, now, then in zip(self.models, state, after, strict=True):
+            if isinstance(model, ModelSeries):
+                assert now.frame is not None
+                assert then.frame is not None
+                there = model.moved(now.frame, then.frame)
+            else:
+                there = model
+            moved.append(placed(replace(there, sh=there.sh[:, :1]), Placement(then.matrix)))
+        return merge(moved)
+
+    def _one(self, index: int, placement: Placement) -> Gaussians:
+        before = self._placed[index]
+        if before is None or before[0] != placement:
+            self._placed[index] = None
+            model = self.models[index]
+            if isinstance(model, ModelSeries):
+                assert placement.frame is not None
+                model = model.at(placement.frame)
+            before = self._placed[index] = placement, placed(model, placement)
+        return before[1]

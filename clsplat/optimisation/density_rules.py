@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Thresholds by which density control marks Gaussians, in float32, exactly as the device compares them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from clsplat.arrays import Float32
+
+FRESH = np.uint32(1 << 31)
+"""Bit of an entry in a list of rows: the row is a copy whose moments start from zero."""
+UNWANTED, USELESS = -1.0, -2.0
+"""Scores of Gaussians that are not densified, and of Gaussians that are pruned because they contribute too little."""
+
+
+@dataclass(frozen=True)
+class MarkRules:
+    """Thresholds (`edge`) that divide the Gaussians; the defaults change nothing.
+
+    A Gaussian is densified if its mean gradient is over `gradient` and it passes `strongest`. It is split if the log of
+    its largest scale is over `large`, else cloned.
+
+    A Gaussian is pruned in any of these cases:
+
+    - Its opacity logit is at most `transparent`.
+    - The log of its largest scale is over `oversized`; for a new half over `oversized_half`.
+    - It is not new and its radius is over `radius`.
+    - It contributes at most `contribution` to every view.
+
+    strongest: (value, row); scores over the value pass, and equal scores up to that row.
+    """
+
+    gradient: float = inf
+    strongest: tuple[float, int] = (-inf, 0)
+    large: float = inf
+    transparent: float = -inf
+    oversized: float = inf
+    oversized_half: float = inf
+    radius: float = inf
+    contribution: float = -inf
+
+
+def edge(holds: Callable[[Float32], Any]) -> float:
+    """The largest float32 for which `holds` is false, so that x > edge is equivalent to holds(x).
+
+    `holds` must be false for small numbers and true for large ones. The result is infinite if `holds` is constant.
+    """
+    low, high = _ordered(-inf), _ordered(inf)
+    with np.errstate(over="ignore", under="ignore"):
+        if holds(_number(low))[0]:
+            return -inf
+        if not holds(_number(high))[0]:
+            return inf
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if holds(_number(middle))[0] else (middle, high)
+    return float(_number(low)[0])
+
+
+def _ordered(value: float) -> int:
+    """An integer in the order of the float32 numbers."""
+    bits = int(np.float32(value).view(np.uint32))
+    return -(bits & 0x7FFFFFFF) if bits >> 31 else bits
+
+
+def _number(order: int) -> Float32:
+    """The float32 at this place in the order, as an array (1,), so that it is compared like one."""
+    return np.array([order if order >= 0 else -order | 0x80000000], np.uint32).view(np.float32)

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Thinning of the model in a training step (DropGaussian): its parameters for the projection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from clsplat.config.training import TrainConfig
+from clsplat.optimisation.step_noise import step_key
+
+THINNING_KEY_OFFSET = 0x5EED
+"""Added to the first word of a step's key, so that noise and thinning are independent."""
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """The Gaussians that one step drops.
+
+    rate: the fraction of them.
+    key: two 32-bit words. With its row they give a Gaussian's random word, which decides if it is dropped.
+    """
+
+    rate: float
+    key: tuple[int, int]
+
+    @property
+    def threshold(self) -> int:
+        """The bound below which a Gaussian's 32-bit random word drops it."""
+        return round(self.rate * 2**32)
+
+    @property
+    def factor(self) -> float:
+        """Factor of the opacities of the remaining Gaussians."""
+        return 1 / (1 - self.rate)
+
+
+def thinning_of(config: TrainConfig, step: int) -> Thinning | None:
+    """The thinning of step number `step`; None if it is off.
+
+    The rate grows linearly to the configured one over the run's steps, each of `config.batch` views.
+    """
+    if config.thinning == 0:
+        return None
+    first, second = step_key(config.seed, step)
+    share = min(step * config.batch / config.iterations, 1.0)
+    return Thinning(config.thinning * share, ((first + THINNING_KEY_OFFSET) & 0xFFFFFFFF, second))

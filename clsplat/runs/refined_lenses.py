@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views with the lenses that a run has refined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from clsplat.runs.run import Run
+from clsplat.scenes.readers.colmap import read_cameras
+from clsplat.scenes.scene import View
+
+
+def through_refined(views: Sequence[View], run: Run | None) -> list[View]:
+    """Views with their own poses and, where `run` has refined lenses, the refined lens. Raises InputError like
+    `read_cameras`."""
+    if run is None or not run.config.refine_lenses or not run.refined_path.is_dir():
+        return list(views)
+    cameras, seen = read_cameras(run.refined_path), []
+    for view in views:
+        if (found := cameras.get(view.name)) is None:
+            seen.append(view)
+            continue
+        lens = found.resized(view.camera.width, view.camera.height)
+        seen.append(replace(view, camera=replace(view.camera, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy)))
+    return seen

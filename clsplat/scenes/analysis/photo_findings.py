@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Findings about a scene before training: problems of its photographs, and the settings that answer them.
+
+They are based on thumbnails, cameras and points, and need no device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.config.masks import NO_MASKS, MaskUse
+from clsplat.errors import InputError, examples
+from clsplat.scenes.analysis.visible_points import MAX_EXPOSURE_COLOUR, MIN_POINTS_PER_VIEW, VisiblePoints
+from clsplat.scenes.scene import Scene, View
+from clsplat.scenes.supervision.masks import masks_beside, read_mask
+from clsplat.scenes.thumbnail import REC601_LUMA
+
+Kind = Literal[
+    "few steps",
+    "exposure",
+    "scales",
+    "masks",
+    "cut out",
+    "strange masks",
+    "alpha",
+    "undistorted",
+    "sky",
+    "few views",
+    "some views",
+    "blur",
+    "duplicates",
+]
+
+EXPOSURE_SPREAD_STOPS = 0.2
+"""Standard deviation of a channel's brightness over the photographs, in stops, from which exposures vary.
+
+Occlusion and highlights alone give up to 0.1 for cameras with locked exposure. Learnt gains pay from about 0.2.
+"""
+DISTANCE_SPREAD_RATIO = 4.0
+"""Ratio of the 90th to the 10th percentile of distance / focal length that counts as a wide range.
+
+At 4, a Gaussian one pixel wide in one photograph is a quarter of a pixel, or four pixels, wide in another.
+"""
+CUT_OUT_BORDER_FRACTION = 0.9
+"""Fraction of the border pixels that masks leave out if they cut an object out of its background."""
+SAMPLED_MASKS = 12
+"""Number of masks that are sampled to recognise cut-outs. The sample may be up to twice as large."""
+TRANSPARENT_PIXEL_FRACTION = 0.02
+"""Fraction of a photograph's pixels that are transparent if its alpha has a meaning. Seams and corners cover less."""
+WIDE_FISHEYE_DEGREES = 100.0
+"""Field of view of a fisheye in degrees from which undistortion loses much: pinhole pictures grow with the tangent."""
+FEW_TRAINING_VIEWS = 16
+"""Number of training photographs below which they hardly constrain the depth of a scene.
+
+Published trainings on 12 photographs are 8 dB below those on 100 photographs; on 24, about 3 dB.
+"""
+SPARSE_TRAINING_VIEWS = 30
+"""Number of training photographs below which unlimited growth overfits (docs/quality.md)."""
+MAX_GAUSSIANS_PER_POINT, MIN_PIXELS_PER_GAUSSIAN = 12, 16
+"""Maximum number of Gaussians per point, and minimum number of pixels per Gaussian, for scenes with few photographs.
+
+A Gaussian has up to 59 parameters, a pixel three values. The 50 photographs of fox do best with 7 Gaussians per point
+(docs/quality.md, Growth).
+"""
+FEW_STEPS_PER_VIEW = 60
+"""Steps per training photograph below which high learning rates pay (docs/decisions/0031-high-rates.md)."""
+SHORT_TRAINING_STEPS = range(1000, 10_001)
+"""Training lengths in steps that are close to those measured with high learning rates (2000 to 7000)."""
+BLUR_SHARPNESS_RATIO = 0.72
+"""Sharpness, relative to the scene's median, below which a photograph counts as blurred.
+
+A blur of 1.5 pixels gives this ratio. The content of a photograph changes the ratio by 0.1 to 0.2.
+"""
+BLUR_OUTLIER_SIGMAS = 3.5
+"""Standard deviations (from quartiles) that a blurred photograph must also lie below the median, in log sharpness."""
+DUPLICATE_RMS = 1.5 / 255
+"""Maximum RMS difference of two thumbnails of the same picture. JPEG rounding causes half of it."""
+FEATURELESS_THUMBNAIL_STD = 8 / 255
+"""Standard deviation of a thumbnail up to which it is featureless and never counts as a duplicate."""
+MIN_SKY_PIXEL_FRACTION, MIN_SKY_VIEW_FRACTION = 0.06, 0.3
+"""Minimum fraction of a photograph that its sky covers, and minimum fraction of the photographs that have a sky."""
+MAX_SKY_POINT_DENSITY_RATIO = 0.1
+"""Maximum density of points in a sky, relative to the mean density in the photograph."""
+MAX_SKY_PIXEL_STEP, MIN_SKY_LUMA = 0.025, 0.45
+"""Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma."""
+MIN_SKY_BLUE_EXCESS = 0.02
+"""Minimum of blue minus red in a sky; a wall under lamps is below 0. A white sky must exceed MAX_EXPOSURE_COLOUR
+instead."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A finding about the photographs.
+
+    kind: identifies the check.
+    text: a clause for the report.
+    options: settings that answer the finding, best first, if they depend on the photographs.
+    """
+
+    kind: Kind
+    text: str
+    options: Sequence[Mapping[str, Any]] = ()
+
+
+def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list[Finding]:
+    """Run all checks on a scene.
+
+    use: how masks are used.
+    iterations: planned number of training steps, 0 if unknown.
+    Raises InputError like `Scene.check_pictures`.
+    """
+    looked = VisiblePoints(scene)
+    found = (
+        _few(scene),
+        _some(scene),
+        _few_steps(scene, iterations),
+        _exposure(looked),
+        _scales(looked),
+        _masks(scene, use),
+        _alpha(scene, use),
+        _undistorted(scene),
+        _sky(looked),
+        _blur(scene),
+        _duplicates(scene),
+    )
+    return [each for each in found if each is not None]
+
+
+def _exposure(looked: VisiblePoints) -> Finding | None:
+    gains = looked.gains
+    if len(gains) < 3:
+        return None
+    values = np.array(list(gains.values()))
+    spread = float(values.std(axis=0).max())
+    if spread < EXPOSURE_SPREAD_STOPS:
+        return None
+    grey = values @ REC601_LUMA.astype(np.float64)
+    low, high = (list(gains)[index] for index in (grey.argmin(), grey.argmax()))
+    return Finding(
+        "exposure",
+        f"exposures or colours differ by {spread:.2f} stops from photograph to photograph, {np.ptp(grey):.1f} from "
+        f"{low} to {high}",
+    )
+
+
+def _scales(looked: VisiblePoints) -> Finding | None:
+    distances = []
+    for view in looked.scene.train_views:
+        _, _, _, depths = looked.places.get(view.name, (0, 0, 0, np.empty(0)))
+        if len(depths) >= MIN_POINTS_PER_VIEW:
+            distances.append(float(np.median(depths)) / view.camera.fx * view.camera.width)
+    if len(distances) < 3:
+        return None
+    near, far = np.quantile(distances, (0.1, 0.9))
+    if far < DISTANCE_SPREAD_RATIO * near:
+        return None
+    return Finding("scales", f"distances of the photographs differ by a factor of {far / near:.0f}, from near to far")
+
+
+def _masks(scene: Scene, use: MaskUse) -> Finding | None:
+    if use.masks != "none":
+        return None
+    try:
+        found = masks_beside(scene.views)
+        some = sorted(found)[:: max(len(found) // SAMPLED_MASKS, 1)]
+        masks = [read_mask(found[name], orient=False, invert=False)[:, :, 0] for name in some]
+    except InputError as error:
+        return _strange_masks(scene, str(error).partition("; ")[0])
+    if not masks:
+        return None
+    kept = [(mask.mean(), np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()) for mask in masks]
+    inside, border = np.mean(kept, axis=0)
+    text = f"there are masks for {len(found):,} of {len(scene.views):,} photographs, and they are not used"
+    if border <= 1 - CUT_OUT_BORDER_FRACTION and inside < 0.5:
+        return Finding("cut out", f"{text}; they cut out an object that covers {100 * inside:.0f} % of the pictures")
+    return Finding("masks", f"{text}; they leave out {100 - 100 * inside:.0f} % of the pictures")
+
+
+def _strange_masks(scene: Scene, reason: str) -> Finding | None:
+    """Report masks that cannot be used. Returns None if no file in their folder fits a photograph."""
+    try:
+        count = len(masks_beside(scene.views, strict=False))
+    except InputError:
+        return None
+    if not count:
+        return None
+    text = f"there are masks for {count:,} of {len(scene.views):,} photographs, which cannot be used ({reason})"
+    return Finding("strange masks", text)
+
+
+def _alpha(scene: Scene, use: MaskUse) -> Finding | None:
+    if use.alpha != "blend":
+        return None
+    shares = np.array([scene.glances[view.name].transparent for view in scene.train_views])
+    if (shares >= TRANSPARENT_PIXEL_FRACTION).mean() < 0.5:
+        return None
+    part = f"{100 * shares.mean():.0f} %"
+    return Finding("alpha", f"{part} of the photographs' area is transparent, and shows the background")
+
+
+def _undistorted(scene: Scene) -> Finding | None:
+    wide = [
+        (2 * np.degrees(view.lens.width / 2 / view.lens.params[0]), view)
+        for view in scene.train_views
+        if view.lens.native is not None and view.camera.is_pinhole
+    ]
+    if not wide or (most := max(angle for angle, _ in wide)) < WIDE_FISHEYE_DEGREES:
+        return None
+    return Finding(
+        "undistorted",
+        f"{len(wide):,} photographs were taken by fisheyes of up to {most:.0f} degrees, and are undistorted",
+    )
+
+
+def _few(scene: Scene) -> Finding | None:
+    count = len(scene.train_views)
+    if count >= FEW_TRAINING_VIEWS:
+        return None
+    return Finding("few views", f"only {count} photographs to train on, so that views from elsewhere will show fog")
+
+
+def _some(scene: Scene) -> Finding | None:
+    count = len(scene.train_views)
+    if not FEW_TRAINING_VIEWS <= count < SPARSE_TRAINING_VIEWS:
+        return None
+    pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
+    points = len(scene.points)
+    most = max(min(pixels // MIN_PIXELS_PER_GAUSSIAN, MAX_GAUSSIANS_PER_POINT * points or pixels), points, 1)
+    why = f"{count} photographs to train on, with {points:,} points and {pixels / 1e6:.1f} million pixels"
+    sparse, bound = {"thinning": 0.2, "penalty": 0.02}, {"density.max_gaussians": most}
+    options = ({**sparse, **bound}, sparse, {"thinning": 0.2})
+    return Finding("some views", f"{why}, support about {most:,} Gaussians", options)
+
+
+def _few_steps(scene: Scene, iterations: int) -> Finding | None:
+    count = len(scene.train_views)
+    if iterations not in SHORT_TRAINING_STEPS or iterations >= FEW_STEPS_PER_VIEW * count:
+        return None
+    each = iterations / count
+    text = f"{iterations:,} steps are {each:.1f} for each of {count:,} photographs to train on, so higher rates pay"
+    return Finding("few steps", text)
+
+
+def _sky(looked: VisiblePoints) -> Finding | None:
+    scene = looked.scene
+    parts = [_sky_part(looked, view) for view in scene.train_views if view.name in looked.places]
+    with_sky = [part for part in parts if part >= MIN_SKY_PIXEL_FRACTION]
+    if len(with_sky) < max(3, MIN_SKY_VIEW_FRACTION * len(parts)) or not len(scene.points):
+        return None
+    return Finding(
+        "sky", f"{len(with_sky):,} photographs have a sky without points, {100 * np.mean(with_sky):.0f} % of each"
+    )
+
+
+def _sky_part(looked: VisiblePoints, view: View) -> float:
+    """Fraction of a view that is sky.
+
+    Sky is a bright, smooth, blue or white region at the upper border, above the horizon, with hardly any points.
+    """
+    pixels = looked.scene.glances[view.name].pixels
+    up = looked.up @ view.camera.rotation.T
+    turns = int(np.round(np.arctan2(up[0], -up[1]) / (np.pi / 2))) % 4  # quarter turns that make the picture upright
+    upright = np.rot90(pixels, turns)
+    light = upright @ REC601_LUMA
+    steps = np.zeros(light.shape)
+    steps[1:] = np.abs(np.diff(light, axis=0))
+    steps[:, 1:] = np.maximum(steps[:, 1:], np.abs(np.diff(light, axis=1)))
+    blue = upright[:, :, 2] - upright[:, :, 0]
+    likely = (
+        (light > MIN_SKY_LUMA)
+        & (steps < MAX_SKY_PIXEL_STEP)
+        & ((blue > MIN_SKY_BLUE_EXCESS) | (light > MAX_EXPOSURE_COLOUR))
+    )
+    reached = np.logical_and.accumulate(likely, axis=0)  # from the border down
+    part = float(reached.mean())
+    if part < MIN_SKY_PIXEL_FRACTION or not likely[0].mean() > 0.5:
+        return 0.0
+    _, rows, columns, _ = looked.places[view.name]
+    held = np.rot90(reached, -turns)[rows, columns].mean() if len(rows) else 1.0
+    if held > MAX_SKY_POINT_DENSITY_RATIO * part or _elevation(view, np.rot90(reached, -turns), looked.up) < 0:
+        return 0.0
+    return part
+
+
+def _elevation(view: View, part: NDArray[np.bool_], up: Float64) -> float:
+    """Sine of the elevation of the mean pixel of `part`, a mask (h, w) of the view."""
+    rows, columns = np.nonzero(part)
+    camera = view.camera.resized(part.shape[1], part.shape[0])
+    x, y = (columns.mean() + 0.5 - camera.cx) / camera.fx, (rows.mean() + 0.5 - camera.cy) / camera.fy
+    ray = np.array([x, y, 1.0]) @ camera.rotation
+    return float(ray @ up / np.linalg.norm(ray))
+
+
+def _blur(scene: Scene) -> Finding | None:
+    names = [view.name for view in scene.train_views]
+    logs = np.log([max(scene.glances[name].sharpness, 1e-6) for name in names])
+    if len(names) < 5:
+        return None
+    low, middle, high = np.quantile(logs, (0.25, 0.5, 0.75))
+    limit = min(middle + np.log(BLUR_SHARPNESS_RATIO), middle - BLUR_OUTLIER_SIGMAS * (high - low) / 1.349)
+    blurred = [name for name, value in zip(names, logs, strict=True) if value < limit]
+    if not blurred:
+        return None
+    return Finding("blur", f"{len(blurred):,} photographs are more blurred than the others ({examples(blurred)})")
+
+
+def _duplicates(scene: Scene) -> Finding | None:
+    """Find photographs with nearly identical thumbnails."""
+    by_size: dict[tuple[int, ...], list[str]] = {}
+    for view in scene.views:
+        by_size.setdefault(scene.glances[view.name].pixels.shape, []).append(view.name)
+    copies = []
+    for names in by_size.values():
+        flat = np.array([scene.glances[name].pixels[::4, ::4].ravel() for name in names], np.float64)
+        squares = (flat * flat).sum(axis=1)
+        apart = (squares[:, None] + squares - 2 * flat @ flat.T) / flat.shape[1]
+        for one, other in np.argwhere(np.triu(apart <= 4 * DUPLICATE_RMS * DUPLICATE_RMS, 1)):
+            a, b = (scene.glances[names[index]].pixels for index in (one, other))
+            if (
+                a.std(axis=(0, 1)).max() > FEATURELESS_THUMBNAIL_STD
+                and float(np.square(a - b).mean()) <= DUPLICATE_RMS * DUPLICATE_RMS
+            ):
+                copies.append(f"{names[other]} is {names[one]}")
+    if not copies:
+        return None
+    return Finding("duplicates", f"{len(copies):,} photographs are duplicates ({examples(copies)})")

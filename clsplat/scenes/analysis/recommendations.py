@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training settings that answer findings about a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Any
+
+from clsplat.config.presets import scheduled
+from clsplat.config.training import TrainConfig
+from clsplat.errors import InputError
+from clsplat.scenes.analysis.photo_findings import Finding, Kind
+
+SCHEDULE_SETTING = "schedule"
+"""Key of a schedule, which is a bundle of settings, in an answer."""
+SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
+    "exposure": ({"appearance": "exposure"},),
+    "scales": ({"antialiased": True},),
+    "masks": ({"masks": "ignore"},),
+    "cut out": ({"masks": "transparent"}, {"masks": "ignore"}),
+    "alpha": ({"alpha": "transparent"}, {"alpha": "ignore"}),
+    "undistorted": ({"lenses": "native"},),
+    "few steps": ({SCHEDULE_SETTING: "high-rates"},),
+    "few views": (
+        {
+            "thinning": 0.2,
+            "penalty": 0.02,
+            SCHEDULE_SETTING: "high-rates",
+            "iterations": 2000,
+            "optimiser.sh_rest_rate": 4e-4,  # few photographs constrain view-dependent colour least
+        },
+        {"thinning": 0.2, "penalty": 0.02},
+        {"thinning": 0.2},
+    ),
+}
+"""Settings that answer each kind of finding, best first. The first option compatible with the other settings is used.
+"""
+SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
+"""Settings that a schedule changes, apart from the number of steps."""
+ADVICE_BY_FINDING: Mapping[Kind, str] = {
+    "sky": "--sky 1000 starts with points far away for it",
+    "strange masks": "rename or remove what is no mask",
+    "blur": "leave them out where others show the same",
+    "duplicates": "remove the copies",
+}
+"""Advice on findings that no setting answers."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A finding and the settings that answer it.
+
+    settings: empty if no setting answers the finding, or none is compatible with the other settings.
+    given: name of a setting of the user that takes precedence, "" for none.
+    """
+
+    finding: Finding
+    settings: Mapping[str, Any]
+    given: str = ""
+
+    @property
+    def words(self) -> str:
+        """Finding with its answer, such as "exposures differ by 0.40 stops (--appearance exposure)".
+
+        Advice that --auto does not apply follows a colon.
+        """
+        kind = self.finding.kind
+        if advice := ADVICE_BY_FINDING.get(kind):
+            return f"{self.finding.text}: {advice}"
+        answer = flags(self.settings)
+        if (options := _options(self.finding)) and not self.settings:
+            wanted = flags(options[0])
+            given = f"--{self.given.replace('_', '-')} is given"
+            answer = given if self.given else f"{wanted} does not go with the other settings"
+        return f"{self.finding.text} ({answer})" if answer else self.finding.text
+
+
+def flags(settings: Mapping[str, Any]) -> str:
+    """Settings as command-line flags."""
+    words = []
+    for name, value in settings.items():
+        words.append(f"--{name.replace('_', '-')}" + ("" if value is True else f" {value}"))
+    return " ".join(words)
+
+
+def answered(
+    found: Sequence[Finding], config: TrainConfig, given: Collection[str] = ()
+) -> tuple[list[Answer], TrainConfig]:
+    """Answer each finding. Returns the answers, and the configuration with all of them applied.
+
+    given: names of settings that must not change.
+    """
+    answers = []
+    for finding in found:
+        options = _options(finding)
+        touched = [_touched(option, given) for option in options]
+        free = [option for option, name in zip(options, touched, strict=True) if not name]
+        taken: Mapping[str, Any] = {}
+        for option in free:
+            try:
+                config = with_settings(config, option)
+            except InputError:
+                continue
+            taken = option
+            break
+        answers.append(Answer(finding, taken, "" if free or not options else touched[0]))
+    return answers, config
+
+
+def _options(finding: Finding) -> Sequence[Mapping[str, Any]]:
+    """Settings that answer a finding, best first; empty if there are none."""
+    return finding.options or SETTINGS_BY_FINDING.get(finding.kind, ())
+
+
+def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
+    """First given setting, by name, that an option or its schedule would change; "" for none."""
+    names = {*option, *((*SCHEDULED_SETTINGS, "density.start") if SCHEDULE_SETTING in option else ())}
+    return min((name for name in given if name in names or name.partition(".")[0] in names), default="")
+
+
+def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:
+    """Apply the settings of an answer to a configuration.
+
+    Raises InputError if they are incompatible, or if a schedule would override settings that differ from the paper's.
+    """
+    changes = dict(settings)
+    config = replace(config, iterations=changes.pop("iterations", config.iterations))
+    if (name := changes.pop(SCHEDULE_SETTING, None)) is not None:
+        paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED_SETTINGS)
+        if values(config) != values(paper):
+            raise InputError(f"--schedule {name}: the run has settings of its own in place of the paper's schedule")
+        changes = dict(zip(SCHEDULED_SETTINGS, values(scheduled(name, config.iterations)), strict=True)) | changes
+    for each, value in changes.items():
+        config = changed(config, each, value)
+    config.check()
+    return config
+
+
+def changed(config: TrainConfig, name: str, value: Any) -> TrainConfig:
+    """Copy of the configuration with one setting changed. A name such as "density.stop" starts with its group."""
+    group, dot, field = name.partition(".")
+    return replace(config, **{group: replace(getattr(config, group), **{field: value}) if dot else value})
+
+
+def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:
+    """Report of the findings and their answers.
+
+    looked: number of photographs.
+    auto: True if the answers are applied.
+    """
+    if not answers:
+        return f"inspected {looked:,} photographs: no setting needs to change"
+    text = "; ".join(answer.words for answer in answers)
+    settings = " ".join(filter(None, (flags(answer.settings) for answer in answers)))
+    end = f". --auto {'takes' if auto else 'would take'} {settings}" if settings else ""
+    return f"inspected {looked:,} photographs: {text}{end}"

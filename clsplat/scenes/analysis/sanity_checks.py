@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sanity checks for scenes on which training would fail without an error.
+
+Some inspect the scene before the first step, others the rendered pictures after some steps. Each warning is one line
+that says how to correct the problem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.training import Background
+from clsplat.errors import InputError, examples
+from clsplat.images.alpha import background_colour, composite
+from clsplat.scenes.camera_checks import absurd
+from clsplat.scenes.point_files import count_points
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene, View
+
+FIRST_RENDER_CHECK_STEP = 100
+"""Training step after which rendered pictures are checked for the first time."""
+MAX_CHECKED_VIEWS = 8
+"""Maximum number of views that are checked, evenly spaced."""
+CHECK_DOWNSCALE = 4
+"""Factor by which checked pictures are downscaled."""
+MANY_START_POINTS = 1_000_000
+"""Number of start points above which more hardly help.
+
+Published models of rooms and gardens grow to 1 to 6 million Gaussians from 50,000 to 200,000 points.
+"""
+MAX_COINCIDENT_FRACTION = 0.05
+"""Fraction of the points that may coincide with others."""
+PRINCIPAL_POINT_MARGIN = 0.5
+"""Distance by which a principal point may lie outside the picture, as a fraction of its width or height."""
+WHITE_LEVEL, BLACK_LEVEL = 0.98, 0.02
+"""Minimum of each channel in a white pixel, and maximum in a black one."""
+BACKGROUND_BORDER_FRACTION = 0.9
+"""Fraction of the photographs' border pixels that have the background's colour if the photographs have a background."""
+
+
+def of_scene(scene: Scene, background: Background) -> list[str]:
+    """Warnings about the scene's points, cameras and photographs, and about the background colour."""
+    lenses = absurd([(view.name, view.lens) for view in scene.views])
+    looked = spread(scene.train_views, MAX_CHECKED_VIEWS)
+    pictures = [_pixels(view) for view in looked]
+    doubts = (
+        _many_points(scene),
+        _other_clouds(scene),
+        _coincident(scene),
+        _principal_points(scene),
+        lenses,
+        _one_place(scene),
+        _empty(looked, pictures, background),
+        _background(pictures, background),
+    )
+    return [text for text in doubts if text]
+
+
+def of_pictures(
+    draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: Sequence[View], kind: str = "training"
+) -> str:
+    """Warning about a model's pictures of these views, "" for none.
+
+    draw: renders the image (H, W, 3) and alpha (H, W) of a camera.
+    kind: the views' name in the message.
+    """
+    looked = spread(views, MAX_CHECKED_VIEWS)
+    drawn = [draw(_small(view.camera)) for view in looked]
+    if not any(alpha.any() for _, alpha in drawn):
+        return (
+            f"no Gaussian is seen by any of the {len(looked)} {kind} views that were checked: the points do not "
+            "lie before the cameras; check that both have the same axes, scale and origin"
+        )
+    if all(_is_flat(image) for image, _ in drawn) and not all(_is_flat(_pixels(view)) for view in looked):
+        return (
+            f"the pictures of all {len(looked)} {kind} views that were checked are of one colour, and the "
+            "photographs are not: check that cameras and points belong together, and settings other than the defaults"
+        )
+    return ""
+
+
+def spread(views: Sequence[View], count: int) -> list[View]:
+    """At most `count` of the views, evenly spaced."""
+    return [views[index] for index in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).astype(int))]
+
+
+def _small(camera: Camera) -> Camera:
+    return camera.resized(max(camera.width // CHECK_DOWNSCALE, 1), max(camera.height // CHECK_DOWNSCALE, 1))
+
+
+def _pixels(view: View) -> NDArray[np.float32]:
+    small = _small(view.camera)
+    return view.load(small.width, small.height)
+
+
+def _is_flat(image: NDArray[Any]) -> bool:
+    """True if the pixels differ by less than one 8-bit step in each channel."""
+    return bool(np.ptp(image.reshape(-1, image.shape[2]), axis=0).max() < 1 / 255)
+
+
+def _many_points(scene: Scene) -> str:
+    if len(scene.points) <= MANY_START_POINTS:
+        return ""
+    return (
+        f"{len(scene.points):,} points to start from are a Gaussian each, which takes memory and time from the first "
+        "step on: --points-limit 200000 keeps as many, evenly"
+    )
+
+
+def _other_clouds(scene: Scene) -> str:
+    """Warn of unused clouds next to the scene that are not copies of its points."""
+    if scene.start.file or not scene.clouds:
+        return ""
+    counts = {path: _count(path) for path in scene.clouds}
+    others = [f"{path} ({count:,} points)" for path, count in counts.items() if count not in (0, len(scene.points))]
+    if not others:
+        return ""
+    return f"{examples(others)} is not used, as the scene has points of its own: --points FILE starts from it"
+
+
+def _count(path: Path) -> int:
+    """Number of points in a cloud's header; 0 if it cannot be read."""
+    try:
+        return count_points(path)
+    except InputError:
+        return 0
+
+
+def _coincident(scene: Scene) -> str:
+    count = len(scene.points)
+    lost = count - len(np.unique(scene.points, axis=0)) if count else 0
+    if lost <= MAX_COINCIDENT_FRACTION * count:
+        return ""
+    return (
+        f"{lost:,} of {count:,} points lie where another one does: their Gaussians start with next to no size, or "
+        "as copies; leave doubles out of the cloud"
+    )
+
+
+def _principal_points(scene: Scene) -> str:
+    def outside(camera: Camera) -> bool:
+        across, down = camera.cx / camera.width, camera.cy / camera.height
+        return not (
+            -PRINCIPAL_POINT_MARGIN <= across <= 1 + PRINCIPAL_POINT_MARGIN
+            and -PRINCIPAL_POINT_MARGIN <= down <= 1 + PRINCIPAL_POINT_MARGIN
+        )
+
+    views = [view for view in scene.views if outside(view.camera)]
+    if not views:
+        return ""
+    camera = views[0].camera
+    where = f"{camera.cx:g} {camera.cy:g} in {camera.width} x {camera.height} pixels"
+    return (
+        f"the principal point of {examples(view.name for view in views)} lies far outside the picture, at {where}: "
+        "check cx and cy, which are pixels from the upper left corner at the cameras' size"
+    )
+
+
+def _one_place(scene: Scene) -> str:
+    if len(scene.views) < 2 or not scene.in_one_place:
+        return ""
+    return (
+        f"all {len(scene.train_views):,} training cameras stand in one place, from where nothing has a depth: check "
+        "the translations of the poses; of photographs that were taken so, views from elsewhere cannot be learnt"
+    )
+
+
+def _empty(views: Sequence[View], pictures: Sequence[NDArray[np.float32]], background: Background) -> str:
+    colour = background_colour(background)
+    if not all(_is_flat(composite(pixels, colour)) for pixels in pictures):
+        return ""
+    return (
+        f"the {len(views)} training photographs that were checked are of one colour, or transparent, so that there "
+        f"is nothing to learn: check {examples(view.name for view in views)}"
+    )
+
+
+def _background(pictures: Sequence[NDArray[np.float32]], background: Background) -> str:
+    edges = []
+    for pixels in pictures:
+        if pixels.shape[2] == 4 and pixels[:, :, 3].min() < 1:
+            return ""  # training composites it over the background
+        edges.append(np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])[:, :3])
+    border = np.concatenate(edges)
+    for name, part in (("white", (border >= WHITE_LEVEL).all(axis=1)), ("black", (border <= BLACK_LEVEL).all(axis=1))):
+        other = "random" if background == "random" else {"white": "black", "black": "white"}[background]
+        if part.mean() >= BACKGROUND_BORDER_FRACTION and background != name and (name == "white" or other == "black"):
+            return (
+                f"{100 * part.mean():.0f} % of the photographs' border is {name}, and the background is {background}: "
+                f"use --background {name}, else Gaussians have to cover it"
+            )
+    return ""

@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contents of a data set in any layout: images with lenses and poses, and points.
+
+Also the pinhole camera that replaces each lens, and the resampling between the two. The camera models and their
+formulas are COLMAP's, evaluated by pycolmap (`Camera.img_from_cam`, `undistort_camera`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import CAMERA_MODELS, Camera
+from clsplat.cameras.model import CameraModel, LensModel
+from clsplat.config.training import Lenses
+from clsplat.errors import InputError, examples
+from clsplat.images.alpha import associate, unassociate
+from clsplat.images.reading import downscale
+from clsplat.process import undisturbed
+
+with undisturbed():  # its import reports Ctrl-C as "not installed", and sets a SIGTERM handler that prints its stack
+    import pycolmap
+
+
+MAX_IMAGE_SIDE_PX = 1 << 20
+"""Maximum width or height in pixels; a larger one means a damaged file. Keeps width times height far from overflow."""
+MAX_COORDINATE = 1e30
+"""Coordinates of this magnitude or more mean a damaged file. Their squares are still finite."""
+MIN_FOCAL_PER_SIDE = 1 / 20
+"""Minimum plausible focal length, as a fraction of the longer side. A fisheye of 220 degrees has 1/4."""
+MIN_CENTRE_CHECK_SIDE_PX = 16
+"""Minimum shorter side in pixels of a picture in whose first pixel a principal point is implausible."""
+
+
+@cache
+def models() -> dict[int, tuple[str, int]]:
+    """Name and number of parameters of each camera model that pycolmap knows, by COLMAP's id."""
+    known = {}
+    for name, member in pycolmap.CameraModelId.__members__.items():
+        if int(member) >= 0:
+            camera = pycolmap.Camera.create_from_model_name(1, name, 1.0, 1, 1)
+            known[int(member)] = (name, len(camera.params))
+    return known
+
+
+@cache
+def lens_models() -> dict[str, tuple[LensModel, CameraModel]]:
+    """The lenses of the camera models by name, each with its camera model."""
+    return {lens.name: (lens, model) for model in CAMERA_MODELS for lens in model.lenses}
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of the camera that took a picture.
+
+    model: COLMAP's name.
+    width, height: pixels.
+    params: COLMAP's, in its order; focal lengths and principal point in pixels. The first pixel's centre is at (0.5,
+        0.5).
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def native(self) -> CameraModel | None:
+        """The camera model that shows its pictures without undistortion, if it is no pinhole; else None."""
+        camera_model = lens_models().get(self.model, (None, None))[1]
+        return camera_model if camera_model is not None and not camera_model.is_pinhole else None
+
+    @property
+    def is_colmap(self) -> bool:
+        """True if COLMAP has the model; the formulas of others are those of their camera model."""
+        return self.model not in lens_models() or lens_models()[self.model][0].is_colmap
+
+    @property
+    def is_panorama(self) -> bool:
+        """True for panoramas, which no pinhole camera can show."""
+        return self.native is not None and self.native.wraps
+
+    @property
+    def is_bent_by_design(self) -> bool:
+        """True for fisheyes, panoramas and similar models, which shift pixels even if their coefficients are 0."""
+        return self.native is not None or self.model in ("FOV", "EUCM") or "FISHEYE" in self.model
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True if pictures need no undistortion. Distorted models whose coefficients are all 0 count too."""
+        if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
+            return True
+        camera = self._camera()
+        return not self.is_bent_by_design and not any(self.params[index] for index in camera.extra_params_idxs())
+
+    @property
+    def focal(self) -> float:
+        """Shortest focal length in pixels."""
+        return min(float(self.params[index]) for index in self._camera().focal_length_idxs())
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Principal point in pixels."""
+        x, y = (self.params[index] for index in self._camera().principal_point_idxs())
+        return x, y
+
+    def pinhole(self, rotation: Float64, translation: Float64) -> Camera:
+        """Pinhole camera of the undistorted picture, with the pose of the original.
+
+        Size and focal length follow COLMAP's image undistorter. It keeps the focal length and crops so that no pixel
+        lies outside the source picture, if this leaves at least a fifth of its size. A fisheye of 180 degrees or more
+        keeps about its picture's size. It loses everything beyond, which no pinhole camera can show.
+        """
+        camera = self._camera()
+        if not self.is_pinhole:
+            camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+        return Camera(
+            width=int(camera.width),
+            height=int(camera.height),
+            fx=float(camera.focal_length_x),
+            fy=float(camera.focal_length_y),
+            cx=float(camera.principal_point_x),
+            cy=float(camera.principal_point_y),
+            rotation=rotation,
+            translation=translation,
+        )
+
+    def camera(self, rotation: Float64, translation: Float64, lenses: Lenses) -> Camera:
+        """Camera for training: the lens itself for a panorama, or for a fisheye that is not undistorted, else
+        `pinhole`."""
+        native = self.native
+        if native is None or (lenses == "undistort" and not native.wraps):
+            return self.pinhole(rotation, translation)
+        if native.wraps:
+            whole = native.whole(self.width, self.height)
+            return Camera(self.width, self.height, *whole, rotation, translation).through(native)
+        count = lens_models()[self.model][0].coefficients
+        given = [self.params[index] for index in self._camera().extra_params_idxs()][:count]
+        return self.bare(rotation, translation).through(native, (*given, *[0.0] * (4 - count)))
+
+    def bare(self, rotation: Float64, translation: Float64) -> Camera:
+        """Pinhole camera with the same size, focal lengths and principal point, without the distortion."""
+        of = self._camera()
+        focal, centre = (of.focal_length_x, of.focal_length_y), (of.principal_point_x, of.principal_point_y)
+        return Camera(self.width, self.height, *focal, *centre, rotation, translation)
+
+    def resized(self, width: int, height: int) -> Lens:
+        """Same lens on another pixel grid. If width and height scale differently, its model has two focal lengths."""
+        if self.is_panorama:
+            return Lens(self.model, width, height, (float(width), float(height)))
+        sx, sy = width / self.width, height / self.height
+        named, _ = lens_models().get(self.model, (LensModel(self.model), None))
+        if named.with_two and abs(sx - sy) * max(self.width, self.height) > 1:
+            model, rest = named.with_two, named.with_two_coefficients
+            coefficients = [*self.params[3:], *[0.0] * rest][:rest]
+            both = (self.params[0], *self.params[:3], *coefficients)
+            return replace(self, model=model, params=both).resized(width, height)
+        camera = self._camera()
+        params = list(self.params)
+        focal, principal = list(camera.focal_length_idxs()), list(camera.principal_point_idxs())
+        for indices in (focal, principal):
+            for index, scale in zip(indices, (sx, sy) if len(indices) == 2 else (math.sqrt(sx * sy),), strict=True):
+                params[index] *= scale
+        return replace(self, width=width, height=height, params=tuple(params))
+
+    def refocused(self, log: float, x: float, y: float) -> Lens:
+        """Same lens, changed as `Camera.refocused` changes a camera."""
+        camera, params = self._camera(), list(self.params)
+        shift = (x * camera.focal_length_x, y * camera.focal_length_y)
+        for index, by in zip(camera.principal_point_idxs(), shift, strict=True):
+            params[index] += by
+        for index in camera.focal_length_idxs():
+            params[index] *= math.exp(log)
+        return replace(self, params=tuple(params))
+
+    def img_from_cam(self, points: Float64) -> Float64:
+        """Project points (N, 3) in camera space to pixels (N, 2); NaN for points without an image in this model."""
+        if self.native is not None and not self.is_colmap:
+            shown = self.camera(np.eye(3), np.zeros(3), "native")
+            a, b, _ = self.native.places_of(shown, points)
+            u = self.native.wrapped(shown, shown.cx + shown.fx * a)
+            return np.stack([u, shown.cy + shown.fy * b], axis=1)
+        return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(points, np.float64)))
+
+    def cam_from_img(self, pixels: Float64) -> Float64:
+        """Intersect the rays of pixels (N, 2) with the plane z = 1, (N, 2); NaN for pixels without a ray."""
+        return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
+
+    def _camera(self) -> pycolmap.Camera:
+        model = self.model if self.is_colmap else "PINHOLE"  # for focal lengths and principal point alone
+        camera = pycolmap.Camera(model=model, width=self.width, height=self.height, params=list(self.params))
+        camera.camera_id = 1
+        return camera
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image of a data set: its name, its lens at the listed size, and its pose `cam_from_world`.
+
+    rotation, translation: (3, 3) and (3,), float64.
+    path: the file, if the data set names it.
+    split: "train", "test", or None if the data set has no split of its own.
+    mask, depth: files of the mask and the depth map, if the data set names them.
+    listed: the name in the data set, if the file has another.
+    """
+
+    name: str
+    lens: Lens
+    rotation: Float64
+    translation: Float64
+    path: Path = Path()
+    split: str | None = None
+    mask: Path | None = None
+    depth: Path | None = None
+    listed: str = ""
+
+    @property
+    def rank(self) -> str:
+        """Name that sorts the image for the split."""
+        return self.listed or self.name
+
+
+@dataclass(eq=False)
+class DataSet:
+    """Images and points of a data set.
+
+    points: (N, 3) float64, world coordinates.
+    colors: (N, 3) float32 in [0, 1].
+    box: corners (low, high) of instant-ngp's volume, world units, or None.
+    missing: names of listed pictures that do not exist and are left out.
+    clouds: point files that the data set does not name. The first is used if there are no points.
+    """
+
+    images: list[PosedImage]
+    points: Float64 = field(default_factory=lambda: np.empty((0, 3)))
+    colors: Float32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    box: tuple[Float64, Float64] | None = None
+    missing: list[str] = field(default_factory=list)
+    clouds: list[Path] = field(default_factory=list)
+
+
+def check_lens(lens: Lens, where: str) -> Lens:
+    """Return `lens`. Raises InputError, beginning with `where`, if it cannot be used."""
+    counts = dict(models().values())
+    counts |= {name: 2 if model.wraps else 4 for name, (row, model) in lens_models().items() if not row.is_colmap}
+    if lens.model not in counts:
+        listed = ", ".join(counts)
+        raise InputError(f"{where}: unknown camera model {lens.model}, expected one of {listed}")
+    if len(lens.params) != counts[lens.model]:
+        raise InputError(
+            f"{where}: {lens.model} has {len(lens.params)} parameters, expected {counts[lens.model]}; export it again"
+        )
+    if not (0 < lens.width <= MAX_IMAGE_SIDE_PX and 0 < lens.height <= MAX_IMAGE_SIDE_PX):
+        raise InputError(
+            f"{where}: image size {lens.width} x {lens.height}, expected 1 to {MAX_IMAGE_SIDE_PX} pixels a side"
+        )
+    if lens.is_panorama:
+        if list(lens.params) != [lens.width, lens.height]:
+            sides = f"{lens.width} {lens.height}"
+            raise InputError(
+                f"{where}: parameters {list(lens.params)}, expected its size, {sides}, of a whole panorama"
+            )
+        return lens
+    camera = lens._camera()  # noqa: SLF001
+    focal = [lens.params[index] for index in camera.focal_length_idxs()]
+    if not all(math.isfinite(value) for value in lens.params) or min(focal) <= 0:
+        raise InputError(f"{where}: parameters {list(lens.params)}, expected finite ones, focal lengths above 0")
+    return lens
+
+
+def in_pixels(lens: Lens) -> tuple[Lens, bool]:
+    """Convert a lens to pixels if it was given in fractions of the picture's width and height.
+
+    A principal point in the first pixel is implausible for a photograph, whereas 0.5 0.5 is the middle in fractions.
+    Focal lengths then are fractions too if they are under MIN_FOCAL_PER_SIDE of the longer side.
+    Returns the lens, and True if it was converted.
+    """
+    camera = lens._camera()  # noqa: SLF001
+    sides, params = (lens.width, lens.height), list(lens.params)
+    centre = list(camera.principal_point_idxs())
+    if lens.is_panorama or min(sides) < MIN_CENTRE_CHECK_SIDE_PX or not all(0 < params[index] <= 1 for index in centre):
+        return lens, False
+    focal = list(camera.focal_length_idxs())
+    if all(params[index] < MIN_FOCAL_PER_SIDE * max(sides) for index in focal):
+        given = [params[index] for index in focal]
+        alike = len(given) == 2 and abs(given[0] / given[1] - 1) < abs(given[0] * sides[0] / given[1] / sides[1] - 1)
+        by = (sides[0],) * 2 if alike else sides  # both are fractions of the width, as pixels are square
+        for index, side in zip(focal, by if len(focal) == 2 else (max(sides),), strict=True):
+            params[index] *= side
+    for index, side in zip(centre, sides, strict=True):
+        params[index] *= side
+    return replace(lens, params=tuple(params)), True
+
+
+def given_in_parts(names: Iterable[object]) -> str:
+    """Warning about cameras of these names whose lenses `in_pixels` converted."""
+    return (
+        f"the principal point (cx cy) of {examples(names)} is given in parts of the picture's width and height and not "
+        "in pixels; it is read so, and focal lengths of under a twentieth of the picture with it"
+    )
+
+
+def pixels_of(
+    points: Float64, camera: Camera, lens: Lens | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Locate points in a view's picture.
+
+    points: (N, 3), world coordinates.
+    lens: needed if the camera is not a pinhole camera.
+    Returns the rows and columns of the points in front of the camera and in its picture, and `inside` (N,), True for
+    them.
+    """
+    local = points @ camera.rotation.T + camera.translation
+    if lens is not None and not camera.is_pinhole:
+        place = lens.resized(camera.width, camera.height).img_from_cam(local)
+        angle = np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])
+        ahead = (np.linalg.norm(local, axis=1) > camera.near) & (angle <= camera.fold[0])
+        with np.errstate(invalid="ignore"):
+            shown = ahead & ((place >= 0) & (place < [camera.width, camera.height])).all(axis=1)
+        return place[shown, 1].astype(np.int64), place[shown, 0].astype(np.int64), shown
+    depth = local[:, 2]
+    ahead = depth > camera.near
+    by = np.where(ahead, depth, 1.0)
+    x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
+    inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    return y[inside].astype(np.int64), x[inside].astype(np.int64), inside
+
+
+def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: Float64, cell: float) -> Float64:
+    """For each point, the least depth among the points in its cell of `cell` x `cell` pixels, (N,)."""
+    across, down = (columns // cell).astype(np.int64), (rows // cell).astype(np.int64)
+    cells = down * (across.max(initial=0) + 1) + across
+    nearest = np.full(cells.max(initial=0) + 1, np.inf)
+    np.minimum.at(nearest, cells, depths)
+    return np.asarray(nearest[cells])
+
+
+def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:
+    """Resample a picture (H, W, C) taken through `lens` to a camera at the same position.
+
+    A cubic spline interpolates, clipped to the picture's range of values. If `camera` is less than 3/4 as wide as the
+    lens's own pinhole camera, interpolation is bilinear at the latter's scale, followed by an area average. Alpha is
+    straight in input and output. Pixels outside the picture repeat its border. `Lens.pinhole` has no such pixels,
+    except for extreme fisheyes.
+    """
+    natural = lens.pinhole(camera.rotation, camera.translation)
+    shrinks = camera.width < 0.75 * natural.width
+    grid = camera.resized(natural.width, natural.height) if shrinks else camera
+    x, y = np.meshgrid(
+        (np.arange(grid.width) + 0.5 - grid.cx) / grid.fx, (np.arange(grid.height) + 0.5 - grid.cy) / grid.fy
+    )
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    pixels = lens.img_from_cam(rays) - 0.5  # the centre of the first pixel is sample 0
+    far = 2.0 * max(lens.width, lens.height)
+    pixels = np.clip(np.nan_to_num(pixels, nan=far), -far, far)
+    coordinates = pixels[:, ::-1].T.reshape(2, grid.height, grid.width)
+
+    has_alpha = image.shape[2] == 4
+    source = associate(image) if has_alpha else image
+    result = np.empty((grid.height, grid.width, source.shape[2]), np.float32)
+    for channel in range(source.shape[2]):
+        plane = np.ascontiguousarray(source[:, :, channel])
+        ndimage.map_coordinates(plane, coordinates, result[:, :, channel], order=1 if shrinks else 3, mode="nearest")
+        np.clip(result[:, :, channel], plane.min(), plane.max(), out=result[:, :, channel])
+    if has_alpha:
+        result = unassociate(result)
+    return downscale(result, camera.width, camera.height)

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Known depths of a scene's views, from COLMAP's tracks or from depth maps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.config.depth import DepthUse
+from clsplat.errors import InputError, examples, warn
+from clsplat.files.documents import is_file
+from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
+from clsplat.scenes.dataset import pixels_of
+from clsplat.scenes.photo_names import match
+from clsplat.scenes.readers import colmap
+from clsplat.scenes.sidecar_files import bases_of, beside, owned
+from clsplat.scenes.supervision.depth_samples import KnownDepth, sampled
+
+if TYPE_CHECKING:
+    from clsplat.scenes.dataset import Lens
+    from clsplat.scenes.scene import Scene, View
+
+DEPTH_FOLDERS = ("depths", "depth")
+"""Names of the depth map folder, next to the photographs' folder or inside it."""
+MIN_DEPTH_FIT_POINTS = 10
+"""Minimum number of points in a photograph to fit its relative depth map to."""
+MIN_TRACKED_POINTS_IN_VIEW = 0.1
+"""Minimum fraction of tracked points that lie in their photographs.
+
+An undistorted fisheye of 200 degrees keeps 0.4. Cameras in another coordinate frame kept 0.001.
+"""
+MAX_DEPTH_SCALE_RATIO = 5.0
+"""Maximum ratio between the scale of a relative map and the median over the photographs."""
+
+
+def with_depths(scene: Scene, use: DepthUse) -> Scene:
+    """Scene whose training views have their known depths; `scene` itself if it has them already.
+
+    Warns of photographs without known depths. Raises InputError for points without tracks. Also raises it for maps that
+    are missing, do not decode, have another shape than their photograph, or fit no photograph.
+    """
+    if scene.depth_use == use:
+        return scene
+    if not use:
+        known: dict[str, KnownDepth] = {}
+    elif use.source == "points":
+        known = _tracked(scene, f"--depth {use.source}")
+    else:
+        known = _mapped(scene, use)
+    without = [view.name for view in scene.train_views if view.name not in known]
+    if use and without:
+        warn(f"{scene.name}: of {len(without):,} photograph(s) no depths are known ({examples(without)})")
+    views = [replace(view, depth=known.get(view.name) if view.split == "train" else None) for view in scene.views]
+    return replace(scene, views=views, depth_use=use)
+
+
+def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
+    """Points that COLMAP observed in each photograph, weighted by their error e in pixels: 1/(1 + e^2)."""
+    model = None if scene.source is None else colmap.find_model(scene.source)
+    if model is None:
+        raise InputError(f"{scene.name}: {asked} wants to know which photographs show a point, expected a COLMAP model")
+    tracks = colmap.read_tracks(model)
+    weights = 1 / (1 + np.square(np.maximum(tracks.errors, 0.0)))
+    tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
+    if not tracked:
+        raise InputError(f"{model}: no point has a track, and {asked} goes by them; export the model with tracks")
+    names = match([view.name for view in scene.train_views], tracked).names
+    rows = {name: tracked[theirs] for name, theirs in names.items()}
+    known = {name: KnownDepth(tracks.points[which], weights[which]) for name, which in rows.items()}
+    if not known:
+        raise InputError(
+            f"{model}: has photographs such as {examples(sorted(tracked))}, and none of the scene's "
+            f"({examples([view.name for view in scene.train_views])}), expected the same; {asked} goes by their points"
+        )
+    _check_frame(scene, known, model)
+    return known
+
+
+def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
+    """Raise InputError if hardly any tracked point lies in its photographs: the cameras may be in another frame."""
+    seen = whole = 0
+    for view in scene.train_views:
+        if view.name in known:
+            camera = view.camera.before(scene.near)
+            seen += int(np.count_nonzero(pixels_of(known[view.name].points, camera, view.lens)[2]))
+            whole += len(known[view.name].points)
+    if seen < MIN_TRACKED_POINTS_IN_VIEW * whole:
+        raise InputError(
+            f"{model}: of {whole:,} points that its photographs show {seen:,} are in these by the scene's cameras, "
+            "expected most of them: take cameras and points of one model"
+        )
+
+
+def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
+    """Depth maps of the photographs. Relative maps get the scale and offset that fit the points."""
+    told = {view.name: view.depth_file for view in scene.views if view.depth_file}
+    files = {**_beside(scene.views, told, strict=not scene.missing), **told}
+    if not files:
+        raise InputError(
+            f"{scene.name}: --depth maps, and there are none; expected depths/IMAGE.png, .exr or .npy beside images/, "
+            "or 'depth_file_path' in transforms.json"
+        )
+    nothing = (np.empty((0, 3)), np.empty(0))
+    lenses, known = {view.name: view.lens for view in scene.views}, {}
+    for name, path in files.items():
+        width, height, whole = map_header(path)
+        _check_shape(path, width, height, lenses[name])
+        known[name] = KnownDepth(*nothing, path, use.unit if whole else 1.0, whole=whole)
+    if use.maps == "relative":
+        return _fitted(scene, known)
+    return {name: one for name, one in known.items() if one.measured(read_map(_path(one))).any()}
+
+
+def _check_shape(path: Path, width: int, height: int, lens: Lens) -> None:
+    if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height):
+        raise InputError(
+            f"{path}: the depth map is {width} x {height} pixels, expected the shape of its photograph's "
+            f"{lens.width} x {lens.height}; make it of that shape"
+        )
+
+
+def _fitted(scene: Scene, known: dict[str, KnownDepth]) -> dict[str, KnownDepth]:
+    """Fit relative maps, which grow with nearness, to the points of each photograph. Scale and offset come from
+    medians.
+
+    Maps with few points, or with a scale far from the others, are left out; `with_depths` warns of them.
+    """
+    points, fits = _tracked(scene, "--depth-maps relative"), {}
+    for view in scene.train_views:
+        if view.name not in known or view.name not in points:
+            continue
+        pixels, near, _ = points[view.name].at(view.camera, view.lens)
+        values = sampled(read_map(_path(known[view.name])), view.camera, view.lens).ravel()[pixels]
+        good = np.isfinite(values)
+        if good.sum() >= MIN_DEPTH_FIT_POINTS:
+            (aim, by_aim), (middle, by) = (_middle(each[good].astype(np.float64)) for each in (near, values))
+            if by > 0:
+                fits[view.name] = (by_aim / by, aim - middle * by_aim / by)
+    usual = float(np.median([scale for scale, _ in fits.values()])) if fits else 0.0
+    good_fits = {
+        name: fit for name, fit in fits.items() if 1 / MAX_DEPTH_SCALE_RATIO <= fit[0] / usual <= MAX_DEPTH_SCALE_RATIO
+    }
+    if not good_fits:
+        raise InputError(
+            f"{scene.name}: no relative depth map agrees with the points, expected values that grow with nearness "
+            "(disparity); --depth-maps metric takes them for depths"
+        )
+    return {name: replace(known[name], fit=fit) for name, fit in good_fits.items()}
+
+
+def _path(known: KnownDepth) -> Path:
+    assert known.path is not None
+    return known.path
+
+
+def _middle(values: Float64) -> tuple[float, float]:
+    """Median, and mean absolute deviation from it."""
+    median = float(np.median(values))
+    return median, float(np.abs(values - median).mean())
+
+
+def _beside(views: Sequence[View], told: Mapping[str, Path], *, strict: bool) -> dict[str, Path]:
+    """Depth maps by view name, in a folder next to the photographs' folder or inside it.
+
+    A map is named like its photograph, with or without the photograph's extension, or with _depth or .depth after the
+    stem.
+    told: maps that the data set names, which are skipped.
+    strict: raise InputError for a map that fits no photograph.
+    Raises InputError for two maps of one photograph.
+    """
+    if all(view.name in told for view in views):
+        return {}
+    for base in bases_of(views):
+        folder = beside(base, DEPTH_FOLDERS)
+        if folder is None:
+            continue
+        known: dict[str, str] = {}
+        for view in views:
+            plain = PurePosixPath(view.path.relative_to(base).as_posix())
+            stem = str(plain.with_suffix(""))
+            for key in (str(plain), stem, f"{stem}_depth", f"{stem}.depth"):
+                known.setdefault(key, view.name)
+        example = next(iter(sorted(known)))
+        return owned(folder, _maps_in(folder), known, "depth map", example, without=told.values(), strict=strict)
+    return {}
+
+
+def _maps_in(folder: Path) -> Iterator[Path]:
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in DEPTH_MAP_SUFFIXES and not path.name.startswith(".") and is_file(path):
+            yield path

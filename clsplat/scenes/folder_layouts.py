@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layouts of data sets: the kind of a folder, its pictures, and which of them are held out or missing."""
+
+from __future__ import annotations
+
+import codecs
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from clsplat.config.training import Missing
+from clsplat.errors import InputError, examples, warn
+from clsplat.files.documents import is_file, open_input
+from clsplat.images.reading import companions, find_images
+from clsplat.scenes.dataset import DataSet, PosedImage
+from clsplat.scenes.photo_files import DOWNSCALED_FOLDER_FACTORS, called, find_pictures, has_pictures, or_smaller
+from clsplat.scenes.photo_names import legible, match
+from clsplat.scenes.point_files import clouds_beside
+from clsplat.scenes.readers import colmap, transforms
+from clsplat.scenes.sidecar_files import inside
+
+Kind = Literal["colmap", "blender", "transforms", "photos"]
+
+COLMAP_IMAGE_FOLDER = "images"
+"""Name of the picture folder of a COLMAP model."""
+OTHER_IMAGE_FOLDERS = ("input", "inputs", "image", "img", "imgs", "rgb", "color", "frames", "photos", "pictures")
+"""Names of the picture folder in other programs' data sets, in the order tried. 3DGS' convert.py reads input/."""
+MODEL_FOLDERS = ("sparse", "colmap", "distorted")
+"""Names of folders with a model and no pictures, which may be given instead of the scene's folder."""
+HELD_OUT_LIST_FILE = "test.txt"
+"""File with the names of the held-out pictures, one a line.
+
+It lies next to a COLMAP model (3DGS authors' code, hierarchical-3d-gaussians) or a transforms.json (LichtFeld).
+"""
+MAX_HELD_OUT_LIST_BYTES = 64 << 20
+"""Maximum size of this file in bytes."""
+
+
+def detect(path: Path) -> Kind:
+    """Layout of a scene's folder or transforms.json. Raises InputError that lists the known layouts if it has none."""
+    path = Path(path)
+    if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise InputError(f"{path}: is a file, expected a scene's folder or a transforms.json")
+        return "blender" if path.name == "transforms_train.json" else "transforms"
+    if not path.is_dir():
+        raise InputError(f"{path}: no such folder, expected a scene")
+    if (path / "transforms_train.json").is_file():
+        return "blender"
+    model = colmap.find_model(path)
+    # nerfstudio keeps the COLMAP model behind its transforms.json below colmap/; that model has larger pictures
+    if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
+        return "colmap"
+    if (path / "transforms.json").is_file():
+        return "transforms"
+    if find_images(path):
+        return "photos"
+    raise InputError(
+        f"{path}: no images found, nor sparse/, transforms_train.json or transforms.json; expected a COLMAP, Blender, "
+        "nerfstudio or instant-ngp scene, or a folder of photos"
+    )
+
+
+def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tuple[DataSet, list[Path]]:
+    """Read a COLMAP model, and find the folders of downscaled pictures that may replace its pictures. Raises
+    InputError."""
+    model_path = colmap.find_model(path)
+    assert model_path is not None  # detect has found it
+    model = colmap.read_model(model_path)
+    folder = _picture_folder(path, chosen, model_path, model.images)
+    present = find_images(folder)
+    if not present:
+        raise InputError(f"{folder}: no images found, expected the {len(model.images)} of {model_path}")
+    listed = [image.name for image in model.images]
+    files = find_pictures(listed, [folder / name for name in listed], folder, model_path, missing, present)
+    names = [called(name, folder / name, file, folder) for name, file in zip(listed, files, strict=True)]
+    posed = zip(model.images, names, files, strict=True)
+    model.images = [
+        replace(image, name=name, path=file, listed=legible(image.name))
+        for image, name, file in posed
+        if file is not None
+    ]
+    model.missing = [legible(name) for name, file in zip(listed, files, strict=True) if file is None]
+    _warn_of_unlisted(present, model, model_path, folder)
+    model.images = _held_out(model, model_path / HELD_OUT_LIST_FILE)
+    model.clouds = clouds_beside([model_path, path])
+    smaller = (
+        []
+        if chosen is not None
+        else [folder.with_name(f"{folder.name}_{factor}") for factor in DOWNSCALED_FOLDER_FACTORS]
+    )
+    return model, [candidate for candidate in smaller if candidate.is_dir()]
+
+
+def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:
+    """Read the data set of one transforms.json, or of Blender's two. Raises InputError."""
+    folder = path.parent if path.is_file() else path
+    images = None if chosen is None else folder / chosen
+    if images is not None and not images.is_dir():
+        raise InputError(f"{images}: no such folder, expected the images of {path}")
+    if kind == "blender":
+        listed_in = folder / "transforms_*.json"
+        data = transforms.read_blender(folder, images=images, missing=missing)
+    else:
+        listed_in = path if path.is_file() else folder / "transforms.json"
+        data = transforms.read_transforms(listed_in, masks=masks, images=images, missing=missing)
+    if not any(image.split for image in data.images):
+        data.images = _held_out(data, folder / HELD_OUT_LIST_FILE)
+    parents = {image.path.parent for image in data.images}
+    present = [file for parent in parents for file in find_images(parent, deep=False)]
+    _warn_of_unlisted(present, data, listed_in, folder)
+    return data
+
+
+def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
+    """Folder of a COLMAP model's pictures: images/, a downscaled copy, another known name, or the scene's folder
+    itself.
+
+    Folders that hold one of the listed pictures come first. Warns if the folder is not images/. Raises InputError if
+    there is none.
+    """
+    if chosen is not None:
+        if not (folder := path / chosen).is_dir():
+            raise InputError(f"{folder}: no such folder, expected the images of {model_path}")
+        return folder
+    # If the model's own folder or sparse/ was given, the pictures are next to one of the folders above it.
+    above = [path, *path.resolve().parents[:2]] if model_path == path or path.name in MODEL_FOLDERS else [path]
+    usual = [inside(parent, (COLMAP_IMAGE_FOLDER,)) or parent / COLMAP_IMAGE_FOLDER for parent in above]
+    if own := next((folder for folder in usual if has_pictures(folder)), None):
+        return own
+    copies = [copy for folder in usual if (copy := or_smaller(folder)) != folder]
+    named = [inside(parent, (name,)) for parent in above for name in OTHER_IMAGE_FOLDERS]
+    others = [folder for folder in named if folder is not None and has_pictures(folder)]
+    bare = [parent for parent in above if find_images(parent, deep=False)]  # RealityScan writes all in one folder
+    found = [*copies, *others, *bare]
+    listed = [folder for folder in found if any(is_file(folder / image.name) for image in images)]
+    if listed or found:
+        folder = (listed or found)[0]
+        warn(f"{model_path}: the pictures are taken from {folder}, as there are none in {usual[0]}")
+        return folder
+    if not (empty := [folder for folder in usual if folder.is_dir()]):
+        raise InputError(f"{usual[0]}: no such folder, expected the {len(images)} images of {model_path}")
+    return empty[0]
+
+
+def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, folder: Path) -> None:
+    listed = {image.path for image in data.images}
+    unlisted = sorted(path for path in present if path not in listed)
+    pictures = {*listed, *(folder / name for name in data.missing)}
+    known = companions(unlisted, pictures, folder) if unlisted else set()
+    if unlisted := [path for path in unlisted if path not in known]:
+        warn(
+            f"{listed_in}: does not list {len(unlisted):,} image(s) that are there, and they are not used: "
+            f"{examples(unlisted)}"
+        )
+
+
+def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
+    """Images with the split from a file of held-out names, if it exists.
+
+    Names are matched as loosely as those in a model (`photo_names.match`). Warns of names that match no picture. Raises
+    InputError if nothing is left to train on.
+    """
+    path = next((each for each in path.parent.iterdir() if each.name.lower() == path.name), path)
+    if not is_file(path):
+        return data.images
+    lines = [line.strip("\ufeff \t").strip("\"',").strip() for line in _text(path).splitlines()]
+    names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
+    found = match(names, [*(image.name for image in data.images), *data.missing])
+    if lost := [legible(name) for name in names if name not in found.names]:
+        none = ", so that it is not used" if not found.names else ""
+        warn(f"{path}: lists {examples(lost)} to hold out, and no picture is called so{none}")
+    held_out = set(found.names.values())
+    if not held_out:
+        return data.images
+    if held_out <= set(data.missing):
+        warn(f"{path}: all pictures that it holds out are missing, so that none is measured")
+    images = [replace(image, split="test" if image.name in held_out else "train") for image in data.images]
+    if all(image.split == "test" for image in images):
+        raise InputError(
+            f"{path}: holds out all {len(images)} pictures, expected some to train on; remove it for a split of "
+            "--test-every"
+        )
+    return images
+
+
+def _text(path: Path) -> str:
+    """Decode a text file in UTF-8 or UTF-16. Bytes of another encoding become surrogates (`photo_names.match`)."""
+    with open_input(path, "a list of pictures") as file:
+        raw = file.read(MAX_HELD_OUT_LIST_BYTES + 1)
+    if len(raw) > MAX_HELD_OUT_LIST_BYTES:
+        raise InputError(f"{path}: has more than {MAX_HELD_OUT_LIST_BYTES} bytes, expected a list of pictures")
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return raw.decode("utf-16", "replace")
+    return raw.decode("utf-8-sig", "surrogateescape")

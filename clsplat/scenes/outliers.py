@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Outliers: cameras and points so far from the others that a scene size computed from all of them is meaningless."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+
+OUTLIER_GAP_RATIO = 2.0
+"""Minimum ratio between successive distances from the middle at which outliers may begin.
+
+In the captures at hand this ratio is at most 1.7 at their edge.
+"""
+OUTLIER_DISTANCE_RATIO = 5.0
+"""Minimum distance of an outlier from the middle, relative to the farthest place that is not one.
+
+A training of 24 photographs whose scene size includes an outlier loses 1.2 dB at 5, 2.7 at 8, 4 at 12 and 7 at 30.
+"""
+MAX_OUTLIER_CAMERA_FRACTION = 0.25
+"""Maximum fraction of the cameras that can be outliers. More of them are part of the capture."""
+MAX_OUTLIER_POINT_FRACTION = 0.01
+"""Maximum fraction of the points that can be outliers; thousands of points remain."""
+
+
+def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | None = None) -> NDArray[np.bool_]:
+    """Mark the outliers (N,) among places (N, 3).
+
+    Distances are measured from `middle` (3,), by default the median of each axis, and sorted. Places behind the first
+    gap of a factor GAP are outliers if they are OUTLIER_DISTANCE_RATIO times as far as the last place before it.
+    most: maximum fraction of outliers.
+    least: minimum distance that both factors apply to, such as the distance of the points that the cameras see. Without
+        it, places that coincide except for a few have no size to compare with, and no outliers.
+    """
+    found = np.zeros(len(places), np.bool_)
+    first = len(places) - int(most * len(places))  # this many are never outliers, whatever their distances are
+    if not 0 < first < len(places):
+        return found
+    distances = np.linalg.norm(places - (np.median(places, axis=0) if middle is None else middle), axis=1)
+    order = np.argsort(distances, kind="stable")
+    within, beyond = distances[order[first - 1 : -1]], distances[order[first:]]
+    reach = np.maximum(within, least)
+    gaps = (beyond > OUTLIER_GAP_RATIO * reach) & (reach > 0)
+    if gaps.any():
+        at = int(gaps.argmax())
+        found[order[first + at :]] = beyond[at:] > OUTLIER_DISTANCE_RATIO * reach[at]
+    return found
+
+
+def stray_cameras(cameras: Sequence[Camera], least: float = 0.0) -> NDArray[np.bool_]:
+    """Mark the outliers (N,) among cameras. least: as for `strays`."""
+    return strays(np.stack([camera.position for camera in cameras]), MAX_OUTLIER_CAMERA_FRACTION, least)

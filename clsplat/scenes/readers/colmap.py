@@ -1,0 +1,474 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading of COLMAP models: cameras, images and points3D, binary or text (https://colmap.github.io/format.html).
+
+`pycolmap.Reconstruction` is not used, because 4.2.1 does not handle damaged files. It fails without naming the file,
+asks for all memory, or accepts a truncated cameras.bin and goes on with unread data. This reader accounts for every
+byte.
+"""
+
+from __future__ import annotations
+
+import codecs
+import io
+import math
+import os
+import re
+import struct
+from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.config.training import Lenses
+from clsplat.errors import InputError, warn
+from clsplat.files.documents import is_file, open_input
+from clsplat.models.codec.values import full_scale
+from clsplat.rotations import rotation_from_quaternion
+from clsplat.scenes.camera_checks import cameras_of
+from clsplat.scenes.dataset import (
+    MAX_COORDINATE,
+    DataSet,
+    Lens,
+    PosedImage,
+    check_lens,
+    given_in_parts,
+    in_pixels,
+    models,
+)
+from clsplat.scenes.photo_names import is_legible, legible, slashed
+
+COLMAP_FILE_STEMS = ("cameras", "images", "points3D")
+COLMAP_COUNT = struct.Struct("<Q")
+OBSERVATION_BYTES = 24  # x, y, id of the point
+TRACK_BYTES = 8  # ids of the image and of the observation in it
+MAX_NAME_BYTES = 4096
+MAX_LINE_CHARACTERS = 1 << 26
+"""Maximum characters of a text line. The observations of a picture and the track of a point are one line each."""
+EDITED_AFTER_SECONDS = 60.0
+"""Seconds by which a text file is newer than its binary file if it was edited since.
+
+Tools that write or copy both files finish the second one sooner.
+"""
+RECORD_COUNT_COMMENT = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
+IMAGE_LINE_FIELDS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+POINT_LINE_FIELDS = "POINT3D_ID X Y Z R G B ERROR TRACK"
+COLMAP_FILE_KIND = "a file of a COLMAP model"
+
+
+def find_model(folder: Path) -> Path | None:
+    """Folder of the model that belongs to `folder`, or None.
+
+    Looks in the folder itself, sparse/ and colmap/sparse/, each with numbered sub-folders such as sparse/0 first. Of
+    several numbered models, the one with the most images is used, as COLMAP's first one may be a fragment.
+    """
+    for candidate in (folder, folder / "sparse", folder / "colmap" / "sparse"):
+        numbered = [path for path in candidate.glob("[0-9]*") if _is_model(path)]
+        if len(numbered) > 1:
+            return max(sorted(numbered), key=_claimed_images)
+        if numbered:
+            return numbered[0]
+        if _is_model(candidate):
+            return candidate
+    return None
+
+
+def read_model(folder: Path) -> DataSet:
+    """Read the model in `folder`: each of the three files as .bin if it exists, else as .txt.
+
+    Without points3D there are no points. Raises InputError that names the file if one is missing, truncated, longer
+    than its contents, damaged, or has an unknown camera model. Warns of text with less than its header announces, and
+    of text newer than the binary file that is read.
+    """
+    images = _read_posed_images(folder)
+    return DataSet(images, *_read_points(folder)) if _file(folder, "points3D") else DataSet(images)
+
+
+def _read_posed_images(folder: Path) -> list[PosedImage]:
+    _warn_of_newer_text(folder)
+    return _read_images(folder, _read_cameras(folder))
+
+
+def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera]:
+    """Cameras of a model by image name, sorted. Points and pictures are not read.
+
+    folder: the model's own or the scene's, as for `find_model`.
+    lenses: distorted cameras become full-size pinhole cameras, as for training (`Lens.camera`).
+    Raises InputError and warns like `read_model`. Also warns of implausible lenses.
+    """
+    return cameras_of(read_images(folder), lenses)
+
+
+def read_images(folder: Path) -> list[PosedImage]:
+    """Images of a model, sorted by name. Raises InputError and warns like `read_model`.
+
+    folder: as for `read_cameras`.
+    """
+    model = find_model(Path(folder))
+    if model is None:
+        raise InputError(f"{folder}: no COLMAP model, expected cameras and images (.bin or .txt) in it or in sparse/0")
+    return [replace(image, name=legible(image.name)) for image in _read_posed_images(model)]
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Observations of points in images.
+
+    points: (N, 3) float64, world coordinates.
+    errors: (N,), mean reprojection errors in pixels.
+    by_image: rows (k,) of both arrays by image name, ascending and unique.
+    """
+
+    points: Float64
+    errors: Float64
+    by_image: dict[str, NDArray[np.int64]]
+
+
+def read_tracks(folder: Path) -> Tracks:
+    """Read the tracks of the model in `folder`, without those in unknown images. Raises InputError like
+    `read_model`."""
+    path = _require(folder, "images")
+    rows = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
+    names = {key: _named(path, name) for key, name, *_ in rows}
+    path = _require(folder, "points3D")
+    places, errors, images, lengths = array("d"), array("d"), array("q"), array("q")
+    for place, error, seen in _binary_tracks(path) if path.suffix == ".bin" else _text_tracks(path):
+        places.extend(place)
+        errors.append(error)
+        images.extend(seen)
+        lengths.append(len(seen))
+    points = np.repeat(np.arange(len(lengths)), np.array(lengths, np.int64))
+    of = np.array(images, np.int64)
+    order = np.argsort(of, kind="stable")
+    keys, begins = np.unique(of[order], return_index=True)
+    parts = np.split(points[order], begins[1:])
+    by_image = {names[key]: np.unique(part) for key, part in zip(keys.tolist(), parts, strict=False) if key in names}
+    return Tracks(np.array(places, np.float64).reshape(-1, 3), np.array(errors, np.float64), by_image)
+
+
+def safe_name(name: str) -> bool:
+    """True if a name from a file is legible and stays inside the folder that it is relative to."""
+    path, windows = PurePosixPath(name), PureWindowsPath(name)
+    inside = not path.is_absolute() and not windows.anchor and ".." not in windows.parts
+    return bool(path.parts) and inside and is_legible(name)
+
+
+def _named(path: Path, name: str) -> str:
+    """Name of a picture, without its drive or root and without ".."; such pictures are found by the end of their path.
+
+    Raises InputError for a name that is not a path inside the images' folder even then.
+    """
+    inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
+    if not safe_name(inner):
+        raise corrupt(path, f"an image has the name {name[:80]!r}, expected a path inside the images' folder")
+    return inner
+
+
+class _Binary:
+    """Reader of little-endian records. Raises InputError where the file ends."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file = path, file
+        self.size = self.left = os.fstat(file.fileno()).st_size
+        self.doing = "its header"
+
+    def read(self, layout: struct.Struct) -> tuple[float, ...]:
+        self._take(layout.size)
+        return layout.unpack(self.file.read(layout.size))
+
+    def need(self, size: int) -> None:
+        """Raise InputError if fewer bytes are left."""
+        if size > self.left:
+            self._take(size)
+
+    def skip(self, size: int) -> None:
+        self._take(size)
+        self.file.seek(size, os.SEEK_CUR)
+
+    def _take(self, size: int) -> None:
+        if size > self.left:
+            raise corrupt(self.path, f"its {self.size} bytes end inside {self.doing}")
+        self.left -= size
+
+    def name(self) -> str:
+        raw = b"".join(islice(iter(lambda: self.file.read(1), b"\0"), min(MAX_NAME_BYTES, self.left)))
+        if len(raw) == min(MAX_NAME_BYTES, self.left):
+            raise corrupt(self.path, f"{self.doing} has a name without an end")
+        self.left -= len(raw) + 1
+        return raw.decode("utf-8", "surrogateescape")  # the system's code page on Windows: `photo_names`
+
+
+def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
+    """Yield the reader at each of the records that the file announces, which have at least `least` bytes each."""
+    with open_input(path, COLMAP_FILE_KIND) as opened:
+        file = _Binary(path, opened)
+        (number,) = map(int, file.read(COLMAP_COUNT))
+        if number * least > file.size:
+            file.doing = f"the {number} {what}s that its header announces"
+            file.skip(number * least)
+        for index in range(number):
+            file.doing = f"{what} {index + 1} of {number}"
+            yield file
+        if file.left:
+            raise corrupt(path, f"{file.left} bytes follow the last of its {number} {what}s")
+
+
+def corrupt(path: Path, trouble: str) -> InputError:
+    """Error for invalid contents of a model's file."""
+    return InputError(f"{path}: truncated or corrupt: {trouble}; copy the file again or export the model anew")
+
+
+def _is_model(folder: Path) -> bool:
+    return any(_file(folder, stem) for stem in ("cameras", "images"))
+
+
+def _file(folder: Path, stem: str) -> Path | None:
+    for extension in (".bin", ".txt"):
+        path = folder / (stem + extension)
+        if is_file(path):
+            return path
+    if not os.path.isdir(folder):  # noqa: PTH112  # Path raises for names too long
+        return None
+    lower = {f"{stem}{extension}".lower() for extension in (".bin", ".txt")}  # hierarchical-3d-gaussians: points3d
+    return next((path for path in sorted(folder.iterdir()) if path.name.lower() in lower and is_file(path)), None)
+
+
+def _require(folder: Path, stem: str) -> Path:
+    path = _file(folder, stem)
+    if path is None:
+        raise InputError(f"{folder}: has no {stem}.bin or {stem}.txt, expected a COLMAP model, cameras and images")
+    return path
+
+
+def _claimed_images(folder: Path) -> int:
+    """Number of images that a model announces; -1 without a file of images."""
+    path = _file(folder, "images")
+    if path is None:
+        return -1
+    if path.suffix == ".bin":
+        with open_input(path, COLMAP_FILE_KIND) as file:
+            return int.from_bytes(file.read(8), "little")
+    return sum(1 for _ in _image_lines(path))
+
+
+def _warn_of_newer_text(folder: Path) -> None:
+    """Warn of edited text files that are not read, as binary files take precedence."""
+    edited = []
+    for stem in COLMAP_FILE_STEMS:
+        binary, text = folder / f"{stem}.bin", folder / f"{stem}.txt"
+        if is_file(binary) and is_file(text) and text.stat().st_mtime > binary.stat().st_mtime + EDITED_AFTER_SECONDS:
+            edited.append(stem)
+    if edited:
+        read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
+        warn(f"{folder}: {read} is read and not the newer {not_read}; remove what is not meant")
+
+
+def _check_count(path: Path, count: int) -> None:
+    """Warn of a text file that is truncated at the end of a line, which no other check detects."""
+    if path.suffix != ".txt":
+        return
+    announced = 0
+    with open_input(path, COLMAP_FILE_KIND) as file:
+        while (line := file.readline(MAX_NAME_BYTES)).lstrip(b"\xef\xbb\xbf").startswith(b"#"):
+            if match := RECORD_COUNT_COMMENT.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
+                announced = int(match[1])
+    if count < announced:
+        warn(f"{path}: its header announces {announced:,}, and it holds {count:,}; is it cut, or edited since?")
+
+
+def _read_cameras(folder: Path) -> dict[int, Lens]:
+    path = _require(folder, "cameras")
+    lenses: dict[int, Lens] = {}
+    in_parts = []
+    for key, lens in _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path):
+        if key in lenses:
+            raise corrupt(path, f"camera {key} is there twice")
+        lenses[key], parts = in_pixels(check_lens(lens, f"{path}: camera {key}"))
+        in_parts += [key] if parts else []
+    if in_parts:
+        warn(f"{path}: {given_in_parts(f'camera {key}' for key in in_parts)}")
+    _check_count(path, len(lenses))
+    return lenses
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    layout, known = struct.Struct("<IiQQ"), models()
+    for file in _records(path, "camera", layout.size):
+        key, model, width, height = (int(value) for value in file.read(layout))
+        if model not in known:
+            raise InputError(
+                f"{path}: camera {key} has the unknown camera model id {model}, expected one of "
+                f"0 to {max(known)}; is the file damaged, or from a newer COLMAP?"
+            )
+        name, parameters = known[model]
+        yield key, Lens(name, width, height, file.read(struct.Struct(f"<{parameters}d")))
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
+    for number, line in _lines(path):
+        with _parsing(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS"):
+            key, model, width, height, *params = line.split()
+            yield int(key), Lens(model, int(width), int(height), tuple(map(float, params)))
+
+
+def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
+    path = _require(folder, "images")
+    images: dict[str, PosedImage] = {}
+    for _, given, camera, pose in _binary_images(path) if path.suffix == ".bin" else _text_images(path):
+        if camera not in lenses:
+            raise corrupt(path, f"image {given[:80]!r} has the camera {camera}, which is not in the model")
+        name = _named(path, given)
+        if name in images:
+            raise corrupt(path, f"image {name} is there twice")
+        quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
+        norm = math.hypot(*pose[:4])
+        if not (0.5 < norm < 2 and (np.abs(translation) < MAX_COORDINATE).all()):
+            raise corrupt(path, f"image {name} has the pose {list(pose)}, expected a unit quaternion, finite numbers")
+        images[name] = PosedImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
+    if not images:
+        raise InputError(f"{path}: holds no images, expected at least one")
+    _check_count(path, len(images))
+    return [images[name] for name in sorted(images)]
+
+
+def _binary_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]]:
+    head = struct.Struct("<I7dI")
+    for file in _records(path, "image", head.size + 1 + COLMAP_COUNT.size):
+        key, *pose, camera = file.read(head)
+        name = file.name()
+        (observations,) = file.read(COLMAP_COUNT)
+        file.skip(int(observations) * OBSERVATION_BYTES)
+        yield int(key), name, int(camera), tuple(pose)
+
+
+def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
+    """Line number, text and expected fields of the first line of each image.
+
+    The second line, with the observations, may be empty. Some tools omit it.
+    """
+    after_pose = False
+    for number, line in _lines(path, keep_empty=True):
+        if after_pose and (not line or _are_observations(line)):
+            after_pose = False
+        elif line:
+            yield (
+                number,
+                line,
+                f"X Y POINT3D_ID, again and again, or as {IMAGE_LINE_FIELDS}" if after_pose else IMAGE_LINE_FIELDS,
+            )
+            after_pose = True
+
+
+def _are_observations(line: str) -> bool:
+    """True if a line's words come in threes and end with a number. The first line of an image ends with a name."""
+    words = line.split()
+    try:
+        float(words[-1])
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
+
+
+def _text_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]]:
+    for number, line, expected in _image_lines(path):
+        with _parsing(path, number, expected):
+            words = line.split(maxsplit=9)  # the name is the rest of the line, spaces included
+            yield int(words[0]), words[9], int(words[8]), tuple(map(float, words[1:8]))
+
+
+def _read_points(folder: Path) -> tuple[Float64, Float32]:
+    path = _require(folder, "points3D")
+    values = array("d")  # a list of tuples would take six times the memory
+    for row in _binary_points(path) if path.suffix == ".bin" else _text_points(path):
+        values.extend(row)
+    table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
+    _check_count(path, len(table))
+    known = ~np.isnan(table).any(axis=1)
+    if not known.all() and known.any():
+        warn(f"{path}: {np.count_nonzero(~known):,} of {len(table):,} points are not numbers, and are left out")
+        table = table[known]
+    near = (np.abs(table[:, :3]) < MAX_COORDINATE).all(axis=1)
+    good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 65535)).all(axis=1)
+    if not good.all():
+        index = int(np.argmin(good))
+        trouble = f"point {index + 1} of {len(table)} has the position and colour {table[index].tolist()}"
+        raise corrupt(path, f"{trouble}, expected finite numbers and colours 0 to 255")
+    levels = table[:, 3:]
+    whole = bool((levels == np.rint(levels)).all())  # text may have colours from 0 to 1, or of 16 bits
+    white = full_scale(levels.astype(np.int64) if whole else levels)
+    return np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(levels / white, np.float32)
+
+
+def _binary_points(path: Path) -> Iterator[tuple[float, ...]]:
+    layout = struct.Struct("<Q3d3BdQ")
+    for file in _records(path, "point", layout.size):
+        _, *values, _, track = file.read(layout)
+        file.skip(int(track) * TRACK_BYTES)
+        yield tuple(values)
+
+
+def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
+    for number, line in _lines(path):
+        with _parsing(path, number, POINT_LINE_FIELDS):
+            _, x, y, z, red, green, blue, *others = _with_colours(line)  # some tools leave error and track out
+            if len(others) == 2 and len(others[1].split()) % 2:
+                raise ValueError("a track is of pairs")
+            yield float(x), float(y), float(z), float(red), float(green), float(blue)
+
+
+def _with_colours(line: str) -> list[str]:
+    """Fields of a point's line, with its track as one field; grey if there is only a position."""
+    words = line.split(maxsplit=8)
+    return [*words, "128", "128", "128"] if len(words) == 4 else words
+
+
+def _binary_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
+    """Position, error and image ids of each point."""
+    layout = struct.Struct("<Q3d3BdQ")
+    for file in _records(path, "point", layout.size):
+        _, *values, error, length = file.read(layout)
+        file.need(int(length) * TRACK_BYTES)
+        track = file.read(struct.Struct(f"<{2 * int(length)}I"))
+        yield tuple(values[:3]), error, tuple(int(key) for key in track[::2])
+
+
+def _text_tracks(path: Path) -> Iterator[tuple[tuple[float, ...], float, tuple[int, ...]]]:
+    for number, line in _lines(path):
+        with _parsing(path, number, POINT_LINE_FIELDS):
+            _, x, y, z, _, _, _, *others = [*line.split(), *[""] * 3] if len(line.split()) == 4 else line.split()
+            error = float(others[0]) if others else 0.0
+            yield (float(x), float(y), float(z)), error, tuple(map(int, others[1::2]))
+
+
+def _lines(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
+    """Line numbers and lines, without comments."""
+    with open_input(path, COLMAP_FILE_KIND) as opened:
+        wide = opened.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # PowerShell redirects to UTF-16
+        opened.seek(0)
+        encoding, errors = ("utf-16", "strict") if wide else ("utf-8-sig", "surrogateescape")
+        file, number = io.TextIOWrapper(opened, encoding=encoding, errors=errors), 0
+        try:
+            while line := file.readline(MAX_LINE_CHARACTERS):
+                number += 1
+                if len(line) == MAX_LINE_CHARACTERS:
+                    raise corrupt(path, f"line {number} has no end")
+                text = line.strip()
+                if not text.startswith("#") and (text or keep_empty):
+                    yield number, text
+        except UnicodeDecodeError:
+            raise corrupt(path, "is not text in UTF-8 or UTF-16") from None
+
+
+@contextmanager
+def _parsing(path: Path, number: int, expected: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, IndexError, OverflowError):
+        raise InputError(f"{path}: line {number} does not read as {expected}; is the file cut or damaged?") from None

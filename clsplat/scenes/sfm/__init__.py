@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Structure from motion with pycolmap, in a worker process."""

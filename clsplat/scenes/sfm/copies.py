@@ -1,0 +1,433 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Copies of photographs in a folder: downscaled, undistorted, of another file type or name. One of each is used."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path, PurePosixPath
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.errors import InputError, examples
+from clsplat.files.documents import is_file, short_digest
+from clsplat.images.reading import IMAGE_SUFFIXES, downscale, image_size, read_image
+from clsplat.scenes.thumbnail import REC601_LUMA, SHARPNESS_SIDE_PX, reduced
+
+UNDISTORTION_FOLDERS = (
+    ("input", "inputs", "original", "originals", "raw", "distorted"),
+    ("images", "image", "rgb", "color", "colour", "frames", "photos"),
+    (
+        *("corrected_images", "images_corrected", "corrected", "undistorted", "undistorted_images"),
+        *("images_undistorted", "dense"),
+    ),
+)
+"""Names of folders that may hold the same photographs before and after undistortion, earlier stages first.
+
+They are used by the 3DGS authors' convert.py, Polycam, OpenSfM (undistorted/images), COLMAP (dense/0/images) and
+others.
+"""
+PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
+"""Indices in UNDISTORTION_FOLDERS of photographs in other folders, and of undistorted photographs."""
+LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
+COPY_THUMBNAIL_SIZE_PX = (96, 72)
+"""Width and height of the thumbnails that are compared."""
+MAX_COMPARED_PIXELS_PER_PIXEL, MIN_COMPARED_WIDTH_PX = 0.5, 24
+"""Maximum thumbnail pixels per pixel of the picture, and minimum width that is compared.
+
+Resizing shows in small pictures.
+"""
+MAX_COPY_RMS_LEVELS, MAX_COPY_RMS_PER_GRADIENT = 1.0, 0.2
+"""Maximum RMS difference of two thumbnails of one photograph: in 255ths, or in RMS differences of neighbouring pixels.
+
+A shift by 0.2 thumbnail pixels, 1/480 of the picture's width, causes the second. JPEG and resizing filters cause less,
+down to pictures of 240 pixels.
+"""
+MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
+"""Minimum correlation of the pictures in two related folders, median of FOLDER_PAIR_SAMPLES, and the pictures' width
+for it.
+
+Photographs correlate with their undistorted copies at 0.9995 (fox, k1 0.058, k2 -0.081). Six other scenes reach 0.93 or
+more, with k1 from 0.1 to -0.35 at a focal length of 0.8 of the width, cropped to valid pixels. In these scenes,
+successive photographs correlate at 0.16 to 0.87, and more distant ones at 0.45 or less. Successive frames of an almost
+still video correlate more than a picture and its copy through a strong lens. Such folders are mistaken for copies.
+"""
+FOLDER_PAIR_SAMPLES = 5
+"""Number of pairs of pictures from two folders that are decoded to compare them."""
+MAX_COPY_ASPECT_RATIO_CHANGE = 1.3
+"""Ratio of aspect ratios from which two pictures are different, although undistortion crops borders."""
+FEATURELESS_STD_LEVELS = 8.0
+"""Standard deviation in 255ths below which a picture is featureless and resembles no other."""
+ASPECT_RATIO_TOLERANCE = 0.02
+"""Relative tolerance between the aspect ratios of one photograph's copies, as sides are rounded."""
+COMPARED_MIDDLE_BYTES = 4096
+"""Bytes from the middle of a file that are compared before the whole file."""
+
+_NUMBERED_FOLDER = re.compile(r"(.+?)[_-](\d{1,2})\Z")
+Thumb = NDArray[np.uint8]
+P = TypeVar("P", "_Place", "_Staged")
+
+
+class Decoded(Protocol):
+    """A decoded photograph."""
+
+    @property
+    def name(self) -> str:
+        """Path below the folder."""
+
+    @property
+    def width(self) -> int:
+        """Pixels, upright."""
+
+    @property
+    def height(self) -> int:
+        """Pixels, upright."""
+
+    @property
+    def lens(self) -> tuple[str, ...]:
+        """Make, model and focal length from EXIF; empty strings for missing ones."""
+
+    @property
+    def transparent(self) -> bool:
+        """True if any pixel is transparent."""
+
+    @property
+    def thumb(self) -> Thumb | None:
+        """Thumbnail from `thumb_of`, None if the photograph is not compared."""
+
+
+@dataclass(frozen=True)
+class Copy:
+    """A photograph that is a copy of another.
+
+    kept: name of the photograph that is used.
+    why: the difference from it, or the evidence, such as "smaller" or "same bytes".
+    """
+
+    kept: str
+    why: str
+
+
+def told_by_names(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
+    """Find copies before all photographs are decoded.
+
+    Copies are files of the same bytes, and pictures of the same names in related folders. A sample of these pictures is
+    decoded to confirm that they look alike.
+
+    Related folders are images and images_2, with half the size, and those in UNDISTORTION_FOLDERS, next to each other
+    or nested. The folder with the most pixels is kept, then the earlier one.
+    """
+    copies = _of_same_bytes(folder, names)
+    groups = _staged([name for name in names if name not in copies])
+    pictures = _Pictures(folder, groups)
+
+    def why(kept: _Staged, other: _Staged) -> str:
+        if kept.kind == other.kind or not pictures.are_alike(kept.head, other.head):
+            return ""
+        size, whole = pictures.size(other.name), pictures.size(kept.name)
+        if kept.stage == other.stage and not _is_downscaled(kept.factor, other.factor, whole, size):
+            return ""
+        if size[0] * size[1] < whole[0] * whole[1]:
+            return "smaller"
+        return "corrected" if kept.stage < other.stage else "not corrected"
+
+    def rank(place: _Staged) -> tuple[Hashable, ...]:
+        return (-pictures.pixels(place.head), *place.kind)
+
+    return resolved({**copies, **_found(groups, rank, why)})
+
+
+def told_by_pictures(photos: Sequence[Decoded]) -> dict[str, Copy]:
+    """Find copies among decoded photographs: the same picture under the same name in sibling folders, or of another
+    type.
+
+    The photograph with the most pixels is kept, then one with transparency, then one with a lens in EXIF, then a
+    lossless one.
+    """
+    by_name = {photo.name: photo for photo in photos}
+
+    def why(kept: _Place, other: _Place) -> str:
+        one, two = by_name[kept.name], by_name[other.name]
+        if not _is_same(one, two):
+            return ""
+        return "smaller" if one.width * one.height > two.width * two.height else "same picture"
+
+    def rank(place: _Place) -> tuple[Hashable, ...]:
+        photo = by_name[place.name]
+        lossless = PurePosixPath(photo.name).suffix.lower() in LOSSLESS_EXTENSIONS
+        return (-photo.width * photo.height, not photo.transparent, not any(photo.lens), not lossless)
+
+    return resolved(_found(_alike(list(by_name)), rank, why))
+
+
+def to_compare(names: Sequence[str]) -> set[str]:
+    """Photographs whose thumbnails `told_by_pictures` compares."""
+    return {place.name for group in _alike(names) for place in group}
+
+
+def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
+    """Grey thumbnail (72, 96) of a picture (H, W, C) of any shape.
+
+    pixels: unsigned integers, or floats from 0 to 1.
+    alpha: index of the alpha channel, -1 for none.
+    """
+    colour = [index for index in range(pixels.shape[2]) if index != alpha]
+    small = np.asarray(reduced(pixels, SHARPNESS_SIDE_PX)[:, :, colour], np.float32)
+    grey = small[:, :, :3] @ REC601_LUMA if len(colour) >= 3 else small[:, :, 0]
+    most = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else 1.0
+    levels = downscale(grey[:, :, None], *COPY_THUMBNAIL_SIZE_PX)[:, :, 0] * (255 / most)
+    return np.asarray(np.rint(np.clip(np.nan_to_num(levels), 0, 255)), np.uint8)
+
+
+def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
+    """Copies with the photograph that is finally used, as the photograph kept for a copy may itself be a copy."""
+
+    def last(name: str) -> str:
+        while name in copies:
+            name = copies[name].kept
+        return name
+
+    return {name: Copy(last(copy.kept), copy.why) for name, copy in copies.items()}
+
+
+def listed(copies: dict[str, Copy]) -> str:
+    """Copies as text for a message: the first of them by name."""
+    return examples(f"{name} is {copy.kept}, {copy.why}" for name, copy in sorted(copies.items()))
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A photograph that may have copies.
+
+    folder: the folder in its path that may differ from its copies, "" for none.
+    """
+
+    name: str
+    folder: str
+
+
+@dataclass(frozen=True)
+class _Staged:
+    """A photograph, classified by the names of its folders.
+
+    head: path up to the last classified folder, "" for none.
+    stage: latest index in UNDISTORTION_FOLDERS among these folders.
+    factor: factor by which it is downscaled.
+    """
+
+    name: str
+    head: str
+    stage: int
+    factor: int
+
+    @property
+    def kind(self) -> tuple[int, int]:
+        """Stage and factor."""
+        return self.stage, self.factor
+
+
+class _Pictures:
+    """Sizes and thumbnails of the pictures in a folder, read on demand.
+
+    groups: photographs of the same name.
+    """
+
+    def __init__(self, folder: Path, groups: Sequence[Sequence[_Staged]]) -> None:
+        self._folder = folder
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self._thumbs: dict[str, Thumb | None] = {}
+        self._names: dict[str, set[str]] = defaultdict(set)
+        self._pairs: dict[frozenset[str], list[tuple[str, str]]] = defaultdict(list)
+        self._alike: dict[frozenset[str], bool] = {}
+        self._pixels: dict[str, int] = {}
+        for group in groups:
+            for place in group:
+                self._names[place.head].add(place.name)
+            for one, two in combinations(group, 2):
+                if one.kind != two.kind:
+                    self._pairs[frozenset((one.head, two.head))].append((one.name, two.name))
+
+    def size(self, name: str) -> tuple[int, int]:
+        """Width and height, 0 for a picture that does not decode. The error is raised when it is staged."""
+        if name not in self._sizes:
+            try:
+                self._sizes[name] = image_size(self._folder / name)
+            except InputError:
+                self._sizes[name] = (0, 0)
+        return self._sizes[name]
+
+    def pixels(self, head: str) -> int:
+        """Number of pixels of the median picture."""
+        if head not in self._pixels:
+            self._pixels[head] = sorted(math.prod(self.size(name)) for name in self._names[head])[
+                len(self._names[head]) // 2
+            ]
+        return self._pixels[head]
+
+    def are_alike(self, one: str, two: str) -> bool:
+        """True if the pictures of two folders are the same, apart from undistortion."""
+        key = frozenset((one, two))
+        if key not in self._alike:
+            pairs = self._pairs[key]
+            chosen = sorted({round(at) for at in np.linspace(0, len(pairs) - 1, min(FOLDER_PAIR_SAMPLES, len(pairs)))})
+            likeness = [each for at in chosen if (each := self._likeness(*pairs[at])) is not None]
+            self._alike[key] = bool(likeness) and float(np.median(likeness)) >= MIN_FOLDER_CORRELATION
+        return self._alike[key]
+
+    def _likeness(self, one: str, two: str) -> float | None:
+        """Correlation of two pictures, None if one is featureless or does not decode."""
+        (width, height), (across, down) = self.size(one), self.size(two)
+        thumbs = [thumb for thumb in (self._thumb(one), self._thumb(two)) if thumb is not None]
+        if len(thumbs) < 2 or min(width, height, across, down) < 1:
+            return None
+        if not 1 / MAX_COPY_ASPECT_RATIO_CHANGE < width * down / (height * across) < MAX_COPY_ASPECT_RATIO_CHANGE:
+            return 0.0
+        first, second = (reduced(each.astype(np.float32)[:, :, None], CORRELATION_SIDE_PX) for each in thumbs)
+        if min(float(first.std()), float(second.std())) < FEATURELESS_STD_LEVELS:
+            return None
+        return float(np.corrcoef(first.ravel(), second.ravel())[0, 1])
+
+    def _thumb(self, name: str) -> Thumb | None:
+        if name not in self._thumbs:
+            try:
+                pixels = read_image(self._folder / name)
+                self._thumbs[name] = thumb_of(pixels, 3 if pixels.shape[2] == 4 else -1)
+            except InputError:
+                self._thumbs[name] = None
+        return self._thumbs[name]
+
+
+def _staged(names: Iterable[str]) -> list[list[_Staged]]:
+    """Groups of photographs with the same stem in the same folders, apart from classified folders.
+
+    Each group has at least two kinds. Folders above a folder of undistorted pictures may be another program's and are
+    also ignored.
+    """
+    groups: dict[tuple[Hashable, ...], list[_Staged]] = defaultdict(list)
+    for name in names:
+        parts = [part.casefold() for part in PurePosixPath(name).parts[:-1]]
+        stage, factor, told, undone = -1, 1, set(), 0
+        for at, part in enumerate(parts):
+            word, by = _numbered(part)
+            its = min(_stage(part), _stage(word))
+            if its < len(UNDISTORTION_FOLDERS):
+                stage, factor = max(stage, its), by if _stage(part) == len(UNDISTORTION_FOLDERS) else 1
+                undone = at if its == UNDISTORTED_FOLDER_STAGE else undone
+                told.add(at)
+            elif part.isdigit() and at and parts[at - 1] == "dense":
+                told.add(at)
+        head = "/".join(PurePosixPath(name).parts[: max(told, default=-1) + 1])
+        place = _Staged(name, head, stage if told else PLAIN_FOLDER_STAGE, factor)
+        for start in {0, undone}:
+            others = tuple(part for at, part in enumerate(parts) if at >= start and at not in told)
+            groups[(others, _plain_stem(name))].append(place)
+    return [group for group in groups.values() if len({place.kind for place in group}) > 1]
+
+
+def _plain_stem(name: str) -> str:
+    """Stem of a picture in lower case, without a second extension: OpenSfM undistorts IMG.JPG to IMG.JPG.jpg."""
+    stem = PurePosixPath(PurePosixPath(name).stem.casefold())
+    return stem.stem if stem.suffix in IMAGE_SUFFIXES else stem.name
+
+
+def _alike(names: Iterable[str]) -> list[list[_Place]]:
+    """Groups of photographs that may be copies by their names.
+
+    They have the same stem and are in one folder, in sibling folders, or in a folder and its sub-folder. These folders
+    may have sub-folders of the same names.
+    """
+    groups: dict[tuple[Hashable, ...], list[_Place]] = defaultdict(list)
+    for name in names:
+        plain = PurePosixPath(name)
+        folders, stem = plain.parts[:-1], plain.stem.casefold()
+        for at in range(len(folders) + 1):
+            groups[(at, folders, stem)].append(_Place(name, ""))
+        for at, folder in enumerate(folders):
+            groups[(at, folders[:at] + folders[at + 1 :], stem)].append(_Place(name, folder))
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _found(
+    groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
+) -> dict[str, Copy]:
+    """Copies in each group: photographs that match one before them in the order of `rank`, which may itself be a copy.
+
+    why: called with the kept and the other photograph; empty if they differ.
+    """
+    copies: dict[str, Copy] = {}
+    for group in groups:
+        seen: list[P] = []
+        for place in sorted(group, key=lambda place: (*rank(place), len(place.name), place.name)):
+            first = next(((one, text) for one in seen if (text := why(one, place))), None)
+            if first is not None:
+                copies.setdefault(place.name, Copy(first[0].name, first[1]))
+            seen.append(place)
+    return copies
+
+
+def _of_same_bytes(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
+    """Files with the same bytes as another. The one in the earliest of UNDISTORTION_FOLDERS is kept, then the one with
+    the shortest name."""
+    alike: dict[tuple[object, ...], list[str]] = {}
+    keys: tuple[Callable[[Path], object], ...] = (lambda path: path.stat().st_size, _middle, short_digest)
+    groups = [[name for name in names if is_file(folder / name)]]
+    for key in keys:
+        alike = defaultdict(list)
+        for number, group in enumerate(groups):
+            for name in group:
+                alike[(number, key(folder / name))].append(name)
+        groups = [group for group in alike.values() if len(group) > 1]
+    copies = {}
+    for group in groups:
+        stages = {name: min((_stage(part) for part in PurePosixPath(name).parts[:-1]), default=0) for name in group}
+        kept, *others = sorted(group, key=lambda name: (stages[name], len(name), name))
+        copies.update({name: Copy(kept, "same bytes") for name in others})
+    return copies
+
+
+def _middle(path: Path) -> bytes:
+    with open(path, "rb") as file:
+        file.seek(path.stat().st_size // 2)
+        return file.read(COMPARED_MIDDLE_BYTES)
+
+
+def _stage(folder: str) -> int:
+    """Index of a folder's name in UNDISTORTION_FOLDERS, the last plus 1 for another name."""
+    return next(
+        (stage for stage, known in enumerate(UNDISTORTION_FOLDERS) if folder.casefold() in known),
+        len(UNDISTORTION_FOLDERS),
+    )
+
+
+def _numbered(folder: str) -> tuple[str, int]:
+    """Split images_4 into images and 4. The factor is 1 if the name has none."""
+    match = _NUMBERED_FOLDER.match(folder)
+    return (match[1], int(match[2])) if match else (folder, 1)
+
+
+def _is_downscaled(factor: int, by: int, whole: tuple[int, int], size: tuple[int, int]) -> bool:
+    """True if two pictures' sizes agree with the factors in the names of their folders."""
+    return factor < by and all(abs(side * by / factor - long) <= by for side, long in zip(size, whole, strict=True))
+
+
+def _is_same(one: Decoded, two: Decoded) -> bool:
+    if one.thumb is None or two.thumb is None:
+        return False
+    if abs(one.width * two.height / (one.height * two.width) - 1) > ASPECT_RATIO_TOLERANCE:
+        return False
+    side = COPY_THUMBNAIL_SIZE_PX[0]
+    while side > MAX_COMPARED_PIXELS_PER_PIXEL * min(one.width, two.width) and side > MIN_COMPARED_WIDTH_PX:
+        side //= 2
+    first, second = (reduced(each.astype(np.float32)[:, :, None], side)[:, :, 0] for each in (one.thumb, two.thumb))
+    if min(float(first.std()), float(second.std())) < FEATURELESS_STD_LEVELS:
+        return False
+    steps = np.sqrt(0.5 * (np.square(np.diff(first, axis=0)).mean() + np.square(np.diff(first, axis=1)).mean()))
+    return float(np.sqrt(np.square(first - second).mean())) <= max(
+        MAX_COPY_RMS_LEVELS, MAX_COPY_RMS_PER_GRADIENT * float(steps)
+    )

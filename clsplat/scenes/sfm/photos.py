@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs for structure from motion: found, decoded once, rotated upright, and grouped by camera."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.errors import ClsplatError, InputError
+from clsplat.files.atomic import require_room, room_error, write_error
+from clsplat.files.documents import is_file
+from clsplat.files.names import ON_WINDOWS, native_name
+from clsplat.images.reading import alpha_of, cannot_be_searched, companions, error_of, open_image, opened, turned
+from clsplat.images.writing import jpeg_room
+from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
+
+SFM_PHOTO_EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+"""Extensions that pycolmap's wheel reads and writes. Its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
+SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
+"""OpenImageIO's names of these formats, which identify a file whatever its extension is."""
+UNREADABLE_PHOTO_EXTENSIONS = frozenset(
+    {".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"}
+)
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photograph as staged for pycolmap.
+
+    name: path below the folder, with forward slashes.
+    width, height: pixels, upright.
+    lens: make, model and focal length from EXIF, empty strings for missing ones.
+    transparent: True if any pixel is transparent by an alpha channel.
+    thumb: thumbnail from `copies.thumb_of`, for photographs that may be copies.
+    """
+
+    name: str
+    width: int
+    height: int
+    lens: tuple[str, ...]
+    transparent: bool = False
+    thumb: Thumb | None = None
+
+
+def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
+    """Photographs below a folder, sorted by name, and the files that are left out, by reason.
+
+    Hidden files and folders are skipped, as is `excluded` (the output, if it is inside). Raises InputError for a folder
+    that does not exist, cannot be read, or has no photographs.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder, expected one with photos")
+    skip = excluded.resolve() if excluded is not None else None
+    photos: list[Path] = []
+    others: list[Path] = []
+    broken: list[Path] = []
+    for parent, folders, files in os.walk(folder, onerror=cannot_be_searched):
+        here = Path(parent)
+        folders[:] = [name for name in folders if not name.startswith(".") and (here / name).resolve() != skip]
+        for name in files:
+            extension = Path(name).suffix.lower()
+            if name.startswith("."):
+                continue
+            if extension in SFM_PHOTO_EXTENSIONS and not name.isprintable():
+                raise InputError(f"{here / name}: has a name that a scene cannot list; rename it")
+            if extension in SFM_PHOTO_EXTENSIONS and (here / name).is_symlink() and not (here / name).exists():
+                broken.append(here / name)
+            elif extension in SFM_PHOTO_EXTENSIONS:
+                photos.append(here / name)
+            elif extension in UNREADABLE_PHOTO_EXTENSIONS:
+                others.append(here / name)
+    if not photos:
+        kinds = " ".join(sorted(SFM_PHOTO_EXTENSIONS))
+        unusable = f", only {len(others)} of a kind not supported such as {others[0].name}" if others else ""
+        unusable += f", only {len(broken)} link(s) that lead nowhere such as {broken[0].name}" if broken else ""
+        raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
+    key = partial(photo_name, folder)
+    aside = companions(photos, photos, folder)
+    kept = [path for path in photos if path not in aside]
+    left_out = {
+        "convert to JPEG, PNG or TIFF first": others,
+        "links that lead nowhere": broken,
+        "by their names masks, depths or the like of other photos": aside,
+    }
+    return sorted(kept, key=key), {why: sorted(paths, key=key) for why, paths in left_out.items() if paths}
+
+
+def photo_name(folder: Path, path: Path) -> str:
+    """Name of a photograph in the scene: its path below the folder, with forward slashes."""
+    return path.relative_to(folder).as_posix()
+
+
+def fingerprint(folder: Path, photos: Sequence[Path], settings: str) -> str:
+    """Digest that changes when a photograph is added, removed or rewritten, or a setting changes. It reads no
+    pixels."""
+    digest = hashlib.sha256(settings.encode())
+    for path in photos:
+        status = path.stat()
+        digest.update(f"\n{photo_name(folder, path)}\t{status.st_size}\t{status.st_mtime_ns}".encode())
+    return digest.hexdigest()
+
+
+def stage_photos(
+    folder: Path, photos: Sequence[Path], target: Path, report: Callable[[float], None], threads: int
+) -> list[Photo]:
+    """Put every photograph under `target`, upright and with its name, and describe it.
+
+    pycolmap ignores the EXIF orientation and cannot read some formats. Rotated photographs, and those whose content has
+    such a format, are rewritten. The others are linked, or copied if the file system cannot link. Every photograph is
+    decoded once, as pycolmap would silently skip a broken one. Raises InputError that names the first photograph that
+    does not decode.
+    """
+    staged: list[Photo] = []
+    compared = to_compare([photo_name(folder, path) for path in photos])
+    with ThreadPoolExecutor(threads) as pool:
+        work = pool.map(partial(_stage, folder, target, compared), photos)
+        try:
+            for photo in work:
+                staged.append(photo)
+                report(len(staged) / len(photos))
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return staged
+
+
+def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) -> Photo:
+    if not is_file(path):
+        raise InputError(f"{path}: cannot be decoded as an image: is no regular file")
+    source = open_image(path)
+    try:
+        spec, kind = source.spec(), source.format_name()
+        pixels = source.read_image(spec.format)
+        # a truncated JPEG still gives pixels, grey at its end, and only an error text says so
+        trouble = error_of(source)
+    finally:
+        source.close()
+    if pixels is None or trouble:
+        raise InputError(f"{path}: cannot be decoded as an image: {_last_line(trouble)}")
+
+    name = photo_name(folder, path)
+    copy = target / name
+    copy.parent.mkdir(parents=True, exist_ok=True)
+    orientation = spec.get_int_attribute("Orientation", 1)
+    width, height = spec.width, spec.height
+    if orientation in range(2, 9) or kind not in SFM_IMAGE_FORMATS:
+        if orientation in range(5, 9):
+            width, height = height, width
+        _write_upright(path, copy, spec)
+    else:
+        try:
+            if ON_WINDOWS and not os.access(path, os.W_OK):
+                raise PermissionError("a link to a file that is read-only cannot be removed again")
+            os.link(path.resolve(), copy)
+        except OSError:
+            shutil.copyfile(path, copy)
+    focal = spec.get_float_attribute("Exif:FocalLength", 0.0)
+    lens = (spec.get_string_attribute("Make"), spec.get_string_attribute("Model"), f"{focal:.3f}" if focal else "")
+    alpha = alpha_of(spec)
+    thumb = thumb_of(turned(pixels, orientation), alpha) if name in compared else None
+    return Photo(name, width, height, lens, _is_transparent(pixels, alpha), thumb)
+
+
+def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
+    """True if a picture (H, W, C) is not opaque everywhere. alpha_channel: -1 for none."""
+    if alpha_channel < 0:
+        return False
+    opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
+    return bool((pixels[:, :, alpha_channel] < opaque).any())
+
+
+def has_alpha(path: Path) -> bool:
+    """True if an image file has an alpha channel. Reads only its header."""
+    with opened(path) as source:
+        return source is not None and alpha_of(source.spec()) >= 0
+
+
+def _write_upright(path: Path, copy: Path, spec: Any) -> None:
+    """Write a photograph upright, in the format of its extension.
+
+    EXIF is kept for the focal length, but its orientation is set to upright.
+    """
+    upright = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(native_name(path)))
+    upright.specmod().attribute("Orientation", 1)
+    upright.specmod().attribute("Compression", "jpeg:98" if copy.suffix.lower() in (".jpg", ".jpeg") else "lzw")
+    with require_room(copy, jpeg_room(spec)):  # libjpeg ends the process when it cannot write
+        written = not upright.has_error and upright.write(native_name(copy))
+    if not written:
+        if error := room_error(copy.parent):
+            raise write_error(copy, error)
+        raise ClsplatError(f"{copy}: cannot write the turned copy of {path}: {_last_line(upright.geterror())}")
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else "unknown kind of file"
+
+
+def camera_groups(photos: Sequence[Photo], shared_camera: bool | str) -> list[list[str]]:
+    """Names of the photographs by camera, each group in order. Photographs in a group share their intrinsics.
+
+    shared_camera: True groups all photographs of one size. "auto" also requires the same make, model and focal length
+        in EXIF. False gives each photograph its own camera.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for photo in photos:
+        if shared_camera is False:
+            key: tuple[object, ...] = (photo.name,)
+        elif shared_camera is True:
+            key = (photo.width, photo.height)
+        else:
+            key = (photo.width, photo.height, *photo.lens)
+        groups.setdefault(key, []).append(photo.name)
+    return list(groups.values())

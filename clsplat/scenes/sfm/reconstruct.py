@@ -1,0 +1,427 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Structure from motion with pycolmap on the CPU: from a folder of photographs to a COLMAP scene with pinhole
+cameras."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, Literal
+
+from clsplat.config.masks import MaskUse
+from clsplat.errors import ClsplatError, InputError, examples, warn
+from clsplat.files.atomic import replace
+from clsplat.files.documents import is_file
+from clsplat.process import apart
+from clsplat.progress import CountedFraction, Progress, no_progress
+from clsplat.scenes.camera_json import load_document
+from clsplat.scenes.sfm import copies as sfm_copies
+from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, stage_mask, warn_of_sense
+
+Matching = Literal["auto", "exhaustive", "sequential"]
+
+SFM_RECORD_FILE = "sfm.json"
+"""Record in the result: its photographs and settings, the photographs without a pose, and its quality."""
+MAX_EXHAUSTIVE_PHOTOS = 100
+"""Number of photographs up to which "auto" matches every pair.
+
+The number of pairs grows with the square, and a CPU matches about 50 a second.
+"""
+MIN_SFM_PHOTOS = 3
+SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
+                 "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
+
+PLACED_CAMERAS_UNIT = "cameras stand"
+# by stage of the worker: the text for the user, and the table that grows by one row for each photograph or pair
+_PROGRESS_BY_STAGE = {
+    "features": ("finding features", "keypoints"),
+    "matches": ("matching photos", "two_view_geometries"),
+    "cameras": ("placing cameras", None),
+    "cameras again": ("placing cameras, second try", None),
+    "undistorting": ("undistorting photos", None),
+}
+
+
+@dataclass(frozen=True)
+class SfmSettings:
+    """Settings that decide the cameras of the same photographs.
+
+    matching: "exhaustive" is every pair, "sequential" is neighbours by name, "auto" is every pair up to 100
+        photographs.
+    camera_model: COLMAP name of the lens model that is fitted. "auto" is OPENCV for cameras with 20 photographs or
+        more, otherwise SIMPLE_RADIAL (one distortion coefficient).
+    shared_camera: see `sfm_photos.camera_groups`.
+    max_image_size: longest side in pixels, for features only; the undistorted photographs keep their size.
+    max_features: maximum number of features in a photograph.
+    seed: the same seed gives the same cameras, bit by bit up to 80 photographs.
+    """
+
+    matching: Matching = "auto"
+    camera_model: str = "auto"
+    shared_camera: bool | Literal["auto"] = "auto"
+    max_image_size: int = 1600
+    max_features: int = 8192
+    seed: int = 0
+
+    def check(self) -> None:
+        """Raise InputError for an unknown matching or camera model."""
+        if self.matching not in ("auto", "exhaustive", "sequential"):
+            raise InputError(f"matching {self.matching!r}: expected auto, exhaustive or sequential")
+        if self.camera_model not in SFM_CAMERA_MODELS:
+            raise InputError(f"camera model {self.camera_model!r}: expected one of {', '.join(SFM_CAMERA_MODELS)}")
+
+    def __str__(self) -> str:
+        """The values in one line, for the fingerprint of a result."""
+        lens = f"{self.camera_model} {self.shared_camera}"
+        return f"{self.matching} {lens} {self.max_image_size} {self.max_features} {self.seed}"
+
+
+DEFAULT_SFM_SETTINGS = SfmSettings()
+
+
+def reconstruct(
+    images: Path,
+    output: Path,
+    settings: SfmSettings = DEFAULT_SFM_SETTINGS,
+    *,
+    threads: int | None = None,
+    overwrite: bool = False,
+    masks: MaskUse | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`, which is returned.
+
+    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. It
+    appears only when all of it is complete. A result of the same photographs and settings is reused.
+
+    threads: all cores if None.
+    overwrite: replace a result of other photographs.
+    masks: find no features where masks or alpha leave pixels out. The output also gets the masks, as
+        `masks/IMAGE.jpg.png`, white for pixels that count.
+    progress: called with a text and a fraction or None in every stage.
+
+    Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
+
+    Warns of copies, and of photographs that cannot be placed, have an unreadable format, or lost their alpha. Raises
+    InputError for a folder without photographs, a photograph that does not decode, and an output that is something
+    else. Also raises it for photographs whose cameras cannot be recovered. Raises ClsplatError if pycolmap fails.
+    KeyboardInterrupt leaves nothing behind.
+    """
+    report = progress or no_progress
+    settings.check()
+    paths, left_out = sfm_photos.find_photos(images, excluded=output)
+    copies = sfm_copies.told_by_names(images, [sfm_photos.photo_name(images, path) for path in paths])
+    paths = [path for path in paths if sfm_photos.photo_name(images, path) not in copies]
+    shapes = _masks(images, paths, masks)
+    fingerprint = sfm_photos.fingerprint(images, paths, f"{settings}{_described(masks, shapes)}")
+    if _is_finished(output, images, fingerprint, overwrite=overwrite):
+        report("using the cameras recovered before", 1.0)
+        return output
+    _require_enough(images, len(paths))
+    for why, others in left_out.items():
+        names = [sfm_photos.photo_name(images, path) for path in others]
+        warn(f"{images}: {_listed(names)} left out: {why}")
+
+    workers = threads or os.cpu_count() or 1
+    output.parent.mkdir(parents=True, exist_ok=True)
+    # next to the output, so that the last step is a rename within one file system
+    work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
+    try:
+        photos = _staged_photos(images, paths, copies, work / "photos", report, workers)
+        masked = _staged_masks(photos, shapes, masks, work)
+        answer = _run_worker(sfm_task(settings, photos, masked, work, workers), work, report)
+        if "failure" in answer:
+            raise InputError(_no_model(images, len(photos), answer["failure"]))
+        _write_record(work / "result", fingerprint, photos, answer["result"])
+        _warn_of_losses(images, photos, answer["result"]["registered"], work / "result" / "images", masks)
+        _move_into_place(work, output)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return output
+
+
+def _described(masks: MaskUse | None, shapes: dict[str, Path]) -> str:
+    """Text about the masks for the fingerprint: their use, and size and time of each file."""
+    if masks is None:
+        return ""
+    stats = [(name, path.stat()) for name, path in sorted(shapes.items())]
+    return f" {masks} {[(name, status.st_size, status.st_mtime_ns) for name, status in stats]}"
+
+
+def _staged_photos(
+    images: Path, paths: list[Path], copies: dict[str, sfm_copies.Copy], target: Path, report: Progress, threads: int
+) -> list[sfm_photos.Photo]:
+    """Put the photographs under `target`. Returns those that are no copies; warns of the copies.
+
+    copies: copies found by their names, by name.
+    Raises InputError if too few are left.
+    """
+    photos = sfm_photos.stage_photos(
+        images, paths, target, lambda fraction: report("reading photos", fraction), threads
+    )
+    copies = sfm_copies.resolved({**copies, **sfm_copies.told_by_pictures(photos)})
+    photos = [photo for photo in photos if photo.name not in copies]
+    if copies:
+        count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
+        again = f"{count} and left out ({sfm_copies.listed(copies)}); to use copies, give their folder alone"
+        warn(f"{images}: {again}")
+    _require_enough(images, len(photos))
+    return photos
+
+
+def _staged_masks(
+    photos: list[sfm_photos.Photo], shapes: dict[str, Path], masks: MaskUse | None, work: Path
+) -> list[str]:
+    """Write the masks of the photographs under `work`. Returns the names of the photographs that have one."""
+    if masks is None:
+        return []
+    masked = []
+    for photo in photos:
+        cut = photo.transparent and masks.alpha != "blend"
+        if cut or photo.name in shapes:
+            shape, target = shapes.get(photo.name), work / "masks" / f"{photo.name}.png"
+            inner = work / "photos" / photo.name if cut else None
+            stage_mask(shape, target, (photo.width, photo.height), invert=masks.invert, photo=inner)
+            masked.append(photo.name)
+    return masked
+
+
+def sfm_task(
+    settings: SfmSettings, photos: list[sfm_photos.Photo], masked: list[str], work: Path, threads: int
+) -> dict[str, Any]:
+    """Task of the worker, as JSON. See `clsplat.scenes.sfm.worker.Worker`."""
+    many = len(photos) > MAX_EXHAUSTIVE_PHOTOS
+    return {
+        "masks": masked,
+        "photos": str(work / "photos"),
+        "work": str(work),
+        "groups": sfm_photos.camera_groups(photos, settings.shared_camera),
+        "sequential": settings.matching == "sequential" or (settings.matching == "auto" and many),
+        "camera_model": settings.camera_model,
+        "max_image_size": settings.max_image_size,
+        "max_features": settings.max_features,
+        "threads": threads,
+        "seed": settings.seed,
+    }
+
+
+def _write_record(folder: Path, fingerprint: str, photos: list[sfm_photos.Photo], result: dict[str, Any]) -> None:
+    """Write sfm.json into the folder of the result."""
+    missing = sorted({photo.name for photo in photos} - set(result["registered"]))
+    record = {"fingerprint": fingerprint, "photos": len(photos), "unregistered": missing, **result}
+    record["files"] = _sizes(folder)
+    (folder / SFM_RECORD_FILE).write_bytes((json.dumps(record, indent=2) + "\n").encode())
+
+
+def _warn_of_losses(
+    images: Path, photos: list[sfm_photos.Photo], registered: list[str], result: Path, masks: MaskUse | None
+) -> None:
+    """Warn of photographs without a pose, and of those that lost their alpha.
+
+    registered: names of the photographs with a pose.
+    result: folder of the undistorted photographs.
+    """
+    if missing := sorted({photo.name for photo in photos} - set(registered)):
+        warn(f"{images}: {_listed(missing)} could not be placed and will not be used")
+    lost = _without_their_alpha(photos, registered, result)
+    if lost and (masks is None or masks.alpha == "blend"):
+        loss = "lost their alpha when their lens was undone: the scene's images are opaque there"
+        warn(f"{images}: {_listed(lost)} {loss}")
+
+
+@dataclass(frozen=True)
+class _FoundPhoto:
+    """A photograph in the folder: its path below it, and its file."""
+
+    name: str
+    path: Path
+
+
+def _require_enough(images: Path, count: int) -> None:
+    if count < MIN_SFM_PHOTOS:
+        raise InputError(f"{images}: only {count} photo(s) found, expected at least {MIN_SFM_PHOTOS}")
+
+
+def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
+    """Masks by photograph name. Raises InputError if masks are asked for but missing, or one fits no photograph."""
+    if use is None or use.masks == "none":
+        return {}
+    photos = [_FoundPhoto(sfm_photos.photo_name(images, path), path) for path in paths]
+    found = masks_beside(photos, others=OTHER_MASK_FOLDERS)
+    if not found:
+        raise InputError(
+            f"{images}: there are no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder"
+        )
+    warn_of_sense(found.values(), use, images)
+    return found
+
+
+def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], result: Path) -> list[str]:
+    """Names of photographs with transparency whose results have no alpha.
+
+    pycolmap keeps alpha only if the lens model has no distortion and the file is copied.
+    """
+    transparent = {photo.name for photo in photos if photo.transparent}
+    return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
+
+
+def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
+    """True if the output is the wanted result. Raises InputError if it must not be replaced."""
+    if not output.exists():
+        return False
+    if not output.is_dir():
+        raise InputError(f"{output}: is a file, expected a folder for the scene or a new name")
+    try:
+        record = load_document(output / SFM_RECORD_FILE, "the record of a result of sfm", "its fingerprint")
+    except InputError:
+        if any(output.iterdir()):
+            raise InputError(f"{output}: is not empty and not a result of sfm, expected a new folder") from None
+        return False
+    complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
+    files = record.get("files")
+    was = files if isinstance(files, dict) else {}  # a record may have no such list
+    now = _sizes(output)
+    changed = sorted(name for name, size in was.items() if now.get(name) != size)
+    if complete and not changed and record.get("fingerprint") == fingerprint:
+        return True
+    if changed and not overwrite:
+        raise InputError(
+            f"{output}: {examples(changed)} are gone or changed since the cameras were recovered; remove the folder, "
+            "or make it anew with clsplat sfm --overwrite"
+        )
+    if not overwrite:
+        raise InputError(
+            f"{output}: holds cameras recovered from other photos or settings than {images} now; "
+            "remove it or choose another folder"
+        )
+    return False
+
+
+def _sizes(result: Path) -> dict[str, int]:
+    """Sizes in bytes of a result's files, by path in the result."""
+    folders = (result / "images", result / "sparse", result / "masks")
+    paths = (path for folder in folders for path in folder.rglob("*"))
+    return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
+
+
+def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str, Any]:
+    """Run `clsplat.scenes.sfm.worker` to its end. Returns its answer, {"result"} or {"failure"}.
+
+    Raises ClsplatError if the worker ends without an answer.
+    """
+    log_path = work / "log.txt"
+    search_path = [str(Path(__file__).resolve().parents[3]), os.environ.get("PYTHONPATH", "")]
+    with open(log_path, "wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "clsplat.scenes.sfm.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            encoding="utf-8",
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, search_path))},
+            **apart(),  # Ctrl-C on the terminal reaches this process, which ends the worker
+        )
+        assert process.stdin is not None
+        assert process.stdout is not None
+        try:
+            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.flush()
+            answer = _follow(process.stdout, work / "database.db", report)
+            process.wait()
+        except OSError:  # the worker is gone: a broken pipe, or on Windows an invalid argument
+            answer = {}
+        finally:
+            process.kill()
+            process.wait()
+            with contextlib.suppress(OSError):  # closing flushes input that the worker never read
+                process.stdin.close()
+            process.stdout.close()
+    if not answer:
+        lines = [line.strip() for line in log_path.read_text("utf-8", errors="replace").splitlines() if line.strip()]
+        raise ClsplatError(f"structure from motion failed (status {process.returncode}): {' | '.join(lines[-3:])}")
+    return answer
+
+
+def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
+    """Report the worker's stages until its answer. Returns an empty dictionary if it ends without one."""
+    inbox: queue.Queue[str | None] = queue.Queue()
+
+    def read() -> None:
+        try:
+            for line in lines:
+                inbox.put(line)
+        except ValueError:  # closed because the caller was interrupted
+            pass
+        inbox.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    text, table, total = "starting", None, None
+    counted_at = time.monotonic()
+    while True:
+        try:
+            line = inbox.get(timeout=0.25)
+        except queue.Empty:
+            if table and total and time.monotonic() - counted_at > 0.5:
+                report(text, min(_rows(database, table) / total, 1.0))
+                counted_at = time.monotonic()
+            continue
+        if line is None:
+            return {}
+        message = json.loads(line)
+        if "result" in message or "failure" in message:
+            return dict(message)
+        if "stage" in message:
+            text, table = _PROGRESS_BY_STAGE[message["stage"]]
+            total, places = message["total"], message["stage"].startswith("cameras")
+            report(text, None if not total else CountedFraction(0, total, PLACED_CAMERAS_UNIT) if places else 0.0)
+        elif total:
+            report(text, CountedFraction(message["done"], total, PLACED_CAMERAS_UNIT))
+
+
+def _rows(database: Path, table: str) -> int:
+    """Number of rows in a table that the worker fills; 0 while it cannot be read."""
+    try:
+        name = f"{database.resolve().as_uri()}?mode=ro"
+        with contextlib.closing(sqlite3.connect(name, uri=True, timeout=0.1)) as connection:
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])  # noqa: S608 - our names
+    except sqlite3.Error:
+        return 0
+
+
+def _move_into_place(work: Path, output: Path) -> None:
+    """Move the finished result to `output`. An earlier result is removed only when the new one is in place."""
+    earlier = work / "earlier"
+    if output.exists():
+        replace(output, earlier)
+    try:
+        replace(work / "result", output)
+    except BaseException:
+        if earlier.exists():
+            replace(earlier, output)
+        raise
+
+
+def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
+    return (
+        f"{images}: no cameras could be recovered from {count} photos: {evidence['features']} features in a typical "
+        f"photo, {evidence['matched']} of {evidence['pairs']} pairs match, {evidence['matches']} matches in the best; "
+        "expected sharp photos of one textured, still scene, each sharing half its view with its neighbours"
+    )
+
+
+def _listed(names: list[str]) -> str:
+    """Text such as 3 photo(s) (a.jpg, b.jpg, c.jpg), shortened if there are many."""
+    return f"{len(names):,} photo(s) ({examples(names)})"

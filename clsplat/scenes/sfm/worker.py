@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Worker process for pycolmap, started by `clsplat.scenes.sfm.reconstruct` as `python -m clsplat.scenes.sfm.worker`.
+
+A separate process is needed for three reasons. pycolmap's long calls ignore Ctrl-C, its log goes to the standard error
+of the process, and a crash in native code must not end the caller.
+
+The task is one line of JSON on standard input, which then stays open. When it closes, the parent has ended, and the
+worker ends too. Answers are lines of JSON on standard output: {"stage", "total"}, {"done"} during a stage, and
+{"result"} or {"failure"} at the end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import statistics
+import sys
+import threading
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TextIO
+
+import pycolmap
+
+MAX_SINGLE_THREAD_PHOTOS = 80
+"""Number of photographs up to which mapping runs on one thread, which makes it repeat bit by bit and costs little."""
+MIN_OPENCV_PHOTOS = 20
+"""Number of photographs of one camera from which the eight parameters of OPENCV are fitted.
+
+On a phone's distorted photographs its reprojection error is 0.477 px, against 0.493 px for SIMPLE_RADIAL.
+"""
+SEQUENTIAL_OVERLAP = 12
+"""Neighbours on each side that sequential matching pairs with a photograph, in addition to those 2, 4, 8, ... away."""
+
+
+class Worker:
+    """One reconstruction. Each method is a stage, in the order of `run`.
+
+    task: see `sfm.reconstruct.sfm_task`. "photos" and "work" are folders, "groups" the names of the photographs that
+        share a camera.
+    """
+
+    def __init__(self, task: dict[str, Any], channel: TextIO) -> None:
+        self.task, self.channel = task, channel
+        self.photos, self.work = Path(task["photos"]), Path(task["work"])
+        self.database = self.work / "database.db"
+        self.count = sum(map(len, task["groups"]))
+
+    def say(self, **message: Any) -> None:
+        print(json.dumps(message), file=self.channel, flush=True)
+
+    def run(self) -> None:
+        pycolmap.set_random_seed(self.task["seed"])
+        self.extract()
+        renumber_by_name(self.database)
+        self.match()
+        models = self.map(relaxed=False)
+        if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
+            # a weak baseline or few features: start from a narrower pair, as a second try
+            models |= self.map(relaxed=True)
+        if not models:
+            self.say(failure=self.evidence())
+            return
+        best = max(models, key=lambda path: models[path].num_reg_images())  # mapping does not sort its models by size
+        self.undistort(best)
+        model = models[best]
+        registered = sorted(model.images[image_id].name for image_id in model.reg_image_ids())
+        self.say(
+            result={
+                "registered": registered,
+                "points": model.num_points3D(),
+                "mean_reprojection_error": model.compute_mean_reprojection_error(),
+                "pycolmap": pycolmap.__version__,
+            }
+        )
+
+    def extract(self) -> None:
+        """Extract SIFT features of every photograph into the database, with one camera for each group."""
+        self.say(stage="features", total=self.count)
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu = False
+        options.num_threads = self.task["threads"]
+        options.max_image_size = self.task["max_image_size"]
+        options.sift.max_num_features = self.task["max_features"]
+        singles = [names[0] for names in self.task["groups"] if len(names) == 1]
+        batches = [(names, pycolmap.CameraMode.SINGLE) for names in self.task["groups"] if len(names) > 1]
+        if singles:  # in one call, as photographs run in parallel only within a call
+            batches.append((singles, pycolmap.CameraMode.PER_IMAGE))
+        for names, mode in batches:
+            model = self.task["camera_model"]
+            if model == "auto":
+                shared = mode == pycolmap.CameraMode.SINGLE and len(names) >= MIN_OPENCV_PHOTOS
+                model = "OPENCV" if shared else "SIMPLE_RADIAL"
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = model
+            if self.task["masks"]:
+                reader.mask_path = self.work / "masks"
+            pycolmap.extract_features(
+                database_path=self.database,
+                image_path=self.photos,
+                image_names=names,
+                camera_mode=mode,
+                reader_options=reader,
+                extraction_options=options,
+                device=pycolmap.Device.cpu,
+            )
+
+    def match(self) -> None:
+        """Match all pairs, or neighbours by name, and verify the matches by epipolar geometry."""
+        options = pycolmap.FeatureMatchingOptions()
+        options.use_gpu = False
+        options.num_threads = self.task["threads"]
+        verification = pycolmap.TwoViewGeometryOptions()
+        verification.ransac.random_seed = self.task["seed"]
+        if self.task["sequential"]:
+            self.say(stage="matches", total=None)
+            pairing = pycolmap.SequentialPairingOptions()
+            pairing.overlap = SEQUENTIAL_OVERLAP
+            match = partial(pycolmap.match_sequential, pairing_options=pairing)
+        else:
+            self.say(stage="matches", total=self.count * (self.count - 1) // 2)
+            match = pycolmap.match_exhaustive
+        match(
+            database_path=self.database,
+            matching_options=options,
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+
+    def map(self, *, relaxed: bool) -> dict[Path, pycolmap.Reconstruction]:
+        """Map incrementally: camera poses and points. Returns every model by its folder."""
+        self.say(stage="cameras again" if relaxed else "cameras", total=self.count)
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = 1 if self.count <= MAX_SINGLE_THREAD_PHOTOS else self.task["threads"]
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.task["seed"]
+        options.min_model_size = 3
+        if relaxed:
+            options.mapper.init_min_tri_angle = 4.0
+            options.mapper.init_max_forward_motion = 1.0
+            options.mapper.init_min_num_inliers = 50
+            options.mapper.abs_pose_min_num_inliers = 15
+            options.mapper.filter_min_tri_angle = 0.8
+            options.triangulation.min_angle = 1.0
+        output = self.work / ("sparse-relaxed" if relaxed else "sparse")
+        output.mkdir()
+        placed = 2
+
+        def count_one() -> None:
+            nonlocal placed
+            placed += 1
+            self.say(done=min(placed, self.count))
+
+        models: dict[int, pycolmap.Reconstruction] = pycolmap.incremental_mapping(
+            database_path=self.database,
+            image_path=self.photos,
+            output_path=output,
+            options=options,
+            next_image_callback=count_one,
+        )
+        return {output / str(index): model for index, model in models.items()}
+
+    def undistort(self, model: Path) -> None:
+        """Resample the registered photographs to pinhole cameras, in the layout that COLMAP's readers expect."""
+        self.say(stage="undistorting", total=None)
+        flat, result = self.work / "undistorted", self.work / "result"
+        pycolmap.undistort_images(
+            output_path=flat,
+            input_path=model,
+            image_path=self.photos,
+            output_type="COLMAP",
+            undistort_options=pycolmap.UndistortCameraOptions(),
+            jpeg_quality=97,
+            num_threads=self.task["threads"],
+        )
+        (result / "sparse").mkdir(parents=True)
+        (flat / "images").rename(result / "images")
+        (flat / "sparse").rename(result / "sparse" / "0")
+        as_pinhole(result / "sparse" / "0")
+        shutil.rmtree(flat)
+        self.undistort_masks(model, result / "masks")
+
+    def undistort_masks(self, model: Path, result: Path) -> None:
+        """Resample the masks of the registered photographs likewise, to the photographs' names with .png."""
+        placed = pycolmap.Reconstruction(model)
+        named = {placed.images[image].name: placed.images[image] for image in placed.reg_image_ids()}
+        for name in set(self.task["masks"]) & named.keys():
+            mask = pycolmap.Bitmap.read(self.work / "masks" / f"{name}.png", as_rgb=False)
+            camera = placed.cameras[named[name].camera_id]
+            flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), mask, camera)
+            path = result / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            flat.write(path)
+
+    def evidence(self) -> dict[str, Any]:
+        """Counts of features and matches, for the message about a failed reconstruction."""
+        with sqlite3.connect(self.database) as connection:
+            features = [row[0] for row in connection.execute("SELECT rows FROM keypoints")]
+            matches = [row[0] for row in connection.execute("SELECT rows FROM two_view_geometries")]
+        return {
+            "features": int(statistics.median(features)) if features else 0,
+            "pairs": len(matches),
+            "matched": sum(rows > 0 for rows in matches),
+            "matches": max(matches, default=0),
+        }
+
+
+def as_pinhole(folder: Path) -> None:
+    """Rewrite SIMPLE_PINHOLE cameras, which undistortion does not change, as PINHOLE, so that readers get one model."""
+    model = pycolmap.Reconstruction(folder)
+    simple = [camera for camera in model.cameras.values() if camera.model_name == "SIMPLE_PINHOLE"]
+    for camera in simple:
+        focal, cx, cy = camera.params
+        camera.model = pycolmap.CameraModelId.PINHOLE
+        camera.params = [focal, focal, cx, cy]
+    if simple:
+        model.write(folder)
+
+
+def renumber_by_name(database: Path) -> None:
+    """Number images, frames, cameras and rigs in the order of the images' names.
+
+    Several threads finish photographs in any order and number them as they finish. The numbers decide the order of all
+    later work, and so the last bits of the result.
+    """
+    connection = sqlite3.connect(database)
+    with connection:
+        rows = connection.execute(
+            "SELECT i.image_id, d.frame_id, i.camera_id, f.rig_id FROM images i "
+            "JOIN frame_data d ON d.data_id = i.image_id JOIN frames f ON f.frame_id = d.frame_id ORDER BY i.name"
+        ).fetchall()
+        images, frames, cameras, rigs = (_ranks([row[column] for row in rows]) for column in range(4))
+        for table, column, ranks in (
+            ("images", "image_id", images),
+            ("keypoints", "image_id", images),
+            ("descriptors", "image_id", images),
+            ("frame_data", "data_id", images),
+            ("pose_priors", "corr_data_id", images),
+            ("frames", "frame_id", frames),
+            ("frame_data", "frame_id", frames),
+            ("cameras", "camera_id", cameras),
+            ("images", "camera_id", cameras),
+            ("rigs", "ref_sensor_id", cameras),
+            ("frame_data", "sensor_id", cameras),
+            ("pose_priors", "corr_sensor_id", cameras),
+            ("rigs", "rig_id", rigs),
+            ("frames", "rig_id", rigs),
+        ):
+            # in two steps, by way of unused numbers, as the columns are unique
+            far = 1 << 30
+            connection.executemany(
+                f"UPDATE {table} SET {column} = ? WHERE {column} = ?",  # noqa: S608 - names from the list above
+                [(new + far, old) for old, new in ranks.items()],
+            )
+            connection.execute(f"UPDATE {table} SET {column} = {column} - {far} WHERE {column} >= {far}")  # noqa: S608
+    connection.close()
+
+
+def _ranks(numbers: Sequence[int]) -> dict[int, int]:
+    """Rank of each number, from 1, in the order of first occurrence."""
+    return {number: place for place, number in enumerate(dict.fromkeys(numbers), start=1)}
+
+
+def _end_with_parent(stream: TextIO) -> None:
+    stream.read()
+    os._exit(3)
+
+
+def main() -> None:
+    """Read the task, run it, and send the answer."""
+    # output that native code prints must not mix with the answers
+    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    task = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_parent, args=(sys.stdin,), daemon=True).start()
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
+    Worker(task, channel).run()
+    channel.flush()
+    # skip the teardown of native threads: the answer is sent, and the parent removes the folder
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

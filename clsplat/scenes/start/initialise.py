@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Initial Gaussians: one per point, isotropic, sized by the distance to its neighbours.
+
+Points without colours take the median colour of the training photographs that show them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import DEFAULT_NEAR_PLANE
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.images.alpha import composite
+from clsplat.scenes.dataset import nearest_around, pixels_of
+from clsplat.scenes.point_files import UNCOLOURED_GREY, of_one_colour
+from clsplat.spherical_harmonics import SH_C0
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
+
+INITIAL_OPACITY = 0.1
+MIN_SQUARED_DISTANCE = 1e-7
+"""The authors' lower bound of the mean squared distance, which keeps coincident points alive.
+
+World units squared, for scenes whose extent is within ORDINARY_EXTENTS. Others use the same fraction of the extent as
+at the nearer end.
+"""
+ORDINARY_EXTENTS = (1.0, 100.0)
+MIN_START_COLOUR = 1 / 512
+"""Half a step of an 8-bit image. A channel that starts at 0 is at the colour clamp, where it has no gradient.
+
+Rounding may then keep it at 0.
+"""
+SCALE_NEIGHBOURS = 3
+COLOUR_VIEWS_PER_POINT = 15
+"""Number of nearest photographs that give a point its colour.
+
+Distant photographs blend a point with its surroundings. With few photographs, one that shows something else has too
+much weight.
+"""
+POINTS_PER_OCCLUSION_CELL = 16
+"""Mean number of points in an occlusion cell.
+
+With fewer points, occluded ones show through. With more, cells are so wide that they cover adjacent objects.
+"""
+MAX_OCCLUSION_CELL_FRACTION = 1 / 25
+"""Maximum side of an occlusion cell, relative to the picture's longer side. With few points, hardly any is occluded."""
+OCCLUSION_DEPTH_RATIO = 1.05
+"""Depth relative to the nearest point of the cell, above which a point counts as occluded."""
+HIDDEN_POINT_RANK = 1e30
+"""Rank of an occluded point per relative depth; larger than the rank of any visible point."""
+UNSEEN_GREY = UNCOLOURED_GREY
+"""Grey value of points that no photograph shows."""
+
+
+def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
+    """Gaussians of SH degree 0 at the scene's points, or at `random_count` random points if it has none."""
+    points: NDArray[Any] = scene.points
+    colors: NDArray[Any] = scene.point_colors
+    if len(points) == 0:
+        points, colors = random_points(random_count, *scene.bounds, rng)
+    return from_points(points, colors, origin=scene.origin, extent=scene.extent, near=scene.near)
+
+
+def from_points(
+    points: ArrayLike,
+    colors: ArrayLike,
+    *,
+    origin: Float64 | None = None,
+    extent: float = 1.0,
+    near: float = DEFAULT_NEAR_PLANE,
+) -> Gaussians:
+    """One Gaussian per point.
+
+    points: (N, 3), world units.
+    colors: (N, 3) in [0, 1].
+    origin: (3,), origin of the means, by default the world's.
+    extent: the scene's extent, world units.
+    near: the model's near plane.
+
+    The standard deviation is the root of the mean squared distance to the three nearest other points, or to all if
+    there are fewer. A lone point gets the lower bound. The opacity is 0.1, the quaternion 1 0 0 0.
+    Raises InputError for no points or points that are not finite, ValueError for wrong shapes.
+    """
+    xyz = np.asarray(points, np.float64)
+    rgb: NDArray[Any] = np.asarray(colors)
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape:
+        raise ValueError(f"points {xyz.shape} and colors {rgb.shape}: expected (N, 3) both")
+    count = len(xyz)
+    if count == 0:
+        raise InputError("no points to start from, expected at least one")
+    if not np.isfinite(xyz).all():
+        raise InputError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite")
+
+    origin = np.zeros(3) if origin is None else origin
+    log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), squared_floor(extent)))
+    quaternions = np.zeros((count, 4), np.float32)
+    quaternions[:, 0] = 1
+    sh = ((np.maximum(rgb, MIN_START_COLOUR) - 0.5) / SH_C0).astype(np.float32)[:, None]
+    return Gaussians(
+        means=np.ascontiguousarray(xyz - origin, np.float32),
+        quaternions=quaternions,
+        log_scales=np.repeat(log_scales.astype(np.float32)[:, None], 3, axis=1),
+        opacity_logits=np.full(count, np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY)), np.float32),
+        sh=sh,
+        origin=origin,
+        near=near,
+    )
+
+
+def squared_floor(extent: float) -> float:
+    """Lower bound of the mean squared distance of a scene's points, world units squared."""
+    low, high = ORDINARY_EXTENTS
+    return MIN_SQUARED_DISTANCE * (extent / min(max(extent, low), high)) ** 2
+
+
+def mean_squared_distance(points: Float64) -> Float64:
+    """Mean squared distance (N,) of points (N, 3) to their three nearest neighbours; 0 for a lone point.
+
+    Coincident points are neighbours at distance 0, as in the authors' code.
+    """
+    from scipy.spatial import cKDTree
+
+    neighbours = min(SCALE_NEIGHBOURS, len(points) - 1)
+    if neighbours == 0:
+        return np.zeros(len(points))
+    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
+    # Sorted, so the first is 0: the point itself or one at the same place, which is the same distance.
+    return np.asarray(np.mean(np.square(distances[:, 1:]), axis=1))
+
+
+def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Generator) -> tuple[Float64, Float64]:
+    """Uniformly random points in a box, and their colours, for a scene without points.
+
+    low, high: (3,), corners of the box, world units.
+    Returns points (count, 3) and colours (count, 3), grey with the authors' small amount of noise.
+    """
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    points = low + rng.random((count, 3)) * (high - low)
+    colors = 0.5 + SH_C0 * rng.random((count, 3)) / 255
+    return points, colors
+
+
+def is_colourless(scene: Scene) -> bool:
+    """True if points have no colours, as in a cloud of --points, or all the same, as clouds without colours are
+    read."""
+    return scene.colourless is not None or of_one_colour(scene.point_colors)
+
+
+def photographed(scene: Scene, background: ArrayLike) -> Float32:
+    """Colours (N, 3) float32 in [0, 1] of the scene's points. Points with colours of their own keep them.
+
+    A colour is the median, by channel, over the COLOUR_VIEWS_PER_POINT training photographs that show the point, at the
+    training size. Masked and occluded points do not count as shown. A point that is occluded in all photographs uses
+    those where it is the least occluded.
+    """
+    count = len(scene.points)
+    ranks, colors = (
+        np.full((count, COLOUR_VIEWS_PER_POINT), np.inf),
+        np.full((count, COLOUR_VIEWS_PER_POINT, 3), np.inf, np.float32),
+    )
+    for view in scene.train_views:
+        camera, picture = view.camera.before(scene.near), view.load_masked()
+        rows, columns, inside = pixels_of(scene.points, camera, view.lens)
+        which, depths = np.flatnonzero(inside), camera.depths_of(scene.points[inside])
+        cell = np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(len(which), 1))
+        cell = max(min(cell, MAX_OCCLUSION_CELL_FRACTION * max(camera.width, camera.height)), 1.0)
+        behind = depths / nearest_around(rows, columns, depths, cell)
+        rank = np.where(behind <= OCCLUSION_DEPTH_RATIO, depths / camera.fx, HIDDEN_POINT_RANK * behind)
+        pixels = picture[rows, columns]
+        counts = pixels[:, 4] > 0 if pixels.shape[1] == 5 else np.ones(len(which), np.bool_)
+        last = ranks[which].argmax(axis=1)
+        kept = counts & (rank < ranks[which, last])
+        which, last = which[kept], last[kept]
+        ranks[which, last] = rank[kept]
+        colors[which, last] = composite(pixels[None, kept, :4], background)[0]
+    shown = ranks < HIDDEN_POINT_RANK
+    colors[~shown & shown.any(axis=1, keepdims=True)] = np.inf
+    medians = np.clip(_medians(colors), 0, 1)
+    return medians if scene.colourless is None else np.where(scene.colourless[:, None], medians, scene.point_colors)
+
+
+def _medians(colors: Float32) -> Float32:
+    """Medians (N, 3) by channel over the finite colours in (N, K, 3), which are sorted in place; UNSEEN_GREY if there
+    are none."""
+    counts = np.isfinite(colors).all(axis=2).sum(axis=1)[:, None, None]
+    colors.sort(axis=1)
+    middles = np.concatenate([np.maximum(counts - 1, 0) // 2, counts // 2], axis=1)
+    medians = np.take_along_axis(colors, middles, axis=1).mean(axis=1)
+    return np.asarray(np.where(counts[:, 0] > 0, medians, np.float32(UNSEEN_GREY)))

@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Masks of photographs: finding their files by name, and applying them to pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from clsplat.arrays import Float32
+from clsplat.config.masks import NO_MASKS, MaskMeaning, MaskUse
+from clsplat.errors import InputError, examples, warn
+from clsplat.images.reading import IMAGE_SUFFIXES, find_images, image_size, read_image, stored_range
+from clsplat.images.writing import write_image
+from clsplat.scenes.dataset import PosedImage
+from clsplat.scenes.sidecar_files import Named, bases_of, beside, inside, owned
+
+MASK_FOLDERS = ("masks", "mask", ".masks", ".mask")
+"""Names of the mask folder, next to the photographs' folder or inside it. RealityScan's is hidden."""
+OTHER_MASK_FOLDERS = (
+    *("images_mask", "images_masks", "image_mask", "image_masks", "masks_images", "masks_png", "dynamic_masks"),
+    *("dynamic_mask", "mattes", "matte", "silhouettes", "silhouette", "segmentation", "segmentations"),
+)
+"""More names of mask folders, which are searched if masks are asked for and not found."""
+DYNAMIC_FOLDER_PREFIX = "dynamic"
+"""Prefix of the name of a folder whose white pixels may be moving objects."""
+MASK_THRESHOLD = 0.5
+"""Minimum mask value of a pixel that counts, and minimum fraction of its area that counts after a change of size."""
+COMPARED_MASKS = 12
+"""Number of masks that are sampled to learn whether others reach a half or have void. At most twice as many are
+read."""
+VOID_LABEL = 255
+"""Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
+MAX_LABEL = 40
+"""Maximum of the other labels. Soft masks have larger values."""
+MAX_LABEL_NOISE_RATIO = 0.01
+"""Ratio of the area labelled 1 to the area labelled 255, below which a mask is black and white with noise."""
+
+
+@dataclass(frozen=True)
+class Mask:
+    """Masking of a photograph.
+
+    use: meaning of the mask, and of the photograph's alpha.
+    path: the mask file, if there is one.
+    """
+
+    use: MaskUse
+    path: Path | None = None
+
+    @property
+    def ignores(self) -> bool:
+        """True if pixels may have to be left out."""
+        return self.use.alpha == "ignore" or (self.path is not None and self.use.masks == "ignore")
+
+    def applied(self, image: Float32, *, orient: bool) -> tuple[Float32, Float32 | None]:
+        """Apply the masks to a photograph (H, W, 3 or 4).
+
+        Returns the photograph, and (H, W, 1): 1 for pixels that count, else 0; None if all count. Raises InputError for
+        a mask of another size, or one that does not decode.
+        """
+        kept, counts = image[:, :, 3:] if image.shape[2] == 4 else None, None
+        if kept is not None and self.use.alpha == "ignore":
+            counts, kept = (kept >= MASK_THRESHOLD).astype(np.float32), None
+        if self.path is not None:
+            mask = read_mask(self.path, orient=orient, invert=self.use.invert)
+            if mask.shape[:2] != image.shape[:2]:
+                raise _misfit(self.path, (mask.shape[1], mask.shape[0]), (image.shape[1], image.shape[0]))
+            if self.use.masks == "ignore":
+                counts = mask if counts is None else counts * mask
+            else:
+                kept = mask if kept is None else kept * mask
+        pixels = image[:, :, :3] if kept is None else np.concatenate([image[:, :, :3], kept], axis=2)
+        return pixels, counts
+
+
+def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
+    """Read a mask (H, W, 1): 1 for pixels that count, else 0.
+
+    Grey values of at least a half count. If the grey is constant, alpha is used instead. Among labels (0 and 1, perhaps
+    255 for void), 1 counts, and void never does. Raises InputError if the file does not decode, and for ambiguous
+    labels. Also raises it if all values are dark: two values, or more if the folder's other masks are dark too.
+    """
+    image = read_image(path, orient=orient)
+    pixels = image[:, :, :3]
+    if image.shape[2] == 4 and np.ptp(pixels.mean(axis=2)) == 0:
+        pixels = image[:, :, 3:]
+    values = pixels.mean(axis=2, keepdims=True)
+    dark = values[(values > 0) & (values < MASK_THRESHOLD)]
+    if dark.size and values.max() < MASK_THRESHOLD:
+        values = _from_labels(path, values, pixels)
+    elif dark.size and dark.max() < (MAX_LABEL + 0.5) / VOID_LABEL and values[values >= MASK_THRESHOLD].min() == 1:
+        values = _without_void(path, values)
+    counts: Float32 = (((values >= MASK_THRESHOLD) != invert) & (values >= 0)).astype(np.float32)
+    return counts
+
+
+def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
+    """Interpret a mask that has no value of at least a half: 1 for labels of 1, -1 for void.
+
+    pixels: the colours whose means are `values`.
+    Raises InputError for other labels. A soft mask may be dark if another mask in its folder is not.
+    """
+    most, exact = stored_range(path)
+    levels = np.unique(np.rint(values * most)).astype(int).tolist()
+    if not most or levels[-1] < 1:
+        return values
+    if exact and levels[-1] == 1:
+        return np.asarray(values * most, np.float32)
+    if exact and levels[-1] == VOID_LABEL < most and set(levels[:-1]) in ({0, 1}, {1}):
+        return _labels(np.rint(values * most), VOID_LABEL)
+    if (len(levels) > 2 or not exact) and any(_reaches_half(other) for other in _like(path)):
+        return values
+    raise InputError(
+        f"{path}: the mask's values are {_stored(pixels, most)}, all of them dark, expected 0 and {most}, where a half "
+        "or more counts (or 0 and 1); make white what counts"
+    )
+
+
+def _stored(pixels: Float32, most: int) -> str:
+    """Pixel values (H, W, 1 or 3) as stored in the file, for a message."""
+    levels = np.unique(np.rint(pixels.reshape(-1, pixels.shape[2]) * most).astype(int), axis=0)
+    if (levels == levels[:, :1]).all():
+        grey = levels[:, 0].tolist()
+        return " and ".join(map(str, grey)) if len(grey) < 3 else f"{len(grey)} from {grey[0]} to {grey[-1]}"
+    colours = [f"({', '.join(map(str, colour))})" for colour in levels.tolist()]
+    return " and ".join(colours) if len(colours) < 3 else f"{len(colours)} colours such as {examples(colours)}"
+
+
+def _without_void(path: Path, values: Float32) -> Float32:
+    """Interpret a mask of black, white and integers that may be labels: 1 for labels of 1, -1 for void.
+
+    They are labels if they cover more area than white does, in the mask or in the masks of its folder. Raises
+    InputError for more labels, and if the meaning is ambiguous.
+    """
+    most, exact = stored_range(path)
+    areas = _areas(values, most)
+    if not exact or areas is None:
+        return values
+    labels, void = areas
+    several = bool((np.rint(values * most)[values < MASK_THRESHOLD] > 1).any())
+    if labels < void:
+        others = [_areas(read_image(other)[:, :, :3].mean(axis=2), most) for other in _like(path) if other != path]
+        labels, void = (int(sum(each)) for each in zip(areas, *(other for other in others if other), strict=True))
+    if labels < MAX_LABEL_NOISE_RATIO * void or (several and labels < void):
+        return values
+    if labels < void or several:
+        found = ", ".join(map(str, np.unique(np.rint(values * most)).astype(int).tolist()[:-1]))
+        what = "labels of several things and void" if several else "labels of 0 and 1 with void, or black and white"
+        raise InputError(
+            f"{path}: the mask's values are {found} and {most}, {what}, expected 0 and {most}, where a half or more "
+            "counts (or 0 and 1); make white what counts and black all else"
+        )
+    return _labels(np.rint(values * most), most)
+
+
+def _labels(levels: Float32, void: int) -> Float32:
+    """Labels, with -1 in place of void."""
+    return np.where(levels == void, np.float32(-1), levels).astype(np.float32)
+
+
+def _areas(values: Float32, most: int) -> tuple[int, int] | None:
+    """Pixel counts of labels from 1 up and of white, for a mask that otherwise has only black; else None."""
+    levels = values * most
+    dark = levels < most * MASK_THRESHOLD
+    whole = np.abs(levels - np.rint(levels)).max() < 0.25  # a mean of three equal channels is whole but for rounding
+    if not most or not whole or not (levels[~dark] > most - MASK_THRESHOLD).all() or (levels[dark] > MAX_LABEL).any():
+        return None
+    found = np.unique(np.rint(levels[dark])).astype(int).tolist()
+    if found and found != list(range(found[0], found[-1] + 1)):
+        return None
+    return int(np.count_nonzero(dark & (levels > MASK_THRESHOLD))), int(np.count_nonzero(~dark))
+
+
+def _like(path: Path) -> list[Path]:
+    """Sample of the masks in a mask's folder, which may also have photographs."""
+    named = "mask" in path.stem.lower()
+    others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
+    return others[:: max(len(others) // COMPARED_MASKS, 1)]
+
+
+def _reaches_half(path: Path) -> bool:
+    return bool(read_image(path)[:, :, :3].mean(axis=2).max() >= MASK_THRESHOLD)
+
+
+def find_masks(
+    folder: Path, names: Iterable[str], without: Iterable[Path] = (), *, strict: bool = True
+) -> dict[str, Path]:
+    """Masks in a folder, by the names of their photographs.
+
+    names: all photographs, relative to their folder.
+    without, strict: as for `owned`.
+
+    A mask is named IMAGE.jpg.png (COLMAP), IMAGE.png, IMAGE_mask.png or IMAGE.jpg.mask.png (RealityScan), in the same
+    sub-folder. mask_0007.png may also belong to image_0007.png (`owned`). Raises InputError for a mask that fits no
+    photograph, and for two masks of one.
+    """
+    names = sorted(names)
+    example = next(iter(names), "IMAGE.jpg")
+    return owned(
+        folder, find_images(folder), _known(names), "mask", example, without=without, strict=strict, numbered=True
+    )
+
+
+def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
+    """Photographs by the possible names of their masks, without the extension.
+
+    plain: also accept the photograph's own name.
+    """
+    known: dict[str, str] = {}
+    for name in names:
+        path = PurePosixPath(name)
+        stem = str(path.with_suffix(""))
+        own = (name, stem) if plain else (name,)
+        before = (str(path.with_name(f"mask{mark}{path.stem}")) for mark in "_-")
+        for key in (*own, *before, *(f"{each}{mark}mask" for each in (stem, name) for mark in "_.-")):
+            known.setdefault(key, name)
+    return known
+
+
+def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict: bool = True) -> dict[str, Mask]:
+    """Masks of a scene's photographs, by name; empty if masks and alpha have no meaning.
+
+    where: the scene, for messages.
+    strict: False if photographs are missing, whose masks may exist.
+    Warns of photographs without a mask. Raises InputError if there are no masks, or one is missing, has another size,
+    or fits no photograph.
+    """
+    if use == NO_MASKS:
+        return {}
+    found: dict[str, Path] = {}
+    if use.masks != "none":
+        told = {image.name: image.mask for image in images if image.mask is not None}
+        found = {**masks_beside(images, told, strict=strict, others=OTHER_MASK_FOLDERS), **told}
+        if not found:
+            raise InputError(
+                f"{where}: --masks {use.masks}, and there are none; expected masks/IMAGE.png beside images/, or "
+                "'mask_path' in transforms.json"
+            )
+        files = {image.name: image.path for image in images}
+        for name, path in found.items():
+            size, photo = image_size(path, orient=False), image_size(files[name], orient=False)
+            if size not in (photo, image_size(files[name], orient=True)):
+                raise _misfit(path, size, photo)
+        warn_of_sense(found.values(), use, where)
+        if without := sorted(name for name in files if name not in found):
+            warn(f"{where}: {len(without):,} photograph(s) have no mask and count as a whole ({examples(without)})")
+    return {image.name: Mask(use, found.get(image.name)) for image in images}
+
+
+def warn_of_sense(masks: Iterable[Path], use: MaskUse, where: Path) -> None:
+    """Warn of masks in a folder whose name suggests that white pixels are moving objects."""
+    folder = next((path.parent for path in masks if path.parent.name.lower().startswith(DYNAMIC_FOLDER_PREFIX)), None)
+    if folder is not None and not use.invert:
+        warn(
+            f"{where}: masks are in {folder.name}, and white is taken for what counts, as in all masks; if it is what "
+            "moves there, give --invert-masks"
+        )
+
+
+def masks_beside(
+    images: Sequence[Named],
+    told: Mapping[str, Path] | None = None,
+    *,
+    strict: bool = True,
+    others: Sequence[str] = (),
+) -> dict[str, Path]:
+    """Masks by photograph name, in a folder next to the photographs' folder or inside it, else next to each photograph.
+
+    told: masks that the data set names, by photograph name. In nerfstudio's scenes, one mask may serve all.
+    strict: as for `find_masks`.
+    others: more names of folders, searched if the usual ones have no masks.
+    Raises InputError like `find_masks`.
+    """
+    told = told or {}
+    if all(image.name in told for image in images):
+        return {}
+    for folders in (MASK_FOLDERS, others) if others else (MASK_FOLDERS,):
+        for base in bases_of(images):
+            folder = beside(base, folders)
+            if folder is not None:
+                names = {str(PurePosixPath(image.path.relative_to(base).as_posix())): image.name for image in images}
+                present = (
+                    file.relative_to(base).as_posix() for file in find_images(base) if folder not in file.parents
+                )
+                masks = find_masks(folder, {*names, *present}, told.values(), strict=strict)
+                if found := {names[key]: path for key, path in masks.items() if key in names}:
+                    return found
+        if found := _beside_each(images, told, folders, strict=strict):
+            return found
+    return {}
+
+
+def _beside_each(
+    images: Sequence[Named], told: Mapping[str, Path], folders: Sequence[str], *, strict: bool
+) -> dict[str, Path]:
+    """Masks in a folder inside each photograph's own folder, or in the photograph's folder itself.
+
+    In the photograph's folder, only files with "mask" or two extensions in their names are masks.
+    """
+    by_parent: dict[Path, dict[str, str]] = {}
+    for image in images:
+        by_parent.setdefault(image.path.parent, {})[image.path.name] = image.name
+    found: dict[str, Path] = {}
+    for parent, names in by_parent.items():
+        masks: dict[str, Path] = {}
+        present = [path.name for path in find_images(parent, deep=False)]
+        if (folder := inside(parent, folders)) is not None:
+            masks = find_masks(folder, {*names, *present}, told.values(), strict=strict)
+        if not masks:
+            paths = [parent / name for name in present if name not in names and _says_mask(name)]
+            masks = owned(parent, paths, _known(sorted(names), plain=False), "mask", "", strict=False)
+        found.update({names[key]: path for key, path in masks.items() if key in names})
+    return found
+
+
+def _says_mask(name: str) -> bool:
+    stem = PurePosixPath(name.lower()).stem
+    return "mask" in stem or PurePosixPath(stem).suffix in IMAGE_SUFFIXES
+
+
+def stage_mask(
+    path: Path | None, target: Path, size: tuple[int, int], *, invert: bool, photo: Path | None = None
+) -> None:
+    """Write a black and white mask for a photograph.
+
+    path: the mask file, None for all white.
+    size: the photograph's width and height.
+    photo: the photograph, if its alpha is a mask too.
+    Raises InputError for a mask of another size.
+    """
+    mask = np.ones((*size[::-1], 1), np.float32)
+    if path is not None:
+        mask = read_mask(path, orient=False, invert=invert)
+        if mask.shape[:2] != size[::-1]:
+            raise _misfit(path, (mask.shape[1], mask.shape[0]), size)
+    if photo is not None:
+        mask = mask * (read_image(photo, orient=False)[:, :, 3:] >= MASK_THRESHOLD)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_image(target, np.repeat(mask, 3, axis=2))
+
+
+def for_sfm(use: MaskUse) -> MaskUse | None:
+    """Use of masks in `clsplat.scenes.sfm.reconstruct`, which finds no features in left-out pixels; None for no masks.
+
+    Raises InputError if masks and alpha have different meanings, as the reconstruction has one mask for both.
+    """
+    meanings = {use.masks, use.alpha} - {"none", "blend"}
+    if len(meanings) > 1:
+        raise InputError(
+            f"--masks {use.masks} and --alpha {use.alpha}: expected one meaning of both for a folder of photos, as "
+            "their reconstruction has one mask for each; give the cameras, or make both the same"
+        )
+    if not meanings:
+        return None
+    masks: MaskMeaning = "none" if use.masks == "none" else "ignore"
+    return MaskUse(masks, "blend" if use.alpha == "blend" else "ignore", use.invert)
+
+
+def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
+    """Use of the masks in a folder that `clsplat.scenes.sfm.reconstruct` made: white pixels count, and alpha is
+    included."""
+    if not (folder / MASK_FOLDERS[0]).is_dir():
+        return replace(use, masks="none", invert=False)
+    meaning: MaskMeaning = "none" if use.alpha == "blend" else use.alpha
+    return replace(use, masks=meaning if use.masks == "none" else use.masks, invert=False)
+
+
+def _misfit(path: Path, size: tuple[int, int], photo: tuple[int, int]) -> InputError:
+    return InputError(
+        f"{path}: the mask is {size[0]} x {size[1]} pixels, expected its photograph's {photo[0]} x {photo[1]}; "
+        "make it of that size"
+    )

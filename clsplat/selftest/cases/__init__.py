@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cases of the self-test: each runs stages on a frozen scene and compares them with their float64 twins."""

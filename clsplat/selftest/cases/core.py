@@ -1,0 +1,430 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The core stages of the self-test, each compared with the float64 reference on one frozen scene.
+
+A stage's input is the device's own output of the stage before, so that errors do not add up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.config.training import OptimiserConfig
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.launch import launch_items
+from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
+from clsplat.layouts.columns import READBACK, SPLAT, TILE
+from clsplat.optimisation.density_rules import MarkRules
+from clsplat.reference import adam as reference_adam
+from clsplat.reference import blend as reference_blend
+from clsplat.reference import density as reference_density
+from clsplat.reference import loss as reference_loss
+from clsplat.reference import project as reference_project
+from clsplat.reference.render import parameters, project_model
+from clsplat.reference.tiles import touched_tiles
+from clsplat.selftest.cases.appearance import of_appearance
+from clsplat.selftest.cases.depth import of_depth
+from clsplat.selftest.cases.grid import of_grid
+from clsplat.selftest.cases.library import LIBRARY_CASES
+from clsplat.selftest.cases.masks import MASK_CASES
+from clsplat.selftest.cases.pictures import PICTURE_CASES
+from clsplat.selftest.cases.poses import of_lens, of_pose
+from clsplat.selftest.cases.ppisp import of_ppisp
+from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped, joined
+from clsplat.selftest.scenes import evenly, keys, padded
+from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
+from clsplat.stages.adam import adam
+from clsplat.stages.blend import blend, blend_grad
+from clsplat.stages.density import DensityStatistics, DeviceMarker, add_statistics, new_statistics
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
+from clsplat.stages.duplicate import Pairs, count, duplicate
+from clsplat.stages.loss import loss
+from clsplat.stages.project import Projected, Screen, project, project_grad, project_step
+from clsplat.stages.ranges import tile_lists
+from clsplat.stages.sort import bitonic_sort, radix_sort
+
+
+def _arithmetic(bench: CaseBench) -> StageOutcome:
+    device, n = bench.device, 4096
+    a, b = evenly(21, (n,), 1.0, 2.0, 1 << 22), evenly(22, (n,), 1.0, 4.0, 1 << 20)
+    c = evenly(23, (n,), -4.0, 4.0, 1 << 22)
+    arrays = [upload(device, values.astype(np.float32)) for values in (a, b, c)]
+    kernel = device.kernels("arithmetic").arithmetic
+
+    def launch() -> DeviceArray:
+        out = bench.work.array("arithmetic", (4, n))
+        launch_items(device, kernel, n // device.shape.lanes, n, *arrays, out)
+        return out
+
+    _, outcome = bench.twice(launch, lambda out: [out.get()])
+    (got,), trouble = outcome.arrays, outcome.trouble
+    exact = {"division": a / b, "square root": np.sqrt(b), "fused multiply-add": a * b + c}
+    errors = {}
+    for (name, wanted), row in zip(exact.items(), got[:3], strict=True):
+        error = np.abs(row.astype(np.float64) - wanted)
+        errors[name] = (float(error.max()), float((error / np.spacing(np.abs(wanted).astype(np.float32))).max()))
+    if (got[2] != exact["fused multiply-add"].astype(np.float32)).any():
+        trouble = trouble or "fused multiply-adds are not rounded once"
+    otherwise = [
+        name for (name, wanted), row in zip(exact.items(), got, strict=False) if (row != wanted.astype(row.dtype)).any()
+    ]
+    if (got[3] != (a * 2.0**-140).astype(np.float32)).any():
+        otherwise.append("denormal numbers")
+    return StageOutcome([got[:3]], errors, outcome.ms, trouble, tuple(otherwise))
+
+
+def _project(bench: CaseBench) -> StageOutcome:
+    device, camera = bench.device, bench.camera
+    columns = [index for index, name in enumerate(SPLAT) if name != "UNUSED"]
+
+    def take(projected: Projected) -> list[Array]:
+        counts = projected.tile_counts.get()
+        return [projected.splats.get()[counts > 0][:, columns], counts]
+
+    bench.projected, outcome = bench.twice(
+        lambda: project(device, bench.work, bench.model, camera, bench.camera_array), take
+    )
+    gaussians = bench.frozen.gaussians
+    wanted = project_model(gaussians, camera, gaussians.sh_degree)
+    got, shown = bench.splats(), bench.visible & wanted.visible
+    log2o = bench.projected.splats.get()[shown, SPLAT.index("LOG2O")]
+    parts = {
+        "mean": (got.means2d[shown], wanted.means2d[shown]),
+        "whitening": (got.whitening[shown], wanted.whitening[shown]),
+        "log2 of opacity": (log2o, np.log2(wanted.opacities[shown])),
+        "depth": (got.depths[shown], wanted.depths[shown]),
+        "colour": (got.colors[shown], wanted.colors[shown]),
+        "extent": (got.half_extents[shown], wanted.half_extents[shown]),
+    }
+    touched = touched_tiles(wanted, camera.width, camera.height, TILE, reference_project.ALPHA_MIN * (1 + 1e-5))
+    _, counts = outcome.arrays
+    too_few = sum(len(tiles) > listed for tiles, listed in zip(touched, counts, strict=True))
+    too_many = int((counts > _box_tiles(wanted, bench.tiles)).sum())
+    return outcome.compared(parts, tile_counts=too_few + too_many)
+
+
+def _box_tiles(projected: reference_project.ProjectedTwin, tiles: tuple[int, int]) -> NDArray[np.int64]:
+    """Number of tiles in each Gaussian's bounding box plus half a pixel, an upper bound of its tiles; 0 if not
+    visible."""
+    low = np.floor((projected.means2d - projected.half_extents - 0.5) / TILE)
+    high = np.floor((projected.means2d + projected.half_extents + 0.5) / TILE) + 1
+    spans = np.clip(high, 0, tiles) - np.clip(low, 0, tiles)
+    return np.where(projected.visible, spans.prod(axis=1), 0).astype(np.int64)
+
+
+def _duplicate(bench: CaseBench) -> StageOutcome:
+    device, work, projected = bench.device, bench.work, bench.projected
+
+    def launch() -> Pairs:
+        bench.counted = count(device, work, projected)
+        return duplicate(device, work, projected.splats, bench.counted, bench.tiles, bench.band)
+
+    bench.pairs, outcome = bench.twice(
+        launch, lambda pairs: [pairs.tile_keys.get(), pairs.pair_ids.get(), bench.counted.first_slots.get()]
+    )
+    tile_keys, ids, first_slots = outcome.arrays
+    counts, got = projected.tile_counts.get().astype(np.int64), bench.splats()
+    order = got.order
+    owners = np.repeat(order, counts[order])
+    place = np.arange(len(owners)) - np.repeat(np.cumsum(counts[order]) - counts[order], counts[order])
+    scanned = np.cumsum(counts) - counts
+    wrong = int((first_slots != scanned).sum())
+    if len(ids) != len(owners):
+        return replace(outcome, trouble=f"{len(ids)} pairs instead of {len(owners)}")
+    wrong += int((ids[:, 1] != owners).sum()) + int((ids[:, 0] != scanned[owners] + place).sum())
+    # each Gaussian's tiles ascend, and include every tile that it reaches
+    wrong += int((np.diff(tile_keys.astype(np.int64))[place[1:] > 0] <= 0).sum()) + int(
+        (tile_keys >= bench.band.end).sum()
+    )
+    threshold = reference_project.ALPHA_MIN * (1 + 1e-5)
+    touched = touched_tiles(got, bench.camera.width, bench.camera.height, TILE, threshold)
+    listed = set(zip(owners.tolist(), tile_keys.tolist(), strict=True))
+    missing = sum((gaussian, tile) not in listed for gaussian, tiles in enumerate(touched) for tile in tiles.tolist())
+    return outcome.compared({}, pairs=wrong + missing)
+
+
+def _sort(bench: CaseBench) -> StageOutcome:
+    """Test both sorts on synthetic keys, as another scene may use the sort that this one does not."""
+    device, work = bench.device, bench.work
+    sizes = [(400, 12, False), (3000, 20, True), (30_000 if bench.frozen.name == "crowd" else 5000, 32, True)]
+    given = [keys(51 + index, n, bits) for index, (n, bits, _) in enumerate(sizes)]
+    on_device = [upload(device, values) for values in given]
+
+    def launch() -> list[DeviceArray]:
+        results: list[DeviceArray] = []
+        for index, ((_, bits, radix), values) in enumerate(zip(sizes, on_device, strict=True)):
+            name = f"sorted{index}"
+            both = radix_sort(device, work, name, values, bits) if radix else bitonic_sort(device, work, name, values)
+            results += both
+        return results
+
+    _, outcome = bench.twice(launch, lambda results: [array.get() for array in results])
+    arrays, wrong = outcome.arrays, 0
+    for values, got, positions in zip(given, arrays[::2], arrays[1::2], strict=True):
+        order = np.argsort(values, kind="stable")
+        wrong += int((got != values[order]).sum()) + int((positions != order).sum())
+    return outcome.compared({}, sorted_keys=wrong)
+
+
+def _ranges(bench: CaseBench) -> StageOutcome:
+    bench.lists, outcome = bench.twice(
+        lambda: tile_lists(bench.device, bench.work, bench.pairs, bench.band),
+        lambda lists: [lists.ranges.get(), lists.gaussian_from_sorted.get(), lists.slot_from_sorted.get()],
+    )
+    tile_keys, ids = bench.pairs.tile_keys.get(), bench.pairs.pair_ids.get()
+    order = np.argsort(tile_keys, kind="stable")
+    ends = np.searchsorted(tile_keys[order], np.arange(bench.band.tiles), side="right")
+    begins = np.searchsorted(tile_keys[order], np.arange(bench.band.tiles), side="left")
+    wanted = np.where((ends > begins)[:, None], np.stack([begins, ends], axis=1), 0)
+    exact = (wanted, ids[order, 1], ids[order, 0])
+    wrong = sum(int((got != values).sum()) for got, values in zip(outcome.arrays, exact, strict=True))
+    return outcome.compared({}, list_entries=wrong)
+
+
+def _blend(bench: CaseBench) -> StageOutcome:
+    device, camera = bench.device, bench.camera
+    bench.blended, outcome = bench.twice(
+        lambda: blend(device, bench.work, bench.lists, bench.inputs),
+        lambda blended: [blended.image.get(), blended.transmittance.get(), blended.stops.get()],
+    )
+    wanted, clear = bench.blend_reference()
+    image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
+    exact = (wanted.image[clear], wanted.transmittance[clear])
+    return outcome.compared({"image": (image, exact[0]), "transmittance": (transmittance, exact[1])})
+
+
+def _loss(bench: CaseBench) -> StageOutcome:
+    device, camera = bench.device, bench.camera
+    image, photograph = bench.blended.image, upload(device, bench.frozen.photograph)
+    sides = (camera.width, camera.height)
+    result, outcome = bench.twice(
+        lambda: loss(device, bench.work, image, photograph, *sides, 0.2),
+        lambda result: [result.gradient.get()[:, : camera.height]],  # the rows below are not written
+    )
+    x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
+    value, gradient = reference_loss.l1_dssim(x, y)
+    sums = (np.array(result.read()), np.array([value, np.square(x - y).mean()]))
+    return outcome.compared({"gradient": (_pixels(bench, outcome.arrays[0]), gradient), "loss and error": sums})
+
+
+def _pixels(bench: CaseBench, planes: Array) -> Float64:
+    """Crop (3, rows, stride) to (H, W, 3) in float64."""
+    return cropped(planes, bench.camera).astype(np.float64)
+
+
+def _blend_grad(bench: CaseBench) -> StageOutcome:
+    device, camera, splats = bench.device, bench.camera, bench.splats()
+    _, clear = bench.blend_reference()
+    planes = padded(camera, 31, -0.5, 0.5)
+    exact = planes.copy()
+    exact[:, : camera.height, : camera.width] *= clear
+
+    def launch(gradient: DeviceArray) -> DeviceArray:
+        return blend_grad(device, bench.work, bench.lists, bench.inputs, bench.blended, gradient)
+
+    given = upload(device, planes)
+    _, outcome = bench.twice(lambda: launch(given), lambda slots: [slots.get()])
+    got = slot_sums(bench, launch(upload(device, exact)).get())
+    background = bench.frozen.background.astype(np.float64)
+    wanted = reference_blend.blend_grad(splats, camera.width, camera.height, background, _pixels(bench, exact))
+    shown = splats.visible
+    moments = _moments(splats, wanted)
+    parts = {
+        "sum of g": (got[shown, :1], moments[shown, :1]),
+        "first moments": (got[shown, 1:3], moments[shown, 1:3]),
+        "second moments": (got[shown, 3:6], moments[shown, 3:6]),
+        "colour": (got[shown, SLOT_COLOURS], wanted.colors[shown]),
+    }
+    return outcome.compared(parts)
+
+
+def _moments(splats: reference_project.ProjectedTwin, wanted: reference_blend.BlendGradients) -> Float64:
+    """Moments (n, 6) in the form of a slot, docs/gradients.md (49), from the gradients of eqs. (25) to (29)."""
+    l11, l12, l22 = (WHITENING_FACTOR * splats.whitening).T
+    gx, gy = -(WHITENING_FACTOR**2) * wanted.means2d.T
+    u = gx / l11
+    v = (gy - l12 * u) / l22
+    dxx, dxy, dyy = -2 * wanted.conics[:, 0], -wanted.conics[:, 1], -2 * wanted.conics[:, 2]
+    uu = l11 * l11 * dxx + 2 * l11 * l12 * dxy + l12 * l12 * dyy
+    uv = l22 * (l11 * dxy + l12 * dyy)
+    return np.stack([wanted.opacities * splats.opacities, u, v, uu, uv, l22 * l22 * dyy], axis=1)
+
+
+def _project_grad(bench: CaseBench) -> StageOutcome:
+    """Test the gradient of projection with synthetic slots, so that an error in blending's gradient is not counted
+    here."""
+    device, n = bench.device, bench.model.count
+    coefficients = bench.model.coefficients
+    made, visible = MadeUpSlots.of(bench), bench.visible
+
+    def launch() -> tuple[DeviceGaussians, Screen]:
+        gradients = allocate_gaussians(device, n, coefficients, zero=True)
+        screen = Screen(bench.work.array("screen", (n, 2)))
+        project_grad(device, bench.model, bench.camera_array, bench.projected, made.slots, gradients, screen)
+        return gradients, screen
+
+    def take(results: tuple[DeviceGaussians, Screen]) -> list[Array]:
+        return [*(results[0][group].get() for group in PARAMETER_GROUPS), results[1].gradients.get()[visible]]
+
+    _, outcome = bench.twice(launch, take)
+    *by_group, on_image = outcome.arrays
+    model, camera = bench.frozen.gaussians, bench.camera
+    on_twin = (project_model(model, camera, model.sh_degree), made.on_image(bench))
+    wanted = reference_project.project_grad(parameters(model), camera, model.sh_degree, *on_twin)
+    got = dict(zip(PARAMETER_GROUPS, by_group, strict=True))
+    parts = {name: (got[name][visible], wanted[name][visible]) for name in got if name in wanted}
+    sh = np.concatenate([got["sh_dc"][:, None], got["sh_rest"]], axis=1)
+    parts["SH"] = (sh[visible], wanted["sh"][visible])
+    parts["means on the image"] = (on_image, made.d_means(bench)[visible])
+    return outcome.compared(parts)
+
+
+_RATES_BY_GROUP = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3)}
+
+
+def _adam(bench: CaseBench) -> StageOutcome:
+    device, step = bench.device, 7
+    count, coefficients = bench.model.count, bench.model.coefficients
+    shapes = group_shapes(count, coefficients)
+    ends = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
+    made = {
+        kind: {
+            g: evenly(60 + 8 * i + j, shapes[g], *ends[kind]).astype(np.float32) for j, g in enumerate(PARAMETER_GROUPS)
+        }
+        for i, kind in enumerate(ends)
+    }
+    outcomes = []
+    moving = bench.projected.tile_counts
+    for sparse in (False, True):
+        config = OptimiserConfig(sparse=sparse)
+        if sparse:
+            for values in made["gradients"].values():
+                values[~bench.visible] = 0.0  # as project_grad leaves them
+
+        def launch(config: OptimiserConfig = config) -> list[DeviceGaussians]:
+            models = [
+                DeviceGaussians(
+                    count, coefficients, {group: upload(device, values) for group, values in arrays.items()}
+                )
+                for arrays in made.values()
+            ]
+            parameters, gradients, first, second = models
+            adam(device, step, _RATES_BY_GROUP, config, parameters, gradients, first, second, moving)
+            return models
+
+        def take(models: list[DeviceGaussians]) -> list[Array]:
+            return [model[group].get() for model in models for group in PARAMETER_GROUPS]
+
+        _, outcome = bench.twice(launch, take)
+        rows = bench.visible if sparse else np.ones(count, np.bool_)
+        after = dict(zip(((kind, group) for kind in made for group in PARAMETER_GROUPS), outcome.arrays, strict=True))
+        parts: dict[str, tuple[Array, Array]] = {}
+        kept = 0
+        for group in PARAMETER_GROUPS:
+            p, g, m, v = (made[kind][group].astype(np.float64) for kind in made)
+            wanted = reference_adam.adam(
+                p, g, m, v, step, _RATES_BY_GROUP[group], config.beta1, config.beta2, config.epsilon
+            )
+            for kind, exact in zip(("parameters", "first", "second"), wanted, strict=True):
+                got = after[kind, group]
+                parts[f"{kind} of {group}"] = (got[rows], exact[rows])
+                kept += int((got[~rows] != made[kind][group][~rows]).sum())
+        wrong = _steps_off(bench, config, made)
+        outcomes.append(outcome.compared(parts, hidden_rows=kept, with_projection=wrong))
+    return joined(outcomes)
+
+
+def _steps_off(bench: CaseBench, config: OptimiserConfig, made: Mapping[str, Mapping[str, Array]]) -> int:
+    """Count the elements that `project_step` moves differently from float64 Adam with the gradients of
+    `project_grad`."""
+    device, step, (n, coefficients) = bench.device, 7, (bench.model.count, bench.model.coefficients)
+    view = (bench.camera_array, bench.projected, MadeUpSlots.of(bench).slots)
+    gradients, screen = (
+        allocate_gaussians(device, n, coefficients, zero=True),
+        Screen(bench.work.array("screen", (n, 2))),
+    )
+    project_grad(device, bench.model, *view, gradients, screen)
+    before = {"parameters": {group: bench.model[group].get() for group in PARAMETER_GROUPS}}
+    before |= {kind: dict(made[kind]) for kind in ("first", "second")}
+    model = {
+        kind: DeviceGaussians(n, coefficients, {group: upload(device, array) for group, array in arrays.items()})
+        for kind, arrays in before.items()
+    }
+    readback = upload(device, np.zeros(len(READBACK), np.uint32))
+    three = (model["parameters"], model["first"], model["second"])
+    project_step(device, step, _RATES_BY_GROUP, config, three, *view, screen, readback)
+    wrong, rows = int(readback.get().sum()), bench.visible if config.sparse else np.ones(n, np.bool_)
+    for group, rate in _RATES_BY_GROUP.items():
+        p, m, v = (before[kind][group].astype(np.float64) for kind in before)
+        g = gradients[group].get().astype(np.float64)
+        exact = reference_adam.adam(p, g, m, v, step, rate, config.beta1, config.beta2, config.epsilon)
+        for kind, wanted in zip(before, exact, strict=True):
+            got = model[kind][group].get()
+            # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step or of a new moment.
+            off = np.abs(got - wanted) > 1e-5 * np.abs(wanted) + 1e-4 * (rate if kind == "parameters" else g**2 + 1e-6)
+            wrong += int(off[rows].sum()) + int((got[~rows] != before[kind][group][~rows]).sum())
+    return wrong
+
+
+def _statistics(bench: CaseBench) -> StageOutcome:
+    device, n, camera, visible = bench.device, bench.model.count, bench.camera, bench.visible
+    values = evenly(34, (n, 2), -0.0625, 0.0625).astype(np.float32)
+    screen = Screen(upload(device, values))
+
+    def launch() -> DensityStatistics:
+        statistics = new_statistics(device, n)
+        for _ in range(2):
+            add_statistics(device, statistics, camera, bench.projected, screen)
+        return statistics
+
+    statistics, outcome = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
+    got = dict(zip(statistics.named(), outcome.arrays, strict=True))
+    norms = np.hypot(*(0.5 * np.array([camera.width, camera.height]) * values.astype(np.float64)).T) * visible
+    sxx, sxy, syy = bench.splats().covariances.T
+    radii = np.ceil(3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))) * visible
+    wrong = int((got["seen"] != 2 * visible).sum())
+    wrong += _marks_wrong(bench, statistics)
+    wrong += int((np.abs(got["radii"] - radii) > 1).sum()) + int((got["radii"] != radii).sum() > 1 + n // 100)
+    return outcome.compared({"gradient sums": (got["gradient_sums"], 2 * norms)}, counts=wrong)
+
+
+def _marks_wrong(bench: CaseBench, statistics: DensityStatistics) -> int:
+    """Count wrong entries in the list of rows, with thresholds that divide the Gaussians by every statistic."""
+    device, model = bench.device, bench.model
+    known = {name: array.get() for name, array in statistics.named().items()}
+    scales, logits = model["log_scales"].get(), model["opacity_logits"].get()
+    middle, limit = 0.500001 * float(np.median(known["gradient_sums"])), float(np.median(scales.max(axis=1)))
+    rules = MarkRules(gradient=middle, large=limit, transparent=float(np.median(logits)) - 1, oversized=limit + 2)
+    rows, halves = reference_density.rows(rules, known, scales, logits)
+    got = DeviceMarker(device, Workspace(device), model, statistics).rows(rules)
+    if got.count != len(rows):
+        return abs(got.count - len(rows))
+    return int((got.rows.get() != rows).sum()) + abs(got.halves - halves)
+
+
+CASES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
+    "arithmetic": _arithmetic,
+    "project": _project,
+    "duplicate": _duplicate,
+    "sort": _sort,
+    "ranges": _ranges,
+    "blend": _blend,
+    **PICTURE_CASES,
+    **MASK_CASES,
+    "loss": _loss,
+    "blend_grad": _blend_grad,
+    "project_grad": _project_grad,
+    "adam": _adam,
+    "statistics": _statistics,
+    "appearance": of_appearance,
+    "ppisp": of_ppisp,
+    "grid": of_grid,
+    "depth": of_depth,
+    "pose": of_pose,
+    "lens": of_lens,
+    **LIBRARY_CASES,
+}

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Self-test of the stages that only rendered pictures need.
+
+They are channels other than colour, slices by depth, holdouts, and cameras without an image plane.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from clsplat.camera import CAMERA_MODELS, Camera
+from clsplat.cameras.model import CameraModel
+from clsplat.device.buffers import upload
+from clsplat.images.holdouts import surfaces_of
+from clsplat.layouts.columns import RAY
+from clsplat.reference import channels as reference_channels
+from clsplat.reference import deep as reference_deep
+from clsplat.reference import deep_merge as reference_deep_merge
+from clsplat.reference import every_pixel
+from clsplat.reference import holdout as reference_holdout
+from clsplat.reference import rays as reference_rays
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.selftest.harness import (
+    MIN_DECISION_MARGIN,
+    WHITENING_FACTOR,
+    Array,
+    CaseBench,
+    StageOutcome,
+    cropped,
+    joined,
+)
+from clsplat.stages.blend import Blended
+from clsplat.stages.channels import FEATURE_WIDTHS, Channels, Features, Motion, channels, features
+from clsplat.stages.deep import deep
+from clsplat.stages.deep_merge import deep_merge
+from clsplat.stages.device_camera import pack_camera
+from clsplat.stages.holdout import holdout, upload_held
+
+TESTED_FEATURES = Features.of(name for name in FEATURE_WIDTHS if name != "backward")
+"""All features but backward motion, which is motion to another camera, by the same function."""
+MIN_NORMAL_COSINE = 1e-4
+"""Cosine between a normal and the direction to the camera below which rounding decides which side is seen."""
+MIN_TRANSMITTANCE_MARGIN = 1e-5
+"""Margin like `harness.MARGIN`, as differences: of the transmittance to one half, of a slice's cut, and between the two
+largest weights."""
+DEEP_CASE_SLICES = 4
+"""Slices per pixel."""
+DEEP_SLICE_PARTS = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(4, 5)}
+"""Fields of a slice that are compared."""
+
+MAX_GAUSSIANS_FOR_REFERENCE = 500
+"""The most Gaussians of a scene whose surround picture is compared. The reference evaluates each at every pixel, which
+takes a second for this number."""
+
+
+def _after(camera: Camera) -> Camera:
+    """The camera that motion leads to: a step aside, up and back, with a longer lens."""
+    return replace(camera, translation=camera.translation + np.array([-0.0625, 0.03125, 0.125]), fx=camera.fx + 2.0)
+
+
+def _features(bench: CaseBench) -> StageOutcome:
+    device, camera, visible = bench.device, bench.camera, bench.visible
+    motion = Motion(upload(device, pack_camera(_after(camera))))
+    view = (bench.model, bench.camera_array, bench.projected, motion)
+    bench.features, outcome = bench.twice(
+        lambda: features(device, bench.work, TESTED_FEATURES, *view),
+        lambda rows: [rows.get()[visible]],
+    )
+    (got,) = outcome.arrays
+    every = reference_channels.features(bench.splats(), bench.frozen.gaussians, camera, _after(camera))
+    wanted = {name: values[visible] for name, values in every.items()}
+    away = wanted["position"] - camera.position
+    clear = np.abs((away * wanted["normal"]).sum(axis=1)) > MIN_NORMAL_COSINE * np.linalg.norm(away, axis=1)
+    parts = {
+        name: (got[:, at : at + FEATURE_WIDTHS[name]], wanted[name]) for name, at in TESTED_FEATURES.offsets.items()
+    }
+    parts["normal"] = (parts["normal"][0][clear], wanted["normal"][clear])
+    return outcome.compared(parts)
+
+
+def _channels(bench: CaseBench) -> StageOutcome:
+    device, camera = bench.device, bench.camera
+    arguments = (bench.features, bench.lists, bench.inputs, bench.blended)
+    _, outcome = bench.twice(
+        lambda: channels(device, bench.work, TESTED_FEATURES, *arguments),
+        lambda planes: [planes.means.get(), planes.whole.get()],
+    )
+    splats, (frame, clear) = bench.splats(), bench.blend_reference()
+    wanted = reference_channels.channels(splats, bench.frozen.gaussians, camera, _after(camera))
+    means, whole = (cropped(planes, camera) for planes in outcome.arrays)
+    sure = clear & (wanted.doubt > MIN_TRANSMITTANCE_MARGIN)
+    # a sum that cancels, as normals may at low opacity, has no accurate digits
+    solid = sure & (frame.transmittance < 0.5)
+    parts = {
+        name: (means[solid, at : at + FEATURE_WIDTHS[name]], getattr(wanted, name).reshape(*solid.shape, -1)[solid])
+        for name, at in TESTED_FEATURES.offsets.items()
+    }
+    parts["median"] = (means[sure, -2], wanted.median[sure])
+    parts["first"] = (means[sure, -1], wanted.first[sure])
+    counts = int((whole[sure, 0] != wanted.count[sure]).sum())
+    indices = int((whole[sure, 1] != wanted.index[sure]).sum())
+    return outcome.compared(parts, counts=counts, indices=indices)
+
+
+def _deep(bench: CaseBench) -> StageOutcome:
+    device, camera = bench.device, bench.camera
+    arguments = (bench.lists, bench.inputs, bench.blended)
+    bench.slices, outcome = bench.twice(
+        lambda: deep(device, bench.work, DEEP_CASE_SLICES, *arguments), lambda slices: [slices.get()]
+    )
+    (planes,), splats, (_, clear) = outcome.arrays, bench.splats(), bench.blend_reference()
+    twin = reference_deep.deep(splats, camera.width, camera.height, DEEP_CASE_SLICES)
+    sure = clear & (twin.margin > MIN_TRANSMITTANCE_MARGIN)
+    wanted = twin.slices[:, sure]
+    got = planes[:, :, : camera.height, : camera.width].transpose(0, 2, 3, 1)[:, sure]
+    return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in DEEP_SLICE_PARTS.items()})
+
+
+def _deep_merge(bench: CaseBench) -> StageOutcome:
+    """Test a merge of the sliced picture with itself, shifted and upside down: depths are equal, and there are too many
+    slices."""
+    device, planes = bench.device, bench.slices.get()
+    pictures = np.stack([planes, np.roll(planes, 3, axis=3), planes[:, :, ::-1], planes])
+    weights = np.full((4, *planes.shape[2:]), 0.25, np.float32)
+    arrays = upload(device, pictures.reshape(*pictures.shape[:3], -1)), upload(device, weights.reshape(4, -1))
+    _, outcome = bench.twice(lambda: deep_merge(device, bench.work, *arrays), lambda merged: [merged.get()])
+    twin = reference_deep_merge.deep_merge(pictures.transpose(0, 1, 3, 4, 2).astype(np.float64), weights)
+    sure = twin.margin > MIN_TRANSMITTANCE_MARGIN
+    got, wanted = outcome.arrays[0].reshape(planes.shape).transpose(0, 2, 3, 1)[:, sure], twin.slices[:, sure]
+    return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in DEEP_SLICE_PARTS.items()})
+
+
+def _holdout(bench: CaseBench) -> StageOutcome:
+    """Test a half-transparent surface and an absorbing volume in front of a wall, each in some of the pixels."""
+    device, camera = bench.device, bench.camera
+    shape = (camera.height, camera.width)
+    at = np.arange(camera.height * camera.width).reshape(shape)
+    wanted_surfaces = []
+    for begin, end, share, every in ((1.5, 1.5, 0.5, 2), (1.75, 3.5, 0.75, 3), (2.75, 2.75, 1.0, 5)):
+        there = at % every == 0
+        depths = (np.where(there, begin, np.inf), np.where(there, end, np.inf))
+        wanted_surfaces.append((*depths, np.full(shape, share)))
+    held = upload_held(device, surfaces_of(*(np.stack(parts, axis=2) for parts in zip(*wanted_surfaces, strict=True))))
+
+    def launch() -> Blended:
+        blended = bench.blended
+        image, left = (upload(device, array.get()) for array in (blended.image, blended.transmittance))
+        anew = Blended(image, left, blended.stops, None)
+        holdout(device, held, bench.lists, bench.inputs, anew)
+        return anew
+
+    _, outcome = bench.twice(launch, lambda anew: [anew.image.get(), anew.transmittance.get()])
+    splats, (_, clear) = bench.splats(), bench.blend_reference()
+    behind = bench.frozen.background.astype(np.float64)
+    image, alpha = reference_holdout.held_out(splats, camera.width, camera.height, wanted_surfaces, behind)
+    got, left = (cropped(planes, camera) for planes in outcome.arrays)
+    return outcome.compared({"colour": (got[clear], image[clear]), "left": (left[clear], 1 - alpha[clear])})
+
+
+def _rays(bench: CaseBench) -> StageOutcome:
+    """Test projection to tangent planes, and a frame with a channel of it, for each projection that uses rays."""
+    models = [model for model in CAMERA_MODELS if model.along_rays and model.self_tested]
+    return joined([_of_rays(bench, model.projection, _camera_of(bench.camera, model)) for model in models])
+
+
+def _camera_of(camera: Camera, model: CameraModel) -> Camera:
+    """The frozen scene's camera along rays, or one amid the scene, with Gaussians all around it, at the poles and on
+    the seam."""
+    if model.is_pinhole:
+        return camera.along_rays(by_rays=True)
+    middle = np.array([0.25, -0.125, 4.0])
+    rotation = camera.rotation
+    translation = -(rotation[:, 0] * middle[0] + rotation[:, 1] * middle[1] + rotation[:, 2] * middle[2])
+    focal = model.wide_focal(camera.width)
+    centre = (0.5 * camera.width, 0.5 * camera.height)
+    amid = Camera(camera.width, camera.height, focal, focal, *centre, rotation, translation)
+    return amid.through(model)
+
+
+def _of_rays(bench: CaseBench, projection: str, camera: Camera) -> StageOutcome:
+    # with its own memory: later stages need the results of earlier ones
+    rasterizer, gaussians = Rasterizer(bench.device), bench.frozen.gaussians
+
+    def launch() -> tuple[ForwardPass, Channels]:
+        frame = rasterizer.forward(bench.model, camera, bench.background, backward=False)
+        return frame, rasterizer.channels(bench.model, frame, Features(), Motion(frame.camera_array))
+
+    def take(results: tuple[ForwardPass, Channels]) -> list[Array]:
+        frame, planes = results
+        counts = frame.projected.tile_counts.get()
+        arrays = (frame.blended.image, frame.blended.transmittance, planes.means, planes.whole)
+        return [frame.projected.splats.get()[counts > 0], counts, *(array.get() for array in arrays)]
+
+    _, outcome = bench.twice(launch, take)
+    splats, counts, image, left, means, _ = outcome.arrays
+    tangents, shown = reference_rays.tangents(gaussians, camera), counts > 0
+    parts = _tangent_parts(tangents, shown, splats)
+    if bench.model.count <= MAX_GAUSSIANS_FOR_REFERENCE:
+        picture = every_pixel.render(gaussians, camera, bench.frozen.background.astype(np.float64))
+        clear = picture.margin > 3 * MIN_DECISION_MARGIN  # float32 directions are accurate to 1e-7, a pixel is 0.1
+        solid = clear & (picture.alpha > 0.5)
+        parts["image"] = (cropped(image, camera)[clear], picture.image[clear])
+        parts["transmittance"] = (cropped(left, camera)[clear], 1 - picture.alpha[clear])
+        of_distances = camera.depths_of_distances()
+        depth = picture.depth if of_distances is None else picture.depth / of_distances
+        parts["mean depth"] = (cropped(means, camera)[solid, 0], depth[solid])
+    hidden = int((shown & ~tangents.visible).sum())
+    return outcome.compared({f"{name}, {projection}": part for name, part in parts.items()}, hidden_Gaussians=hidden)
+
+
+def _tangent_parts(tangents: reference_rays.Tangents, shown: Any, splats: Array) -> dict[str, tuple[Array, Array]]:
+    """Columns of the visible Gaussians, and their values in float64."""
+
+    def column(*names: str) -> Array:
+        return splats[:, [RAY.index(name) for name in names]]
+
+    sxx, sxy, syy = (tangents.covariances[shown][:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
+    l11 = WHITENING_FACTOR * np.sqrt(syy / (sxx * syy - sxy * sxy))
+    u = l11[:, None] * (tangents.right[shown] - (sxy / syy)[:, None] * tangents.down[shown])
+    v = (WHITENING_FACTOR / np.sqrt(syy))[:, None] * tangents.down[shown]
+    size = np.linalg.norm(u, axis=1, keepdims=True), np.linalg.norm(v, axis=1, keepdims=True)
+    return {
+        "direction": (column("FX", "FY", "FZ"), tangents.directions[shown]),
+        "U": (column("UX", "UY", "UZ") / size[0], u / size[0]),
+        "V": (column("VX", "VY", "VZ") / size[1], v / size[1]),
+        "distance": (column("DEPTH"), tangents.depths[shown, None]),
+        "log2 of opacity": (column("LOG2O"), np.log2(tangents.opacities[shown, None])),
+        "colour": (column("RED", "GREEN", "BLUE"), tangents.colors[shown]),
+    }
+
+
+PICTURE_CASES: dict[str, Callable[[CaseBench], StageOutcome]] = {
+    "features": _features,
+    "channels": _channels,
+    "deep": _deep,
+    "deep_merge": _deep_merge,
+    "holdout": _holdout,
+    "rays": _rays,
+}

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trust in a driver: the self-test in a worker process that the driver may crash, and the driver records.
+
+A record applies to one device, driver, kernel shape and set of kernels. `clsplat selftest` ignores the records: it
+always tests, and forgets a failure if the test passes.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+
+from clsplat.device import sandbox
+from clsplat.device.context import Device, all_devices
+from clsplat.device.drivers import driver_records
+from clsplat.device.drivers.quirks import title
+from clsplat.device.drivers.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
+from clsplat.device.drivers.worker_process import TRUST_DRIVER_VARIABLE, Child, patience, python_module, regardless
+from clsplat.errors import DeviceError, DriverError
+from clsplat.selftest.result import FORWARD_STAGES, SELFTEST_STAGES, TRAINING_STAGES, Result
+
+
+@dataclass
+class DriverReport:
+    """The self-test result of a device.
+
+    digests: of each stage's output, by "scene/stage".
+    build_seconds: None if the kernels were not built first.
+    end: how the process ended before its work was done, or empty.
+    crashed: True if the driver caused that.
+    hung: True if the process did not come back.
+    kernels: the kernels that were built and launched, named as in `device.sandbox`.
+    remembered: a recorded failure in this shape that this test could not clear, or empty.
+    """
+
+    results: list[Result] = field(default_factory=list)
+    digests: dict[str, str] = field(default_factory=dict)
+    build_seconds: float | None = None
+    end: str = ""
+    crashed: bool = False
+    hung: bool = False
+    wanted: tuple[str, ...] = SELFTEST_STAGES
+    kernels: dict[str, str] = field(default_factory=dict)
+    remembered: str = ""
+
+    @property
+    def failure(self) -> str:
+        """The reason why the driver cannot be trusted, or an empty string."""
+        for result in self.results:
+            if result.trouble:
+                return f"{result.stage}: {result.trouble}"
+            if not result.passed:
+                most = f"where at most {result.bound:g} are expected"
+                return f"{result.stage}: {result.where} is off by {result.ulp:.3g} ulp, {most}"
+        return self.end
+
+    @property
+    def other_bits(self) -> list[str]:
+        """Stages that passed, but with bits other than the stored ones."""
+        return [result.stage for result in self.results if result.same_bits is False and result.passed]
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in one sentence."""
+        if self.failure:
+            return f"cannot be trusted: {self.failure}"
+        if not self.other_bits:
+            return "can be trusted"
+        otherwise = [name for result in self.results for name in result.otherwise]
+        names = " and ".join(otherwise)
+        reason = f"this device treats {names} otherwise than IEEE 754" if otherwise else "the reason is not known"
+        return (
+            f"can be trusted, but its bits are not those of other devices in {', '.join(self.other_bits)}: {reason}; "
+            "every error is within its bound"
+        )
+
+
+def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *, quick: bool = False) -> DriverReport:
+    """Test the `index`-th device in a worker process. stages: in the order of SELFTEST_STAGES, including
+    FORWARD_STAGES."""
+    report = DriverReport(wanted=tuple(stages))
+    begun, seconds = "starting", patience()
+    words = [str(index), shape.label, ",".join(stages), *(["quick"] if quick else [])]
+    with closing(Child(python_module("clsplat.selftest.worker", *words))) as child:
+        try:
+            while (message := child.receive(seconds)) is not None:
+                begun = message.get("begins", begun)
+                report.build_seconds = message.get("built", report.build_seconds)
+                if "result" in message:
+                    report.results.append(Result(**message["result"]))
+                    report.digests = message["digests"]
+                if "done" in message or "failed" in message:
+                    report.kernels, report.end = message.get("done", {}), message.get("failed", "")
+                    report.crashed = bool(report.end)
+                    return report
+            report.end, report.crashed = f"the process {child.ending(begun)}", child.crashed
+        except TimeoutError as error:
+            report.end, report.crashed, report.hung = f"the driver {error} from {begun}", True, True
+    return report
+
+
+def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
+    """Test a device on its first use, in about a second plus the build of its kernels, and record that it passed.
+
+    Nothing is tested if it has a record, or if CLSPLAT_TRUST_DRIVER=1.
+
+    stages: the stages that will be used, of SELFTEST_STAGES; the stages of a frame are tested as well.
+    Returns the device; in another kernel shape, with a warning, if its driver aborts or hangs in the present one.
+    Raises DriverError if it does so in every shape, and DeviceError if its numbers cannot be trusted.
+    """
+    if regardless():
+        return device
+    cl_device, given = device.cl_device, device.shape
+    failed, wanted = failures(cl_device), wanted_shape(cl_device)
+    shapes = [shape for shape in (given, *shapes_in_turn(cl_device)) if shape.label not in failed]
+    # if all have failed, the reason may be gone: the wanted shape is tried again
+    announced = False
+    for shape in dict.fromkeys(shapes or [given]):
+        tried = device if shape == given else device.with_shape(shape.label)
+        if not _has_passed(tried, stages):
+            if not announced:
+                print(f"{title(cl_device)}: used for the first time, a short test of its driver", file=sys.stderr)
+            announced = True
+            if failure := _short_test(tried, stages):
+                driver_records.remember(cl_device, shape.label, failed=failure)
+                failed[shape.label] = failure
+                continue
+        if shape != given:
+            first = wanted if device.is_another and wanted.label in failed else given
+            driver_records.tell_once(instead(cl_device, first, shape, failed[first.label]))
+        return tried
+    raise DriverError(
+        f"{title(cl_device)}, kernels in the shape {given.label}: {failed[given.label]}; none of "
+        f"{', '.join(failed)} works; {_ADVICE}"
+    )
+
+
+_ADVICE = (
+    f"clsplat selftest tells more, CLSPLAT_DEVICE takes another device, {TRUST_DRIVER_VARIABLE}=1 goes on regardless"
+)
+
+
+def _has_passed(device: Device, stages: Sequence[str]) -> bool:
+    entry = driver_records.entries(device.cl_device).get(device.shape.label, driver_records.Entry())
+    return not entry.failed and set(stages) <= entry.stages
+
+
+def _short_test(device: Device, stages: Sequence[str]) -> str:
+    """Run the short test, and record the stages that passed.
+
+    Returns how the driver aborted or hung in the device's shape, or an empty string. Raises DriverError if the test
+    itself failed, and DeviceError like `require`.
+    """
+    wanted = [name for name in SELFTEST_STAGES if name in FORWARD_STAGES or name in stages]
+    report = examine(device.index, device.shape, wanted, quick=True)
+    if report.crashed and not report.hung:  # the driver's linker may have been killed
+        report = examine(device.index, device.shape, wanted, quick=True)
+    if report.crashed:
+        return report.end
+    if report.end:
+        raise DriverError(f"{title(device.cl_device)}: its test could not be made: {report.end}; {_ADVICE}")
+    if report.failure:
+        raise DeviceError(f"{title(device.cl_device)}: the driver {report.verdict}; {_ADVICE}")
+    if report.other_bits:
+        warnings.warn(f"{title(device.cl_device)}: {report.verdict}", stacklevel=2)
+    driver_records.remember(device.cl_device, device.shape.label, stages=wanted, kernels=report.kernels, failed="")
+    return ""
+
+
+def examine_device(index: int) -> DriverReport:
+    """Run the whole test in the device's wanted shape.
+
+    If that passes, and so does the kernel that failed before, if any, the shape is used again.
+    """
+    device = all_devices()[index]
+    shape = wanted_shape(device)
+    report = examine(index, shape)
+    entry = driver_records.entries(device).get(shape.label, driver_records.Entry())
+    if entry.failed and not report.failure:
+        report.remembered = _still(index, entry, report)
+        if not report.remembered:
+            driver_records.remember(device, shape.label, failed="")
+    return report
+
+
+def _still(index: int, entry: driver_records.Entry, report: DriverReport) -> str:
+    """The reason why a recorded failure is kept, or an empty string."""
+    name, build = entry.trial.get("name"), entry.trial.get("build")
+    if not entry.trial or name in report.kernels:  # this test has covered the failure
+        return ""
+    if build is None:
+        return f"{entry.failed}; this test does not come to it"
+    trouble = sandbox.again(index, entry.trial)
+    return f"{entry.failed}; tried once more: {trouble}" if trouble else ""

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic slots of pairs, and the gradients that they imply, to test stages independently of blending's gradient."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.device.buffers import upload
+from clsplat.layouts.columns import SLOT, SLOT_PLAIN
+from clsplat.reference import project as reference_project
+from clsplat.reference.render import project_model
+from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench
+from clsplat.selftest.scenes import evenly
+from clsplat.stages.project import Slots
+
+SLOT_MOMENTS = slice(SLOT.index("G"), SLOT.index("GVV") + 1)
+SLOT_COLOURS = slice(SLOT.index("RED"), SLOT.index("BLUE") + 1)
+
+
+def slot_sums(bench: CaseBench, slots: Array) -> Float64:
+    """Sums (n, 9) of each Gaussian's slots in float64."""
+    sums = np.zeros((bench.model.count, SLOT_PLAIN))
+    np.add.at(
+        sums, bench.lists.gaussian_from_sorted.get(), slots[bench.lists.slot_from_sorted.get()].astype(np.float64)
+    )
+    return sums
+
+
+@dataclass(frozen=True, eq=False)
+class MadeUpSlots:
+    """Slots, and their sums (n, 9) by Gaussian in float64."""
+
+    slots: Slots
+    sums: Float64
+
+    @classmethod
+    def of(cls, bench: CaseBench) -> MadeUpSlots:
+        """Synthetic slots of the scene's pairs."""
+        values = evenly(33, (bench.counted.pairs, SLOT_PLAIN), -1.0, 1.0).astype(np.float32)
+        return cls(Slots(upload(bench.device, values), bench.counted.first_slots), slot_sums(bench, values))
+
+    def d_means(self, bench: CaseBench) -> Float64:
+        """Gradients (n, 2) by the means on the image, per pixel: docs/gradients.md (50)."""
+        l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
+        _, u, v, *_ = self.sums[:, SLOT_MOMENTS].T
+        found: Float64 = -np.stack([l11 * u, l12 * u + l22 * v], axis=1) / WHITENING_FACTOR**2
+        return found
+
+    def on_image(self, bench: CaseBench) -> reference_project.ProjectedGradients:
+        """Gradients by what the twin projects of the scene."""
+        l11, l12, l22 = (WHITENING_FACTOR * bench.splats().whitening).T
+        *_, uu, uv, vv = self.sums[:, SLOT_MOMENTS].T
+        entries = [l11 * l11 * uu, l11 * (l12 * uu + l22 * uv), l12 * l12 * uu + 2 * l12 * l22 * uv + l22 * l22 * vv]
+        gaussians = bench.frozen.gaussians
+        true = project_model(gaussians, bench.camera, gaussians.sh_degree)
+        by_opacity = self.sums[:, SLOT.index("G")] / np.where(bench.visible, true.opacities, 1.0)
+        by_covariance = 0.5 / WHITENING_FACTOR**4 * np.stack(entries, axis=1)
+        by_colour = self.sums[:, SLOT_COLOURS]
+        return reference_project.ProjectedGradients(self.d_means(bench), by_covariance, by_opacity, by_colour)

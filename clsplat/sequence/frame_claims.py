@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames shared by jobs that run at the same time. A job checks each frame again before it starts it, and claims it by
+a file next to it."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal
+
+from clsplat.errors import warn
+from clsplat.files.locks import claim, give_back
+from clsplat.sequence.finished_frames import is_complete
+from clsplat.sequence.task import RenderOptions, Task
+
+CLAIM_HEARTBEAT_SECONDS = 60.0
+"""Seconds between updates of a claim's modification time."""
+CLAIM_POLL_SECONDS = 0.25
+"""Seconds between checks of frames that other jobs have claimed."""
+CLAIM_WARNING_SECONDS = 10.0
+"""Seconds of waiting for other jobs before a warning."""
+State = Literal["ours", "done", "theirs"]
+
+
+class Sharing:
+    """Claims of this job's frames. All methods are thread-safe."""
+
+    def __init__(self, options: RenderOptions) -> None:
+        self.options = options
+        self._claims: dict[str, Path] = {}
+        self._changing, self._closed = threading.Lock(), threading.Event()
+        threading.Thread(target=self._hold, name="clsplat-claims", daemon=True).start()
+
+    def begin(self, task: Task) -> State:
+        """Claim a frame if possible.
+
+        ours: the frame is to be rendered here.
+        done: its file is complete by now.
+        theirs: another process is rendering it.
+        """
+        if is_complete(task, self.options):
+            return "done"
+        if (claimed := claim(task.path)) is None:
+            return "theirs"
+        if is_complete(task, self.options):  # completed while it was being claimed
+            give_back(claimed)
+            return "done"
+        with self._changing:
+            self._claims[task.key] = claimed
+        return "ours"
+
+    def _hold(self) -> None:
+        """Update the claims while the job runs, as a frame may take hours."""
+        while not self._closed.wait(CLAIM_HEARTBEAT_SECONDS):
+            with self._changing:
+                for claimed in self._claims.values():
+                    with suppress(OSError):
+                        os.utime(claimed)  # not Path.touch, which would create a missing file again
+
+    def end(self, task: Task) -> None:
+        """Release a frame whose file is complete, or will not be."""
+        with self._changing:
+            claimed = self._claims.pop(task.key, None)
+        if claimed is not None:
+            give_back(claimed)
+
+    def close(self) -> None:
+        """Release all unfinished frames."""
+        self._closed.set()
+        with self._changing:
+            claims, self._claims = list(self._claims.values()), {}
+        for claimed in claims:
+            with suppress(OSError):
+                give_back(claimed)
+
+
+class FrameQueue:
+    """The frames of a job, which its threads take one by one.
+
+    Frames that no other job has claimed come first, then the others, when they are done or given up.
+    stop: set when no more frames are wanted.
+    """
+
+    def __init__(self, tasks: Iterable[Task], sharing: Sharing | None = None) -> None:
+        self.stop = threading.Event()
+        self._left, self._sharing, self._turn = iter(tasks), sharing, threading.Lock()
+        self._theirs: deque[Task] = deque()
+        self._told = False
+
+    def take(self, skip: Callable[[Task], None]) -> Task | None:
+        """The next frame to render, None if there is none. Waits for frames of other jobs.
+
+        skip: called with each frame that is done already.
+        """
+        began = time.monotonic()
+        while not self.stop.is_set():
+            task, waits = self._next()
+            if task is None or self._sharing is None or (state := self._sharing.begin(task)) == "ours":
+                return task
+            if state == "done":
+                skip(task)
+                continue
+            with self._turn:
+                self._theirs.append(task)
+            if waits:
+                self._tell(task, time.monotonic() - began)
+                self.stop.wait(CLAIM_POLL_SECONDS)
+        return None
+
+    def _next(self) -> tuple[Task | None, bool]:
+        """The next frame, and True if another job had claimed it before."""
+        with self._turn:
+            if (task := next(self._left, None)) is not None:
+                return task, False
+            return (self._theirs.popleft() if self._theirs else None), True
+
+    def _tell(self, task: Task, seconds: float) -> None:
+        if seconds > CLAIM_WARNING_SECONDS and not self._told:
+            self._told = True
+            warn(f"--skip-existing: another process renders {task.path}, which is still missing; waiting for it")
+
+    def end(self, task: Task) -> None:
+        """Release a frame whose file is complete, or will not be."""
+        if self._sharing is not None:
+            self._sharing.end(task)
+
+    def close(self) -> None:
+        """Leave unfinished frames to other jobs."""
+        if self._sharing is not None:
+            self._sharing.close()

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models of a job: one file, one file per frame, the models of a shot file, or those placed by a USD stage. Needs no
+device."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from clsplat.errors import InputError, warn
+from clsplat.files.documents import digest
+from clsplat.gaussians import Gaussians
+from clsplat.models.formats import colour_space, format_of
+from clsplat.models.formats.usd import USD_SUFFIXES
+from clsplat.models.instances import Changing, Ensemble, Placement, State, Track, gone_on, kind_of, near_of
+from clsplat.models.series import ModelSeries
+from clsplat.runs.run import model_file
+from clsplat.sequence.numbered import digest_of_name, is_sequence, open_sequence
+from clsplat.sequence.task import RenderOptions, Task, end_before, model_times
+from clsplat.shots.frame_numbers import ranges
+from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_layout
+from clsplat.shots.usd_models import read_stage
+
+
+@dataclass(frozen=True, eq=False)
+class JobModels:
+    """The models of a job.
+
+    path: of the file that defines them.
+    models: each in its own world.
+    names: one per model.
+    digest: SHA-256 of their sources; for a single model file, of that file.
+    space: the colour space of all.
+    tracks: their placements, None for a single model used as it is.
+    files: of the models, empty for a stage.
+    volumes: regions with mattes, for each model.
+    numbered: files by frame number for each model, empty for a model that does not change.
+    """
+
+    path: Path
+    models: tuple[Gaussians | ModelSeries, ...]
+    names: tuple[str, ...]
+    digest: str
+    space: str
+    tracks: tuple[Track, ...] | None = None
+    files: tuple[Path, ...] = ()
+    volumes: tuple[tuple[Volume, ...], ...] = ()
+    numbered: tuple[dict[int, Path], ...] = ()
+
+    @property
+    def drawn(self) -> Gaussians | tuple[Gaussians | ModelSeries, ...]:
+        """The models in the form that `FrameRenderer` takes."""
+        return self.one if self.tracks is None else self.models
+
+    @property
+    def one(self) -> Gaussians:
+        """The model that is used as it is."""
+        return self.still[0]
+
+    @property
+    def still(self) -> tuple[Gaussians, ...]:
+        """The models that do not change over time, so all that are not a `ModelSeries`."""
+        return tuple(model for model in self.models if not isinstance(model, ModelSeries))
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians in all models; for a model that changes, in its first sample."""
+        return sum(model.count if isinstance(model, ModelSeries) else len(model) for model in self.models)
+
+    @property
+    def changing(self) -> bool:
+        """True if a model changes over time."""
+        return any(isinstance(model, ModelSeries) for model in self.models)
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """Rising frame numbers for which models that change have files."""
+        return tuple(sorted({number for files in self.numbered for number in files}))
+
+    def state(self, frame: float) -> State | None:
+        """Placements at a frame, None if there are none. Raises InputError for an invalid one."""
+        return None if self.tracks is None else tuple(track.at(frame) for track in self.tracks)
+
+    def at(self, frame: float) -> Gaussians:
+        """All models at a frame, merged into one."""
+        state = self.state(frame)
+        return self.one if state is None else Ensemble(self.models).at(state)
+
+    def seen(self, tasks: Sequence[Task], options: RenderOptions) -> list[Task]:
+        """The tasks with placements of the models, and cameras adapted to these. Raises InputError."""
+        known: dict[Placement | State, Placement | State] = {}  # equal placements are stored once
+        self._check_numbers([task.number for task in tasks])
+        placed = []
+        for task in tasks:
+            views = [self._seen(view, options, known) for view in task.views]
+            placed.append(replace(views[0], right=views[1] if views[1:] else None))
+        return placed
+
+    def _seen(self, task: Task, options: RenderOptions, known: dict[Placement | State, Placement | State]) -> Task:
+        """A view with placements of the models."""
+        model, times = kind_of(self.models[0]), model_times(task, options)
+        if self.tracks is None:
+            return task.seen_by(model, dict.fromkeys(times, model.near))
+        states: dict[float, State] = {}
+        for time in times:
+            end, frame = end_before(task, time, options), task.number + time
+            if end is None:
+                state = [track.at(frame) for track in self.tracks]
+            else:
+                state = [gone_on(track, frame, task.number + end) for track in self.tracks]
+            kept = tuple(known.setdefault(placement, placement) for placement in state)
+            states[time] = known.setdefault(kept, kept)  # type: ignore[arg-type, assignment]
+        nears = {time: near_of(self.models, state) for time, state in states.items()}
+        seen = task.seen_by(replace(model, near=nears[times[0]]), nears)
+        return replace(seen, placed=states, files=self._files_of(states.values()))
+
+    def _files_of(self, states: Iterable[State]) -> tuple[Path, ...]:
+        """Files from which models that change are read for these states. Their samples are registered as expected."""
+        found: dict[Path, None] = {}
+        for state in states:
+            for index, placement in enumerate(state):
+                if isinstance(series := self.models[index], ModelSeries) and placement.frame is not None:
+                    series.expect([placement.frame])
+                    paths = list(self.numbered[index].values()) if self.numbered else []
+                    found.update(dict.fromkeys(paths[sample] for sample in series.sources(placement.frame) if paths))
+        return tuple(found)
+
+    def _check_numbers(self, numbers: Sequence[int]) -> None:
+        """Raise InputError for frames beyond a sequence of files. Warns about frames inside it that have no file."""
+        for path, files in zip(self.files, self.numbered, strict=False):
+            if not files:
+                continue
+            first, last, have = min(files), max(files), f"there are the frames {ranges(list(files))}"
+            if beyond := [number for number in numbers if not first <= number <= last]:
+                raise InputError(
+                    f"{path}: has no file of the frame(s) {ranges(sorted(set(beyond)))}; {have}; give --frames "
+                    f"{first}-{last}, or cameras of these frames"
+                )
+            if missing := sorted({number for number in numbers if number not in files}):
+                warn(f"{path}: has no file of the frame(s) {ranges(missing)}, made from the neighbouring files; {have}")
+
+
+def load_cast(path: Path, transform: KeyedTrack | None = None) -> JobModels:
+    """Load the models that MODEL names: a run, a model file, one file per frame, a shot file or a USD stage.
+
+    transform: applied to all models.
+    Raises InputError for an unreadable file, and for models that differ in colour space or rendering method.
+    """
+    if is_layout(path):
+        cast = _of_layout(path)
+    elif is_sequence(path):
+        series, files = open_sequence(path)
+        space, track = colour_space(next(iter(files.values()))), Changing(KeyedTrack(str(path)))
+        digested = digest_of_name(path)
+        cast = JobModels(path, (series,), (path.stem,), digested, space, (track,), (path,), numbered=(files,))
+    else:
+        file = model_file(path)
+        stage = read_stage(file) if file.suffix.lower() in USD_SUFFIXES and format_of(file).name == "OpenUSD" else None
+        if stage is not None:
+            cast = JobModels(file, stage.models, stage.names, stage.digest, stage.space, stage.tracks)
+        else:
+            cast = JobModels(
+                file, (Gaussians.load(file),), (file.stem,), digest(file), colour_space(file), None, (file,)
+            )
+    if transform is None:
+        return cast
+    inner = cast.tracks or (KeyedTrack(str(path)),)
+    return replace(cast, tracks=tuple(Within(track, transform) for track in inner))
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A loaded model of a shot.
+
+    file: of the model, or the pattern of its files.
+    """
+
+    model: Gaussians | ModelSeries
+    digest: str
+    space: str
+    file: Path
+    numbered: dict[int, Path]
+
+
+def _opened(path: Path) -> _Opened:
+    if is_sequence(path):
+        series, files = open_sequence(path)
+        return _Opened(series, digest_of_name(path), colour_space(next(iter(files.values()))), path, files)
+    if is_layout(path):
+        raise InputError(f"{path}: is no model file, expected one")
+    file = model_file(path)
+    return _Opened(Gaussians.load(file), digest(file), colour_space(file), file, {})
+
+
+def _of_layout(path: Path) -> JobModels:
+    """The models of a shot file. Models that share a file are read once."""
+    entries = read_layout(path)
+    known: dict[Path, _Opened] = {}
+    sums = hashlib.sha256()
+    found = []
+    for entry in entries:
+        where = f"{path}: model '{entry.name}'"
+        try:
+            if entry.path not in known:
+                known[entry.path] = _opened(entry.path)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        found.append(known[entry.path])
+        sums.update(found[-1].digest.encode())
+    space, first = found[0].space, kind_of(found[0].model)
+    for entry, opened in zip(entries, found, strict=True):
+        where, kind = f"{path}: model '{entry.name}'", kind_of(opened.model)
+        if opened.space != space:
+            raise InputError(
+                f"{where}: is of the colour space {opened.space}, expected {space} as '{entries[0].name}' is"
+            )
+        if kind.antialiased != first.antialiased:
+            raise InputError(f"{where}: is {_not(kind.antialiased)}antialiased, unlike '{entries[0].name}'")
+        if kind.by_rays != first.by_rays:
+            raise InputError(f"{where}: is {_not(kind.by_rays)}drawn along rays, unlike '{entries[0].name}'")
+        if entry.volumes and isinstance(opened.model, ModelSeries):
+            raise InputError(f"{where}: has 'mattes' and changes over time, expected one model for all frames")
+    tracks = tuple(
+        Changing(entry.track) if isinstance(opened.model, ModelSeries) else entry.track
+        for entry, opened in zip(entries, found, strict=True)
+    )
+    return JobModels(
+        path,
+        tuple(opened.model for opened in found),
+        tuple(entry.name for entry in entries),
+        sums.hexdigest(),
+        space,
+        tracks,
+        tuple(opened.file for opened in found),
+        tuple(entry.volumes for entry in entries),
+        tuple(opened.numbered for opened in found),
+    )
+
+
+def _not(is_so: bool) -> str:
+    return "" if is_so else "not "

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Default cameras for a model without camera files.
+
+An orbit follows from where the Gaussians are and how much detail they show. If a run knows the photographs' own
+cameras, a path can go among those instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.scenes.outliers import stray_cameras
+from clsplat.shots.viewpoints import COLMAP_UP, extent_of, look_at
+
+DEFAULT_ORBIT_SIZE_PX = (1280, 720)
+"""Default width and height of pictures, in pixels."""
+ORBIT_FOV_RADIANS = math.radians(40.0)
+"""Field of view of the shorter side, in radians."""
+SUBJECT_SAMPLE_SIZE = 100_000
+"""Gaussians sampled to locate a model. More of them move its centre by less than a pixel."""
+MIN_GAUSSIANS_FOR_STRAYS = 100
+"""Fewest Gaussians of a model in which some are treated as strays."""
+BALL_SHRINK_FACTOR = 0.9
+"""Ratio of successive ball radii in the search for the most detailed region."""
+REGION_DETAIL_FRACTION = 0.35
+"""Largest fraction of a model's detail that its most detailed region may hold."""
+MAX_SCENE_REGION_RADIUS_RATIO = 0.2
+"""Radius of the most detailed region, relative to the model's, up to which the model is a scene around an object.
+Models of a single object have at least 0.3; a room with a table in the middle has 0.05."""
+MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
+"""Sizes below which a Gaussian shows no more detail: this quantile of all sizes, and this fraction of the model's
+radius. Some files have Gaussians of size 0."""
+SCENE_RADIUS_MARGIN = 1.3
+"""Radius shown of a scene, relative to the radius of its most detailed region."""
+ORBIT_FRAMING_MARGIN = 1.1
+"""Radius that fits into a picture, relative to the subject's radius, since strays extend beyond the subject."""
+RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))
+"""Elevations of the camera rings, in radians. A turntable follows the first ring; a spiral rises and sinks between the
+others."""
+CAMERAS_PER_RING = 24
+"""Cameras per ring."""
+
+
+def parse_up(text: str) -> tuple[float, float, float]:
+    """Unit vector for an axis such as `x` or `-y`, or for three numbers with commas. Raises InputError."""
+    expected = InputError(f"--up {text[:80]}: expected x, y, z, -x, -y, -z or three numbers with commas, not all 0")
+    name, sign = text.strip().removeprefix("-"), -1.0 if text.strip().startswith("-") else 1.0
+    if name in ("x", "y", "z"):
+        return tuple(sign * (axis == name) for axis in "xyz")  # type: ignore[return-value]  # three entries
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        raise expected from None
+    most = max(abs(x), abs(y), abs(z))
+    if not (0 < most < math.inf and math.isfinite(x + y + z)):
+        raise expected
+    x, y, z = x / most, y / most, z / most  # keeps the squares in range
+    length = math.hypot(x, y, z)
+    return x / length, y / length, z / length
+
+
+def cameras_around(
+    gaussians: Gaussians,
+    up: tuple[float, float, float] = COLMAP_UP,
+    size: tuple[int | None, int | None] = (None, None),
+) -> list[Camera]:
+    """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene, facing its
+    centre.
+
+    up: of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
+    size: width and height in pixels; a side that is None follows from the other at the default aspect ratio.
+    Raises InputError for a model without Gaussians.
+    """
+    if not len(gaussians):
+        raise InputError("the model has no Gaussians, expected some to look at")
+    centre, radius = _subject(gaussians)
+    axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+    ahead = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    ahead -= (ahead @ axis) * axis
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, axis)
+    width, height = _size(size)
+    focal = 0.5 * min(width, height) / math.tan(0.5 * ORBIT_FOV_RADIANS)
+    distance = ORBIT_FRAMING_MARGIN * radius / math.sin(0.5 * ORBIT_FOV_RADIANS)
+    cameras = []
+    for elevation in RING_ELEVATIONS_RADIANS:
+        for azimuth in 2 * np.pi * np.arange(CAMERAS_PER_RING) / CAMERAS_PER_RING:
+            level = np.sin(azimuth) * right - np.cos(azimuth) * ahead
+            position = centre + distance * (np.cos(elevation) * level + np.sin(elevation) * axis)
+            rotation, translation = look_at(position, centre, axis)
+            cameras.append(Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, translation))
+    return cameras
+
+
+def among(own: Sequence[Camera], size: tuple[int | None, int | None] = (None, None)) -> list[Camera]:
+    """The photographs' own cameras without strays, as pinholes, for a path within the photographed region.
+
+    size: width and height in pixels. If both are given, the field of view is the largest that fits into the
+      photographs'. Otherwise the pictures keep the photographs' aspect ratio.
+    Photographs that are not perspective are replaced by pinholes with the default field of view.
+    """
+    far = stray_cameras(own)
+    return [_pinhole(camera, size) for camera, stray in zip(own, far, strict=True) if not stray]
+
+
+def _pinhole(camera: Camera, size: tuple[int | None, int | None]) -> Camera:
+    width, height = size
+    if not camera.is_pinhole:
+        width, height = _size(size)
+        focal = 0.5 * min(width, height) / math.tan(0.5 * ORBIT_FOV_RADIANS)
+        return Camera(
+            width,
+            height,
+            focal,
+            focal,
+            0.5 * width,
+            0.5 * height,
+            camera.rotation,
+            camera.translation,
+            near=camera.near,
+        )
+    if width is None or height is None:
+        return camera
+    scale = max(width / camera.width, height / camera.height)
+    across, down = (scale * value for value in (camera.cx - 0.5 * camera.width, camera.cy - 0.5 * camera.height))
+    fx, fy, cx, cy = scale * camera.fx, scale * camera.fy, 0.5 * width + across, 0.5 * height + down
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
+def _size(size: tuple[int | None, int | None]) -> tuple[int, int]:
+    width, height = size
+    if width is None and height is None:
+        return DEFAULT_ORBIT_SIZE_PX
+    if width is None:
+        assert height is not None
+        return max(1, round(height * DEFAULT_ORBIT_SIZE_PX[0] / DEFAULT_ORBIT_SIZE_PX[1])), height
+    return width, max(
+        1, round(width * DEFAULT_ORBIT_SIZE_PX[1] / DEFAULT_ORBIT_SIZE_PX[0])
+    ) if height is None else height
+
+
+def _subject(gaussians: Gaussians) -> tuple[Float64, float]:
+    """Centre (3,) in the world and radius of the subject: all Gaussians but strays, or a scene's most detailed region.
+
+    Balls shrink towards the greatest detail, measured as opacity over size (mean shift, Fukunaga and Hostetler 1975).
+    The search ends when a ball holds no more than 35 % of the detail.
+    """
+    rows = slice(None, None, max(1, len(gaussians) // SUBJECT_SAMPLE_SIZE))
+    means = gaussians.means[rows].astype(np.float64)
+    largest = gaussians.log_scales[rows].max(axis=1).astype(np.float64)
+    low, high = extent_of(means) if len(means) >= MIN_GAUSSIANS_FOR_STRAYS else extent_of(means, 1.0)
+    middle, whole = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    if whole == 0:
+        return middle + gaussians.origin, 3 * float(np.exp(largest.max()))
+    least = max(float(np.quantile(largest, MIN_DETAIL_SIZE_QUANTILE)), math.log(MIN_DETAIL_SIZE_RATIO * whole))
+    detail = np.exp(least - np.maximum(largest, least)) / (
+        1 + np.exp(-gaussians.opacity_logits[rows].astype(np.float64))
+    )
+    kept = ((means >= low) & (means <= high)).all(axis=1)
+    means, detail = means[kept], detail[kept]
+    centre, radius = middle, whole
+    wanted = REGION_DETAIL_FRACTION * detail.sum()
+    while (inside := np.linalg.norm(means - centre, axis=1) <= radius).any() and detail[inside].sum() > wanted:
+        centre, radius = np.average(means[inside], axis=0, weights=detail[inside]), BALL_SHRINK_FACTOR * radius
+        if radius <= MAX_SCENE_REGION_RADIUS_RATIO * whole / 100:  # all detail is in one place
+            break
+    if radius > MAX_SCENE_REGION_RADIUS_RATIO * whole:
+        return middle + gaussians.origin, whole
+    return centre + gaussians.origin, SCENE_RADIUS_MARGIN * radius

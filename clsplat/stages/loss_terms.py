@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loss terms beside L1 and D-SSIM. Launches alpha_loss.cl and depth_loss.cl; a new term is a class here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import launch_grid
+from clsplat.layouts.columns import TILE
+from clsplat.stages.blend import Blended
+
+ALPHA_PIXEL_BYTES = 9
+"""Bytes of the alpha loss, per pixel with padding: alpha, its gradient and, rounded up, its sums."""
+DEPTH_PIXEL_BYTES = 17
+"""Bytes of the depth loss, per pixel with padding: nearness, its gradient, target and weight, and the sums."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A render and its photograph, as `stages.loss.loss` hands them to a term.
+
+    target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha.
+    gradient: planes (3 + terms, rows, stride), of which the term writes its own.
+    sums: all partial sums of the loss, of which the term writes `rows / TILE * stride`.
+    pixels: number of pixels that count.
+    """
+
+    device: Device
+    work: Workspace
+    blended: Blended
+    target: DeviceArray
+    gradient: DeviceArray
+    sums: DeviceArray
+    pixels: float
+
+
+class LossTerm:
+    """A loss term. Its value is weight * (sum of its partial sums) / divisor, by `scale`."""
+
+    wants_alpha = False
+    """True if the term reads the photograph's alpha, the fourth plane of the target."""
+
+    @property
+    def key(self) -> object:
+        """Values on which the launch depends, for replays by a command buffer; None if it cannot be replayed."""
+        return None
+
+    def scale(self, pixels: float) -> tuple[float, float]:
+        """Weight and divisor of the sums."""
+        raise NotImplementedError
+
+    def launch(self, compared: Compared, plane: int, first: int) -> None:
+        """Write plane number `plane` of the gradient, and the partial sums from number `first`."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class AlphaTerm(LossTerm):
+    """Weighted mean absolute difference between the alpha of the render and of the photograph."""
+
+    weight: float
+    wants_alpha = True
+
+    @property
+    def key(self) -> object:
+        """The weight."""
+        return self.weight
+
+    def scale(self, pixels: float) -> tuple[float, float]:
+        """The weight over the pixels."""
+        return self.weight, pixels
+
+    def launch(self, compared: Compared, plane: int, first: int) -> None:
+        """Launch alpha_loss.cl, whose plane is the fourth."""
+        assert plane == compared.target.shape[0] - 1 == 3, "alpha comes right behind the colours"
+        _, rows, stride = compared.target.shape
+        blended, kernel = compared.blended, compared.device.kernels("alpha_loss").alpha_loss
+        planes = (blended.stops, blended.transmittance, compared.target, compared.gradient, compared.sums)
+        scale = self.weight / compared.pixels
+        launch_grid(compared.device, kernel, (stride, rows // TILE), stride, rows, first, scale, *planes)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthTerm(LossTerm):
+    """Weighted absolute differences between the render's nearness, 1 / depth, and known values.
+
+    planes: (2, rows, stride) float32, nearness and weight; the weight is 0 where nearness is unknown.
+    factor: weight of the sum in the loss.
+    """
+
+    planes: NDArray[np.float32]
+    factor: float
+
+    def scale(self, pixels: float) -> tuple[float, float]:  # noqa: ARG002
+        """The factor; the weights of pixels contain their number."""
+        return self.factor, 1.0
+
+    def launch(self, compared: Compared, plane: int, first: int) -> None:
+        """Send the known depths, and launch depth_loss.cl."""
+        blended, (_, rows, stride) = compared.blended, compared.target.shape
+        assert blended.nearness is not None, "blended with nearness"
+        aims = compared.work.array("depth_aims", (2, rows, stride))
+        aims.send(self.planes)
+        kernel = compared.device.kernels("depth_loss").depth_loss
+        planes = (blended.stops, blended.nearness, aims, compared.gradient, compared.sums)
+        launch_grid(compared.device, kernel, (stride, rows // TILE), stride, rows, plane, first, self.factor, *planes)

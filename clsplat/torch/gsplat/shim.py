@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replacement of gsplat's names by clsplat's, for programs written for gsplat, and access to gsplat's strategies."""
+
+from __future__ import annotations
+
+import functools
+import re
+import sys
+from collections.abc import Callable
+from importlib import import_module
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+from torch import Tensor
+
+from clsplat.errors import ClsplatError
+from clsplat.torch.covariances import quat_scale_to_covar_preci
+from clsplat.torch.gsplat import absent_names
+from clsplat.torch.harmonics import spherical_harmonics
+from clsplat.torch.pixels import rasterize_to_pixels
+from clsplat.torch.projection import fully_fused_projection
+from clsplat.torch.relocation import compute_relocation
+from clsplat.torch.rendering import RollingShutterType, rasterization
+from clsplat.torch.selective_adam import SelectiveAdam
+from clsplat.torch.tiles import isect_offset_encode, isect_tiles
+
+GSPLAT_VERSION = "1.5.3"
+"""The version of gsplat whose calls clsplat has."""
+REPLACEMENTS_BY_MODULE: dict[str, tuple[Any, ...]] = {
+    "gsplat.cuda._wrapper": (
+        fully_fused_projection,
+        isect_offset_encode,
+        isect_tiles,
+        quat_scale_to_covar_preci,
+        rasterize_to_pixels,
+        spherical_harmonics,
+    ),
+    "gsplat.optimizers.selective_adam": (SelectiveAdam,),
+    "gsplat.relocation": (compute_relocation,),
+    "gsplat.rendering": (rasterization,),
+}
+"""Functions and classes, by the gsplat module that defines them."""
+GSPLAT_PACKAGES = ("gsplat", "gsplat.cuda", "gsplat.optimizers")
+TWO_RADII_SINCE_VERSION = (1, 5)
+"""The first version of gsplat in which a splat has two radii."""
+FUNCTIONS_CHANGED_IN_1_5 = (fully_fused_projection, isect_tiles)
+"""Functions whose results or arguments changed in that version."""
+
+
+def install_as_gsplat() -> list[str]:
+    """Let a program that imports gsplat run on clsplat.
+
+    If gsplat is installed, its functions are replaced in all imported modules, gsplat's and the program's. Functions
+    that gsplat has only in CUDA, and clsplat does not have, then raise an InputError when they are called. gsplat's own
+    Python code stays. For versions before 1.5, `meta["radii"]` of `rasterization` has one radius a splat, as their
+    strategies expect.
+
+    If gsplat is not installed, a module `gsplat` with clsplat's names is created. It refuses the other names, and has
+    no strategies. A second call does nothing.
+
+    Returns
+    -------
+    list of str
+        The names that now belong to clsplat.
+
+    Notes
+    -----
+    gsplat 1.5.3 (Apache-2.0), https://github.com/nerfstudio-project/gsplat.
+    """
+    if not _has("gsplat"):
+        return _make_package()
+    old = _version(import_module("gsplat")) < TWO_RADII_SINCE_VERSION
+    homes = {
+        home: [each for each in given if not (old and each in FUNCTIONS_CHANGED_IN_1_5)]
+        for home, given in REPLACEMENTS_BY_MODULE.items()
+    }
+    replaced: dict[int, tuple[Any, Any]] = {}
+    for home, given in homes.items():
+        module = import_module(home) if _has(home) else None
+        for ours in given:
+            theirs = getattr(module, ours.__name__, None)
+            if theirs is not None and not _is_ours(theirs):
+                replaced[id(theirs)] = (theirs, _with_one_radius(ours) if old and ours is rasterization else ours)
+    for home in filter(_has, absent_names.CUDA_ONLY_MODULES):
+        for name in absent_names.CUDA_ONLY_NAMES:
+            theirs = getattr(import_module(home), name, None)
+            if theirs is not None and not absent_names.is_refused(theirs):
+                replaced[id(theirs)] = (theirs, absent_names.refuses(name, theirs))
+    names = []
+    for module_name, module in list(sys.modules.items()):
+        for name, value in list(getattr(module, "__dict__", {}).items()):
+            theirs, ours = replaced.get(id(value), (None, None))
+            if theirs is not None and theirs is value:
+                setattr(module, name, ours)
+                names += [] if absent_names.is_refused(ours) else [f"{module_name}.{name}"]
+    return sorted(names)
+
+
+def strategy(name: str) -> Any:
+    """A class of `gsplat.strategy`, with clsplat's replacements for the functions that need CUDA.
+
+    Raises ImportError if gsplat is not installed, ClsplatError if it is older than 1.5.
+    """
+    if not _has("gsplat") or not _has("gsplat.strategy"):
+        raise ImportError(_own(name))
+    if (found := _version(import_module("gsplat"))) < TWO_RADII_SINCE_VERSION:
+        raise ClsplatError(
+            f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()"
+        )
+    operations = import_module("gsplat.strategy.ops")
+    for ours in (quat_scale_to_covar_preci, compute_relocation):
+        setattr(operations, ours.__name__, ours)
+    return getattr(import_module("gsplat.strategy"), name)
+
+
+def _of_gsplat(place: str, name: str) -> Any:
+    """An attribute of the replacement module `place` that clsplat does not have."""
+    if name in absent_names.CUDA_ONLY_NAMES:
+        return absent_names.refuses(name)
+    if place == "gsplat" and name in {"DefaultStrategy", "MCMCStrategy"}:
+        return strategy(name)
+    if place == "gsplat" and name in absent_names.PURE_PYTHON_NAMES:
+        raise ImportError(_own(name))
+    raise AttributeError(f"module {place!r} has no attribute {name!r}; clsplat.torch is in the place of gsplat")
+
+
+def _own(name: str) -> str:
+    return f"{name} is gsplat's own: pip install --no-deps gsplat=={GSPLAT_VERSION}; it needs no CUDA here"
+
+
+def _has(module: str) -> bool:
+    try:
+        return find_spec(module) is not None
+    except ModuleNotFoundError:  # the parent package is missing
+        return False
+
+
+def _version(module: ModuleType) -> tuple[int, ...]:
+    numbers = re.match(r"(\d+)\.(\d+)", str(getattr(module, "__version__", GSPLAT_VERSION)))
+    return tuple(int(part) for part in numbers.groups()) if numbers else TWO_RADII_SINCE_VERSION
+
+
+def _is_ours(value: Any) -> bool:
+    return str(getattr(value, "__module__", "")).startswith("clsplat.torch")
+
+
+def _with_one_radius(function: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]) -> Callable[..., Any]:
+    """`rasterization` with the larger of the two radii, as before gsplat 1.5: (C, N), or (nnz,) if packed."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        images, alphas, meta = function(*args, **kwargs)
+        meta["radii"] = meta["radii"].amax(-1)
+        return images, alphas, meta
+
+    return call
+
+
+def _make_package() -> list[str]:
+    """Create the module `gsplat` and its submodules in `sys.modules`."""
+    names = []
+    for home in sorted({*GSPLAT_PACKAGES, *REPLACEMENTS_BY_MODULE}):
+        module = ModuleType(home, "clsplat.torch in the place of gsplat.")
+        module.__spec__ = ModuleSpec(home, None, is_package=home in GSPLAT_PACKAGES)
+        if home in GSPLAT_PACKAGES:
+            module.__path__ = []
+        sys.modules[home] = module
+        parent, _, last = home.rpartition(".")
+        if parent:
+            setattr(sys.modules[parent], last, module)
+    for home, given in REPLACEMENTS_BY_MODULE.items():
+        for ours in given:
+            places = {home, "gsplat"} | ({home.rpartition(".")[0]} if "optimizers" in home else set())
+            if ours is compute_relocation:
+                places.discard("gsplat")  # gsplat's top-level package does not have it
+            for place in places:
+                setattr(sys.modules[place], ours.__name__, ours)
+                names.append(f"{place}.{ours.__name__}")
+    for place in ("gsplat", "gsplat.cuda._wrapper"):
+        sys.modules[place].RollingShutterType = RollingShutterType  # type: ignore[attr-defined]
+    for place in ("gsplat", "gsplat.rendering", "gsplat.cuda._wrapper"):
+        sys.modules[place].__getattr__ = functools.partial(_of_gsplat, place)  # type: ignore[method-assign]
+    sys.modules["gsplat"].__version__ = GSPLAT_VERSION  # type: ignore[attr-defined]
+    return sorted(names)

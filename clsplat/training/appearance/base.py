@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Base of the appearance models: colours of each photograph, learnt with the model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clsplat.runs.run import Run
+from clsplat.training.step.component import Component, Named
+from clsplat.training.step.inputs import ViewInputs, ViewPart
+
+
+class Appearance(Component):
+    """Appearances of all training views. The base class learns nothing and leaves the model's colours unchanged."""
+
+    def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
+        """Appearances of the views of a step; empty for the model's own colours.
+
+        step: number of the last view.
+        """
+        return ()
+
+    def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
+        """Views with their appearances."""
+        shares = self.of_views([each.view for each in inputs], step)
+        if not shares:
+            return inputs
+        return [replace(each, parts=(*each.parts, share)) for each, share in zip(inputs, shares, strict=True)]
+
+    def record(self) -> dict[str, Any] | None:
+        """Content of appearance.json; None if there is nothing to write."""
+        return None
+
+    def tables(self) -> dict[str, NDArray[Any]]:
+        """Arrays of appearance.npz, by name; empty if there is no such file."""
+        return {}
+
+    def load(self, named: Named, count: int) -> None:  # noqa: ARG002
+        """Load the arrays of a checkpoint. Raises ValueError for arrays of other photographs."""
+        self.take(named("appearance/"))
+
+    def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Load arrays by name without the prefix."""
+
+    def write(self, run: Run) -> None:
+        """Write appearance.json and appearance.npz."""
+        if (record := self.record()) is not None:
+            run.write_appearance(record, self.tables())

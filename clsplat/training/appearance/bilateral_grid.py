@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bilateral grids of each photograph, learnt with the model: use in a step, and storage in a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.context import Device
+from clsplat.device.launch import only_tried
+from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, device_bytes, grid_gradient, step_grid
+from clsplat.training.appearance.base import Appearance
+from clsplat.training.appearance.schedule import loaded, rate_at, saved
+from clsplat.training.step.inputs import ViewPart
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
+
+VARIATION_WEIGHT = 10.0
+"""Weight of a grid's total variation in the loss."""
+
+GRID_RATE_END_FRACTION = 0.01
+"""Fraction of the learning rate that is left at the last step."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGrid(ViewPart):
+    """Grid of one view in one step.
+
+    visit: number of this visit to the view, from 1.
+    ends: True if a pass through all views ends with it.
+    place: the view's place in a batch.
+    """
+
+    device: Device
+    grids: Grids
+    view: int
+    visit: int
+    rate: float
+    ends: bool
+    place: int = 0
+
+    def on(self, device: Device, values: NDArray[np.float32]) -> ViewGrid:
+        """The same grid on another device, made from `values`, to apply it and to compute its gradient."""
+        grids = upload(device, values)
+        return replace(self, device=device, grids=Grids(grids, grids, grids), view=0)
+
+    def values(self) -> NDArray[np.float32]:
+        """The photograph's grid, in the form that `on` takes."""
+        return self.grids.grids.get_rows(self.view, self.view + 1)
+
+    def compare(
+        self,
+        work: Workspace,
+        image: DeviceArray,
+        target: DeviceArray,  # noqa: ARG002
+        width: int,
+        height: int,
+    ) -> DeviceArray:
+        """Image with the photograph's colours."""
+        return apply_grid(self.device, work, self.grids, self.view, image, width, height)
+
+    def gradient(
+        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
+    ) -> DeviceArray:
+        """Turn `gradient` into the gradient of the image, in place, and return the grid's for `update`.
+
+        `update` is tried here, before anything changes.
+        """
+        of_view, size = (self.grids, self.view, image, gradient), (width, height)
+        by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
+        if self.visit == 1:
+            with only_tried(self.device):
+                replace(self, ends=True).update(by_grid, by_grid)
+        return by_grid
+
+    def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
+        """Take Adam's step. After a pass the mean of all grids becomes the identity, as their common part belongs to
+        the model."""
+        assert own is not None, "made by `gradient`"
+        step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)
+        if self.ends:
+            centre_grids(self.device, self.grids, readback)
+
+
+class GridsOfAll(Appearance):
+    """Grids of all training views."""
+
+    def __init__(self, config: TrainConfig, device: Device, scene: Scene) -> None:
+        self._config, self._device, self._scene = config, device, scene
+        self._count = len(scene.train_views)
+        start = np.broadcast_to(np.eye(3, 4, dtype=np.float32), (self._count, *GRID_SHAPE))
+        self._grids = Grids.on(device, np.ascontiguousarray(start))
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes per pixel on the device, including the grids, divided over the largest picture."""
+        return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
+
+    def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:
+        """Grids of the views of a step. Each pass visits every view once.
+
+        step: number of the last view.
+        """
+        count = self._count
+        numbers = range(step - len(views) + 1, step + 1)
+        return [
+            ViewGrid(
+                self._device,
+                self._grids,
+                view,
+                (number - 1) // count + 1,
+                rate_at(self._config, number, count, ends=GRID_RATE_END_FRACTION, hastens=False),
+                number % count == 0,
+                place,
+            )
+            for place, (view, number) in enumerate(zip(views, numbers, strict=True))
+        ]
+
+    def record(self) -> dict[str, Any]:
+        """Content of appearance.json: indices of the photographs' grids in appearance.npz. Held-out photographs have
+        none."""
+        places = {view.name: {"grid": place} for place, view in enumerate(self._scene.train_views)}
+        return {"kind": self._config.appearance, "photographs": places, "held_out": {}}
+
+    def tables(self) -> dict[str, NDArray[Any]]:
+        """Arrays of appearance.npz."""
+        return {"grids": self._grids.grids.get()}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        held = {"grids": self._grids.grids, "first": self._grids.first, "second": self._grids.second}
+        return saved(held)
+
+    def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Load the arrays of a checkpoint. Raises ValueError for arrays of other photographs."""
+        values = loaded(self._device, arrays, ("grids", "first", "second"), self._grids.grids.shape)
+        self._grids = Grids(**values)

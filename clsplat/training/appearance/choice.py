@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choice of the appearance model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.training.appearance.base import Appearance
+from clsplat.training.appearance.bilateral_grid import GridsOfAll
+from clsplat.training.appearance.exposure import GainsOfAll
+from clsplat.training.appearance.ppisp import PpispOfAll
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
+
+
+APPEARANCE_MODELS: dict[str, Callable[[TrainConfig, Device, Scene], Appearance]] = {
+    "exposure": GainsOfAll,
+    "ppisp": PpispOfAll,
+    "grid": GridsOfAll,
+}
+"""Appearance models by the setting `appearance`."""
+
+
+def appearance_of(config: TrainConfig, device: Device, scene: Scene) -> Appearance:
+    """Appearances of a training by its settings."""
+    if config.appearance == "none":
+        return Appearance()
+    return APPEARANCE_MODELS[config.appearance](config, device, scene)

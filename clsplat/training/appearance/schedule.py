@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learning rate of photographs' gains and grids, and their arrays in a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, upload
+from clsplat.device.context import Device
+
+APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
+"""Steps of the warm-up, at most a tenth of all, and the fraction of the rate at its start."""
+FULL_LENGTH_STEPS = 10_000
+"""Number of steps below which a training is short. In as many steps a gain can change by about 2 octaves, at the rate
+of the settings."""
+
+
+def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
+    """Learning rate of step number `step`.
+
+    views: a photograph has a gradient in one of so many steps, which makes Adam's steps smaller by the root of it.
+    ends: fraction of the rate that is left at the last step.
+    hastens: raise the rate in a short training, so that gains can change by the same amount.
+    """
+    rise: float = WARM_UP_START_FRACTION ** (1 - min(step / min(APPEARANCE_WARM_UP_STEPS, config.iterations / 10), 1.0))
+    fall: float = ends ** (step / config.iterations)
+    short = max(FULL_LENGTH_STEPS / config.iterations, 1.0) if hastens else 1.0
+    return float(config.appearance_rate * short * views**0.5 * rise * fall)
+
+
+def saved(held: Mapping[str, DeviceArray]) -> dict[str, NDArray[Any]]:
+    """Arrays of a checkpoint, by name."""
+    return {f"appearance/{name}": array.get() for name, array in held.items()}
+
+
+def loaded(
+    device: Device, arrays: Mapping[str, NDArray[Any]], names: Iterable[str], shape: tuple[int, ...]
+) -> dict[str, DeviceArray]:
+    """Upload the arrays of a checkpoint. Raises ValueError if one is missing, or belongs to other photographs."""
+    values = {}
+    for name in names:
+        value = arrays.get(name)
+        if value is None or value.shape != shape or value.dtype != np.float32 or not np.isfinite(value).all():
+            raise ValueError(f"has no appearance/{name} of shape {shape}")
+        values[name] = upload(device, value)
+    return values

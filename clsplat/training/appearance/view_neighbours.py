@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs with nearby cameras: pictures hardly determine the common part of their gains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.spatial import KDTree
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+
+NEIGHBOUR_DISTANCE_LIMIT = 2.5
+"""Distance at which cameras stop being neighbours.
+
+It combines two distances: between centres, relative to the median distance from the middle, and between unit viewing
+directions. At a quarter of it about half of the weight is left. Colours by direction, of SH degree 3, can vary over
+about that distance.
+"""
+MAX_MEAN_NEIGHBOURS = 256
+"""Maximum mean number of neighbours of a camera, including itself. The distance is reduced to keep it."""
+NEIGHBOUR_WEIGHT_STEP = 2.0**-20
+"""Weights are multiples of this, so that they are equal on processors that round differently."""
+
+
+def places(cameras: Sequence[Camera]) -> Float64:
+    """Points (n, 6) whose distances `NEIGHBOUR_DISTANCE_LIMIT` limits. Centres that differ only by rounding
+    coincide."""
+    centres = np.array([camera.position for camera in cameras])
+    apart = centres - np.median(centres, axis=0)
+    extent = float(np.median(np.linalg.norm(apart, axis=1)))
+    if extent <= 1e-6 * np.abs(centres).max():
+        apart, extent = np.zeros_like(apart), 1.0
+    return np.concatenate([apart / extent, [camera.rotation[2] for camera in cameras]], axis=1)
+
+
+def common(cameras: Sequence[Camera], told: NDArray[np.bool_]) -> csr_array:
+    """Symmetric matrix (n, n) that extracts the common part of neighbouring photographs' values.
+
+    told: (n,), photographs that count; rows and columns of the others are 0.
+
+    It keeps up to all of the common part, and half of the value of a photograph without neighbours. Its entries are w /
+    sqrt(t t'), where w is (1 - r)^6 (6 r + 1) at a distance of r NEIGHBOUR_DISTANCE_LIMIT. t and t' are 1 more than the
+    sums of their w. These w are positive definite in six dimensions (Wendland, Advances in Computational Mathematics 4,
+    1995). So the matrix is positive semidefinite, except for rounding to `NEIGHBOUR_WEIGHT_STEP`.
+    """
+    numbers = np.flatnonzero(told)
+    if not len(numbers):
+        return csr_array((len(told), len(told)), dtype=np.float64)
+    points = places(cameras)[numbers]
+    tree, reach = KDTree(points), NEIGHBOUR_DISTANCE_LIMIT
+    while (
+        tree.count_neighbors(tree, reach) > MAX_MEAN_NEIGHBOURS * len(points)
+        and reach > NEIGHBOUR_DISTANCE_LIMIT / 1024
+    ):
+        reach /= 2**0.5
+    pairs = tree.query_pairs(reach, output_type="ndarray")
+    apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) / reach
+    weights = (1 - apart) ** 6 * (6 * apart + 1)
+    half = csr_array((weights, tuple(numbers[pairs].T)), shape=(len(told), len(told)))
+    near = half + half.T + diags_array(told.astype(np.float64))
+    scale = diags_array(told / np.sqrt(1 + near.sum(axis=1)))
+    result = csr_array(scale @ near @ scale)
+    result.data = np.round(result.data / NEIGHBOUR_WEIGHT_STEP) * NEIGHBOUR_WEIGHT_STEP
+    result.eliminate_zeros()
+    result.sort_indices()
+    return result

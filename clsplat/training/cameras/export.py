@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Refined cameras at the end of a training: their COLMAP model, and warnings about large changes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+
+from clsplat.errors import examples
+from clsplat.runs.run import Run
+from clsplat.scenes.readers.colmap_writer import write_model
+from clsplat.scenes.scene import Scene
+from clsplat.training.cameras.intrinsics import RefinedLenses
+from clsplat.training.cameras.poses import Poses
+from clsplat.training.cameras.validation_gate import Drift
+
+POSE_WARNING_DEGREES, POSE_WARNING_EXTENTS = 5.0, 0.1
+"""Rotation in degrees, and movement relative to the scene's extent, above which a refined pose causes a warning."""
+LENS_WARNING_FOCAL_LENGTHS = 0.1
+"""Change of a lens, in focal lengths, above which it causes a warning."""
+
+
+def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, along: Drift | None) -> None:
+    """Write the refined cameras, and warn of any camera with a large change.
+
+    along: mean motion of the refined poses, which is applied to held-out poses and to the points.
+    """
+    cameras, points = {view.name: view.camera for view in scene.views}, scene.points
+    if along is not None:
+        cameras = {name: along.taken_along(camera) for name, camera in cameras.items()}
+        points = along.points(points)
+    cameras |= {view.name: camera for view, camera in zip(scene.train_views, poses.cameras, strict=True)}
+    images = [(view.name, lenses.refined(view.lens), cameras[view.name]) for view in scene.views]
+    write_model(run.refined_path, images, points, scene.point_colors)
+    degrees, shifts = poses.motions()
+    far = (degrees > POSE_WARNING_DEGREES) | (shifts > POSE_WARNING_EXTENTS * scene.extent)
+    if far.any():
+        names = [view.name for view, one in zip(scene.train_views, far, strict=True) if one]
+        warnings.warn(
+            f"--refine-poses: {examples(names)}: moved by up to {degrees.max():.1f} degrees and {shifts.max():.3g} "
+            "world units; look at their renders, or leave them out"
+        )
+    if (most := lenses.largest) > LENS_WARNING_FOCAL_LENGTHS:
+        warnings.warn(
+            f"--refine-lenses: a focal length or principal point has changed by {most:.1%} of the focal length; look "
+            "at the renders, or leave them as they are"
+        )
+
+
+def doubt_poses(mean: Mapping[str, float], most: float) -> None:
+    """Warn if the model's world has left the given cameras' world, by more than `most` dB."""
+    lost = mean.get("psnr_aligned", 0.0) - mean["psnr"]
+    if 0 < most < lost:
+        warnings.warn(
+            f"--refine-poses: held-out views have {mean['psnr']:.2f} dB where they were given and "
+            f"{mean['psnr_aligned']:.2f} dB where they fit the model best: it has moved with the refined cameras. Use "
+            "those of refined/ with it; where the given ones are good, train without --refine-poses"
+        )

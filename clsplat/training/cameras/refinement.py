@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras of training views, refined with the model, and their gradients, which also align held-out views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import only_tried
+from clsplat.runs.run import Run
+from clsplat.scenes.scene import Scene
+from clsplat.stages.pose import LENS_NUMBERS, POSE_NUMBERS, lens_rows, pose_rows, sum_of, sums_of
+from clsplat.training.cameras.export import keep_cameras
+from clsplat.training.cameras.intrinsics import RefinedLenses
+from clsplat.training.cameras.poses import Poses
+from clsplat.training.cameras.validation_gate import CameraGate, Drift, drift
+from clsplat.training.step.component import Component, Named
+from clsplat.training.step.inputs import StepRows, ViewInputs, ViewPart
+
+REFINEMENT_ARRAYS_PER_PARAMETER = 4
+"""Arrays on the device for each parameter: the parameter, two moments, and a view's gradient."""
+
+
+@dataclass(eq=False)
+class CameraSums(ViewPart):
+    """Gradients with respect to the pose and the lens of a step's view, of a model of `count` rows.
+
+    `add_rows` receives all rows, in order.
+    pose, lens: which gradients to sum.
+    move: called with the sums after Adam.
+    """
+
+    wants_gradients = True
+
+    work: Workspace
+    count: int
+    pose: bool = True
+    lens: bool = False
+    move: Callable[[CameraSums], None] | None = None
+    _device: Device | None = field(default=None, init=False)
+    _sums: dict[int, DeviceArray] = field(default_factory=dict, init=False)
+
+    def lens_gradients(self, rows: int) -> DeviceArray | None:
+        """Room (rows, 4) for the rows' gradients with respect to the lens, if they are needed."""
+        return self.work.array("by_lens", (rows, LENS_NUMBERS)) if self.lens else None
+
+    def add_rows(self, rows: StepRows) -> None:
+        """Sum the rows' gradients. Later kernels are tried here, before anything changes."""
+        assert rows.gradients is not None, "asked for where cameras are refined"
+        counts = rows.projected.tile_counts
+        if self._device is None:
+            self._device = rows.device
+            self._sums = {
+                numbers: sums_of(self.work, self.count, numbers)
+                for numbers in (POSE_NUMBERS,) * self.pose + (LENS_NUMBERS,) * self.lens
+            }
+            for sums in self._sums.values():
+                with only_tried(rows.device):
+                    sum_of(rows.device, self.work, sums)
+        if self.pose:
+            of_view = (rows.camera_array, counts, rows.gradients)
+            pose_rows(rows.device, rows.parameters, *of_view, self._sums[POSE_NUMBERS], rows.start)
+        if rows.by_lens is not None:
+            lens_rows(rows.device, counts, rows.by_lens, self._sums[LENS_NUMBERS], rows.start)
+
+    def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:  # noqa: ARG002
+        """Move the camera; waits for the device."""
+        if self.move is not None:
+            self.move(self)
+
+    def _gradient(self, numbers: int) -> Float64:
+        assert self._device is not None, "a model has rows"
+        found: Float64 = sum_of(self._device, self.work, self._sums[numbers]).get()[0].astype(np.float64)
+        return found
+
+    def by_pose(self) -> Float64:
+        """Gradient (6,) with respect to the motion of `Camera.moved`; waits for the device."""
+        return self._gradient(POSE_NUMBERS)
+
+    def by_lens(self) -> Float64:
+        """Gradient (4,) with respect to ln fx, ln fy, cx and cy; waits for the device."""
+        return self._gradient(LENS_NUMBERS)
+
+
+class Cameras(Component):
+    """Cameras of the training views. Refined poses and lenses change until their gate ends it.
+
+    work: memory for sums over the model's rows.
+    held_out: number of held-out views that the gate uses.
+    """
+
+    def __init__(self, config: TrainConfig, scene: Scene, work: Workspace | None = None, held_out: int = 0) -> None:
+        views, extent = scene.train_views, scene.extent
+        self.poses, self.lenses = Poses(config, views, extent), RefinedLenses(config, views)
+        self.gate = CameraGate(config, held_out)
+        self._config, self._scene, self._views, self._work = config, scene, views, work
+
+    @property
+    def models(self) -> int:
+        """Parameters, two moments and a view's gradients, if cameras are refined."""
+        return REFINEMENT_ARRAYS_PER_PARAMETER if self._config.refines else 0
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes per Gaussian for gradients with respect to the lens."""
+        return 4 * LENS_NUMBERS * self._config.refine_lenses
+
+    def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:
+        """Views with sums of the gradients with respect to the cameras that this step refines."""
+        if self.gate.ended is not None or not self._config.refines:
+            return inputs
+        return [self._joined(each, step, count) for each in inputs]
+
+    def _joined(self, inputs: ViewInputs, step: int, count: int) -> ViewInputs:
+        pose, lens = self.poses.moves(inputs.view, step), self.lenses.moves(step)
+        if not (pose or lens):
+            return inputs
+        assert self._work is not None, "given by a trainer"
+        sums = CameraSums(self._work, count, pose, lens, partial(self._move, inputs, step))
+        return replace(inputs, parts=(*inputs.parts, sums))
+
+    def _move(self, inputs: ViewInputs, step: int, sums: CameraSums) -> None:
+        """Change the view's camera by the gradients; waits for the device."""
+        if sums.pose:
+            self.poses.move(inputs.view, step, sums.by_pose())
+        if sums.lens:
+            self.lenses.move(inputs.view, step, inputs.camera, sums.by_lens())
+
+    def of(self, view: int) -> Camera:
+        """Camera of a training view; the same object if lenses are not refined and its pose has not moved."""
+        return self.lenses.seen(self._views[view].lens, self.poses.cameras[view])
+
+    def drift(self) -> Drift | None:
+        """Drift of the refined poses from the given ones; None if poses are not refined."""
+        given = [view.camera for view in self._views]
+        return drift(given, self.poses.cameras, self._scene.extent) if self.poses.on else None
+
+    def refined_arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name, without the gate's."""
+        return self.poses.arrays() | self.lenses.arrays()
+
+    def go_back(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Load the cameras from `refined_arrays`. Raises ValueError for arrays of other views."""
+        for part, name in ((self.poses, "poses/"), (self.lenses, "lenses/")):
+            part.load({key.removeprefix(name): array for key, array in arrays.items() if key.startswith(name)})
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        return self.refined_arrays() | self.gate.arrays()
+
+    def load(self, named: Named, count: int) -> None:  # noqa: ARG002
+        """Load the arrays of a checkpoint. Raises ValueError for arrays of other views."""
+        self.poses.load(named("poses/"))
+        self.lenses.load(named("lenses/"))
+        self.gate.load(named("gate/"), self.refined_arrays())
+
+    def write(self, run: Run) -> None:
+        """Write the refined cameras."""
+        if self._config.refines:
+            keep_cameras(run, self._scene, self.poses, self.lenses, self.drift())

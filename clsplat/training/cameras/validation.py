@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Held-out photographs that validate a training's refined cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import warn
+from clsplat.evaluation import metrics
+from clsplat.images.alpha import background_colour, composite
+from clsplat.runs.appearance import Look
+from clsplat.scenes.scene import Scene, View
+from clsplat.training.cameras.refinement import Cameras
+from clsplat.training.cameras.validation_gate import spread
+from clsplat.training.supervision.image_cache import ImageCache
+
+Draw = Callable[[Camera], NDArray[Any]]
+"""Image (H, W, 3) of the model over the background of evaluations, from a camera in world coordinates."""
+
+
+class ValidationViews:
+    """Held-out views for the gate, at most `validation_gate.MAX_GATE_VIEWS`. Their pixels are decoded once."""
+
+    def __init__(self, scene: Scene, device: Device, config: TrainConfig) -> None:
+        held_out = scene.test_views
+        self.views: list[View] = [held_out[index] for index in spread(len(held_out))]
+        self._photographs = ImageCache(self.views, device)
+        self._background = background_colour(config.background)
+        self._measure = metrics.psnr if config.appearance == "none" else metrics.psnr_corrected
+
+    def psnr(self, draw: Draw, look: Look, cameras: Sequence[Camera]) -> float:
+        """Mean PSNR in dB of the views through these cameras; 0 if no photograph counts.
+
+        look: the views' appearance, as far as it is known. If appearance is learnt, colours are fitted. A photograph
+        counts if its mask keeps a pixel.
+        """
+        found = []
+        for index, camera in enumerate(cameras):
+            pixels, counts = self._photographs.load(index, 1.0), None
+            if pixels.shape[2] == 5:
+                pixels, counts = pixels[:, :, :4], pixels[:, :, 4] > 0
+                if not counts.any():
+                    continue
+            image = look(self.views[index].name, np.nan_to_num(draw(camera)))
+            found.append(self._measure(image, composite(pixels, self._background), counts))
+        return float(np.mean(found)) if found else 0.0
+
+
+def judge(cameras: Cameras, judges: ValidationViews, step: int, draw: Draw, look: Look) -> None:
+    """Measure the held-out views with the refined cameras. If the gate rejects them, go back to earlier ones with a
+    warning.
+
+    Poses of held-out views are as given, or moved by the drift of the refined poses, whichever fits better. The given
+    ones are right if only some training poses were wrong, and the moved ones if the whole frame drifts.
+    """
+    seen = [cameras.lenses.seen(view.lens, view.camera) for view in judges.views]
+    psnr = judges.psnr(draw, look, seen)
+    if (drift := cameras.drift()) is not None:
+        psnr = max(psnr, judges.psnr(draw, look, [drift.taken_along(camera) for camera in seen]))
+    best, warning = cameras.gate.judge(step, psnr, cameras.refined_arrays())
+    if best is not None:
+        cameras.go_back(best)
+    if warning:
+        warn(warning)

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gate that uses held-out photographs to return to earlier cameras. Policy only, no OpenCL."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+from clsplat.config.training import DensityConfig, TrainConfig
+from clsplat.training.cameras.poses import checked_arrays, first_step
+from clsplat.training.density.adaptive import is_due, is_reset_due
+
+MAX_GATE_VIEWS = 8
+"""Maximum number of held-out views that are measured."""
+GATE_MEASUREMENTS = 10
+"""Measurements in a training, in addition to the one when refinement begins."""
+LOW_MEASUREMENTS_IN_A_ROW = 2
+"""Consecutive measurements below the bound that end refinement. A single one may follow a densification."""
+RESET_SETTLING_DIVISOR = 3
+"""Divisor of the interval between opacity resets that gives the time a model needs to recover from one. Until then it
+cannot judge its cameras."""
+DRIFT_ITERATIONS, MIN_DRIFT_RESIDUAL = 10, 1e-12
+"""Iterations of a drift's weights, and the smallest residual and spread that do not count as zero."""
+
+
+def steps_of(config: TrainConfig) -> tuple[int, ...]:
+    """Steps after which cameras are judged, rising: when refinement begins and at every tenth of the training.
+
+    Just after a densification, and for long after an opacity reset, a model cannot judge its cameras. The measurement
+    then moves to the last step before, as a step measures first and then changes the model.
+    """
+    density, first = config.density, first_step(config)
+    settling = (density.opacity_reset_every or DensityConfig.opacity_reset_every) // RESET_SETTLING_DIVISOR
+    white, resets = config.background == "white", density.growth != "mcmc"
+
+    def settled(step: int) -> int:
+        late = range(step, max(step - density.every, 0), -1)
+        step = next((each for each in late if is_due(density, each)), step)
+        late = range(step, max(step - settling, 0) if resets else step, -1)
+        return next((each for each in late if is_reset_due(density, each, white=white)), step)
+
+    wanted = {first, *(part * config.iterations // GATE_MEASUREMENTS for part in range(1, GATE_MEASUREMENTS + 1))}
+    return tuple(sorted({settled(step) for step in wanted if step >= first}))
+
+
+def spread(count: int, most: int = MAX_GATE_VIEWS) -> list[int]:
+    """At most `most` of `count` indices, evenly spaced from the first to the last."""
+    picked = min(count, most)
+    return [index * (count - 1) // max(picked - 1, 1) for index in range(picked)]
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Similarity transform of the world: x becomes scale * rotation @ x + shift. rotation (3, 3), shift (3,)."""
+
+    scale: float
+    rotation: Float64
+    shift: Float64
+
+    def taken_along(self, camera: Camera) -> Camera:
+        """Camera that sees in the drifted world the same as this one in the original world."""
+        rotation = camera.rotation @ self.rotation.T
+        position = self.scale * self.rotation @ camera.position + self.shift
+        return camera.posed(rotation, -rotation @ position)
+
+    def points(self, points: Float64) -> Float64:
+        """Points (N, 3) of the original world, moved to the drifted one."""
+        moved: Float64 = self.scale * points @ self.rotation.T + self.shift
+        return moved
+
+
+def drift(given: Sequence[Camera], refined: Sequence[Camera], extent: float) -> Drift:
+    """Similarity that best maps the given poses to the refined ones, n each.
+
+    A camera's residual is the root of (angle^2 + (distance/extent)^2), angles in radians. Squares have Huber weights
+    with the median residual as the bound, so that a few outliers have little influence. The rotation fits positions and
+    axes together (Kabsch 1976), as cameras may lie on a line or in a point. The scale is Umeyama's (1991), from the
+    positions.
+    """
+    old, new = (np.array([camera.rotation for camera in cameras]) for cameras in (given, refined))
+    at, to = (np.array([camera.position for camera in cameras]) / extent for cameras in (given, refined))
+    turns, weights = new.transpose(0, 2, 1) @ old, np.ones(len(old))
+    for _ in range(DRIFT_ITERATIONS):
+        parts = weights / weights.sum()
+        from_middle, to_middle = parts @ at, parts @ to
+        a, b = at - from_middle, to - to_middle
+        left, _, right = np.linalg.svd((parts[:, None, None] * turns).sum(axis=0) + 2 * (parts * b.T) @ a)
+        left[:, 2] *= np.sign(np.linalg.det(left @ right))
+        rotation = left @ right
+        turned, squares = a @ rotation.T, float((parts * (a * a).T).sum())
+        scale = float((parts * (b * turned).T).sum()) / squares if squares > MIN_DRIFT_RESIDUAL else 1.0
+        angles = np.square(new @ rotation - old).sum(axis=(1, 2)) / 2  # 4 sin^2 of half the angle
+        residuals = np.sqrt(angles + np.square(b - scale * turned).sum(axis=1))
+        bound = max(float(np.median(residuals)), MIN_DRIFT_RESIDUAL)
+        weights = bound / np.maximum(residuals, bound)
+    return Drift(scale, rotation, extent * (to_middle - scale * rotation @ from_middle))
+
+
+class CameraGate:
+    """Held-out PSNR of a training that refines its cameras, and its best cameras.
+
+    measured: step and dB of each measurement.
+    ended: step after which refinement ended, None while it continues.
+    """
+
+    def __init__(self, config: TrainConfig, held_out: int) -> None:
+        self.on = config.refines and config.refine_gate > 0 and held_out > 0
+        self._config, self._steps = config, steps_of(config) if self.on else ()
+        self.measured: list[tuple[int, float]] = []
+        self.ended: int | None = None
+        self._best: dict[str, NDArray[Any]] = {}
+
+    def is_due(self, step: int) -> bool:
+        """True if the cameras have to be judged after this step, or if a due step was passed without a measurement."""
+        last = self.measured[-1][0] if self.measured else -1
+        return any(last < due <= step for due in self._steps)
+
+    @property
+    def best(self) -> tuple[int, float]:
+        """Step and dB of the best measurement before refinement ended; the first of equal ones."""
+        known = [each for each in self.measured if self.ended is None or each[0] <= self.ended]
+        return max(known, key=lambda each: each[1])
+
+    def judge(
+        self, step: int, psnr: float, cameras: Mapping[str, NDArray[Any]]
+    ) -> tuple[dict[str, NDArray[Any]] | None, str]:
+        """Record a measurement in dB.
+
+        cameras: the cameras' arrays of a checkpoint.
+        Returns the arrays of the cameras to go back to, or None to keep these, and the text of a warning, or "".
+        """
+        self.measured.append((step, psnr))
+        if self.ended is not None:
+            return None, ""
+        at, best = self.best
+        if at == step:
+            self._best = {name: array.copy() for name, array in cameras.items()}
+            return None, ""
+        low = list(takewhile(lambda each: each[1] < best - self._config.refine_gate, reversed(self.measured)))[::-1]
+        if len(low) < LOW_MEASUREMENTS_IN_A_ROW:
+            return None, ""
+        poses = self._config.refine_poses
+        flag, reach = ("--refine-poses", "--pose-reach") if poses else ("--refine-lenses", "--lens-reach")
+        figures, steps = (
+            " and ".join(each) for each in zip(*((f"{value:.2f}", str(on)) for on, value in low), strict=True)
+        )
+        found = f"{flag}: held-out views had {best:.2f} dB at step {at}, {figures} dB at steps {steps}"
+        advice = f"try a smaller {reach}, or none of {flag}"
+        if step >= self._config.iterations:
+            return None, f"{found}: no step is left to go back; {advice}"
+        self.ended = step
+        return self._best, f"{found}: the cameras are again those of step {at}, and stay; {advice}"
+
+    def record(self) -> dict[str, Any]:
+        """Measurements so far, for metrics.jsonl. Requires at least one."""
+        measured = [{"step": step, "psnr": psnr} for step, psnr in self.measured]
+        return {"measured": measured, "best": self.best[0], "ended": self.ended}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        if not self.measured:
+            return {}
+        ended = np.array([-1 if self.ended is None else self.ended], np.int64)
+        own = {"measured": np.array(self.measured, np.float64), "ended": ended, **self._best}
+        return {f"gate/{name}": array for name, array in own.items()}
+
+    def load(self, arrays: Mapping[str, NDArray[Any]], cameras: Mapping[str, NDArray[Any]]) -> None:
+        """Load the arrays of a checkpoint, by name without the prefix. There are none before the first measurement.
+
+        cameras: arrays with the shapes of the best measurement's.
+        Raises ValueError for arrays of other views.
+        """
+        self.measured, self.ended, self._best = [], None, {}
+        if not self.on or not arrays:
+            return
+        measured = arrays.get("measured", np.zeros(0))
+        if measured.ndim != 2 or measured.shape[1] != 2 or not len(measured) or not np.isfinite(measured).all():
+            raise ValueError(f"has no gate/measured of steps and dB (shape {measured.shape})")
+        like = {"gate/ended": np.zeros(1, np.int64), **{f"gate/{name}": array for name, array in cameras.items()}}
+        self._best = checked_arrays(like, arrays, "gate/")
+        ended = int(self._best.pop("ended")[0])
+        self.ended = None if ended < 0 else ended
+        self.measured = [(int(step), float(psnr)) for step, psnr in measured]

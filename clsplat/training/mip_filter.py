@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mip-Splatting's 3D smoothing filter: no Gaussian becomes smaller than the training pictures can show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.context import Device
+from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.stages.sampling import SAMPLING_GAUSSIAN_BYTES, limit_scales, sampling_limits, upload_cameras
+from clsplat.training.step.component import Component, Named
+
+SAMPLING_LIMIT_INTERVAL_STEPS = 100
+"""Steps between updates of the limits: the means move slowly."""
+
+
+class MipFilter(Component):
+    """Lower limits of the scales in training, from the cameras of its pictures at full size. Inactive unless the
+    settings ask for antialiasing."""
+
+    def __init__(self, config: TrainConfig, device: Device, work: Workspace, cameras: Sequence[Camera]) -> None:
+        self._device, self._work, self._on = device, work, config.antialiased
+        self._least: DeviceArray | None = None  # (n,), None until computed before the next step
+        if not self._on:
+            return
+        self._cameras = upload_cameras(device, cameras)
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes per Gaussian on the device."""
+        return SAMPLING_GAUSSIAN_BYTES if self._on else 0
+
+    def is_due(self, step: int, views: int) -> bool:
+        """True if the limits have to be computed before the `views` steps that end with this one."""
+        return self._on and (self._least is None or (step - 1) % SAMPLING_LIMIT_INTERVAL_STEPS < views)
+
+    def before_step(self, gaussians: AnyGaussians) -> None:
+        """Compute the limits, and apply them."""
+        self._least = allocate(self._device, (gaussians.count,), np.float32)
+        sampling_limits(self._device, self._work, gaussians, self._cameras, self._least)
+        self.after_adam(gaussians)
+
+    def after_adam(self, gaussians: AnyGaussians) -> None:
+        """Raise scales below their limit to it."""
+        if self._least is not None:
+            limit_scales(self._device, self._work, gaussians, self._least)
+
+    def rows_moved(self) -> None:
+        """Forget the limits."""
+        self._least = None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        return {} if self._least is None else {"sampling/least": self._least.get()}
+
+    def load(self, named: Named, count: int) -> None:
+        """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for another number of Gaussians."""
+        least = named("sampling/").get("least") if self._on else None
+        if least is not None and least.shape != (count,):
+            raise ValueError(f"sampling/least has shape {least.shape}")
+        self._least = None if least is None else upload(self._device, np.ascontiguousarray(least, np.float32))

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks and preparation of a training, before its first step."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from clsplat.config.training import TrainConfig
+from clsplat.errors import InputError
+from clsplat.images.alpha import background_colour
+from clsplat.runs import scene_record
+from clsplat.runs.run import Run, check_resumed
+from clsplat.scenes.analysis import sanity_checks
+from clsplat.scenes.depth_sources import with_depths
+from clsplat.scenes.scene import Scene
+from clsplat.scenes.start.initialise import is_colourless, photographed
+from clsplat.scenes.start.point_cloud import with_points
+from clsplat.training.cameras.refinement import Cameras
+
+
+def prepared(scene: Scene, config: TrainConfig) -> Scene:
+    """Scene with its start points and known depths; `scene` itself if it has them already.
+
+    Raises InputError for points, depths or cameras to refine on which training would fail.
+    """
+    scene = with_depths(with_points(scene, config.start_points), config.depth_use)
+    scene.require_training_views()
+    if config.refines:
+        Cameras(config, scene)
+    return scene
+
+
+def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
+    """Raise InputError, with the setting's `name`, if a run is past its last step."""
+    if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
+        raise InputError(f"{name} {config.iterations}: {run.path} is at step {done} already, expected more")
+
+
+def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
+    """Scene to train on, with colours, recorded in the run. Warns of each doubt about it.
+
+    Raises InputError if the run has already been trained, or trained on another scene.
+    """
+    scene = prepared(scene, config)
+    if run is not None:
+        if not resume and (run.checkpoints() or run.read_metrics()):
+            raise InputError(
+                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
+                "starts again"
+            )
+        run.keep_config(config)
+        if resume:
+            scene_record.check(run, scene, run.scene or Path(scene.name), config.resolution)
+        scene_record.keep(run, scene, resuming=resume)
+        if resume and run.checkpoints():
+            return scene
+    for text in sanity_checks.of_scene(scene, config.background):
+        warnings.warn(text)
+    if is_colourless(scene):
+        warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
+        scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
+    return scene
+
+
+def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume: bool) -> TrainConfig:
+    """Settings of the training. Raises InputError for invalid arguments of `clsplat.train`."""
+    for name, value, kind, meant in (
+        ("scene", scene, Scene, "clsplat.load_scene(...)"),
+        ("config", config, TrainConfig | None, "TrainConfig(...)"),
+        ("run", run, Run | None, "Run.create(...)"),
+    ):
+        if not isinstance(value, kind):
+            raise InputError(f"{name} is {value!r:.100}, expected {meant}")
+    if resume and run is None:
+        raise InputError("resume=True: expected run=..., the run to go on with")
+    if config is None:
+        config = run.config if run is not None else TrainConfig()
+    config.check()
+    if resume and run is not None:
+        check_resumed(run, config)
+        check_steps_left(run, config, "iterations")
+    scene.require_training_views()
+    return config
+
+
+def late_settings(config: TrainConfig) -> Iterator[str]:
+    """Describe each non-default setting that takes effect after the last step, or starts before the first."""
+    last, expected = config.iterations, f"expected at most --iterations {config.iterations}"
+    ends = f"training ends at step {last}"
+    density = config.density
+    if density.every and density.growth != "paper" and density.stop > last:
+        yield (
+            f"--density.growth {density.growth}: --density.max-gaussians {density.max_gaussians:,} is reached at "
+            f"--density.stop {density.stop}, {ends}; {expected}, such as {5 * last // 7}"
+        )
+    optimiser = config.optimiser
+    if optimiser.cooldown > last:
+        part = optimiser.cooldown_to ** (1 - last / optimiser.cooldown)
+        yield (
+            f"--optimiser.cooldown {optimiser.cooldown}: the learning rates begin at {part:.2g} of what they are, "
+            f"training has {last} steps; {expected}"
+        )
+    late = [step for step in config.warmup if step >= max(last, 2)]
+    if late and tuple(config.warmup) != TrainConfig.warmup:
+        yield (
+            f"--warmup {','.join(map(str, late))}: the training resolution does not double then, {ends} at "
+            f"1/{2 ** len(late)} of the size; expected less than --iterations {last}"
+        )

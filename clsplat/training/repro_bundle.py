@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bundle of a training that stopped because of non-finite numbers, and the replay of its one training step.
+
+    python -m clsplat.training.repro_bundle RUN/trouble-step-0001234.npz [--device DEVICE] [--json]
+
+prints the number of non-finite values after each stage of that step. The exit status is 0 if there are any, else 1.
+A bundle is a checkpoint's file, with the inputs of one view: a photograph, a camera and a background. Its Gaussians are
+only those concerned if they reproduce the trouble on their own, else all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device import cl
+from clsplat.device.context import Device, open_device
+from clsplat.errors import ClsplatError, InputError
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import REFUSED, SPLAT
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.runs.checkpoints import Checkpoint, read_checkpoint, write_checkpoint
+from clsplat.runs.settings import config_text, parse_config
+from clsplat.stages.device_camera import padded_size
+from clsplat.stages.device_gaussians import (
+    DeviceGaussians,
+    HostArray,
+    HostGaussians,
+    allocate_gaussians,
+    host_model,
+    to_device,
+    to_host,
+)
+from clsplat.stages.loss import Loss
+from clsplat.stages.loss_terms import DepthTerm
+from clsplat.stages.project import Slots
+from clsplat.training.density.choice import strategy_of
+from clsplat.training.stability.health import Incident, finite_or_zero
+from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields
+from clsplat.training.step.inputs import StepRows, ViewInputs
+from clsplat.training.supervision.image_cache import kept_pixels
+from clsplat.version import package_version
+
+if TYPE_CHECKING:
+    from clsplat.training.trainer import Trainer
+
+_INTRINSICS = ("fx", "fy", "cx", "cy", "near")
+RECORDED_CAMERA_FIELDS = ("width", "height", *_INTRINSICS, "projection", "radial", "by_rays")
+_MODEL_KINDS = ("parameters", "first", "second")
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """One training step.
+
+    record: step, stage, name of the view, rates, size, versions, device.
+    models: parameters and moments by group.
+    """
+
+    record: dict[str, Any]
+    config: TrainConfig
+    inputs: ViewInputs
+    models: dict[str, HostGaussians]
+
+
+def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
+    """Write `folder`/trouble-step-STEP.npz for the incident, and return its path."""
+    photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
+    camera = trainer.camera(incident.view, photograph.shape[1], photograph.shape[0])
+    device = trainer.device
+    record: dict[str, Any] = {
+        "step": incident.step,
+        "view": incident.name,
+        "stage": incident.stage,
+        "message": str(incident),
+        "rates": trainer.rates(),
+        "camera": {name: getattr(camera, name) for name in RECORDED_CAMERA_FIELDS},
+        "settings": config_text(trainer.config, None),
+        "versions": {
+            "clsplat": package_version(),
+            "numpy": np.__version__,
+            "pyopencl": cl.VERSION_TEXT,
+            "python": platform.python_version(),
+            "system": platform.platform(),
+        },
+        "device": {"name": device.name, "driver": device.driver, "shape": str(device.shape)},
+    }
+    pixels = {"photograph": photograph, "background": incident.background}
+    aims = trainer.depths.aims(incident.view, camera, incident.step, photograph)
+    if aims is not None:
+        record["depth_factor"], pixels["depth"] = aims.factor, aims.planes
+    pose = {"rotation": camera.rotation, "translation": camera.translation}
+    inputs = ViewInputs(0, photograph, camera, incident.background, kept=kept_pixels(photograph), depth=aims)
+
+    def reproduced(models: dict[str, HostGaussians]) -> bool:
+        return bool(first_trouble(replay(Bundle(record, trainer.config, inputs, models), device)))
+
+    trainer.settle()
+    models, alone = {}, False
+    if len(incident.gaussians.get("parameters/means", ())):
+        models = _unmarked({kind: host_model(incident.gaussians, kind) for kind in _MODEL_KINDS})
+        alone = reproduced(models)
+    if not alone:
+        models = _unmarked({kind: to_host(model) for kind, model in trainer.models().items()})
+    record["of"] = models["parameters"].count, trainer.parameters.count
+    record["reproduced"] = alone or reproduced(models)
+    arrays = {f"{kind}/{g}": array.values for kind, model in models.items() for g, array in model.arrays.items()}
+    path = folder / f"trouble-step-{incident.step:07d}.npz"
+    write_checkpoint(path, incident.step, {**pixels, **pose, **arrays}, record)
+    return path
+
+
+def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
+    """Models with the moments before `adam` refused a step, as far as they are known."""
+    for kind in ("first", "second"):
+        arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
+        models[kind] = replace(models[kind], arrays=arrays)
+    return models
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Read a bundle. Raises InputError for other files."""
+    try:
+        return _bundle_of(read_checkpoint(path), path)
+    except Exception as error:  # as for a checkpoint: zipfile raises nearly anything for a flipped bit
+        if isinstance(error, InputError) and str(path) in str(error):
+            raise
+        why = f"{type(error).__name__}: {error}"[:300]
+        raise InputError(f"{path}: not a bundle of a training that gave up ({why})") from None
+
+
+def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
+    """Raises nearly any exception for arrays and values that make no step. Sizes follow from the photograph's."""
+    record, arrays = {**saved.state, "step": saved.step}, saved.arrays
+    record["rates"] = {group: float(record["rates"][group]) for group in PARAMETER_GROUPS}
+    config, _ = parse_config(record["settings"], path)
+    photograph = arrays["photograph"]
+    height, width, channels = photograph.shape
+    lens, pose = record["camera"], (arrays["rotation"].reshape(3, 3), arrays["translation"].reshape(3))
+    fx, fy, cx, cy, near = (float(lens[name]) for name in _INTRINSICS)
+    k1, k2, k3, k4 = map(float, lens["radial"])
+    more = {"projection": lens["projection"], "radial": (k1, k2, k3, k4), "by_rays": bool(lens["by_rays"])}
+    camera = Camera(width, height, fx, fy, cx, cy, *pose, near, **more)
+    if photograph.dtype not in (np.uint8, np.float32) or channels not in (3, 4, 5):
+        raise ValueError(f"a photograph {photograph.shape} of {photograph.dtype}")
+    camera.check()
+    aims = None
+    if "depth" in arrays:
+        planes = arrays["depth"].astype(np.float32).reshape(2, *padded_size(width, height))
+        aims = DepthTerm(planes, float(record["depth_factor"]))
+    background = arrays["background"].astype(np.float32).reshape(3)
+    inputs = ViewInputs(0, photograph, camera, background, kept=kept_pixels(photograph), depth=aims)
+    return Bundle(record, config, inputs, {kind: host_model(arrays, kind) for kind in _MODEL_KINDS})
+
+
+class _Counts(StepProbe):
+    """Counts of non-finite numbers after each stage of a step."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.seen = (slice(None), slice(camera.height), slice(camera.width))
+        self.counts: dict[str, int] = {}
+
+    def forward(self, frame: ForwardPass) -> None:
+        """Count in the drawn splats, and in the image."""
+        drawn = frame.projected.tile_counts.get() > 0
+        written = [column for column, name in enumerate(SPLAT) if name != "UNUSED"]
+        self.counts["project"] = _wrong(frame.projected.splats.get()[drawn][:, written])
+        self.counts["blend"] = _wrong(frame.blended.image.get()[self.seen])
+
+    def loss(self, result: Loss) -> None:
+        """Count in the loss's gradient."""
+        self.counts["loss"] = _wrong(result.gradient.get()[self.seen])
+
+    def pair_gradients(self, slots: Slots) -> None:
+        """Count in the gradients of pairs."""
+        self.counts["blend_grad"] = _wrong(slots.values.get())
+
+    def before_rows(self, rows: StepRows) -> None:
+        """Count in the gradients of Gaussians."""
+        assert rows.gradients is not None, "replay asks for them"
+        self.counts["project_grad"] = _wrong_in(rows.gradients)
+
+
+def replay(bundle: Bundle, device: Device) -> dict[str, int]:
+    """Repeat the step. Returns the number of non-finite values after each stage, and of the steps that `adam`
+    refuses."""
+    config, record = bundle.config, bundle.record
+    rasterizer, probe = Rasterizer(device, config.rasterizer), _Counts(bundle.inputs.camera)
+    rasterizer.antialias(on=config.antialiased)
+    parameters, first, second = (to_device(device, bundle.models[kind]) for kind in _MODEL_KINDS)
+    gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
+    probe.counts["parameters"] = _wrong_in(parameters)
+    fields = slot_fields(strategy_of(config).needs(record["step"]), nearness=bundle.inputs.depth is not None)
+    step = GradientStep(device, rasterizer, config, record["step"], record["rates"], fields)
+    step.run((parameters, first, second), bundle.inputs, probe, gradients)
+    return {**probe.counts, "adam": int(rasterizer.readback.get()[-len(REFUSED) :].sum())}
+
+
+def first_trouble(counts: dict[str, int]) -> str | None:
+    """First stage followed by a non-finite value."""
+    return next((stage for stage, count in counts.items() if count), None)
+
+
+def _wrong(values: NDArray[Any]) -> int:
+    return int(np.count_nonzero(~np.isfinite(values)))
+
+
+def _wrong_in(gaussians: DeviceGaussians) -> int:
+    return sum(_wrong(gaussians[group].get()) for group in PARAMETER_GROUPS)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line of the module's docstring."""
+    parser = argparse.ArgumentParser(
+        prog="python -m clsplat.training.repro_bundle", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("bundle", type=Path)
+    parser.add_argument("--device")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    try:
+        bundle = read_bundle(options.bundle)
+        counts = replay(bundle, open_device(options.device))
+    except ClsplatError as error:
+        print(f"clsplat.training.repro_bundle: error: {error}", file=sys.stderr)
+        return error.exit_status
+    stage = first_trouble(counts)
+    if options.json:
+        print(json.dumps({"counts": counts, "stage": stage, **bundle.record}, indent=2))
+        return 0 if stage else 1
+    print(bundle.record["message"])
+    (kept, count), camera = bundle.record["of"], bundle.inputs.camera
+    print(f"{kept:,} of {count:,} Gaussians, {camera.width}x{camera.height}; not finite after")
+    for name, count in counts.items():
+        print(f"  {name:13}{count:>12,}")
+    print(f"first in {stage}" if stage else "all is well on this device")
+    return 0 if stage else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

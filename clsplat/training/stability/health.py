@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Policy for non-finite numbers in Gaussians, steps and runs. No OpenCL.
+
+docs/decisions/0016-never-a-nan.md gives the reasons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.gaussians import PARAMETER_GROUPS
+
+MAX_TROUBLED_STEPS = 5
+"""Troubled steps among the last TROUBLE_WINDOW_STEPS at which training goes back to a checkpoint."""
+TROUBLE_WINDOW_STEPS = 100
+MAX_CHECKPOINT_RETURNS = 3
+"""Maximum number of returns to a checkpoint. The next trouble ends the run."""
+RETURN_RATE_FACTOR = 0.5
+"""Factor on the learning rates at each return, for the rest of the run."""
+MAX_BROKEN_FRACTION = 0.5
+"""Fraction of broken Gaussians above which a model is not repaired: training goes back at once."""
+MAX_INCIDENT_GAUSSIANS = 1000
+"""Maximum number of an incident's Gaussians that are copied."""
+
+Model = Mapping[str, NDArray[np.float32]]
+"""Arrays by parameter group; the first axis is the Gaussians."""
+
+
+def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Gaussians with a broken parameter (n,), and Gaussians with a non-finite moment (n,).
+
+    A parameter is broken if it is not finite or over its limit. A non-finite moment is also `adam`'s mark for a refused
+    step.
+    """
+    count = len(parameters["means"])
+    broken, refused = np.zeros(count, bool), np.zeros(count, bool)
+    for group, values in parameters.items():
+        broken |= ~(np.abs(values) < PARAMETER_GROUPS[group].limit).reshape(count, -1).all(axis=1)
+    for moments in (first, second):
+        for values in moments.values():
+            refused |= ~np.isfinite(values).reshape(count, -1).all(axis=1)
+    return broken, refused
+
+
+def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Gaussians to remove. A Gaussian without a gradient is not at fault for a non-finite loss."""
+    return broken if stage == "loss" else broken | refused
+
+
+def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Copy with zeros in place of non-finite values; moments start at zero too."""
+    return np.where(np.isfinite(values), values, np.float32(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Incident:
+    """Non-finite numbers, and the response.
+
+    step, view: where they arose.
+    stage: the first that showed them: "loss", "project_grad", "parameters" or "adam".
+    count: number of Gaussians concerned, or of array elements if no Gaussian is.
+    done: the response in words.
+    gaussians: up to MAX_INCIDENT_GAUSSIANS of the Gaussians concerned, by "parameters/means" and so on.
+    """
+
+    step: int
+    view: int
+    name: str
+    stage: str
+    count: int
+    done: str
+    background: NDArray[np.float32]
+    gaussians: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        concerned = len(self.gaussians.get("parameters/means", ()))
+        whose = f"{self.count:,} {'Gaussian' if concerned else 'element'}{'' if self.count == 1 else 's'}"
+        what = {
+            "loss": "the loss is not finite",
+            "project_grad": f"gradients of {whose} are not finite",
+            "parameters": f"parameters of {whose} are not finite, or far too large",
+            "adam": f"steps or moments of {whose} are not finite",
+        }[self.stage]
+        return f"step {self.step}, view {self.name}, stage {self.stage}: {what}; {self.done}"
+
+
+@dataclass
+class RetryBudget:
+    """Count of recent trouble, and the effects of earlier trouble; saved in checkpoints."""
+
+    troubled: list[int] = field(default_factory=list)
+    rate_factor: float = 1.0
+    returns: int = 0
+    lost: bool = False
+
+    def note(self, step: int, *, lost: bool = False) -> None:
+        """Record trouble in a step.
+
+        lost: too much of the model is broken to continue with it.
+        """
+        self.troubled = [*(earlier for earlier in self.troubled if step - TROUBLE_WINDOW_STEPS < earlier < step), step]
+        self.lost = self.lost or lost
+
+    @property
+    def over(self) -> bool:
+        """True if it is time to go back."""
+        return self.lost or len(self.troubled) >= MAX_TROUBLED_STEPS
+
+    @property
+    def spent(self) -> bool:
+        """True if there is no return left."""
+        return self.returns >= MAX_CHECKPOINT_RETURNS
+
+    def after_return(self) -> RetryBudget:
+        """State after the return to a checkpoint."""
+        return RetryBudget(rate_factor=RETURN_RATE_FACTOR * self.rate_factor, returns=self.returns + 1)

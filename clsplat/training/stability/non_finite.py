@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Watch over a training: notices that `adam` has refused steps, finds the stage at fault, and returns a remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import REFUSED
+from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.training.stability import health
+from clsplat.training.stability.health import Incident, RetryBudget
+
+
+@dataclass(frozen=True, eq=False)
+class LastStep:
+    """A step to inspect if it turns out to have had trouble.
+
+    sums: returns the sums of its loss, until the next step has a loss.
+    others: its further views.
+    """
+
+    step: int
+    view: int
+    background: NDArray[np.float32]
+    sums: Callable[[], NDArray[np.float32]]
+    others: tuple[LastStep, ...] = ()
+
+    def with_bad_loss(self) -> LastStep | None:
+        """The first of its views whose loss is not finite."""
+        return next((one for one in (self, *self.others) if not np.isfinite(one.sums()).all()), None)
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """Repair of a model.
+
+    rows: rows to keep, or None for all.
+    moments: new values of all rows that change, by "first" and "second" and by group.
+    """
+
+    rows: NDArray[np.uint32] | None
+    moments: Mapping[str, Mapping[str, NDArray[np.float32]]]
+
+
+class NonFiniteMonitor:
+    """State of the watch.
+
+    readback: the values that a pass reads back; the last four are `adam`'s counts (`Rasterizer.readback`).
+    names: names of the views.
+    last: the step under way, once it has its loss.
+    incidents: incidents not reported yet.
+    patience: the count of trouble.
+    """
+
+    def __init__(self, readback: DeviceArray, names: Sequence[str]) -> None:
+        self.readback, self.names = readback, names
+        self.patience = RetryBudget()
+        self.incidents: list[Incident] = []
+        self.latest: Incident | None = None
+        self.last: LastStep | None = None
+        self._noticed: tuple[LastStep, str, int] | None = None
+
+    def forget(self) -> None:
+        """Forget the last step and its trouble, as the model is a new one."""
+        self.last = self._noticed = None
+        self.readback.fill(0)
+
+    def begin(self, view: LastStep) -> None:
+        """Remember a view of the step under way, after its loss."""
+        last = self.last
+        same = last is not None and last.step == view.step
+        self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
+
+    def notice(self, refused: Sequence[int]) -> None:
+        """Take `adam`'s counts (`REFUSED`) of the last step, whose loss must still be available."""
+        if not any(refused) or self._noticed is not None or self.last is None:
+            return
+        counts = dict(zip(REFUSED, refused, strict=True))
+        stage = "parameters" if counts["parameters"] else ("project_grad" if counts["gradients"] else "adam")
+        culprit = self.last.with_bad_loss()
+        self._noticed = (culprit or self.last, "loss" if culprit else stage, sum(refused))
+
+    def look(self) -> None:
+        """Read the counts now instead of waiting for the next pass."""
+        self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
+
+    def loss_failed(self) -> None:
+        """Record a non-finite loss. If no Gaussian is broken, `adam` has nothing to refuse."""
+        if self.last is not None and self._noticed is None:
+            self._noticed = (self.last.with_bad_loss() or self.last, "loss", 0)
+
+    def examine(self, models: Mapping[str, AnyGaussians]) -> Repair | None:
+        """Remedy for the noticed trouble, or None without trouble.
+
+        models: parameters, first and second moments.
+        """
+        if self._noticed is None:
+            return None
+        (last, stage, elements), self._noticed = self._noticed, None
+        self.readback.fill(0)
+        return self._judge(
+            last, stage, elements, {k: {g: m[g].get() for g in PARAMETER_GROUPS} for k, m in models.items()}
+        )
+
+    def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Repair | None:
+        """Remedy, or None, after a check of every number, including numbers that `adam` has not visited.
+
+        arrays: by "parameters/means" and so on.
+        """
+        host = {
+            kind: {g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS} for kind in ("parameters", "first", "second")
+        }
+        if self.last is None or self.patience.lost or not np.any(health.examine(**host)):
+            return None
+        return self._judge(self.last, "parameters", 0, host)
+
+    def _judge(
+        self, last: LastStep, stage: str, elements: int, host: Mapping[str, Mapping[str, NDArray[np.float32]]]
+    ) -> Repair | None:
+        broken, refused = health.examine(**host)
+        lost = health.lost(stage, broken, refused)
+        concerned = np.flatnonzero(broken | refused)
+        hopeless = bool(np.mean(lost) > health.MAX_BROKEN_FRACTION)
+        self.latest = Incident(
+            step=last.step,
+            view=last.view,
+            name=self.names[last.view],
+            stage=stage,
+            count=len(concerned) or elements,
+            done=_done(stage, int(lost.sum()), len(lost), hopeless=hopeless),
+            background=last.background,
+            gaussians={
+                f"{k}/{g}": host[k][g][concerned[: health.MAX_INCIDENT_GAUSSIANS]]
+                for k in host
+                for g in PARAMETER_GROUPS
+            },
+        )
+        self.incidents.append(self.latest)
+        self.patience.note(last.step, lost=hopeless)
+        if hopeless:
+            return None
+        moments = {k: {g: health.finite_or_zero(v) for g, v in host[k].items()} for k in ("first", "second")}
+        rows = np.flatnonzero(~lost).astype(np.uint32)
+        return Repair(rows if lost.any() else None, moments if refused.any() else {})
+
+
+def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:
+    if hopeless:
+        return f"{lost:,} of {count:,} are too many to remove"
+    if lost:
+        return f"{lost:,} removed"
+    return "nothing is learnt where it shows" if stage == "loss" else "moments begin again from zero"

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Components of a training in addition to the Gaussians: appearance, refined cameras, mip filter, known depths.
+
+`Trainer` loops over a list of components. A new one is a subclass of `Component`, and a line in `Trainer._start`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clsplat.runs.run import Run
+from clsplat.stages.device_gaussians import AnyGaussians
+from clsplat.training.step.inputs import ViewInputs
+
+Named = Callable[[str], Mapping[str, NDArray[Any]]]
+"""Arrays of a checkpoint whose names have a prefix, by name without the prefix."""
+
+
+class Component:
+    """Part of a training with state of its own. By default no method does anything."""
+
+    @property
+    def models(self) -> int:
+        """Arrays on the device for each parameter; 0 if a step of one view needs no more than usual."""
+        return 0
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes per Gaussian on the device."""
+        return 0
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes per pixel on the device."""
+        return 0
+
+    def is_due(self, step: int, views: int) -> bool:  # noqa: ARG002
+        """True if `before_step` has work before the `views` steps that end with this one."""
+        return False
+
+    def before_step(self, gaussians: AnyGaussians) -> None:
+        """Do the work that is due. Repeating it has no further effect."""
+
+    def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
+        """Views of a step, with the component's share.
+
+        step: number of the last view.
+        count: number of Gaussians.
+        """
+        return inputs
+
+    def after_adam(self, gaussians: AnyGaussians) -> None:
+        """Change the parameters after Adam's step."""
+
+    def rows_moved(self) -> None:
+        """Forget data of individual rows, as the rows have changed."""
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, by name."""
+        return {}
+
+    def load(self, named: Named, count: int) -> None:
+        """Load the arrays of a checkpoint of `count` Gaussians. Raises ValueError for arrays of other views."""
+
+    def write(self, run: Run) -> None:
+        """Write the files of a finished training."""

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gradient of one view and Adam's step along it: the work of a training step, which `repro_bundle` repeats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import TypeVar
+from weakref import ref
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.gaussians import group_shapes
+from clsplat.layouts.columns import SlotFields
+from clsplat.optimisation.dropout import thinning_of
+from clsplat.optimisation.step_noise import Exploration
+from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
+from clsplat.stages.adam import adam, updates_sh_rest
+from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
+from clsplat.stages.loss import Loss, loss
+from clsplat.stages.noise import noise
+from clsplat.stages.project import Slots, project_grad, project_step, step_numbers
+from clsplat.stages.target import target
+from clsplat.training.density import StatisticsNeeds
+from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
+from clsplat.training.step.loss_terms import loss_terms
+
+R = TypeVar("R")
+
+
+class StepProbe:
+    """Observer of a step. Each method is called after its stage is launched. By default none does anything."""
+
+    def forward(self, frame: ForwardPass) -> None:
+        """The view is rendered."""
+
+    def loss(self, result: Loss) -> None:
+        """The render is compared with the photograph."""
+
+    def pair_gradients(self, slots: Slots) -> None:
+        """The gradient of blending is computed."""
+
+    def before_rows(self, rows: StepRows) -> None:
+        """Adam is about to change these rows."""
+
+    def after_rows(self, rows: ViewRows) -> None:
+        """Adam has changed these rows."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientStep:
+    """Forward, loss, backward and Adam of one view, on a device and in a rasterizer's memory.
+
+    fields: the slot fields that the step fills.
+    turn: see `loss`.
+    room: see `Rasterizer.forward`.
+    explore: noise and penalties of the step.
+    """
+
+    device: Device
+    rasterizer: Rasterizer
+    config: TrainConfig
+    step: int
+    rates: Mapping[str, float]
+    fields: SlotFields
+    _: KW_ONLY
+    turn: int = 0
+    room: PairCapacity | None = None
+    explore: Exploration | None = None
+
+    def run(
+        self,
+        model: tuple[AnyGaussians, ...],
+        inputs: ViewInputs,
+        probe: StepProbe,
+        gradients: DeviceGaussians | None = None,
+        *,
+        reads_loss: bool = False,
+    ) -> Loss:
+        """Update the model (parameters, first and second moments) by a view.
+
+        gradients: room for the gradients of the rows on the device at once, for a probe or a share that reads them.
+        They are zero before and after. The model has the same bits without them.
+        reads_loss: the loss will be read.
+        """
+        rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
+        frame = rasterizer.forward(
+            model[0],
+            camera,
+            inputs.background,
+            room=self.room,
+            thinning=thinning_of(self.config, self.step),
+            nearness=self.fields.nearness,
+        )
+        probe.forward(frame)
+        result = self._compare(model[0], inputs, frame)
+        if reads_loss:
+            result = result.fetched()
+        probe.loss(result)
+        size = (camera.width, camera.height)
+        own = [part.gradient(work, frame.blended.image, result.gradient, *size) for part in inputs.parts]
+        slots = self.replayed(
+            model[0],
+            (frame.part, frame.background, result.gradient, self.fields),
+            lambda: rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
+        )
+        probe.pair_gradients(slots)
+        for start, stop, part in parts(work, *model, keep=True):
+            self._change(self._rows(start, stop, part, inputs, frame, slots, gradients), inputs, probe)
+        self.learn(inputs, own)
+        return result
+
+    def _compare(self, of: AnyGaussians, inputs: ViewInputs, frame: ForwardPass) -> Loss:
+        """Loss of a frame."""
+        work, photograph, size = self.rasterizer.work, inputs.photograph, (inputs.camera.width, inputs.camera.height)
+        terms = loss_terms(self.config, inputs)
+        alpha = any(term.wants_alpha for term in terms)
+        planes = target(self.device, work, photograph, frame.background, frame.blended, alpha=alpha)
+        image = frame.blended.image
+        for part in inputs.parts:
+            image = part.compare(work, image, planes, *size)
+
+        def compared() -> Loss:
+            return loss(
+                self.device,
+                work,
+                image,
+                planes,
+                *size,
+                self.config.dssim_weight,
+                self.turn,
+                kept=inputs.kept,
+                blended=frame.blended,
+                terms=terms,
+            )
+
+        keys = tuple(term.key for term in terms)
+        if None in keys:
+            return compared()
+        return self.replayed(of, (frame.part, image.buffer, inputs.kept, keys, self.turn), compared)
+
+    def _rows(
+        self,
+        start: int,
+        stop: int,
+        model: tuple[DeviceGaussians, ...],
+        inputs: ViewInputs,
+        frame: ForwardPass,
+        slots: Slots,
+        gradients: DeviceGaussians | None,
+    ) -> StepRows:
+        """Rows of a part of the model, with room for their gradients."""
+        by_lens = (part.lens_gradients(stop - start) for part in inputs.parts)
+        return StepRows(
+            start,
+            stop,
+            frame.projected.rows(start, stop),
+            self.rasterizer.screen(stop - start, self.fields),
+            model,
+            self.rasterizer.device_of(inputs.camera),
+            frame.camera_array,
+            slots.rows(start, stop),
+            gradients,
+            next((room for room in by_lens if room is not None), None),
+        )
+
+    def _change(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
+        """Take Adam's step of some rows."""
+        if rows.gradients is not None:
+            project_grad(
+                rows.device,
+                rows.parameters,
+                rows.camera_array,
+                rows.projected,
+                rows.slots,
+                rows.gradients,
+                rows.screen,
+                fields=self.fields,
+                sh_rest=updates_sh_rest(self.config.optimiser, self.step),
+                explore=self.explore,
+                by_lens=rows.by_lens,
+            )
+            for part in inputs.parts:
+                part.add_rows(rows)
+        probe.before_rows(rows)
+        self.update(rows)
+        probe.after_rows(rows)
+
+    def replayed(
+        self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
+    ) -> R:
+        """`Workspace.replayed` if the step is by capacity.
+
+        A step with exact counts has new arrays each time, so its tape would never be reused.
+        """
+        if self.room is None:
+            return make()
+        return self.rasterizer.work.replayed(of, key, make, numbers)
+
+    def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
+        """Take Adam's step of the view's shares, along their own gradients."""
+        for part, gradient in zip(inputs.parts, own, strict=True):
+            part.update(gradient, self.rasterizer.readback)
+
+    def update(self, rows: StepRows) -> None:
+        """Take Adam's step of some rows, with the gradient of projection if it is not computed yet."""
+        optimiser, readback = self.config.optimiser, self.rasterizer.readback
+        if rows.gradients is not None:
+            parameters, first, second = rows.model
+            models = (parameters, rows.gradients, first, second)
+            adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
+        else:
+            view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
+            arguments = (rows.device, self.step, self.rates, optimiser, rows.model, *view)
+            fields, explore = self.fields, self.explore
+            arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
+            key = (*map(ref, rows.model), rows.projected, *arrays, updates_sh_rest(optimiser, self.step))
+            penalised = explore is not None and explore.penalised
+            self.replayed(
+                rows.parameters,
+                (*key, rows.device, rows.camera_array, fields, penalised),
+                lambda: project_step(*arguments, fields=fields, explore=explore),
+                step_numbers(optimiser, self.step, self.rates, explore),
+            )
+        if self.explore is not None:
+            noise(self.device, self.explore, rows.parameters, rows.start, readback)
+
+
+def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
+    """Room for a view's gradients of the rows that are on the device at once.
+
+    zero: fill it with zeros, as `GradientStep.run` requires.
+    """
+    rows = min(parameters.rows, parameters.count) if isinstance(parameters, HostGaussians) else parameters.count
+    shapes = group_shapes(rows, parameters.coefficients)
+    arrays = {group: work.array(f"view_{group}", shape) for group, shape in shapes.items()}
+    for array in arrays.values() if zero else ():
+        array.fill(0.0)
+    return DeviceGaussians(rows, parameters.coefficients, arrays)
+
+
+def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:
+    """Slot fields that these statistics need.
+
+    nearness: depths are compared.
+    """
+    return SlotFields(needs.absolute, needs.contributions, nearness)

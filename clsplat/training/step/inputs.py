@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs of a view in a training step, its parts, and the rows of the model that it changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.camera import Camera
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.stages.device_gaussians import DeviceGaussians
+from clsplat.stages.loss_terms import DepthTerm
+from clsplat.stages.project import Projected, Screen, Slots
+
+
+@dataclass(frozen=True, eq=False)
+class ViewInputs:
+    """A view of a step.
+
+    view: its index among the training views.
+    photograph: (H, W, 3 to 5): colours, then alpha and mask.
+    camera: of the photograph's size.
+    begins: True if an epoch begins with it.
+    kept: number of pixels that its mask keeps, None without a mask.
+    depth: known depths, if they are compared.
+    area: full-resolution pixels per pixel.
+    place: its number in the step.
+    parts: components' shares in it.
+    """
+
+    view: int
+    photograph: NDArray[Any] | DeviceArray
+    camera: Camera
+    background: NDArray[np.float32]
+    begins: bool = False
+    kept: int | None = None
+    depth: DepthTerm | None = None
+    area: float = 1.0
+    place: int = 0
+    parts: tuple[ViewPart, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ViewRows:
+    """Rows [start, stop) of the model, on the device at once; all of them if the model fits.
+
+    projected: projection of these rows in the step's view.
+    screen: their screen-space gradients, valid after the rows have changed.
+    """
+
+    start: int
+    stop: int
+    projected: Projected
+    screen: Screen
+
+
+@dataclass(frozen=True, eq=False)
+class StepRows(ViewRows):
+    """Rows with everything that a step has for them.
+
+    model: their parameters, and their moments or whatever else the step changes.
+    device: with the switches of the view's projection.
+    camera_array, slots: the step's camera, and the gradients of the rows' pairs.
+    gradients: gradients of the rows, if requested.
+    by_lens: (rows, 4), gradients with respect to the view's lens.
+    """
+
+    model: tuple[DeviceGaussians, ...]
+    device: Device
+    camera_array: DeviceArray
+    slots: Slots
+    gradients: DeviceGaussians | None
+    by_lens: DeviceArray | None = None
+
+    @property
+    def parameters(self) -> DeviceGaussians:
+        """Parameters of the rows."""
+        return self.model[0]
+
+    @property
+    def first(self) -> DeviceGaussians:
+        """Adam's first moments."""
+        return self.model[1]
+
+
+class ViewPart:
+    """A component's share (`training.component`) in one view of a step. By default no method does anything."""
+
+    wants_gradients = False
+    """True if `add_rows` reads the rows' gradients."""
+
+    def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
+        """The same share on another device, made from `values`, to compare and to compute its gradient there."""
+        return self
+
+    def values(self) -> NDArray[np.float32]:
+        """Values that `on` takes."""
+        return np.zeros(0, np.float32)
+
+    def compare(
+        self,
+        work: Workspace,  # noqa: ARG002
+        image: DeviceArray,
+        target: DeviceArray,  # noqa: ARG002
+        width: int,  # noqa: ARG002
+        height: int,  # noqa: ARG002
+    ) -> DeviceArray:
+        """Give the image the photograph's colours, or give the photograph in `target` the image's colours, in place.
+
+        Returns the image to compare.
+        """
+        return image
+
+    def gradient(
+        self,
+        work: Workspace,  # noqa: ARG002
+        image: DeviceArray,  # noqa: ARG002
+        gradient: DeviceArray,  # noqa: ARG002
+        width: int,  # noqa: ARG002
+        height: int,  # noqa: ARG002
+    ) -> DeviceArray | None:
+        """Turn dL/d(compared image) into dL/d(image), in place. Returns the share's own gradient."""
+        return None
+
+    def lens_gradients(self, rows: int) -> DeviceArray | None:  # noqa: ARG002
+        """Room (rows, 4) for the rows' gradients with respect to the lens, if they are needed."""
+        return None
+
+    def add_rows(self, rows: StepRows) -> None:
+        """Sum the gradients of these rows, before the rows change."""
+
+    def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
+        """Take Adam's step along the share's own gradient. It changes nothing if a step by capacity has stopped."""

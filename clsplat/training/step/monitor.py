@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trainer's probe of a training step: non-finite values, rehearsal of kernels, statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from clsplat.device.launch import only_tried
+from clsplat.rendering.rasterizer import ForwardPass
+from clsplat.stages.adam import updates_sh_rest
+from clsplat.stages.density import DensityStatistics, add_contributions, add_statistics
+from clsplat.stages.loss import Loss
+from clsplat.training.density import StatisticsNeeds
+from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
+from clsplat.training.step.gradient_step import GradientStep, StepProbe
+from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
+from clsplat.training.step.speculative_steps import SpeculativeSteps
+
+
+@dataclass(frozen=True, eq=False)
+class StepMonitor(StepProbe):
+    """Probe that notices non-finite values, rehearses the kernels that change the state, and adds density control's
+    statistics.
+
+    number: views so far, including this one.
+    rehearsed: keys of the steps whose kernels were tried; this step's key is added.
+    changes: called before the model changes.
+    """
+
+    step: GradientStep
+    number: int
+    inputs: ViewInputs
+    needs: StatisticsNeeds
+    statistics: DensityStatistics
+    watch: NonFiniteMonitor
+    pending: SpeculativeSteps
+    rehearsed: set[tuple[object, ...]]
+    changes: Callable[[], None]
+
+    def forward(self, frame: ForwardPass) -> None:
+        """Take the counts of the step before, which this pass has read back."""
+        self.watch.notice(frame.refused)
+        self.pending.seen(frame)
+
+    def loss(self, result: Loss) -> None:
+        """Remember the step, to inspect it if it turns out to have had trouble."""
+        sums = result.copy or result.sums.get
+        self.watch.begin(LastStep(self.number, self.inputs.view, self.inputs.background, sums))
+
+    def before_rows(self, rows: StepRows) -> None:
+        """Rehearse every kernel that changes the state, before the first row changes. A driver may fail in any of
+        them."""
+        step, parameters = self.step, rows.parameters
+        sh_rest = updates_sh_rest(step.config.optimiser, step.step)
+        size = (parameters.count, parameters.coefficients)
+        build = (sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
+        key = (*size, *build, *self.inputs.camera.model.defines.items())
+        if key not in self.rehearsed:
+            with only_tried(step.device), only_tried(step.rasterizer.device), only_tried(rows.device):
+                step.update(rows)
+                self.add_statistics(self.statistics.rows(0, rows.stop - rows.start), rows)
+            self.rehearsed.add(key)
+        self.changes()
+
+    def after_rows(self, rows: ViewRows) -> None:
+        """Add the rows to the statistics."""
+        self.add_statistics(self.statistics.rows(rows.start, rows.stop), rows)
+
+    def add_statistics(self, statistics: DensityStatistics, rows: ViewRows) -> None:
+        """Add the step to the statistics of some rows, as far as density control needs them."""
+        device, camera, screen = self.step.device, self.inputs.camera, rows.screen
+        if self.needs.gradients:
+            size = (camera.width, camera.height, camera.fx)
+            self.step.replayed(
+                statistics,
+                (rows.projected, screen.gradients, *size),
+                lambda: add_statistics(device, statistics, camera, rows.projected, screen),
+            )
+        if screen.contributions is not None and statistics.current_totals is not None:
+            add_contributions(device, statistics, rows.projected, screen.contributions, self.inputs.area)

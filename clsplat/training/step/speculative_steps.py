@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training steps by capacity: launched before their number of pairs is known, and checked one step later.
+
+A step with more pairs than its capacity is repeated (docs/decisions/0025-launch-by-capacity.md).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device
+from clsplat.errors import switched_on
+from clsplat.layouts.columns import READBACK
+from clsplat.rendering.rasterizer import MAX_COUNTED_PASSES, ForwardPass, PairCapacity, Rasterizer
+from clsplat.stages.loss import Loss
+from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
+
+BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
+"""Variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
+
+Run = Callable[[int, PairCapacity | None], Loss]
+"""A function that runs one step, with a turn, and a room or None for the exact number of pairs."""
+
+
+@dataclass(eq=False)
+class _Step:
+    """A step whose counts the host has not read.
+
+    readback, counts: the counts on the device, and a function that waits for their copy.
+    before: the watched step before this one.
+    kept: host memory that the device may still have to read.
+    """
+
+    run: Run
+    turn: int
+    result: Loss
+    readback: DeviceArray
+    counts: Callable[[], NDArray[Any]]
+    before: LastStep | None
+    kept: list[object]
+
+
+def by_capacity(device: Device) -> bool:
+    """True if this device launches steps by capacity where possible. Raises InputError."""
+    return switched_on(BY_CAPACITY_VARIABLE) if os.environ.get(BY_CAPACITY_VARIABLE) else device.kind != "cpu"
+
+
+class SpeculativeSteps:
+    """A training's steps launched by capacity, at most two at a time, and the capacity of the next one.
+
+    begin: called before a step is repeated, which begins by repairing the trouble that `watch` has noticed.
+    redone: number of repeated steps.
+    """
+
+    def __init__(self, device: Device, watch: NonFiniteMonitor, begin: Callable[[], None]) -> None:
+        self.on = by_capacity(device)
+        self._device, self._watch, self._begin = device, watch, begin
+        self._steps: list[_Step] = []
+        self._kept: list[object] = []
+        self._most: int | None = None
+        self._of: tuple[object, int] = (None, 0)
+        self._turn = 0
+        self._frame: ForwardPass | None = None
+        self.redone = 0
+
+    @property
+    def turns(self) -> int:
+        """Number of losses whose sums are kept at a time."""
+        return MAX_COUNTED_PASSES if self.on else 1
+
+    def forget(self) -> None:
+        """Forget all steps, as the model is a new one."""
+        self._steps.clear()
+        self._most = None
+
+    def seen(self, frame: ForwardPass) -> None:
+        """Note a step's frame, as soon as it is launched."""
+        self._frame = frame
+        if frame.part.counted.arriving is None:
+            self._count(frame.part.counted.pairs if len(frame.bands) == 1 else None)
+
+    def _count(self, pairs: int | None) -> None:
+        self._most = None if pairs is None else max(pairs, self._most or 0)
+
+    def room(self, rasterizer: Rasterizer, size: object, gaussians: int) -> int:
+        """Number of pairs to reserve: a quarter more than the most seen at this photograph size.
+
+        Scaled by the growth in Gaussians. 0 if the number is unknown or exceeds the capacity.
+        """
+        if (before := self._of) != (size, gaussians):
+            self._of = size, gaussians
+            grown = max(gaussians / max(before[1], 1), 1.0)
+            self._most = round(self._most * grown) if self._most is not None and size == before[0] else None
+        if self._most is None:
+            return 0
+        wanted = max(self._most + self._most // 4, 1024)
+        step = 1 << (wanted.bit_length() - 4)  # few sizes, so that arrays keep theirs
+        wanted = -(-wanted // step) * step
+        return wanted if wanted <= rasterizer.capacity else 0
+
+    def launch(self, run: Run, room: int, *, reads_loss: bool) -> Loss:
+        """Run a step, by capacity if there is room, and then check the step before.
+
+        reads_loss: check this one too.
+        """
+        if not self.on:
+            return run(0, None)
+        if not room:
+            self.settle()
+        turn = self._turn = (self._turn + 1) % self.turns  # exact steps too, as their loss is read a step later
+        before, result = self._watch.last, run(turn, PairCapacity(room, turn) if room else None)
+        if not room:
+            return result
+        assert self._frame is not None, "each step has a frame"
+        counted, under_way = self._frame.part.counted, self._device.under_way
+        assert counted.arriving is not None, "it was launched by capacity"
+        assert counted.on_device is not None, "it was launched by capacity"
+        step = _Step(run, turn, result, counted.on_device, counted.arriving, before, list(under_way))
+        self._steps.append(step)
+        under_way.clear()
+        self._look(0 if reads_loss else 1)
+        return step.result if reads_loss else result.copied(lambda: self._sums(step))
+
+    def _sums(self, step: _Step) -> NDArray[Any]:
+        """Sums of a step's loss, once the step is known to be complete."""
+        self.settle()
+        copy = step.result.copy
+        return copy() if copy is not None else step.result.sums.get()
+
+    def settle(self) -> None:
+        """Wait until all steps are known to be complete, or repeat them.
+
+        Call it before reading or changing the model, its statistics or the random state that steps use.
+        """
+        self._look(0)
+
+    def _look(self, left: int) -> None:
+        """Check all steps except the last `left`."""
+        while len(self._steps) > left:
+            counts = self._steps[0].counts()
+            if counts[READBACK.index("STOPPED")]:
+                self._again()
+                return
+            self._count(int(counts[READBACK.index("PAIRS")]))
+            self._kept = self._steps.pop(0).kept  # copies launched after the counts may be under way
+
+    def _again(self) -> None:
+        """Repeat the steps that the device has skipped, with exact counts."""
+        steps, self._steps = self._steps, []
+        values = steps[0].readback.get()
+        values[READBACK.index("STOPPED")] = 0
+        steps[0].readback.set(values)
+        self._watch.last = steps[0].before
+        for step in steps:
+            self._begin()
+            step.result = step.run(step.turn, None)
+            self.redone += 1

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Known depths of the training views, which a step compares with the render's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.camera import DEFAULT_NEAR_PLANE, Camera
+from clsplat.config.depth import DEPTH_WEIGHT_END_FRACTION
+from clsplat.config.training import TrainConfig
+from clsplat.scenes.scene import View
+from clsplat.stages.device_camera import padded_size
+from clsplat.stages.loss_terms import DEPTH_PIXEL_BYTES, DepthTerm
+from clsplat.training.step.component import Component
+from clsplat.training.step.inputs import ViewInputs
+
+MAX_TARGET_NEARNESS = 1e6
+"""Exclusive limit of inverse depth times the scene's extent. Nearer depths come from damaged maps."""
+
+
+def weight_at(config: TrainConfig, step: int) -> float:
+    """Weight of the depth loss in step number `step`."""
+    fall: float = DEPTH_WEIGHT_END_FRACTION ** (step / config.iterations)
+    return config.depth_weight * fall
+
+
+class DepthTargets(Component):
+    """Known depths of all training views at one resolution; inactive unless the settings ask for depths.
+
+    pixels: returns a view's photograph (H, W, 3 to 5) at the step's size, on the host.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        views: list[View],
+        extent: float,
+        near: float = DEFAULT_NEAR_PLANE,
+        pixels: Callable[[int], NDArray[Any]] | None = None,
+    ) -> None:
+        self._config, self._views, self._extent, self._near, self._pixels = config, views, extent, near, pixels
+        self._held: dict[int, tuple[tuple[int, int], tuple[NDArray[np.int64], Float32, Float32]]] = {}
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes per pixel on the device."""
+        return DEPTH_PIXEL_BYTES if self._config.depth_use else 0
+
+    def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
+        """Views with their depths."""
+        if not self._config.depth_use or self._pixels is None:
+            return inputs
+        aims = [self.aims(each.view, each.camera, step, self._pixels(each.view)) for each in inputs]
+        return [replace(each, depth=depth) for each, depth in zip(inputs, aims, strict=True)]
+
+    def aims(self, view: int, camera: Camera, step: int, photograph: NDArray[Any] | None = None) -> DepthTerm | None:
+        """Depths to compare with a view's render, of the size of the step's camera; None without depths.
+
+        photograph: the view's, (H, W, 3 to 5). The fifth channel is a mask, under which no depth counts.
+        """
+        if not self._config.depth_use:
+            return None
+        width, height = camera.width, camera.height
+        pixels, nearness, weights = self._known(view, width, height, photograph)
+        rows, stride = padded_size(width, height)
+        planes = np.zeros((2, rows, stride), np.float32)
+        at = pixels // width, pixels % width
+        of_distances = camera.depths_of_distances()
+        planes[0][at] = nearness if of_distances is None else nearness * of_distances[at]
+        planes[1][at] = weights
+        total = float(weights.sum(dtype=np.float64))
+        factor = weight_at(self._config, step) * self._extent / total if total > 0 else 0.0
+        return DepthTerm(planes, factor)
+
+    def _known(
+        self, view: int, width: int, height: int, photograph: NDArray[Any] | None
+    ) -> tuple[NDArray[np.int64], Float32, Float32]:
+        size, held = (width, height), self._held.get(view)
+        if held is None or held[0] != size:
+            of, nothing = self._views[view], np.empty(0, np.float32)
+            found = None if of.depth is None else of.depth.at(of.camera.resized(*size).before(self._near), of.lens)
+            pixels, nearness, weights = found or (np.empty(0, np.int64), nothing, nothing)
+            counts = nearness * self._extent < MAX_TARGET_NEARNESS
+            if photograph is not None and photograph.shape[2] == 5:
+                counts &= photograph[:, :, 4].ravel()[pixels] > 0
+            held = self._held[view] = size, (pixels[counts], nearness[counts], weights[counts])
+        return held[1]

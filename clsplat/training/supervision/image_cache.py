@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels of the training views, on the host and on the device."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.device.buffers import DeviceArray, allocate, shared
+from clsplat.device.context import Device
+from clsplat.device.upload_ring import UPLOAD_RING_SLOTS, UploadRing
+from clsplat.errors import CapacityError
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import View
+
+
+def kept_pixels(image: NDArray[Any]) -> int | None:
+    """Number of pixels that a photograph's mask, its fifth channel, keeps; None without a mask."""
+    return int(np.count_nonzero(image[:, :, 4])) if image.shape[2] == 5 else None
+
+
+class ImageCache:
+    """Pixels of the training views at one resolution, decoded once each; uint8 if it represents them exactly.
+
+    allowed: maximum number of bytes on the device.
+    """
+
+    def __init__(self, views: list[View], device: Device) -> None:
+        self._views, self._device = views, device
+        self._factor = 0.0
+        self._held: dict[tuple[int, float], NDArray[Any]] = {}
+        self._on_device: dict[int, DeviceArray] = {}
+        self._kept: dict[tuple[int, float], int | None] = {}
+        self._taken = self.allowed = 0
+        self._uploads: UploadRing | None = None
+
+    def for_device(self, device: Device) -> ImageCache:
+        """The same photographs for another device, sharing the host's pixels."""
+        other = ImageCache(self._views, device)
+        other._held = self._held
+        return other
+
+    def follow(self, allowed: int) -> None:
+        """Set the maximum number of bytes on the device."""
+        self.allowed = allowed
+        if self._taken > allowed:
+            self._leave_device()
+
+    def load(self, index: int, factor: float) -> NDArray[Any]:
+        """View `index` at 1/factor of its size; do not write to it.
+
+        (H, W, 3 or 4), straight alpha, or 5 channels with its mask, 0 where a pixel does not count.
+        """
+        if factor != self._factor:
+            self._factor = factor
+            for key in [key for key in self._held if key[1] != factor]:
+                del self._held[key]
+            self._leave_device()
+        if (index, factor) not in self._held:
+            camera = self._views[index].camera
+            image: NDArray[np.float32] = self._views[index].load_masked(
+                max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
+            )
+            levels = np.rint(image * 255)
+            exact = (
+                np.array_equal(levels * np.float32(1 / 255), image)  # as in target.cl
+                and 0 <= levels.min() <= levels.max() <= 255
+            )
+            self._held[index, factor] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
+        return self._held[index, factor]
+
+    def kept(self, index: int, factor: float) -> int | None:
+        """Number of pixels of this image that count; None without a mask."""
+        if (index, factor) not in self._kept:
+            self._kept[index, factor] = kept_pixels(self.load(index, factor))
+        return self._kept[index, factor]
+
+    def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
+        """This image, on the device if there is room for it.
+
+        It is uploaded once and stays, or it has been sent `ahead`. A device that shares the host's memory reads it
+        there.
+        """
+        image = self.load(index, factor)
+        if index not in self._on_device:
+            if self._device.shares_memory:
+                self._on_device[index] = shared(self._device, image)
+            elif self._uploads is not None and (sent := self._uploads.take((index, factor))) is not None:
+                return sent
+            elif self._taken + image.nbytes <= self.allowed:
+                try:
+                    array = allocate(self._device, image.shape, image.dtype)
+                except CapacityError:  # another program may have taken memory that the plan counted on
+                    self.allowed = self._taken
+                    return image
+                array.send(image)
+                self._on_device[index] = array
+                self._taken += image.nbytes
+        return self._on_device.get(index, image)
+
+    def ahead(self, index: int, factor: float) -> None:
+        """Send this image to the device while it is busy, for the next `bring` of it, if there is no room to keep it.
+
+        Call it after launching a step.
+        """
+        if self._device.shares_memory or index in self._on_device:
+            return
+        image = self.load(index, factor)
+        if self._taken + image.nbytes <= self.allowed:
+            return
+        if self._uploads is None and UPLOAD_RING_SLOTS * image.nbytes <= self.allowed:
+            while self._taken + UPLOAD_RING_SLOTS * image.nbytes > self.allowed:  # evict the latest uploads
+                self._taken -= self._on_device.popitem()[1].nbytes
+            try:
+                self._uploads = UploadRing(self._device, image.nbytes)
+            except CapacityError:
+                self.allowed = self._taken
+                return
+            self._taken += self._uploads.taken
+        if self._uploads is not None:
+            self._uploads.begin((index, factor), image)
+
+    def _leave_device(self) -> None:
+        self._on_device.clear()
+        self._uploads, self._taken = None, 0

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Size of the pictures in each training step: small at first, as there is no fine detail to fit yet. Policy only: no
+device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of the pictures by step.
+
+    until: (last step, factor) with rising steps and falling factors. After the last one the size is full.
+    """
+
+    until: tuple[tuple[int, float], ...]
+
+    def factor(self, step: int) -> float:
+        """Divisor of the photographs' width and height at `step`, from 1."""
+        return next((factor for last, factor in self.until if step <= last), 1.0)
+
+
+def by_doubling(warmup: tuple[int, ...]) -> Sizes:
+    """Sizes that double after each of these steps (Kerbl et al. 2023, section 7.1)."""
+    return Sizes(tuple((last, float(2 ** (len(warmup) - index))) for index, last in enumerate(warmup)))

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Gaussians in training: parameters, Adam's moments and density statistics, and the plans that move their rows."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.device.buffers import DeviceArray, Workspace
+from clsplat.device.context import Device
+from clsplat.device.launch import only_tried
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.rendering.memory_plan import Plan
+from clsplat.stages.density import (
+    DensityStatistics,
+    DeviceMarker,
+    DeviceRowList,
+    carry,
+    gather,
+    list_rows,
+    new_statistics,
+    try_gather,
+    widen,
+)
+from clsplat.stages.device_gaussians import (
+    AnyGaussians,
+    HostGaussians,
+    allocate_gaussians,
+    host_gaussians,
+    host_zeros,
+    to_device,
+    to_host,
+    upload_gaussians,
+)
+from clsplat.training.density import RowPlan
+
+
+class TrainedModel:
+    """Parameters, first and second moments and statistics, on the device or streamed from the host.
+
+    make_plan: plans the device's memory for a number of Gaussians.
+    counts_contributions: True if the statistics have contributions.
+    """
+
+    parameters: AnyGaussians
+    first: AnyGaussians
+    second: AnyGaussians
+    statistics: DensityStatistics
+    plan: Plan
+
+    def __init__(
+        self, device: Device, work: Workspace, make_plan: Callable[[int], Plan], *, counts_contributions: bool
+    ) -> None:
+        self._device, self._work, self._make_plan = device, work, make_plan
+        self._counts_contributions = counts_contributions
+
+    def begin(self, initial: Gaussians) -> None:
+        """Start from a model on the host."""
+        self.plan = self._make_plan(len(initial))
+        if self.plan.streamed:
+            self.set(host_gaussians(copy.deepcopy(initial), self.plan.rows))
+        else:
+            self.set(upload_gaussians(self._device, initial))
+
+    def load(self, models: Sequence[HostGaussians]) -> None:
+        """Continue with parameters, first and second moments of a checkpoint, and new statistics."""
+        self.plan = self._make_plan(models[0].count)
+        self.set(*(self._placed(model) for model in models))
+
+    def free(self) -> None:
+        """Free all arrays."""
+        del self.parameters, self.first, self.second, self.statistics
+
+    def set(
+        self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
+    ) -> None:
+        """Set the arrays, with new statistics. Without moments they start from zero."""
+        count, coefficients = parameters.count, parameters.coefficients
+        self.parameters = parameters
+        self.first = first or self._zeros(count, coefficients)
+        self.second = second or self._zeros(count, coefficients)
+        self.statistics = new_statistics(self._device, count, contributions=self._counts_contributions)
+
+    def kinds(self) -> dict[str, AnyGaussians]:
+        """Parameters, first and second moments, by their names in a checkpoint."""
+        return {"parameters": self.parameters, "first": self.first, "second": self.second}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Arrays of a checkpoint, without the statistics."""
+        return {
+            f"{kind}/{group}": model[group].get() for kind, model in self.kinds().items() for group in PARAMETER_GROUPS
+        }
+
+    def marker(self) -> DeviceMarker:
+        """Marker of the Gaussians by density rules."""
+        return DeviceMarker(self._device, self._work, self.parameters, self.statistics)
+
+    def widen(self, coefficients: int) -> None:
+        """Make room for more SH coefficients, which start from zero."""
+        models = [*self.kinds().values()] if self.plan.gathers else self._take_down()
+        self.parameters, self.first, self.second = (
+            self._placed(widen(self._device, model, coefficients)) for model in models
+        )
+
+    def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | None:
+        """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
+
+        changes: called before anything changes, once the kernels have been tried.
+        """
+        listed = plan.listed
+        if plan.rows is not None:
+            listed = list_rows(self._device, plan.rows, plan.fresh)
+        if listed is not None:
+            assert isinstance(listed, DeviceRowList)
+            self._move(listed.rows, changes, new_statistics=plan.new_statistics)
+            if listed.halves and plan.halves is not None:
+                self._halve(listed, plan.halves, plan.halved)
+        changes()
+        for group, (rows, values) in plan.values.items():
+            changed = self.parameters[group].get()
+            changed[rows] = values
+            self.parameters[group].set(changed)
+        for group, change in plan.changes.items():
+            self.parameters[group].set(change(self.parameters[group].get()))
+        for group in plan.restarted:
+            self.first[group].fill(0.0)
+            self.second[group].fill(0.0)
+        if plan.forget_contributions:
+            self.statistics.forget_contributions()
+        return None if listed is None else listed.rows
+
+    def _zeros(self, count: int, coefficients: int) -> AnyGaussians:
+        if isinstance(self.parameters, HostGaussians):
+            return host_zeros(count, coefficients, self.parameters.rows)
+        return allocate_gaussians(self._device, count, coefficients, zero=True)
+
+    def _take_down(self) -> list[HostGaussians]:
+        """Move parameters, first and second moments to the host, and free them on the device."""
+        models = [to_host(model) for model in self.kinds().values()]
+        del self.parameters, self.first, self.second
+        return models
+
+    def _placed(self, model: AnyGaussians) -> AnyGaussians:
+        """Move the model to the place that the plan assigns, if it is elsewhere."""
+        if isinstance(model, HostGaussians):
+            return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
+        return model
+
+    def _halve(
+        self,
+        listed: DeviceRowList,
+        halves: Callable[[Mapping[str, Float32]], Mapping[str, Float32]],
+        halved: Sequence[str],
+    ) -> None:
+        """Replace the last rows, which are copies of split Gaussians, with their halves, computed from the groups
+        `halved`."""
+        count, half = listed.count, listed.halves // 2
+        split = {group: self.parameters[group].get_rows(count - half, count) for group in halved}
+        for group, values in halves(split).items():
+            self.parameters[group].set_rows(count - listed.halves, values)
+
+    def _move(self, listed: DeviceArray, changes: Callable[[], None], *, new_statistics: bool) -> None:
+        """Move all arrays, so that row j becomes the old row listed[j], with zero moments if it is FRESH."""
+        gathers = self.plan.gathers
+        with only_tried(self._device):
+            try_gather(self._device, listed.shape[0], self.parameters)
+        changes()
+        self.plan = self._make_plan(listed.shape[0])
+        rows: DeviceArray | NDArray[np.uint32] = listed
+        models = [*self.kinds().values()]
+        if not (gathers and self.plan.gathers):
+            del models
+            models, rows = [*self._take_down()], listed.get()
+        statistics = self.statistics
+        moved = [gather(self._device, rows, model, renews=index > 0) for index, model in enumerate(models)]
+        del models
+        self.set(*(self._placed(model) for model in moved))
+        carry(self._device, listed, statistics, self.statistics, densified=new_statistics)

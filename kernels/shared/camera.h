@@ -1,0 +1,59 @@
+// The camera model of this build: the one place that chooses a header of shared/camera/. All have the same functions
+// and macros, which docs/cameras.md (Adding a camera model) lists. Needs math.h and lanes.h.
+//
+// A kernel defines the parts that it needs before the first include:
+//   NEEDS_PROJECTION   a Gaussian's place on the image plane; gaussian.h defines it
+//   NEEDS_GRADIENT     the gradient by the mean, through that place
+//   NEEDS_TANGENTS     with RAYS, a pixel on the plane that touches the sphere of directions; one lane
+//   NEEDS_BOXES        with RAYS, the box of pixels around a direction; one lane
+//   NEEDS_MOTION       the motion of a mean, in pixels; one lane
+//   NEEDS_PIXEL_WIDTH  the width of a pixel in the world; one lane
+// With RAYS, the direction of a pixel is always there.
+#include "shared/elementary.h"
+#include "shared/angles.h"
+
+#ifndef CAMERA_SPACE // address space of the camera
+#define CAMERA_SPACE __constant
+#endif
+
+#ifdef NEEDS_TANGENTS
+typedef struct {
+  float e1[3], e2[3]; // right and down on the tangent plane
+  float k[4];         // d(tangent plane) / d(pixel): a pixel's footprint there
+} Tangent;
+#endif
+#ifdef NEEDS_BOXES
+typedef struct {
+  float low_x, high_x, low_y, high_y; // in pixels, not clamped
+  int whole_rows;                     // it wraps all the way round
+} Box;
+#endif
+#ifdef RAYS
+#include "shared/camera/directions.h"
+#endif
+
+#if defined(ORTHOGRAPHIC)
+#include "shared/camera/orthographic.h"
+#elif defined(EQUIRECTANGULAR)
+#include "shared/camera/equirectangular.h"
+#elif defined(FISHEYE_RAYS) // with BENT_FISHEYE, its series of the angle
+#include "shared/camera/fisheye.h"
+#elif defined(PERSPECTIVE_RAYS)
+#include "shared/camera/perspective_rays.h"
+#else
+#include "shared/camera/perspective.h"
+#endif
+
+#ifdef ON_PLANE
+#include "shared/camera/plane.h"
+#endif
+
+// A component of the view direction at a Gaussian, in world axes, and of the gradient through that direction.
+// `offset`: from the camera's centre, `length`: of all of it, `axis`: of the camera's axis.
+#ifdef PARALLEL_RAYS // one direction for all Gaussians
+#define SEEN_ALONG(offset, length, axis) (axis)
+#define BY_DIRECTION(gradient, length) (0.0f)
+#else
+#define SEEN_ALONG(offset, length, axis) ((offset) / (length))
+#define BY_DIRECTION(gradient, length) ((gradient) / (length))
+#endif

@@ -1,0 +1,30 @@
+// Orthographic: the image is linear in x and y, (3) and (15) to (17) of docs/cameras.md, as are the equation numbers.
+#define ON_PLANE
+#define PARALLEL_RAYS
+
+// The quantity in which the image position is linear, and its low part.
+#define RATIO(x, z) (x)
+#define ratio_rest(ratio, x, x_low, z, z_low) (x_low)
+
+#ifdef NEEDS_PROJECTION
+static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
+                                  float low_rest, float high, float high_rest) {
+  return (floatL)(0.0f);
+}
+
+// (16). Arguments as in perspective.h.
+static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
+  *rx = (floatL)(0.0f);
+  *jx = (floatL)(focal);
+}
+#endif
+
+#ifdef NEEDS_GRADIENT
+// (20). Arguments as in perspective.h.
+static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
+                                 floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
+  d[0] = jx * d_mx;
+  d[1] = jy * d_my;
+  d[2] = beyond[0] = beyond[1] = (floatL)(0.0f);
+}
+#endif

@@ -1,0 +1,41 @@
+// Perspective: the image is linear in x/z and y/z, (2) of docs/cameras.md. Other equation numbers refer to
+// docs/gradients.md.
+#define ON_PLANE
+
+// The quantity in which the image position is linear, and its low part.
+#define RATIO(x, z) ((x) / (z))
+#define ratio_rest slope_rest
+
+#ifdef NEEDS_PROJECTION
+// The low part of x/z as in the Jacobian; where x/z is clamped, the low part of the limit.
+static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
+                                  float low_rest, float high, float high_rest) {
+  const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
+  const floatL above = ratio == low ? (floatL)(low_rest) : rest;
+  return ratio == high ? (floatL)(high_rest) : above;
+}
+
+// (3), (4): the Jacobian's row by x is jx (1, 0, -rx), by y jy (0, 1, -ry). low, high: limits of the ratio.
+static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
+  *rx = clampL(x / z, low, high);
+  *jx = focal / z;
+}
+#endif
+
+#ifdef NEEDS_GRADIENT
+// (52): the mean in the camera's frame, through the image position and through J. Where the ratio is clamped, J
+// depends on z alone. at: the mean; limited: rx, ry; jx, jy: of the Jacobian; d_mx, d_my: the gradient by the image
+// position; by_j02, by_j12: by the Jacobian's last column, over -jx and -jy; d_size: by the log of the size. Fills
+// d[3], and beyond[2]: (145), a clamped ratio is a fixed position on the image.
+static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
+                                 floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
+  const floatL z = at[2], rx = at[0] / z, ry = at[1] / z;
+  const floatL d_j02 = rx == limited[0] ? by_j02 : (floatL)(0.0f);
+  const floatL d_j12 = ry == limited[1] ? by_j12 : (floatL)(0.0f);
+  beyond[0] = (by_j02 - d_j02) / z;
+  beyond[1] = (by_j12 - d_j12) / z;
+  d[0] = jx * (d_mx - d_j02 / z);
+  d[1] = jy * (d_my - d_j12 / z);
+  d[2] = -fmaL(d[0], rx, fmaL(d[1], ry, d_size / z));
+}
+#endif

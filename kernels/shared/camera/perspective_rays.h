@@ -1,0 +1,66 @@
+// Perspective along rays: Gaussians of a pinhole camera on their tangent planes, as a fisheye's. Equation numbers refer
+// to docs/cameras.md.
+#define ON_PLANE
+
+// The quantity in which the image position is linear, and its low part.
+#define RATIO(x, z) ((x) / (z))
+#define ratio_rest slope_rest
+
+// (2): the unit direction (x, y, z) of pixels (px, py).
+static inline void ray_of(floatL px, floatL py, CAMERA_SPACE float *camera, floatL *x, floatL *y, floatL *z) {
+  const floatL a = (px - camera[CAMERA_CX]) / camera[CAMERA_FX], b = (py - camera[CAMERA_CY]) / camera[CAMERA_FY];
+  const floatL shrunk = 1.0f / sqrt(fmaL(a, a, fmaL(b, b, (floatL)(1.0f))));
+  *x = shrunk * a;
+  *y = shrunk * b;
+  *z = shrunk;
+}
+
+#ifdef NEEDS_TANGENTS
+#define NEAR_DEPTH(z, distance) (z)
+#define is_shown(f, camera) 1
+
+// (9), (30); f: the direction.
+static inline void tangent_of(const float *f, __constant float *camera, Tangent *t) {
+  const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
+  tangent_around_axis(f, across, f[2] * f[2], 1.0f, f[2], camera, t);
+}
+
+// (31): the gradient, through the low-pass part of the covariance, by a step of the mean's direction along e1 and e2.
+// g: the gradient by the covariance's xx, xy (once) and yy.
+static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
+  const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2];
+  low_pass_around_axis(f, r, z * z, z, -2.0f * (z * r), -r, camera, g, by);
+}
+#endif
+
+#ifdef NEEDS_BOXES
+#define NO_END 1e15f
+#define LEAST_AHEAD 1e-4f // per length of the direction; less is outside every picture
+
+// (32), one side: the image range, in focal lengths, of the directions within an angle of a given one. `sine` is the
+// sine of that angle; along and z are the direction's coordinates. An end that crosses the camera's plane is unbounded.
+static inline void side_of(float along, float z, float sine, float *low, float *high) {
+  const float level = sqrt(fma1(along, along, z * z));
+  *low = -NO_END;
+  *high = NO_END;
+  if (!(sine < 0.999f * level)) return;
+  const float ratio = sine / level, cosine = sqrt(1.0f - ratio * ratio);
+  const float ahead_low = fma1(cosine, z, ratio * along), ahead_high = fma1(cosine, z, -(ratio * along));
+  if (ahead_low > LEAST_AHEAD * level) *low = fma1(cosine, along, -(ratio * z)) / ahead_low;
+  if (ahead_high > LEAST_AHEAD * level) *high = fma1(cosine, along, ratio * z) / ahead_high;
+}
+
+// The box of all directions within an angle of f; `reach` is the tangent of the angle.
+static inline void box_of(const float *f, float reach, __constant float *camera, Box *t) {
+  const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
+  const float cx = camera[CAMERA_CX] - camera[CAMERA_WINDOW_X], cy = camera[CAMERA_CY] - camera[CAMERA_WINDOW_Y];
+  const float sine = reach / sqrt(fma1(reach, reach, 1.0f));
+  t->whole_rows = 0;
+  side_of(f[0], f[2], sine, &t->low_x, &t->high_x);
+  side_of(f[1], f[2], sine, &t->low_y, &t->high_y);
+  t->low_x = fma1(fx, t->low_x, cx);
+  t->high_x = fma1(fx, t->high_x, cx);
+  t->low_y = fma1(fy, t->low_y, cy);
+  t->high_y = fma1(fy, t->high_y, cy);
+}
+#endif

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`.ci/run`: its parts, its table of steps, and its status. Steps are replaced by commands that do nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+STEP = re.compile(r'\bstep ("[^"]+") .*')
+ROW = re.compile(r"^ *(\d+)  (.+)$", re.MULTILINE)
+
+pytestmark = pytest.mark.skipif(os.name != "posix" or shutil.which("bash") is None, reason="bash is not there")
+
+
+def ran(folder: Path, *arguments: str, **steps: str) -> subprocess.CompletedProcess[str]:
+    """The script in a folder that holds nothing else; steps: commands by the names of steps, otherwise `true`."""
+
+    def stub(found: re.Match[str]) -> str:
+        name = found[1].strip('"')
+        return f"step {found[1]} {steps.get(name, 'eval python=python3' if name == 'environment' else 'true')}"
+
+    script = folder / ".ci/run"
+    script.parent.mkdir()
+    script.write_text(STEP.sub(stub, (ROOT / ".ci/run").read_text()).replace("\n    inherit\n", "\n"))
+    variables = {**os.environ, "TMPDIR": str(folder)}
+    result = subprocess.run(
+        ["bash", str(script), *arguments], capture_output=True, text=True, check=False, env=variables
+    )
+    assert [path.name for path in folder.iterdir()] == [".ci"]
+    shutil.rmtree(script.parent)
+    return result
+
+
+def rows(output: str) -> list[str]:
+    """Names of the steps in the table."""
+    return [name for _, name in ROW.findall(output.partition("\nseconds  step\n")[2])]
+
+
+def test_the_parts_have_every_step_once(tmp_path: Path) -> None:
+    quick, full, both = (ran(tmp_path, *arguments) for arguments in (["quick"], ["full"], []))
+    assert {quick.returncode, full.returncode, both.returncode} == {0}
+    assert [line.rpartition(",")[0] for line in (quick.stdout.splitlines()[-1], full.stdout.splitlines()[-1])] == [
+        "== all passed: quick",
+        "== all passed: full",
+    ]
+    assert both.stdout.splitlines()[-1].startswith("== all passed: quick full, ")
+    names = STEP.findall((ROOT / ".ci/run").read_text())
+    assert set(rows(quick.stdout)) & set(rows(full.stdout)) == {"environment", "in all"}
+    assert rows(both.stdout) == rows(quick.stdout)[:-1] + rows(full.stdout)[1:]
+    assert {f'"{name}"' for name in rows(both.stdout)} == {*names, '"in all"'}
+
+
+def test_the_first_failure_ends_the_run_with_the_table(tmp_path: Path) -> None:
+    result = ran(tmp_path, mypy="bash -c 'exit 7'")
+    assert result.returncode == 1 and "all passed" not in result.stdout
+    assert rows(result.stdout) == ["environment", "ruff check", "ruff format", "mypy (failed)", "in all"]
+    assert "== FAILED: mypy (status 7 after " in result.stderr
+
+
+@pytest.mark.parametrize(("command", "status"), [("exit 0", 0), ("exit 3", 3), ("kill -TERM $$", -signal.SIGTERM)])
+def test_a_run_that_is_cut_off_says_in_which_step(tmp_path: Path, command: str, status: int) -> None:
+    result = ran(tmp_path, "full", torch=command)
+    assert result.returncode == status and "all passed" not in result.stdout
+    assert rows(result.stdout) == ["environment", "OpenCL drivers", "torch (did not end)", "in all"]
+
+
+@pytest.mark.parametrize("arguments", [["all"], ["quick", "full"], ["--quick"]])
+def test_other_arguments_are_refused(tmp_path: Path, arguments: list[str]) -> None:
+    result = ran(tmp_path, *arguments)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == f"usage: bash .ci/run [quick|full], but the arguments are: {' '.join(arguments)}\n"
+
+
+def test_help_is_what_the_script_opens_with(tmp_path: Path) -> None:
+    result = ran(tmp_path, "--help")
+    assert result.returncode == 0
+    assert result.stdout.startswith("All that a change must pass") and "bash .ci/run quick " in result.stdout

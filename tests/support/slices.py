@@ -1,0 +1,25 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Slices of deep pictures (bins, H, W, 5), over each other and up to a depth, in float64."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+
+
+def flattened(slices: NDArray[Any]) -> Float64:
+    """(H, W, 4): red, green, blue, alpha of the slices over each other, front to back."""
+    flat = np.zeros((*slices.shape[1:3], 4))
+    for each in slices.astype(np.float64):
+        flat += (1 - flat[:, :, 3:]) * each[:, :, :4]
+    return flat
+
+
+def in_front(slices: NDArray[Any], depth: float) -> Float64:
+    """(H, W): the alpha in front of a depth; slices may have further axes first."""
+    left = np.where(slices[..., 4] < depth, 1 - slices[..., 3].astype(np.float64), 1.0)
+    return np.asarray(1 - left.prod(axis=-3))

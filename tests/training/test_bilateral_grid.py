@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bilateral grids of photographs, learnt with the model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny import CONFIG, write_scene
+
+from clsplat.api import train
+from clsplat.cli.main import main
+from clsplat.device.context import Device
+from clsplat.runs.run import Run
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
+from clsplat.stages.grid import GRID_SHAPE
+from clsplat.training.supervision.image_cache import ImageCache
+from clsplat.training.trainer import Trainer
+
+WITH_GRIDS = replace(CONFIG, appearance="grid")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+def test_only_grids_of_trained_views_move(default_device: Device, scene: Scene) -> None:
+    trainer = Trainer(scene, WITH_GRIDS, default_device)
+    trainer.train_step()
+    trainer.train_step()
+    moved = trainer.checkpoint()[0]["appearance/first"].reshape(len(scene.train_views), -1).any(axis=1)
+    assert moved.sum() == 2
+
+
+def test_a_run_keeps_its_grids(
+    default_device: Device,
+    scene: Scene,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Photographs that are darker by turns: their grids are, and their mean is the identity after a pass."""
+    plain, count = ImageCache.load, len(scene.train_views)
+
+    def dimmed(self: ImageCache, index: int, factor: float) -> np.ndarray:
+        image = plain(self, index, factor)
+        values = image / np.float32(255) if image.dtype == np.uint8 else image
+        return np.ascontiguousarray(values * np.float32(0.6 if index % 2 else 1.0), np.float32)
+
+    monkeypatch.setattr(ImageCache, "load", dimmed)
+    density = replace(CONFIG.density, every=0)
+    config = replace(WITH_GRIDS, iterations=20 * count, density=density, warmup=())
+    run = Run.create(tmp_path / "run", config)
+    train(scene, config, device=default_device, run=run)
+    record = json.loads(run.appearance_path.read_text("utf-8"))
+    assert record["kind"] == "grid"
+    with np.load(run.appearance_path.with_suffix(".npz")) as file:
+        grids = file["grids"]
+    assert grids.shape == (count, *GRID_SHAPE)
+    np.testing.assert_allclose(grids.mean(axis=0), np.broadcast_to(np.eye(3, 4), GRID_SHAPE), atol=1e-6)
+    gains = grids[:, :, :, :, range(3), range(3)].mean(axis=(1, 2, 3, 4))
+    assert gains[::2].min() > gains[1::2].max()
+    assert "psnr_corrected" in json.loads(run.eval_path.read_text("utf-8"))["mean"]
+    cameras = str(scene.train_views[1].path.parents[1])
+    names = ["--appearance", scene.train_views[1].name]
+    assert main(["render", str(run.path), "--cameras", cameras, "-o", f"{tmp_path}/{{name}}.png", *names]) == 2
+    assert "bilateral grids" in capsys.readouterr().err

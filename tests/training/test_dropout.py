@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Thinning of a step's model: which Gaussians are left out, the gradient of the rest, and the same bytes again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from quick import quick
+from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
+from scenes import random_cloud
+from tiny import short, write_scene
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.errors import InputError
+from clsplat.gaussians import Gaussians
+from clsplat.optimisation.dropout import Thinning, thinning_of
+from clsplat.reference.dropout import factors, logit_grad, thinned_logits
+from clsplat.reference.render import forward, render_grad
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
+from clsplat.stages.device_camera import padded_size
+from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
+
+CONFIG = replace(short(iterations=40), thinning=0.5)
+GROUP_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+THINNING = Thinning(0.3, (0x12345678, 0x9ABCDEF0))
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+def cloud() -> tuple[Gaussians, Camera]:
+    """Gaussians that stay under 1 when the rest are left out, for which the twin has a logit."""
+    model, camera = random_cloud(300, 3, 64, 48)
+    return replace(model, opacity_logits=np.minimum(model.opacity_logits, np.float32(0.5))), camera
+
+
+def thinned(model: Gaussians, thinning: Thinning) -> Gaussians:
+    logits = thinned_logits(model.opacity_logits.astype(np.float64), factors(thinning, len(model)))
+    return replace(model, opacity_logits=logits.astype(np.float32))
+
+
+def test_the_share_rises_and_the_steps_differ() -> None:
+    rates = [thinning_of(CONFIG, step) for step in (1, 20, 40)]
+    assert [one and one.rate for one in rates] == [0.5 / 40, 0.25, 0.5]
+    assert thinning_of(replace(CONFIG, thinning=0.0), 20) is None
+    assert thinning_of(replace(CONFIG, batch=2), 20) == Thinning(0.5, rates[1].key if rates[1] else (0, 0))
+    kept = [factors(one, 100_000) > 0 for one in rates if one]
+    assert kept[1].mean() == pytest.approx(0.75, abs=0.006)
+    both = kept[1] & kept[2]
+    assert both.mean() == pytest.approx(0.375, abs=0.007), "drawn apart"
+
+
+@pytest.mark.parametrize("first_row", [0, 77])
+def test_twin_words_go_by_the_row_of_the_model(first_row: int) -> None:
+    np.testing.assert_array_equal(
+        factors(THINNING, 200, first_row), factors(THINNING, 300)[first_row : first_row + 200]
+    )
+
+
+def test_the_twin_s_slopes() -> None:
+    logits, step = np.linspace(-5, 0.5, 9), 1e-6
+    by = factors(THINNING, 9)
+    up, down = thinned_logits(logits + step, by), thinned_logits(logits - step, by)
+    np.testing.assert_allclose(logit_grad(logits, by, np.ones(9)), (up - down) / (2 * step), rtol=1e-6, atol=1e-12)
+
+
+def gradients_of(
+    device: Device, model: Gaussians, camera: Camera, d_image: Float64, thinning: Thinning | None
+) -> tuple[Float32, NDArray[np.uint32], Gaussians]:
+    """The kernels' image (H, W, 3), counts of tiles and gradients."""
+    rasterizer, held = Rasterizer(device), upload_gaussians(device, model)
+    frame = rasterizer.forward(held, camera, np.zeros(3, np.float32), thinning=thinning)
+    (rows, stride), (height, width) = padded_size(camera.width, camera.height), (camera.height, camera.width)
+    image = frame.blended.image.get().reshape(3, rows, stride)[:, :height, :width].transpose(1, 2, 0)
+    tiles, planes = frame.projected.tile_counts.get(), np.zeros((3, rows, stride), np.float32)
+    planes[:, :height, :width] = d_image.transpose(2, 0, 1)
+    gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
+    rasterizer.backward(held, frame, upload(device, planes), gradients)
+    return image, tiles, download_gaussians(gradients)
+
+
+@pytest.mark.slow_in_groups
+@pytest.mark.parametrize("projection", quick(["perspective", "orthographic", "fisheye"], "perspective"))
+def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device, projection: str) -> None:
+    """The twin's in perspective; where it draws nothing else, those of the kernels without thinning."""
+    model, camera = cloud()
+    if projection != "perspective":
+        camera = replace(camera, projection=projection)
+    by, wanted = factors(THINNING, len(model)), thinned(model, THINNING)
+    d_image, steady = np.random.default_rng(5).standard_normal((camera.height, camera.width, 3)), np.array(True)
+    if projection == "perspective":
+        blended = forward(wanted, camera).blended
+        steady, picture = blended.margin > 1e-4, blended.image
+        d_image[~steady] = 0
+        gradients = render_grad(wanted, camera, d_image).parameters
+    else:
+        picture, _, found = gradients_of(shaped_device, wanted, camera, d_image, None)
+        gradients = {name: getattr(found, name).astype(np.float64) for name in GROUP_FIELDS}
+    image, tiles, got = gradients_of(shaped_device, model, camera, d_image, THINNING)
+    assert not tiles[by == 0].any() and tiles.any()
+    assert np.abs(image - picture)[np.broadcast_to(steady, image.shape[:2])].max() < 1e-4
+    gradients["opacity_logits"] = logit_grad(model.opacity_logits.astype(np.float64), by, gradients["opacity_logits"])
+    for name, values in gradients.items():
+        assert values.any()
+        difference = np.linalg.norm(getattr(got, name).astype(np.float64) - values)
+        assert difference <= 1e-4 * np.linalg.norm(values), name
+
+
+def test_stopping_and_going_on_gives_the_same_bytes(
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
+) -> None:
+    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
+
+
+def test_it_changes_the_model(scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes) -> None:
+    assert model_bytes(scene, replace(CONFIG, thinning=0.0), default_device, tmp_path / "whole") != undisturbed
+
+
+@pytest.mark.slow
+def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
+    """Rows that come in parts are thinned by their place in the model."""
+    scene = load_scene(write_scene(tmp_path / "scene", points=False))
+    many = replace(CONFIG, random_points=1500, thinning=0.5)
+    check_in_less_memory(scene, many, default_device, tmp_path)
+
+
+def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
+    check_on_two_devices(scene, CONFIG, default_device, 12)
+
+
+@pytest.mark.parametrize("rate", [-0.1, 0.95])
+def test_a_share_that_makes_no_sense(rate: float) -> None:
+    with pytest.raises(InputError, match=f"--thinning {rate}: expected 0 to 0.9"):
+        TrainConfig(thinning=rate).check()

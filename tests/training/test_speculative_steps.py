@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training by capacity: the bytes of training with exact counts, also where steps have more pairs than room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import Any
+
+import numpy as np
+import pytest
+from compare import assert_same_bits
+from numpy.typing import NDArray
+from quick import quick
+from tiny import short, write_scene
+
+from clsplat.bench import stages as bench_stages
+from clsplat.bench import workload as bench_subject
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
+from clsplat.device.context import Device
+from clsplat.device.program import Kernel
+from clsplat.errors import InputError
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
+from clsplat.stages.device_gaussians import upload_gaussians
+from clsplat.training.density import ModelState, RowPlan
+from clsplat.training.density.adaptive import Adaptive
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE, SpeculativeSteps, by_capacity
+from clsplat.training.trainer import Trainer
+
+CONFIG = short(density={"min_contribution": 0.01})
+"""Densifies and prunes after steps 15, 20, 25, ...; resets opacities after 20; contributions make an epoch matter."""
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+
+
+Result = tuple[dict[str, NDArray[Any]], list[tuple[float, float]], Trainer]
+
+
+def trained(
+    scene: Scene,
+    device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    capacity: bool,
+    too_small: Collection[int] = (),
+    before: Callable[[Trainer], None] = lambda _trainer: None,
+) -> Result:
+    """Everything that a checkpoint has after CONFIG, the losses that were read, and the trainer. too_small: the steps
+    whose room is for 8 pairs, where they have any; before: called before each step."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "01"[capacity])
+    trainer, losses = Trainer(scene, CONFIG, device), []
+    real = trainer.pending.room
+    monkeypatch.setattr(
+        trainer.pending, "room", lambda *size: (room := real(*size)) and (8 if trainer.step in too_small else room)
+    )
+    for step in range(1, CONFIG.iterations + 1):
+        before(trainer)
+        result = trainer.train_step(reads_loss=step % 10 == 0)
+        if step % 10 == 0 or step == 17:
+            losses.append(result.read())
+    return trainer.checkpoint()[0], losses, trainer
+
+
+def assert_alike(one: Result, other: Result) -> None:
+    assert one[0].keys() == other[0].keys()
+    for name, values in one[0].items():
+        assert_same_bits(values, other[0][name], name)
+    assert one[1] == other[1]
+    assert list(map(str, one[2].watch.incidents)) == list(map(str, other[2].watch.incidents))
+
+
+TOO_SMALL = {"none": (), "within": (7,), "twice": (12, 13), "before density control": (15, 25), "last": (40,)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", TOO_SMALL)
+def test_trained_by_capacity_is_trained_with_exact_counts(
+    device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, steps: str
+) -> None:
+    exact = trained(scene, device, monkeypatch, capacity=False)
+    other = trained(scene, device, monkeypatch, capacity=True, too_small=TOO_SMALL[steps])
+    assert exact[2].pending.redone == 0
+    assert (other[2].pending.redone > 0) == (steps != "none")
+    assert_alike(exact, other)
+
+
+@pytest.mark.slow
+def test_a_group_s_shape_has_the_same_bytes_by_capacity(
+    device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = device.with_shape(lanes=1, items=64)
+    exact = trained(scene, device, monkeypatch, capacity=False)
+    assert_alike(exact, trained(scene, device, monkeypatch, capacity=True, too_small=(16, 31)))
+
+
+@pytest.mark.parametrize("kind", ["parameters", "first"])
+def test_trouble_is_mended_and_told_as_with_exact_counts(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    def spoil(trainer: Trainer) -> None:
+        if trainer.step == 16:
+            trainer.settle()
+            array = trainer.models()[kind]["means"]
+            values = array.get()
+            values[5, 0] = np.nan
+            array.set(values)
+
+    results = [trained(scene, default_device, monkeypatch, capacity=on, before=spoil) for on in (False, True)]
+    assert_alike(*results)
+    assert len(results[1][2].watch.incidents) == 1
+    assert results[1][2].pending.redone == 2
+
+
+@pytest.mark.parametrize("shape", quick([(1, 64), (8, 1)], (8, 1)))
+def test_a_step_by_capacity_waits_for_no_number(
+    device: Device, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
+) -> None:
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
+    device = device.with_shape(lanes=shape[0], items=shape[1])
+    trainer = bench_stages.trainer_of(bench_subject.synthetic(6000, 320, 200), device, RasterizerConfig())
+    for _ in range(3):
+        trainer.train_step()
+    for _ in range(4):
+        calls = bench_stages.calls_of(device, trainer.train_step)
+        assert (calls.blocking_reads, calls.blocking_writes, calls.reads) == (0, 0, 1)
+        assert 0 < calls.launches <= 40
+    assert len(device.under_way) < 10, "what the device has read is let go of"
+
+
+class _Looks(Adaptive):
+    """A strategy that looks at the model after each step."""
+
+    def after_gradient(self, model: ModelState) -> RowPlan | None:
+        return None if np.isfinite(model.parameters["means"].get()).all() else RowPlan()
+
+
+def test_what_is_looked_at_or_tight_is_exact(
+    default_device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
+    asked: list[int] = []
+    real = SpeculativeSteps.launch
+
+    def launch(self: SpeculativeSteps, run: Any, room: int, **options: Any) -> Any:
+        asked.append(room)
+        return real(self, run, room, **options)
+
+    monkeypatch.setattr(SpeculativeSteps, "launch", launch)
+    pairs = short(rasterizer=BenchSwitches(depth_sort="pairs"))
+    trainers = [
+        Trainer(scene, CONFIG, default_device, strategy=_Looks),
+        Trainer(scene, CONFIG, default_device.with_memory_limit(50 << 20)),
+        Trainer(scene, pairs, default_device),
+    ]
+    for trainer in trainers:
+        for _ in range(3):
+            trainer.train_step()
+    assert asked == [0] * 9
+    plain = Trainer(scene, CONFIG, default_device)
+    for _ in range(3):
+        plain.train_step()
+    assert asked[9] == 0 < asked[10], "the first step says how many pairs there are"
+
+
+def test_the_default_is_the_kind_of_the_device(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(BY_CAPACITY_VARIABLE, raising=False)
+    assert by_capacity(default_device) == (default_device.kind != "cpu")
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "yes")
+    with pytest.raises(InputError, match=f"{BY_CAPACITY_VARIABLE}=yes: expected 1, or 0"):
+        by_capacity(default_device)
+
+
+def test_launches_come_from_tapes(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all of a step but the photograph's planes, as long as the model stays."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
+    trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), device, RasterizerConfig())
+    made: list[str] = []
+    real = Device.enqueue
+
+    def enqueue(self: Device, kernel: Kernel, *arguments: Any, **options: Any) -> Any:
+        made.append(kernel.name)
+        return real(self, kernel, *arguments, **options)
+
+    monkeypatch.setattr(Device, "enqueue", enqueue)
+    steps = []
+    for _ in range(12):
+        made.clear()
+        trainer.train_step()
+        steps.append(list(made))
+    assert len(steps[2]) > 12
+    assert steps[-3:] == [["target"]] * 3
+    trainer.model.set(upload_gaussians(device, trainer.gaussians()))  # as density control does
+    made.clear()
+    trainer.train_step()
+    assert len(made) > 12

@@ -1,0 +1,132 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Time of a frame against the number of Gaussians and against the size of the image, and how far off a line it is.
+
+    python tools/bench/bench_growth.py [--max-gaussians 3e6] [--max-megapixels 8] [--repeat 5] [--device DEVICE]
+                                       [--json] [--plot growth.svg]
+
+The scene is the one that `clsplat bench` makes up. With more Gaussians each is smaller, so that all together they cover
+the same area, at 1024x768; with more pixels 200,000 Gaussians grow with the image, 4:3. Wall time of
+`Rasterizer.forward` from an idle device to an idle device, median.
+
+The line ms = a + b x is fitted by least squares of the relative residuals (each weighted by 1 / ms), so that small
+sizes count as much as large ones. The largest residual is stated, as a share of what was measured.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+from measuring import Result, machine, number, options_parser, parsed, require, show, sizes, tool
+from plotting import Panel, plot_growth
+
+from clsplat.bench.workload import synthetic
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device, open_device
+from clsplat.progress import aligned
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.stages.device_gaussians import upload_gaussians
+
+GAUSSIANS, WIDTH, HEIGHT = 200_000, 1024, 768
+"""Sizes that stay as they are while the other grows."""
+FEWEST = 10_000
+MEGAPIXELS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+POINTS = 3
+"""Fewer are always on a line, or none at all."""
+
+
+def size_of(megapixels: float) -> tuple[int, int]:
+    """Width and height of an image of 4:3."""
+    width = round((megapixels * 1e6 * 4 / 3) ** 0.5)
+    return width, round(width * 3 / 4)
+
+
+def measure(device: Device, count: int, width: int, height: int, repeat: int) -> Result:
+    """A row of the table: `pairs` are those of a tile and a Gaussian."""
+    print(f"{count:,} Gaussians, {width}x{height}", file=sys.stderr, flush=True)
+    subject = synthetic(count, width, height)
+    rasterizer = Rasterizer(device)
+    gaussians = upload_gaussians(device, subject.gaussians)
+    background = upload(device, np.zeros(3, np.float32))
+
+    def draw() -> ForwardPass:
+        return rasterizer.forward(gaussians, subject.camera, background, backward=False)
+
+    frames = [draw() for _ in range(2)]  # kernels are built in the first, and the memory has grown after it
+    ms = statistics.median(device.timed(draw)[1] for _ in range(repeat))
+    pairs = frames[-1].part.pairs.tile_keys.shape[0]
+    return {"gaussians": count, "width": width, "height": height, "pairs": pairs, "ms": ms}
+
+
+def fit(x: Sequence[float], ms: Sequence[float]) -> tuple[float, float, list[float]]:
+    """a and b of ms = a + b x, and the relative residuals, (fitted - measured) / measured."""
+    times = np.asarray(ms)
+    rows = np.stack([np.ones(len(times)), np.asarray(x)], axis=1) / times[:, None]
+    (a, b), *_ = np.linalg.lstsq(rows, np.ones(len(times)), rcond=None)
+    residuals: list[float] = (rows @ (a, b) - 1).tolist()
+    return float(a), float(b), residuals
+
+
+def growth(rows: list[Result], unit: str, x: Sequence[float]) -> Result:
+    """The rows with their residuals, and the line; x in `unit`, one for each row."""
+    a, b, residuals = fit(x, [row["ms"] for row in rows])
+    told = [{**row, "x": value, "residual": residual} for row, value, residual in zip(rows, x, residuals, strict=True)]
+    largest = max(residuals, key=abs)
+    return {"unit": unit, "rows": told, "ms_at_zero": a, "ms_per_unit": b, "largest_residual": largest}
+
+
+def table(part: Result) -> list[str]:
+    """Text table of one of the two growths."""
+    rows: list[tuple[str, ...]] = [("Gaussians", "image", "tile pairs", "ms", "off the line")]
+    for row in part["rows"]:
+        size, off = f"{row['width']}x{row['height']}", f"{row['residual']:+.1%}"
+        rows.append((f"{row['gaussians']:,}", size, f"{row['pairs']:,}", f"{row['ms']:.2f}", off))
+    line = f"ms = {part['ms_at_zero']:.2f} + {part['ms_per_unit']:.2f} x, x in {part['unit']}"
+    return [*aligned(rows), "", f"{line}; largest residual {part['largest_residual']:+.1%}"]
+
+
+def panel(part: Result) -> Panel:
+    """Panel of one of the two growths."""
+    measured = [(row["x"], row["ms"]) for row in part["rows"]]
+    ends = np.geomspace(measured[0][0], measured[-1][0], 50).tolist()  # a line is curved where the axes are logarithmic
+    fitted = [(x, part["ms_at_zero"] + part["ms_per_unit"] * x) for x in ends]
+    kept = [point for point in fitted if point[1] > 0]
+    label = (
+        f"{part['ms_at_zero']:.1f} + {part['ms_per_unit']:.1f} x, off by {abs(part['largest_residual']):.0%} at most"
+    )
+    return Panel(f"x: {part['unit']}", "ms a frame, median", {"measured": measured}, {label: kept})
+
+
+@tool("bench_growth")
+def main(arguments: Sequence[str]) -> int:
+    """Measure and print."""
+    parser = options_parser(__doc__)
+    parser.add_argument("--max-gaussians", metavar="N", type=number, default=3_000_000)
+    parser.add_argument("--max-megapixels", metavar="X", type=float, default=8.0)
+    options = parsed(parser, arguments)
+    counts = sizes(FEWEST, options.max_gaussians)
+    images = [size_of(size) for size in MEGAPIXELS if size <= options.max_megapixels]
+    least = sizes(FEWEST, 10 * FEWEST)[POINTS - 1]
+    require(len(counts) >= POINTS, f"--max-gaussians {options.max_gaussians}: expected at least {least}")
+    least_pixels = f"--max-megapixels {options.max_megapixels:g}: expected at least {MEGAPIXELS[POINTS - 1]:g}"
+    require(len(images) >= POINTS, least_pixels)
+    device = open_device(options.device)
+    by_count = [measure(device, count, WIDTH, HEIGHT, options.repeat) for count in counts]
+    by_size = [measure(device, GAUSSIANS, *image, options.repeat) for image in images]
+    parts = {
+        "gaussians": growth(by_count, "million Gaussians", [1e-6 * count for count in counts]),
+        "pixels": growth(by_size, "megapixels", [1e-6 * width * height for width, height in images]),
+    }
+    result = {**machine(device, options.repeat), **parts}
+    show(result, [*table(parts["gaussians"]), "", *table(parts["pixels"])], as_json=options.json)
+    if options.plot is not None:
+        title = f"A frame on {result['device']}, {result['driver'].split('  ')[0]}"
+        plot_growth(options.plot, [panel(part) for part in parts.values()], title)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,209 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Time of the library's calls beside the renderer's and the trainer's.
+
+    python tools/bench/bench_library.py [--gaussians 1e5] [--size 640x480] [--repeat 25] [--device DEVICE] [--json]
+
+The scene is the one that `clsplat bench` makes up, SH of degree 3. All calls take their turn before one has its next;
+after medians in ms come the medians of the ratios in a turn: of images alone to `Renderer.render`, of images with what
+a gradient needs to a trainer's `Rasterizer.forward`, whose image stays on the device, and of gradients to
+`Rasterizer.backward`. Of a call the gradient by the view matrix is left out, as the trainer has none. Without PyTorch
+its rows are left out.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+from measuring import Result, machine, number, options_parser, parsed, require, show, tool
+
+from clsplat.bench.workload import Subject, synthetic
+from clsplat.camera import Camera
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device, open_device
+from clsplat.library.rasterize import rasterize
+from clsplat.progress import aligned
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.rendering.renderer import Renderer
+from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
+
+DEGREE = 3
+Call = tuple[str, Callable[[], Callable[[], object]]]
+"""A name, and a function that makes ready outside of the time and returns what is timed."""
+
+
+def size(text: str) -> tuple[int, int]:
+    """Width and height, from WxH."""
+    width, height = text.lower().split("x")
+    return int(width), int(height)
+
+
+def arrays_of(subject: Subject) -> dict[str, Any]:
+    """The arguments of `rasterize`."""
+    gaussians, camera = subject.gaussians, subject.camera
+    return {
+        "means": gaussians.means,
+        "quaternions": gaussians.quaternions,
+        "scales": np.exp(gaussians.log_scales),
+        "opacities": 1 / (1 + np.exp(-gaussians.opacity_logits)),
+        "colors": gaussians.sh,
+        "viewmats": view_of(camera),
+        "intrinsics": lens_of(camera),
+    }
+
+
+def view_of(camera: Camera) -> Any:
+    """(1, 4, 4) float32."""
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3], pose[:3, 3] = camera.rotation, camera.translation
+    return pose[None]
+
+
+def lens_of(camera: Camera) -> Any:
+    """(1, 3, 3) float32."""
+    return np.array([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], np.float32)
+
+
+def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
+    """`Renderer.render`, a trainer's frame, and its gradient from a gradient by the image that is on the device."""
+    renderer, rasterizer, camera = Renderer(device), Rasterizer(device), subject.camera
+    gaussians = upload_gaussians(device, subject.gaussians)
+    gradients = allocate_gaussians(device, gaussians.count, gaussians.coefficients, zero=True)
+    black = upload(device, np.zeros(3, np.float32))
+    planes = upload(device, gradient_of(camera).transpose(2, 0, 1))
+
+    def forward() -> Callable[[], object]:
+        return lambda: renderer.render(subject.gaussians, camera)
+
+    def backward() -> Callable[[], object]:
+        frame = rasterizer.forward(gaussians, camera, black, backward=True)
+        device.finish()
+
+        def work() -> None:
+            rasterizer.backward(gaussians, frame, planes, gradients)
+            device.finish()
+
+        return work
+
+    def frame() -> Callable[[], object]:
+        def work() -> None:
+            rasterizer.forward(gaussians, camera, black, backward=True)
+            device.finish()
+
+        return work
+
+    return ("Renderer.render", forward), ("Rasterizer.forward", frame), ("Rasterizer.backward", backward)
+
+
+def of_numpy(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
+    """`clsplat.rasterize` without and with what a gradient needs, and its vector-Jacobian product."""
+    arrays, gradient = arrays_of(subject), gradient_of(subject.camera)[None]
+
+    def call(*, differentiable: bool = True) -> Any:
+        width, height = subject.camera.width, subject.camera.height
+        how: dict[str, Any] = {"sh_degree": DEGREE, "differentiable": differentiable, "device": device}
+        found = rasterize(**arrays, width=width, height=height, **how)
+        return found, found.images, found.alphas
+
+    def backward() -> Callable[[], object]:
+        found = call()[0]
+        return lambda: found.vjp(gradient, cameras=False)
+
+    alone = partial(call, differentiable=False)
+    return ("rasterize, differentiable=False", lambda: alone), ("rasterize", lambda: call), ("rasterize, vjp", backward)
+
+
+def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, Call, Call]:
+    """`clsplat.torch.rasterization` without and with what a gradient needs, and the backward pass."""
+    import torch
+
+    from clsplat.torch import rasterization
+
+    tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays_of(subject).items()}
+    poses, lenses = tensors.pop("viewmats"), tensors.pop("intrinsics")
+    leaves = [tensor.requires_grad_() for tensor in tensors.values()]
+    gradient = torch.from_numpy(gradient_of(subject.camera)[None])
+
+    def call() -> Any:
+        means, quats, scales, opacities, sh = leaves
+        views = (poses, lenses, subject.camera.width, subject.camera.height)
+        how: dict[str, Any] = {"sh_degree": DEGREE, "packed": packed, "device": device}
+        return rasterization(means, quats, scales, opacities, sh, *views, **how)
+
+    def backward() -> Callable[[], object]:
+        for leaf in leaves:
+            leaf.grad = None
+        images = call()[0]
+        return lambda: images.backward(gradient)
+
+    def without() -> Any:
+        with torch.no_grad():
+            return call()
+
+    title = f"torch.rasterization, packed={packed}"
+    return (f"{title}, no_grad", lambda: without), (title, lambda: call), (f"{title}, backward", backward)
+
+
+def gradient_of(camera: Camera) -> Any:
+    """A gradient by the image, (H, W, 3) float32."""
+    return np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
+
+
+def measure(groups: list[tuple[Call, Call, Call]], repeat: int) -> list[Result]:
+    """The rows: the first group is what the others are compared to."""
+    times: dict[str, list[float]] = {name: [] for group in groups for name, _ in group}
+    for turn in range(repeat + 2):  # kernels are built in the first, and the memory has grown after it
+        for group in groups:
+            for name, prepare in group:
+                work = prepare()
+                began = time.perf_counter()
+                kept = work()
+                if turn > 1:
+                    times[name].append(1e3 * (time.perf_counter() - began))
+                del kept, work
+    rows = []
+    for place in range(3):
+        base = times[groups[0][place][0]]
+        for group in groups:
+            name = group[place][0]
+            ratios = [ms / other for ms, other in zip(times[name], base, strict=True)]
+            rows.append({"call": name, "ms": statistics.median(times[name]), "ratio": statistics.median(ratios)})
+    return rows
+
+
+@tool("bench_library")
+def main(arguments: Sequence[str]) -> int:
+    """Measure and print."""
+    parser = options_parser(__doc__, 25, plot=False)
+    parser.add_argument("--gaussians", metavar="N", type=number, default=100_000)
+    parser.add_argument("--size", metavar="WxH", type=size, default=(640, 480))
+    options = parsed(parser, arguments)
+    require(options.gaussians >= 1, f"--gaussians {options.gaussians}: expected at least 1")
+    require(min(options.size) >= 1, f"--size {options.size[0]}x{options.size[1]}: expected at least 1x1")
+    device, subject = open_device(options.device), synthetic(options.gaussians, *options.size)
+    groups = [of_the_renderer(device, subject), of_numpy(device, subject)]
+    try:
+        groups += [of_torch(device, subject, packed=packed) for packed in (False, True)]
+    except ModuleNotFoundError as error:
+        print(f"bench_library: {error}: without the rows of torch", file=sys.stderr)
+    rows = measure(groups, options.repeat)
+    result = {
+        **machine(device, options.repeat),
+        "gaussians": options.gaussians,
+        "width": options.size[0],
+        "height": options.size[1],
+        "rows": rows,
+    }
+    lines = [("call", "ms", "ratio"), *((row["call"], f"{row['ms']:.1f}", f"{row['ratio']:.2f}") for row in rows)]
+    show(result, aligned(lines), as_json=options.json)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

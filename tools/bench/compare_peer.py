@@ -1,0 +1,185 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""A training step beside that of OpenSplat 1.2.0 (CPU), measured elsewhere, on the scenes that it was measured on.
+
+    python tools/bench/compare_peer.py fox banana sceaux_castle --limit './limit 20000' [--device DEVICE] [--json]
+    python tools/bench/compare_peer.py fox --limit-gpairs 3.55
+
+The arguments are the scenes' folders (docs/quality.md says whence), with the sizes and starting points that the
+peer had. The step is the trainer's own, at the full size (`--warmup ''`), pictures decoded beforehand as the peer
+does; the median of steps 3 to 30, wall time from an idle device to an idle device.
+
+The peer's seconds are carried over by what limits both machines: the (Gaussian, pixel) pairs a second that blending's
+arithmetic allows with everything in registers. It was 5.09 Gpairs/s where the peer was measured, on two cores with
+vectors of 16 lanes. --limit is a program that prints `... N Gpairs/s` for this machine, with its arguments; it runs
+behind every other step, and the median counts, as of the steps: so neighbours on the machine slow both. Short runs do
+(20000 repetitions of limit.c). Build it for the vectors that the machine has: with wider ones it is too slow, and the
+peer would look slower than it is. For the same reason clsplat's own kernel of that limit is measured too, by the
+shape's vectors, and counts where it is the faster. (By vectors of 16 it does a quarter more than limit.c on AVX-512, as
+a pair takes it fewer operations; its figure where the peer was is not known.) --limit-gpairs is a figure
+known already, and is taken as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import shlex
+import statistics
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from measuring import Result, machine, require, show, tool
+
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device, open_device
+from clsplat.errors import InputError
+from clsplat.progress import aligned
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.scene import Scene
+from clsplat.stages.peak import measure_limits
+from clsplat.training.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Work of the peer, pixels and starting Gaussians, and its median seconds a step."""
+
+    width: int
+    height: int
+    gaussians: int
+    seconds: float
+
+
+PEER = "OpenSplat 1.2.0"
+PEERS = {
+    "fox": Peer(449, 800, 13_560, 0.335),
+    "banana": Peer(800, 532, 7_426, 0.328),
+    "sceaux_castle": Peer(800, 590, 8_378, 0.462),
+}
+"""Medians of steps 3 to 30 on a quiet machine, with OMP_WAIT_POLICY=passive, which is faster than without."""
+PEER_GPAIRS = 5.09
+"""The limit where the peer was measured, 10^9 pairs a second."""
+FIRST, LAST = 3, 30
+
+
+def open_scene(folder: Path) -> tuple[Scene, Peer]:
+    """The scene, as the peer had it. Raises InputError where it is another."""
+    scene = load_scene(folder)
+    peer = PEERS.get(scene.name)
+    if peer is None:
+        raise InputError(f"{folder}: the peer has not been measured on it, expected one of {', '.join(PEERS)}")
+    for view in scene.views:
+        found = (view.camera.width, view.camera.height)
+        if found != (peer.width, peer.height):
+            raise InputError(f"{view.path}: is {found[0]}x{found[1]}, the peer had {peer.width}x{peer.height}")
+    if len(scene.points) != peer.gaussians:
+        raise InputError(f"{folder}: has {len(scene.points)} points, the peer started from {peer.gaussians}")
+    return scene, peer
+
+
+def step_and_limit(scene: Scene, device: Device, program: str | None) -> tuple[float, float | None]:
+    """Median milliseconds of a training step, and of the limit that the program prints between the steps, in Gpairs/s.
+    Raises InputError."""
+    trainer = Trainer(scene, TrainConfig(warmup=()), device)
+    for index in range(len(trainer.views)):
+        trainer.photographs.load(index, 1)
+    times, limits = [], []
+    for step in range(LAST):
+        times.append(device.timed(trainer.train_step)[1])
+        if program is not None and step % 2:
+            limits.append(limit_of(program))
+    return statistics.median(times[FIRST - 1 :]), statistics.median(limits) if limits else None
+
+
+def limit_of(program: str) -> float:
+    """Limit of this machine that the program prints, in Gpairs/s. Raises InputError."""
+    try:
+        done = subprocess.run(shlex.split(program), capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError, ValueError, IndexError) as error:
+        raise InputError(f"--limit {program}: cannot be run ({error})") from None
+    match = re.search(r"([\d.]+) Gpairs/s", done.stdout)
+    require(match is not None, f"--limit {program}: printed {done.stdout.strip()!r}, expected N Gpairs/s in it")
+    assert match is not None
+    return float(match[1])
+
+
+def measure(folder: Path, device: Device, program: str | None, known: float | None) -> Result:
+    """A row of the table; seconds but for `ms`, limits in Gpairs/s."""
+    scene, peer = open_scene(folder)
+    ms, printed = step_and_limit(scene, device, program)
+    limits: dict[str, float] = {}
+    if known is not None:
+        limits["given"] = known
+    elif printed is not None:
+        limits["program"] = printed
+        limits["kernel"] = 1e-9 * measure_limits(device, copy_bytes=2**20, widened=False).pairs_per_second
+    limit = max(limits.values())
+    scaled = peer.seconds * PEER_GPAIRS / limit
+    return {
+        "scene": scene.name,
+        "width": peer.width,
+        "height": peer.height,
+        "gaussians": peer.gaussians,
+        "ms": ms,
+        "limits": limits,
+        "limit": limit,
+        "peer_seconds": peer.seconds,
+        "peer_seconds_scaled": scaled,
+        "ratio": 1e3 * scaled / ms,
+    }
+
+
+def table(result: Result) -> list[str]:
+    """A line a scene."""
+    header = ("scene", "image", "Gaussians", "ms", "peer, s", "limit, Gpairs/s", "peer scaled, s", "scaled / ours")
+    rows: list[tuple[str, ...]] = [header]
+    for row in result["rows"]:
+        size, limit = f"{row['width']}x{row['height']}", f"{row['limit']:.2f}"
+        times = (f"{row['ms']:.1f}", f"{row['peer_seconds']:.3f}", limit, f"{row['peer_seconds_scaled']:.3f}")
+        rows.append((row["scene"], size, f"{row['gaussians']:,}", *times, f"{row['ratio']:.1f}"))
+    note = f"peer: {PEER}, measured where the limit was {PEER_GPAIRS} Gpairs/s"
+    others = [
+        f"{row['scene']}: {', '.join(f'{name} {value:.2f}' for name, value in row['limits'].items())}"
+        for row in result["rows"]
+        if len(row["limits"]) > 1
+    ]
+    return [*aligned(rows), "", note, *([f"limits, the largest counts: {'; '.join(others)}"] if others else [])]
+
+
+@tool("compare_peer")
+def main(arguments: Sequence[str]) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("scenes", metavar="SCENE", nargs="+", type=Path)
+    limit = parser.add_mutually_exclusive_group(required=True)
+    limit.add_argument("--limit", metavar="PROGRAM")
+    limit.add_argument("--limit-gpairs", metavar="N", type=float)
+    parser.add_argument("--device")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    known: float | None = options.limit_gpairs
+    if known is not None:
+        require(0 < known < math.inf, f"--limit-gpairs {known}: expected more than 0")
+    for folder in options.scenes:
+        open_scene(folder)
+    if options.limit is not None:
+        limit_of(options.limit)  # a program that does not run is told before anything is measured
+    device = open_device(options.device)
+    rows = []
+    for folder in options.scenes:
+        print(f"{folder}: {LAST} steps", file=sys.stderr, flush=True)
+        rows.append(measure(folder, device, options.limit, known))
+    result = {**machine(device, LAST - FIRST + 1), "peer": PEER, "peer_limit": PEER_GPAIRS, "rows": rows}
+    show(result, table(result), as_json=options.json)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,235 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Every kernel under Oclgrind: reads and writes out of bounds, data races, values read before they are written.
+
+    python tools/ci/check_memory.py [--shapes 1x64,8x1] [--jobs N] [--keep FOLDER]
+
+Runs `memory_workload.py` in children whose only device is Oclgrind's (Debian and Ubuntu: apt install oclgrind), once
+for bounds, races and API calls and once for uninitialised values; prints each finding with its kernel and line. Exit
+status 0: nothing found, 1: something was, a kernel never ran, or a fault planted to be found was not, 2: no Oclgrind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from memory_workload import PARTS
+
+from clsplat.device.source import _INCLUDE, kernel_root
+
+LIBRARY = "lib/oclgrind/liboclgrind-rt-icd.so"
+WORKLOAD = Path(__file__).with_name("memory_workload.py")
+COMMON_OPTIONS = "-D__has_builtin(x)=0"  # it has no prefetch
+CHECKS = {
+    # Functions are not inlined, as it does not know what LLVM 14 then says of pointers that do not overlap.
+    "races": {"OCLGRIND_DATA_RACES": "1", "OCLGRIND_BUILD_OPTIONS": f"-fno-inline {COMMON_OPTIONS}"},
+    # Not optimised, as it does not know LLVM's `freeze`.
+    "uninitialised": {"OCLGRIND_UNINITIALIZED": "1", "OCLGRIND_BUILD_OPTIONS": f"-O0 {COMMON_OPTIONS}"},
+}
+"""The environment of each; bounds and API calls are checked in both."""
+
+PLANTED = {
+    "races": {"planted_bounds": "Invalid write", "planted_race": "data race"},
+    "uninitialised": {"planted_bounds": "Invalid write", "planted_uninitialised": "Uninitialized"},
+}
+"""Findings expected of memory_workload.PLANTED, for the check to be one."""
+
+ACCEPTED = (
+    (
+        re.compile(r"runtime error detected\s+Function: clGetDeviceInfo\s+Error:\s+CL_INVALID_VALUE"),
+        "pyopencl asks every device for its shared virtual memory when it makes a kernel, which came with OpenCL 2.0",
+    ),
+)
+"""Findings that count as none: a pattern of the whole finding, and why."""
+
+
+STARTS = r"^(?=Invalid |Uninitialized |Controlflow |\S+-\S+ data race|Oclgrind|OCLGRIND|\S.*detected)"
+"""Pattern of the start of a finding in a log."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A finding of Oclgrind, with numbers that differ from run to run left out; kernel and place where it names
+    them."""
+
+    message: str
+    kernel: str = ""
+    place: str = ""
+
+    def __str__(self) -> str:
+        return ": ".join(filter(None, (self.kernel, self.place, self.message)))
+
+
+def library() -> Path | None:
+    """Oclgrind's OpenCL driver, or None."""
+    program = shutil.which("oclgrind")
+    prefixes = [*([Path(program).resolve().parents[1]] if program else []), Path("/usr"), Path("/usr/local")]
+    return next((path for prefix in prefixes if (path := prefix / LIBRARY).is_file()), None)
+
+
+def kernels() -> dict[str, str]:
+    """The stem of the file of every kernel."""
+    pattern = re.compile(r"__kernel\s+void\s+(\w+)\s*\(")
+    return {
+        name: path.stem for path in sorted(kernel_root().glob("*.cl")) for name in pattern.findall(path.read_text())
+    }
+
+
+def places(stem: str) -> list[str]:
+    """FILE:LINE of every line that a driver gets for `stem`.cl, see `clsplat.device.source.kernel_source`."""
+    seen: set[str] = set()
+    found: list[str] = []
+
+    def append(name: str) -> None:
+        if name in seen:
+            return
+        seen.add(name)
+        for number, line in enumerate((kernel_root() / name).read_text(encoding="utf-8").splitlines(), 1):
+            if match := _INCLUDE.match(line):
+                append(match.group(1))
+            else:
+                found.append(f"kernels/{name}:{number}")
+
+    append(f"{stem}.cl")
+    return found
+
+
+def findings(log: str, stems: dict[str, str]) -> tuple[Counter[Finding], Counter[str]]:
+    """Findings in a log, and the reasons of those that were accepted, each with its number."""
+    found: Counter[Finding] = Counter()
+    accepted: Counter[str] = Counter()
+    for text in re.split(STARTS, log, flags=re.MULTILINE):
+        if not text.strip() or re.fullmatch(r"\s*\d+ warnings? generated\.\s*", text):
+            continue
+        reason = next((reason for pattern, reason in ACCEPTED if pattern.search(text)), None)
+        if reason:
+            accepted[reason] += 1
+            continue
+        message = re.sub(r"0x[0-9a-f]+", "0x...", " ".join(text.split("\tEntity")[0].split()))
+        message = message.split(" Kernel: ")[0]
+        kernel = re.search(r"Kernel:\s+(\w+)", text)
+        line = re.search(r"At line (\d+)", text)
+        place = ""
+        if kernel and line and kernel[1] in stems:
+            listed = places(stems[kernel[1]])
+            place = listed[int(line[1]) - 1] if int(line[1]) <= len(listed) else ""
+        found[Finding(message, kernel[1] if kernel else "", place)] += 1
+    return found, accepted
+
+
+@dataclass(frozen=True)
+class Result:
+    """One child: what it was asked, its status, what it printed and what Oclgrind logged."""
+
+    name: str
+    status: int
+    output: str
+    log: str
+    seconds: float
+
+
+def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result:
+    """A part of the workload in a child whose only device is Oclgrind's."""
+    vendors = folder / "vendors"
+    vendors.mkdir(exist_ok=True)
+    (vendors / "oclgrind.icd").write_text(f"{driver}\n")
+    name = f"{shape} {check} {part}".rstrip()
+    log = folder / f"{name.replace(' ', '-')}.log"
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("OCLGRIND_", "CLSPLAT_"))}
+    environment |= CHECKS[check]
+    environment |= {
+        "OCL_ICD_VENDORS": str(vendors),
+        "OCLGRIND_CHECK_API": "1",
+        "OCLGRIND_LOG": str(log),
+        "OCLGRIND_MAX_ERRORS": "10000",
+        "OCLGRIND_GLOBAL_MEM_SIZE": str(1 << 30),
+        "OCLGRIND_NUM_THREADS": "1",
+        "CLSPLAT_TRUST_DRIVER": "1",  # this process is the trial
+        "PYOPENCL_NO_CACHE": "1",  # else the optimised build of one check would be found by the other
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(WORKLOAD.parents[2]), os.environ.get("PYTHONPATH", "")))),
+    }
+    command = [sys.executable, str(WORKLOAD), shape, part, *(["plain"] if check == "uninitialised" else [])]
+    start = time.monotonic()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
+    logged = log.read_text(errors="replace") if log.exists() else ""
+    return Result(name, done.returncode, done.stdout, logged + done.stderr, time.monotonic() - start)
+
+
+def report(result: Result, stems: dict[str, str]) -> bool:
+    """Print what a child found; whether that is nothing."""
+    found, accepted = findings(result.log, stems)
+    print(f"{result.name}: {sum(found.values())} findings, {result.seconds:.0f} s")
+    for reason, count in accepted.items():
+        print(f"  accepted, {count} times: {reason}")
+    for finding, count in found.most_common():
+        print(f"  {finding} ({count} times)")
+    if result.status != 0:
+        last = result.output.split()[-1:] or ["nothing"]
+        print(f"  ended with status {result.status}; the last kernel was {last[0]}")
+    return result.status == 0 and not found
+
+
+def report_planted(result: Result, check: str) -> bool:
+    """Print the planted faults that were missed; True if every one was found and the child ended well."""
+    found, _ = findings(result.log, {})
+    missing = [
+        name
+        for name, message in PLANTED[check].items()
+        if not any(finding.kernel == name and message in finding.message for finding in found)
+    ]
+    print(f"{result.name}: {len(PLANTED[check]) - len(missing)} of {len(PLANTED[check])} faults found")
+    for name in missing:
+        print(f"  not found: {name}")
+    return result.status == 0 and not missing
+
+
+def main(arguments: list[str]) -> int:
+    """Run the checks; see the module."""
+    parser = argparse.ArgumentParser(prog="check_memory", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--shapes", default="1x64,8x1", help="kernel shapes, LANESxITEMS with 1 or 8 lanes")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="children at once")
+    parser.add_argument("--keep", type=Path, help="folder for Oclgrind's logs")
+    options = parser.parse_args(arguments)
+    driver = library()
+    if driver is None:
+        print("check_memory: error: no Oclgrind found, expected it from: apt install oclgrind", file=sys.stderr)
+        return 2
+    stems = kernels()
+    shapes = options.shapes.split(",")
+    asked = [(shape, check, part) for shape in shapes for check in reversed(CHECKS) for part in PARTS]
+    asked += [("planted", check, "") for check in CHECKS]  # the longest are first
+    with tempfile.TemporaryDirectory(prefix="clsplat-memory-") as scratch:
+        folder = options.keep or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
+        with ThreadPoolExecutor(max(options.jobs, 1)) as pool:
+            results = list(pool.map(lambda each: run(each[0], each[1], each[2], driver, folder), asked))
+    clean, missing = True, {check: set(stems) for check in CHECKS}
+    for (shape, check, _), result in zip(asked, results, strict=True):
+        if shape == "planted":
+            clean &= report_planted(result, check)
+            continue
+        clean &= report(result, stems)
+        missing[check] -= set(result.output.split())
+    for check, names in missing.items():
+        if names:  # some kernels are built in some shapes alone
+            print(f"{check}, never ran: {', '.join(sorted(names))}")
+            clean = False
+    print(f"{len(stems)} kernels in {len(shapes)} shapes: {'clean' if clean else 'NOT clean'}")
+    return int(not clean)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,592 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Table of machines: on each the short self-test of its drivers and the smoke tests, in this one environment.
+
+    .venv/bin/python tools/ci/machines.py [--list] [--only NAME,...] [--full NAME,...] [--jobs N] [--markdown]
+
+A machine differs in the drivers that there are, the variables that are set, the user, and the place of the home. Its
+home is new, so that every driver is met for the first time. --list prints the names and --only runs some; --full
+runs all of tools/test on some; --jobs runs so many at once; --markdown prints the table as docs/machines.md has it.
+
+PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL where CLSPLAT_DEBIAN_POCL names its
+libpocl.so or in the system's list, Rusticl where CLSPLAT_RUSTICL names its libRusticlOpenCL.so, and Debian's QEMU where
+CLSPLAT_QEMU names its program or on the path. A machine that cannot be had is "not run", with the reason. Exit status 1
+where one failed. docs/machines.md has what each is for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from opencl_drivers import BESIDE, SYSTEM_VENDORS
+from processor import has_avx512, processor
+
+ROOT = Path(__file__).resolve().parents[2]
+HOOKS = ROOT / "tools" / "ci" / "hooks"
+PYTHON = sys.executable
+
+SHORT_LIMIT = 300
+"""Seconds for the short self-test: 7 with PoCL on two free cores, 40 with four drivers, and the machine may be busy."""
+SMOKE_LIMIT = 600
+"""Seconds for the smoke tests: 27 with PoCL on two free cores, some 70 with four drivers; a busy machine took 211."""
+FULL_LIMIT = 1200
+"""Seconds for tools/test, which takes 6 minutes on two cores."""
+TRAIN_LIMIT = 120
+"""Seconds for ten steps on a tiny scene, whose kernels the self-test has built for the most part."""
+EMULATED = 4
+"""Factor on an emulated processor's limits: the short self-test takes 80 s of a core instead of 20."""
+TAIL = 25
+"""Lines of a failed step's output that are shown."""
+
+SHORT = """
+import sys
+from clsplat.cli.main import main
+from clsplat.device.context import list_devices, open_device
+from clsplat.device.drivers.driver_records import memory_path
+from clsplat.errors import ClsplatError
+from clsplat.selftest.driver_check import require
+if memory_path().exists():
+    sys.exit(f"{memory_path()}: exists, expected a home in which no driver is known")
+if not list_devices():
+    sys.exit("no OpenCL device")
+try:
+    for info in list_devices():
+        require(open_device(str(info.index)))
+except ClsplatError as error:
+    sys.exit(str(error))
+"""
+"""The question that `train` asks of a driver at its first use, of each driver in turn."""
+SCENE = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {support!r})
+from tiny import write_scene
+write_scene(Path(sys.argv[1]))
+"""
+
+
+@dataclass(frozen=True)
+class Step:
+    """A command of a machine. status: its exit status; says: a part of its last line on standard error, then the only
+    one; without: what none of its output has."""
+
+    name: str
+    command: tuple[str, ...]
+    limit: float
+    status: int = 0
+    says: str = ""
+    without: str = "Traceback"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A row. drivers: their .icd files by name, the folder of OCL_ICD_VENDORS; pypi: whether PyPI's PoCL is there too;
+    wrap: the words before each command; missing: the reason that it cannot run, or nothing; prepare: given the
+    machine's folder, made ready before the first step; home, temporary: below that folder, unless absolute."""
+
+    name: str
+    purpose: str
+    steps: tuple[Step, ...] = ()
+    drivers: tuple[tuple[str, str], ...] = ()
+    pypi: bool = False
+    variables: tuple[tuple[str, str], ...] = ()
+    wrap: tuple[str, ...] = ()
+    missing: str = ""
+    prepare: Callable[[Path], None] = field(default=lambda folder: None)
+    home: str = "home"
+    temporary: str = "tmp"
+
+
+@dataclass
+class Result:
+    """The outcome of a machine: seconds of each step that passed, and the trouble, or why it was not run."""
+
+    machine: Machine
+    seconds: dict[str, float] = field(default_factory=dict)
+    trouble: str = ""
+    output: str = ""
+
+    @property
+    def words(self) -> str:
+        """Result for the table."""
+        if self.machine.missing:
+            return f"not run: {self.machine.missing}"
+        return f"FAILED: {self.trouble}" if self.trouble else "passed"
+
+
+def environment_of(machine: Machine, folder: Path) -> dict[str, str]:
+    """All variables of a machine: nothing of ours but the path."""
+    variables = {
+        "PATH": os.environ.get("PATH", os.defpath),
+        "LANG": "C.UTF-8",
+        "HOME": str(folder / machine.home),
+        "TMPDIR": str(folder / machine.temporary),
+        "OCL_ICD_VENDORS": str(folder / "drivers"),
+        "PYTHONDONTWRITEBYTECODE": "1",  # the checkout is not this user's, in some
+        "RUSTICL_ENABLE": "llvmpipe",
+    }
+    if not machine.pypi:
+        variables.update(PYTHONPATH=str(HOOKS), CLSPLAT_WITHOUT_PYPI_POCL=str(folder / "no-drivers"))
+    return variables | {name: value.replace("{folder}", str(folder)) for name, value in machine.variables}
+
+
+def run_machine(machine: Machine, show: Callable[[str], None] = print) -> Result:
+    """Run a machine's steps up to the first that fails."""
+    result = Result(machine)
+    if machine.missing:
+        return result
+    with tempfile.TemporaryDirectory(prefix="clsplat-machine-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        folder.chmod(0o755)  # another user's home may be in it
+        for part in ("drivers", "no-drivers", "made"):
+            (folder / part).mkdir()
+        for driver, library in machine.drivers:
+            (folder / "drivers" / f"{driver}.icd").write_text(f"{library}\n")
+        for part in (machine.home, machine.temporary):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+        machine.prepare(folder)
+        environment = environment_of(machine, folder)
+        for step in machine.steps:
+            start = time.monotonic()
+            result.trouble, result.output = run_step(step, machine.wrap, environment, folder)
+            seconds = time.monotonic() - start
+            if result.trouble:
+                result.trouble = f"{step.name}: {result.trouble}"
+                break
+            result.seconds[step.name] = seconds
+            show(f"{machine.name}: {step.name}, {seconds:.0f} s")
+    return result
+
+
+def run_step(step: Step, wrap: Sequence[str], environment: dict[str, str], folder: Path) -> tuple[str, str]:
+    """Run a step to its end or its limit; gives what is wrong, or nothing, and what it printed."""
+    command = [word.replace("{folder}", str(folder)) for word in (*wrap, *step.command)]
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+        child = subprocess.Popen(
+            command,
+            cwd=ROOT,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=errors,
+            start_new_session=True,
+        )
+        _RUNNING.add(child)
+        try:
+            status = child.wait(step.limit)
+        except subprocess.TimeoutExpired:
+            status = None
+        finally:
+            _end(child)
+            _RUNNING.discard(child)
+        texts = []
+        for stream in (output, errors):
+            stream.seek(0)
+            texts.append(stream.read().decode(errors="replace"))
+    return wrong(step, status, texts[1], "".join(texts)), "".join(texts)
+
+
+_RUNNING: set[subprocess.Popen[bytes]] = set()
+"""Children that Ctrl-C has to end: the terminal sends it to our own group alone."""
+
+
+def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
+    """Difference of a step's end from what was expected, or nothing; status None: it did not end."""
+    if status is None:
+        return f"did not end within {step.limit:g} s"
+    if status != step.status:
+        return f"exit status {status}, expected {step.status}"
+    lines = errors.strip().splitlines()
+    if step.says and not (lines and step.says in lines[-1]):
+        return f"its last line is {lines[-1] if lines else 'empty'!r}, expected {step.says!r} in it"
+    if step.without in output:
+        return f"printed {step.without!r}"
+    return ""
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End all that a step has started; it leads a group of its own."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)
+    child.wait()
+
+
+def short_test(limit: float = SHORT_LIMIT) -> Step:
+    return Step("short self-test", (PYTHON, "-c", SHORT), limit)
+
+
+OWN_SHAPE = "not 8x1-rusticl and not 1x1-rusticl"
+"""Expression for the smoke tests that run. Rusticl 22.3 runs work-groups of one item wrongly: the sort leaves its
+output as it was. It gets 1x64, and the self-test refuses what is wrong where another is asked for."""
+
+
+def smoke(*, stages: bool = True) -> Step:
+    """The smoke tests, from the files that have any: collecting all tests takes 10 s more. stages: also those of single
+    kernels; where only the user or the paths are other, the self-test has run the same kernels on the same driver."""
+    pytest = (PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=short")
+    files = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.smoke" in path.read_text("utf-8"))
+    names = [str(path.relative_to(ROOT)) for path in files if stages or path.parent.name != "stages"]
+    command = (*pytest, "-m", "smoke", "-k", OWN_SHAPE, *names)
+    return Step("smoke tests", command, SMOKE_LIMIT, without="no tests ran")
+
+
+def full() -> Step:
+    """The quick tests, with the caller's binaries for Intel's runtime: the steps before build theirs, and all would
+    take minutes."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    binaries = os.environ.get("CLSPLAT_BINARIES") or str(cache / "clsplat" / "binaries")
+    command = ("env", f"CLSPLAT_BINARIES={binaries}", PYTHON, "tools/test", "--quiet")
+    return Step("quick tests", command, FULL_LIMIT, without="no tests ran")
+
+
+def ten_steps(folder: str, *, limit: float = TRAIN_LIMIT, status: int = 0, says: str = "") -> tuple[Step, Step]:
+    """Ten steps of training on a tiny scene below a folder, which is written first, by this machine too."""
+    scene, run = f"{folder}/scene", f"{folder}/run"
+    tests = SCENE.format(support=str(ROOT / "tests" / "support"))
+    train = (PYTHON, "-m", "clsplat", "train", scene, "-o", run, "--iterations", "10")
+    return (
+        Step("scene", (PYTHON, "-c", tests, scene), limit),
+        Step("ten steps", train, limit, status=status, says=says),
+    )
+
+
+@dataclass(frozen=True)
+class Found:
+    """Means to make machines of; empty where it is missing."""
+
+    pypi: bool
+    intel: str
+    debian: str
+    rusticl: str
+    qemu: str
+    avx512: bool
+    root: bool
+    mounts: tuple[str, ...]
+    """The command that runs another with mounts of its own; none where that is not allowed."""
+    stranger: tuple[str, ...]
+    """The command that runs another as a user other than root that can read this; none where that is not allowed."""
+
+
+def look() -> Found:
+    """The means that this machine has."""
+    intel = Path(sys.prefix) / "lib" / "libintelocl.so"
+    debian = os.environ.get(BESIDE, "")
+    if not debian and (listed := SYSTEM_VENDORS / "pocl.icd").exists():
+        debian = listed.read_text().strip()
+    qemu = os.environ.get("CLSPLAT_QEMU", "") or shutil.which("qemu-x86_64") or shutil.which("qemu-x86_64-static") or ""
+    return Found(
+        pypi=any(Path(sys.prefix).glob("lib/python*/site-packages/pyopencl/.libs/pocl.icd")),
+        intel=str(intel.resolve()) if intel.exists() else "",
+        debian=debian,
+        rusticl=os.environ.get("CLSPLAT_RUSTICL", ""),
+        qemu=qemu,
+        avx512=has_avx512(),
+        root=_is_root(),
+        mounts=_mounts(),
+        stranger=_stranger(),
+    )
+
+
+def machines(found: Found) -> list[Machine]:
+    """Every row."""
+    usual, elsewhere = (short_test(), smoke()), smoke(stages=False)
+    no_pypi = "" if found.pypi else "pyopencl brings no PoCL here"
+    no_debian = "" if found.debian else "the distribution's PoCL is missing"
+    no_intel = "" if found.intel else "intel-opencl-rt is not installed"
+    no_rusticl = "" if found.rusticl else "CLSPLAT_RUSTICL names no library"
+    debian, intel, rusticl = ((("debian", found.debian),), (("intel", found.intel),), (("rusticl", found.rusticl),))
+    no_avx512 = "" if found.avx512 else "this processor has no AVX-512"
+    home_alone = Machine("", "", (short_test(), elsewhere), pypi=True, missing=no_pypi)
+    every = tuple(
+        (name, path) for name, path in (*debian, *intel, *rusticl) if path
+    )  # what is missing here has a row of its own that says so
+    return [
+        Machine("pypi-pocl", "what pip brings, alone", usual, pypi=True, missing=no_pypi),
+        replace(
+            home_alone,
+            name="pypi-pocl-1-thread",
+            purpose="the same, with one thread",
+            steps=usual,
+            variables=(("POCL_MAX_PTHREAD_COUNT", "1"),),
+        ),
+        emulated(found, no_pypi),
+        Machine("debian-pocl", "the distribution's PoCL", usual, debian, missing=no_debian),
+        *(
+            Machine(
+                f"debian-pocl-{library}",
+                f"the same, its built-ins for {library.upper()}",
+                usual,
+                debian,
+                variables=(("POCL_KERNELLIB_NAME", library),),
+                missing=no_debian,
+            )
+            for library in ("sse2", "avx2")
+        ),
+        Machine("intel", "Intel's runtime", usual, intel, missing=no_intel),
+        *(
+            Machine(
+                f"intel-{target}",
+                f"the same, for {processor}",
+                usual,
+                intel,
+                variables=(("CL_CONFIG_CPU_TARGET_ARCH", target),),
+                missing=no_intel or (no_avx512 if target == "skx" else ""),
+            )
+            for target, processor in (("corei7", "SSE4.2"), ("core-avx2", "AVX2"), ("skx", "AVX-512"))
+        ),
+        Machine("rusticl", "Mesa's Rusticl on llvmpipe, shaped as a GPU", usual, rusticl, missing=no_rusticl),
+        Machine(
+            "all",
+            f"all of them together: {', '.join(['pypi', *(name for name, _ in every)])}",
+            usual,
+            every,
+            pypi=True,
+            missing=no_pypi or ("" if every else "there is one driver only"),
+        ),
+        Machine("none", "no driver: the message says what to install", no_driver()),
+        replace(
+            home_alone,
+            name="not-root",
+            purpose="a user who may write at home alone",
+            wrap=found.stranger,
+            prepare=_give_away,
+            missing=no_pypi or _no_stranger(found),
+        ),
+        read_only_home(found, home_alone),
+        replace(
+            home_alone,
+            name="odd-paths",
+            purpose="spaces and letters beyond ASCII in home, TMPDIR and the scene's path",
+            steps=(short_test(), *ten_steps("{folder}/a hôme/スプラット"), elsewhere),
+            home="a hôme",
+            temporary="a hôme/tmp é",
+        ),
+        full_temporary(found, home_alone),
+        replace(
+            home_alone,
+            name="lang-c",
+            purpose="LANG=C, and a scene with letters beyond ASCII in its path",
+            steps=(short_test(), *ten_steps("{folder}/made/é"), elsewhere),
+            variables=(("LANG", "C"),),
+        ),
+        replace(
+            home_alone,
+            name="ascii",
+            purpose="LC_ALL=C with Python kept from making UTF-8 of it",
+            steps=(short_test(), *ten_steps("{folder}/made"), elsewhere),
+            variables=(("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")),
+        ),
+    ]
+
+
+def emulated(found: Found, missing: str) -> Machine:
+    """A processor without AVX-512, which PyPI's PoCL takes for what it is."""
+
+    def write_interpreter(folder: Path) -> None:
+        # what TCG lacks of Haswell: it says so of each in every process
+        processor = "Haswell,-pcid,-x2apic,-tsc-deadline,-hle,-invpcid,-rtm"
+        command = shlex.join([found.qemu, "-cpu", processor, PYTHON])
+        script = folder / "python"
+        script.write_text(f'#!/bin/sh\nexec {command} "$@"\n')
+        script.chmod(0o755)
+
+    steps = tuple(
+        replace(step, limit=EMULATED * step.limit, command=("{folder}/python", *step.command[1:]))
+        for step in (short_test(), *ten_steps("{folder}/made"))
+    )
+    return Machine(
+        "pypi-pocl-haswell",
+        "what pip brings, in 16 lanes on an emulated processor without AVX-512",
+        steps,
+        pypi=True,
+        variables=(
+            ("PYTHONPATH", str(HOOKS)),
+            ("CLSPLAT_INTERPRETER", "{folder}/python"),
+            ("CLSPLAT_SHAPE", "16x1"),
+            # np.fmax of NumPy 2.4 ends the emulator (QEMU 7.2) where it has loops for AVX2; kernels are none of NumPy's
+            ("NPY_DISABLE_CPU_FEATURES", "X86_V3"),
+        ),
+        missing=missing or ("" if found.qemu else "qemu-x86_64 is missing (Debian's qemu-user)"),
+        prepare=write_interpreter,
+    )
+
+
+def no_driver() -> tuple[Step, ...]:
+    """Each verb that wants a device says what to install."""
+    install = "pip install 'pyopencl[pocl]'"
+    scene, train = ten_steps("{folder}/made")
+    return (
+        Step("devices", (PYTHON, "-m", "clsplat", "devices"), TRAIN_LIMIT, status=2, says=install),
+        scene,
+        replace(train, status=2, says=install),
+        Step("demo", (PYTHON, "-m", "clsplat", "demo", "-o", "{folder}/demo"), TRAIN_LIMIT, status=2, says=install),
+    )
+
+
+def read_only_home(found: Found, alone: Machine) -> Machine:
+    """A home on a mount that is read-only, which holds for root too; else a home that cannot be made, below a file."""
+    machine = replace(alone, name="read-only-home", purpose="nothing can be written at home")
+    if found.mounts:
+        script = 'mount --bind "$1" "$1" && mount -o remount,ro,bind "$1" && shift && exec "$@"'
+        return replace(machine, wrap=(*found.mounts, "sh", "-c", script, "sh", "{folder}/home"))
+
+    def write_file(folder: Path) -> None:
+        (folder / "file").touch()
+
+    return replace(machine, prepare=write_file, variables=(("HOME", "{folder}/file/home"),))
+
+
+def full_temporary(found: Found, alone: Machine) -> Machine:
+    """A TMPDIR without a byte left, for training beside it and on it."""
+    script = 'mount -t tmpfs -o size=64k none "$1" && { cat /dev/zero >"$1/filler" 2>/dev/null; shift; exec "$@"; }'
+    scene, train = ten_steps("{folder}/made")
+    command = tuple("{folder}/tmp/run" if word == "{folder}/made/run" else word for word in train.command)
+    on_it = Step("on it", command, TRAIN_LIMIT, status=1, says="the disk is full")
+    return replace(
+        alone,
+        name="full-tmp",
+        purpose="no space left in TMPDIR: training beside it, and one line for training on it",
+        wrap=(*found.mounts, "sh", "-c", script, "sh", "{folder}/tmp"),
+        steps=(short_test(), scene, train, on_it),
+        missing=alone.missing or ("" if found.mounts else "mounts are not allowed here"),
+    )
+
+
+def _is_root() -> bool:
+    return os.name == "posix" and os.geteuid() == 0
+
+
+def _mounts() -> tuple[str, ...]:
+    command = ("unshare", "--mount") if _is_root() else ("unshare", "--map-root-user", "--mount")
+    return command if _works((*command, "mount", "-t", "tmpfs", "none", tempfile.gettempdir())) else ()
+
+
+def _stranger() -> tuple[str, ...]:
+    """The command prefix for user nobody, allowed to read all if the checkout or Python lie in root's home: so nothing
+    has to be copied."""
+    nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+    reading = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
+    # a child too: setpriv itself may still follow paths that its command may not
+    code = "import clsplat.cli.main, pyopencl, subprocess, sys; subprocess.check_call([sys.executable, '-V'])"
+    for command in (nobody, (*nobody, *reading)):
+        if _is_root() and _works((*command, PYTHON, "-c", code)):
+            return command
+    return ()
+
+
+def _no_stranger(found: Found) -> str:
+    if found.stranger:
+        return ""
+    return "another user cannot read this" if found.root else "this user is not root, so that every row is that"
+
+
+def _give_away(folder: Path) -> None:
+    for name in ("home", "tmp", "made"):
+        os.chown(folder / name, 65534, 65534)
+
+
+def _works(command: Sequence[str]) -> bool:
+    if shutil.which(command[0]) is None:
+        return False
+    return subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
+
+
+def table(results: Sequence[Result], *, markdown: bool = False) -> str:
+    """All rows, plain or as Markdown."""
+    rows = [("machine", "what it is", "seconds", "result")]
+    for result in results:
+        times = ", ".join(f"{name} {seconds:.0f}" for name, seconds in result.seconds.items())
+        rows.append((result.machine.name, result.machine.purpose, times, result.words))
+    if markdown:
+        rows[1:] = [(f"`{row[0]}`", *row[1:]) for row in rows[1:]]
+        rows.insert(1, ("---",) * 4)
+        return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the table."""
+    summary, _, details = (__doc__ or "").partition("\n\n")
+    parser = argparse.ArgumentParser(
+        description=summary, epilog=details, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--list", action="store_true", help="print the names and what each is")
+    parser.add_argument("--only", default="", metavar="NAME,...", help="these alone")
+    parser.add_argument("--full", default="", metavar="NAME,...", help="tools/test too on these")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="so many at once")
+    parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
+    given = parser.parse_args(arguments)
+    rows = machines(look())
+    try:
+        wanted, whole = (_named(rows, flag, text) for flag, text in (("--only", given.only), ("--full", given.full)))
+    except ValueError as error:
+        parser.error(str(error))
+    if given.jobs < 1:
+        parser.error(f"--jobs {given.jobs}: expected at least 1")
+    rows = [row for row in rows if not wanted or row.name in wanted]
+    rows = [replace(row, steps=(*row.steps, full())) if row.name in whole else row for row in rows]
+    if given.list:
+        for row in rows:
+            print(f"{row.name}: {row.purpose}" + (f" (not run: {row.missing})" if row.missing else ""))
+        return 0
+    return run_all(rows, jobs=given.jobs, markdown=given.markdown)
+
+
+def _named(rows: Sequence[Machine], flag: str, text: str) -> set[str]:
+    names = {row.name for row in rows}
+    wanted = {name for name in text.split(",") if name}
+    if unknown := wanted - names:
+        raise ValueError(f"{flag} {','.join(sorted(unknown))}: no such machine; there are {', '.join(sorted(names))}")
+    return wanted
+
+
+def run_all(rows: Sequence[Machine], *, jobs: int = 1, markdown: bool = False) -> int:
+    """Run machines and print how each went, and the table; gives the exit status."""
+
+    def show(text: str) -> None:
+        print(text, flush=True)
+
+    def run(machine: Machine) -> Result:
+        result = run_machine(machine, show)
+        if result.trouble:
+            tail = "".join(f"    {line}\n" for line in result.output.splitlines()[-TAIL:])
+            show(f"{machine.name}: {result.words}\n{tail}")
+        return result
+
+    start = time.monotonic()
+    with ThreadPoolExecutor(jobs) as pool:
+        try:
+            results = list(pool.map(run, rows))
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in tuple(_RUNNING):
+                _end(child)
+            return 130
+    failed = [result.machine.name for result in results if result.trouble]
+    missing = sum(bool(result.machine.missing) for result in results)
+    print(f"\n{table(results, markdown=markdown)}\n")
+    print(
+        f"{len(rows)} machines on {processor()}, {os.cpu_count()} cores: {len(rows) - len(failed) - missing} passed, "
+        f"{len(failed)} failed, {missing} not run, {time.monotonic() - start:.0f} s"
+    )
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

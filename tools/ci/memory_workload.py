@@ -1,0 +1,477 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Workload of `tools/ci/check_memory.py` in a child under Oclgrind: every kernel on scenes of a few tiles.
+
+    memory_workload.py planted|LANESxITEMS [plain]
+
+Prints the name of each kernel before it runs. `plain`: with the replacements that the check of uninitialised
+reads needs with Oclgrind 21.10, see STAND_INS.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from memory_library import library
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from clsplat.bench.stages import _Picture
+from clsplat.camera import Camera
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
+from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
+from clsplat.device import buffers, launch, program
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
+from clsplat.device.context import Device, all_devices
+from clsplat.device.drivers.shapes import Shape
+from clsplat.device.program import Kernel
+from clsplat.device.source import kernel_source
+from clsplat.frame.deep import Merge
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.images.holdouts import surfaces_of
+from clsplat.layouts.columns import POSE_ROWS, READBACK, WIDEST_SLOTS
+from clsplat.optimisation.density_rules import MarkRules
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.rendering.renderer import Renderer
+from clsplat.scenes.dataset import Lens
+from clsplat.scenes.scene import Scene
+from clsplat.scenes.supervision.depth_samples import KnownDepth
+from clsplat.stages import scan as stages_scan
+from clsplat.stages.adam import adam, add_view
+from clsplat.stages.appearance import Gains, step_gains
+from clsplat.stages.blend import count_pairs, tile_items
+from clsplat.stages.density import DeviceMarker, carry, gather, new_statistics
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
+from clsplat.stages.peak import _splats
+from clsplat.stages.scan import scan
+from clsplat.stages.sort import bitonic_sort, radix_sort
+from clsplat.training.trainer import Trainer
+
+STAND_INS = (
+    "arrays are filled by a copy from the host, as what clEnqueueFillBuffer writes counts as uninitialised there",
+    "rows are written with the whole of their array, as its shadow of a write begins where the buffer does",
+    "no buffer is released, as what is written to memory that is used again counts as uninitialised at times",
+    "vectors made of shorter vectors are made of their elements, as its shadow of such a shuffle reads past the end",
+    "the padding of an image gradient is masked by a choice in each lane, as its shadow of x & 0 is that of x",
+)
+"""Differences of the check of uninitialised reads from the product, and the reasons. What is not replaced here is
+found: each is the cause of a crash or of findings."""
+
+PLANTED = """
+__kernel void planted_bounds(__global float *out, const int n) { out[n + get_global_id(0)] = 1.0f; }
+__kernel void planted_race(__global float *out) { out[0] = (float)get_global_id(0); }
+__kernel void planted_uninitialised(__global float *out, __global const float *in) { out[0] = in[1] > 0.0f; }
+"""
+"""One fault of each kind that the check is there to find; it fails where it does not."""
+
+
+def camera(width: int, height: int) -> Camera:
+    """Looks along z, a little off the centre."""
+    return Camera(width, height, 0.9 * width, 0.8 * width, 0.45 * width, 0.55 * height, np.eye(3), np.zeros(3))
+
+
+def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians:
+    """Gaussians of all sizes and opacities, some beside the image, behind the camera or too faint to show."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(1.5, 5.0, count)
+    depth[::9] *= -1
+    at = rng.uniform(-0.2, 1.2, (count, 2)) * (view.width, view.height)
+    sides = (at - (view.cx, view.cy)) / (view.fx, view.fy) * depth[:, None]
+    sh = rng.normal(0, 0.2, (count, (degree + 1) ** 2, 3))
+    return Gaussians(
+        np.concatenate([sides, depth[:, None]], axis=1).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        np.log(np.abs(depth)[:, None] / view.fx * rng.uniform(0.5, 4.0, (count, 3))).astype(np.float32),
+        rng.uniform(-6, 6, count).astype(np.float32),
+        sh.astype(np.float32),
+    )
+
+
+def frames(device: Device) -> None:
+    """Forward and backward: as trained, with every exact switch off, in bands, and the counting build."""
+    view = camera(33, 17)
+    gaussians, background = cloud(40, view), upload(device, np.array([0.1, 0.2, 0.3], np.float32))
+    held = upload_gaussians(device, gaussians)
+    names = [each.name for each in fields(BenchSwitches) if isinstance(each.default, bool)]
+    switched: dict[str, Any] = {"tile_test": "square", "depth_sort": "pairs", "key_bits": "all"}
+    all_off = BenchSwitches(**switched | dict.fromkeys(names, False))
+    for config, small in ((RasterizerConfig(), False), (all_off, False), (RasterizerConfig(), True)):
+        rasterizer = Rasterizer(device, config)
+        if small:
+            rasterizer.capacity = 70
+        frame = rasterizer.forward(held, view, background, nearness=True)
+        if small and len(frame.bands) < 2:
+            raise SystemExit("the frame in bands has one band only")
+        gradient = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
+        gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
+        gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
+        screen = rasterizer.backward(held, frame, upload(device, gradient), gradients, fields=WIDEST_SLOTS)
+        read = [
+            *(gradients[group].get() for group in PARAMETER_GROUPS),
+            screen.gradients.get(),
+            frame.blended.image.get(),
+        ]
+        shown = frame.projected.tile_counts.get() > 0
+        if not all(np.isfinite(values[shown] if len(values) == len(shown) else values).all() for values in read):
+            raise SystemExit("a gradient is not finite")
+        if not small:
+            count_pairs(
+                rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, background, frame.camera
+            )
+
+
+def subgroups(device: Device) -> None:
+    """The probe of sub-groups, and the gradient of blending with them, where items are grouped. Oclgrind has none: an
+    item stands for what it should have got, so that the sums are wrong, but places and order of what is written are
+    those of sub-groups of 8."""
+    if device.shape.items == 1:
+        return
+    opened = device.with_shape(f"{device.shape.label}s")
+    opened._subgroups.append({"SUBGROUP": 8, "EXCHANGED(x,step)": "(x)"})  # noqa: SLF001
+    items = opened.shape.items
+    out = allocate(opened, (3, items), np.float32)
+    launch.launch_groups(opened, opened.kernels("probe_subgroup").probe_subgroup, 1, items, out)
+    view = camera(33, 17)
+    rasterizer, held = Rasterizer(opened), upload_gaussians(opened, cloud(40, view))
+    frame = rasterizer.forward(held, view, upload(opened, np.zeros(3, np.float32)), nearness=True)
+    gradient = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
+    gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
+    slots = rasterizer.pair_gradients(frame, upload(opened, gradient), fields=WIDEST_SLOTS)
+    if not (np.isfinite(out.get()).all() and np.isfinite(slots.values.get()).all()):
+        raise SystemExit("a sum by sub-groups is not finite")
+
+
+def by_two_launches(device: Device) -> None:
+    """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view. Gradients of
+    several views."""
+    model, gradients, first, second = (allocate_gaussians(device, 11, 4, zero=True) for _ in range(4))
+    counts, readback = (
+        upload(device, np.arange(11, dtype=np.uint32) % 3),
+        upload(device, np.zeros(len(READBACK), np.uint32)),
+    )
+    for sparse in (False, True):
+        rates, config = dict.fromkeys(PARAMETER_GROUPS, 0.1), OptimiserConfig(sparse=sparse)
+        adam(device, 1, rates, config, model, gradients, first, second, counts, readback)
+    add_view(device, counts, gradients, first, upload(device, np.zeros(11, np.uint32)))
+    if not all(np.isfinite(model[group].get()).all() for group in PARAMETER_GROUPS):
+        raise SystemExit("Adam's step is not finite")
+
+
+def rendering(device: Device) -> None:
+    """Kernels that only rendering needs: fewer SH bands by Gaussian, half floats."""
+    view = camera(20, 17)
+    gaussians = cloud(27, view, 3)
+    gaussians.sh[::2, 4:] = 0
+    config = RasterizerConfig(sh_storage="half", sh_tolerance=0.05)
+    Renderer(device, config=config).render(gaussians, view)
+
+
+def pictures(device: Device) -> None:
+    """Kernels that only pictures need: channels beside colour, slices by depth; cameras without an image plane."""
+    flat = camera(33, 17)
+    around = replace(flat, fx=33 / (2 * np.pi), fy=33 / (2 * np.pi), projection="equirectangular")
+    gaussians = cloud(30, flat, 6)
+    for view in (flat, around, replace(around, fx=9.0, fy=9.0, projection="fisheye")):
+        renderer = Renderer(device)
+        motion = ("motion",) if view is flat else ()
+        after = replace(view, translation=np.array([0.1, 0.0, 0.1]))
+        _, found = renderer.render_channels(gaussians, view, ("normal", "position", *motion), after=after)
+        slices = renderer.render_deep(gaussians, view, 3)
+        halves = [np.full((view.height, view.width), part, np.float32) for part in (0.25, 0.75)]
+        wall = np.full((view.height, view.width, 1), 2.5)
+        renderer.render_channels(gaussians, view, holdout=surfaces_of(wall, 1.5 * wall, 0.2 * wall))
+        several = Merge(renderer.device, 3)((slices.transpose(0, 3, 1, 2), half) for half in halves)
+        if not all(np.isfinite(values).all() for values in (*found.values(), slices, several)):
+            raise SystemExit(f"a channel of the {view.projection} camera is not finite")
+        if not found["count"].any():
+            raise SystemExit(f"nothing is in the picture of the {view.projection} camera")
+
+
+PAPER = TrainConfig(
+    iterations=6,
+    sh_degree=2,
+    sh_degree_every=2,
+    warmup=(1,),
+    density=DensityConfig(every=2, start=1, stop=6, gradient_threshold=1e-7, opacity_reset_every=3),
+)
+AHEAD = replace(PAPER, iterations=3, warmup=())
+VIEW, LOW = camera(20, 17), camera(17, 7)
+"""Of four tiles, and of two: Oclgrind takes most of its time for the pixels of blending and of the loss."""
+
+
+def training(device: Device) -> None:
+    """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset. Some
+    by capacity, of which one has too little."""
+    density = replace(PAPER.density, absolute_gradients=True, min_contribution=1e-3, prune_every=3, max_gaussians=60)
+    wide = replace(
+        PAPER,
+        iterations=4,
+        warmup=(),
+        sh_degree=1,
+        sh_degree_every=1,
+        background="random",
+        optimiser=OptimiserConfig(sparse=True),
+        density=density,
+    )
+    for config, channels, view in ((PAPER, 3, VIEW), (wide, 4, LOW), (AHEAD, 3, LOW)):
+        _train(device, config, channels, view)
+
+
+def methods(device: Device) -> None:
+    """Two steps of each of training's methods, and by each kind of camera."""
+    short = replace(AHEAD, iterations=2)
+    _train(device, replace(short, antialiased=True), 3, LOW)
+    _train(device, replace(short, density=replace(PAPER.density, growth="mcmc", max_gaussians=60)), 3, LOW)
+    _train(device, replace(short, appearance="exposure", masks="ignore"), 5, LOW)
+    # Of so small a scene points tell no gain, and none is pulled; the last photograph's row is the array's end.
+    gains = Gains.on(device, np.zeros((3, 3), np.float32), csr_array(np.ones((3, 3))))
+    columns, readback = upload(device, np.ones((3, 16), np.float32)), upload(device, np.zeros(len(READBACK), np.uint32))
+    step_gains(device, gains, 2, columns, 1, 1e-3, readback)
+    gains.logs.get()
+    _train(device, replace(short, appearance="ppisp"), 3, LOW)
+    _train(device, replace(short, appearance="grid"), 3, LOW)
+    _train(device, replace(short, masks="transparent"), 5, LOW)
+    # One view is not held; sums of more than POSE_ROWS Gaussians take two kernels.
+    _train(
+        device,
+        replace(short, refine_poses=True, refine_lenses=True, iterations=3),
+        3,
+        LOW,
+        views=3,
+        count=POSE_ROWS + 1,
+    )
+    _train(device, replace(short, depth="points"), 3, LOW)
+    long = replace(PAPER.density, growth="budget", max_gaussians=60, long_axis=True)
+    _train(device, replace(short, thinning=0.3, density=long), 3, LOW)
+    fisheye = replace(LOW, fx=9.0, fy=9.0, projection="fisheye", radial=(0.05, 0.01, 0.0, 0.0))
+    around = LOW.width / (2 * np.pi)
+    panorama = replace(LOW, fx=around, fy=around, projection="equirectangular")
+    for view in (fisheye, panorama, replace(LOW, fx=9.0, fy=9.0, projection="orthographic")):
+        _train(device, short, 3, view)
+
+
+def _train(device: Device, config: TrainConfig, channels: int, view: Camera, views: int = 1, count: int = 18) -> None:
+    pixels = np.random.default_rng(2).random((view.height, view.width, channels), np.float32)
+    if channels == 3:
+        pixels = (np.rint(255 * pixels) / np.float32(255)).astype(np.float32)  # which goes to the device as bytes
+    if channels == 5:
+        pixels[:, :, 4] = pixels[:, :, 4] > 0.3
+    gaussians = cloud(count, camera(view.width, view.height), 5, degree=0)
+    gaussians.opacity_logits[18:] = -9  # as rows they count, and blending them would take most of the time
+    trainer = Trainer(scene_of(view, pixels, views), config, device, gaussians)
+    trainer.pending.on = config is AHEAD
+    if config is AHEAD:
+        rooms = iter((0, 2000, 1))
+        trainer.pending.room = lambda *_: next(rooms)  # type: ignore[method-assign]
+    losses = [trainer.train_step().read()[0] for _ in range(config.iterations)]
+    if trainer.pending.redone != (config is AHEAD):
+        raise SystemExit(f"{trainer.pending.redone} steps were made again")
+    if not np.isfinite(losses).all():
+        raise SystemExit(f"the training went wrong: losses {losses}")
+
+
+def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene:
+    """A view, once or more often, its picture in memory at any size."""
+
+    class Picture(_Picture):
+        def load_masked(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
+            return self.pixels[: height or view.height, : width or view.width]
+
+    lens = Lens("PINHOLE", view.width, view.height, (view.fx, view.fy, view.cx, view.cy))
+    means = cloud(18, camera(view.width, view.height), 5, degree=0).means.astype(np.float64)
+    depth = KnownDepth(means, np.ones(len(means)))  # for trainings that compare depths
+    names = [f"{number}.png" for number in range(views)]
+    pictures = [Picture(name, view, Path(name), "train", lens, depth=depth, pixels=pixels) for name in names]
+    return Scene("tiny", list(pictures), np.zeros((0, 3)), np.zeros((0, 3), np.float32), (-np.ones(3), np.ones(3)))
+
+
+def sorts(device: Device) -> None:
+    """Both sorts, the radix sort with several groups and passes, and of one item alone; scans with them."""
+    rng, work = np.random.default_rng(4), Workspace(device)
+    few = stages_scan.MAX_SINGLE_CHUNK_ELEMENTS
+    for alone, n, bits, sort in (
+        (few, 300, 16, None),
+        (few, 700, 20, radix_sort),
+        (0, 2500, 13, radix_sort),
+        (0, 77, 5, radix_sort),
+        (few, 1, 1, radix_sort),
+    ):
+        stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = alone
+        keys = rng.integers(0, 1 << bits, n).astype(np.uint32)
+        on_device = upload(device, keys)
+        done = sort(device, work, "keys", on_device, bits) if sort else bitonic_sort(device, work, "keys", on_device)
+        order = np.argsort(keys, kind="stable")
+        if not (np.array_equal(done[0].get(), keys[order]) and np.array_equal(done[1].get(), order)):
+            raise SystemExit(f"{n} keys were not sorted")
+    values, total = upload(device, np.ones(2100, np.uint32)), allocate(device, (1,), np.uint32)
+    stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = 0
+    scan(device, work, values, values, total)  # more than one chunk
+    stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = few
+    if int(total.get()[0]) != 2100:
+        raise SystemExit("2100 values were not added up")
+
+
+def density(device: Device) -> None:
+    """Rows that are marked, listed and gathered, of a model on the device and of one on the host, in parts."""
+    count = 3 * device.row_alignment + 1
+    gaussians = cloud(count, camera(20, 17), 9, degree=1)
+    statistics = new_statistics(device, count, contributions=True)
+    statistics.load({name: np.linspace(0, 2, count, dtype=np.float32) for name in statistics.named()})
+    rules = MarkRules(gradient=0.5, strongest=(0.8, 9), large=-2.0, transparent=-5.0, contribution=0.01, radius=1.9)
+    for model in (upload_gaussians(device, gaussians), host_gaussians(gaussians, device.row_alignment)):
+        listed = DeviceMarker(device, Workspace(device), model, statistics).rows(rules)
+        after = new_statistics(device, listed.count, contributions=True)
+        carry(device, listed.rows, statistics, after, densified=True)
+        if isinstance(model, DeviceGaussians):
+            gather(device, listed.rows, model, renews=True)["means"].get()
+        if not 0 < listed.halves < listed.count or not np.isinf(after.named()["whole_totals"].get()).any():
+            raise SystemExit("nothing is split, or nothing is new")
+
+
+def limits(device: Device) -> None:
+    """The kernels of `clsplat bench` that measure what the device does at most, a round of each; the probes of the
+    tests and of the self-test."""
+    items, lanes = tile_items(device), device.shape.lanes
+    copied = max(lanes, 4)
+    splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
+    kernels = device.kernels("peak", ITEMS=items)
+    for kernel in (kernels.limit_blend, kernels.limit_blend_grad):
+        launch.launch_groups(device, kernel, 1, items, 2, splats, sums)
+    sums.get()
+    source, copy = upload(device, np.ones(16 * copied, np.float32)), allocate(device, (16 * copied,), np.float32)
+    launch.launch_items(device, device.kernels("peak").limit_copy, 16, 16 * copied, source, copy)
+    probe = device.kernels("probe")
+    for name, values, rows in (
+        ("probe_elementary", np.linspace(0.1, 0.9, 5, dtype=np.float32), 4),
+        ("probe_half", np.arange(5, dtype=np.uint16), 4),
+    ):
+        out = allocate(device, (rows, len(values)), np.float32)
+        extra = (len(values),) if name == "probe_elementary" else ()
+        launch.launch_grid(device, getattr(probe, name), (len(values),), upload(device, values), out, *extra)
+        out.get()
+    copy.get()
+    numbers = [upload(device, np.full(lanes, value, np.float32)) for value in (1.5, 2.5, -0.5)]
+    results = allocate(device, (4, lanes), np.float32)
+    launch.launch_items(device, device.kernels("arithmetic").arithmetic, 1, lanes, *numbers, results)
+    results.get()
+
+
+def planted(device: Device) -> None:
+    """Faults that Oclgrind has to find."""
+    kernels = cl.Program(device.context, PLANTED).build(options=["-cl-std=CL1.2"])
+    out, unwritten = allocate(device, (8,), np.float32), allocate(device, (8,), np.float32)
+    for name, size, arguments in (
+        ("planted_bounds", 1, (out.buffer, np.int32(8))),
+        ("planted_race", 4, (out.buffer,)),
+        ("planted_uninitialised", 1, (out.buffer, unwritten.buffer)),
+    ):
+        print(name, flush=True)
+        getattr(kernels, name)(device.queue, (size,), (1,), *arguments)
+        device.finish()
+
+
+def stand_in(lanes: int) -> None:
+    """See STAND_INS."""
+    kept = []
+
+    class Kept(buffers._Buffer):  # noqa: SLF001
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            kept.append(self)
+
+    def fill(self: DeviceArray, value: float) -> None:
+        self.set(np.full(self.shape, value, self.dtype))
+
+    def set_rows(self: DeviceArray, start: int, values: NDArray[Any]) -> None:
+        whole = self.get()
+        whole[start : start + len(values)] = values
+        self.set(whole)
+
+    DeviceArray.set_rows = set_rows  # type: ignore[method-assign]
+    buffers._Buffer = Kept  # type: ignore[misc]  # noqa: SLF001
+    DeviceArray.fill = fill  # type: ignore[method-assign]
+    vars(program)["kernel_source"] = lambda stem: by_elements(kernel_source(stem), lanes)
+
+
+def by_elements(source: str, lanes: int) -> str:
+    """Kernel source in which (float8)(a.lo, b.s01, ...) has .s0 and so on of every part, and LOAD_CELL and the mask of
+    image gradients are of elements too, line by line."""
+    parts = r"\w+\.(?:lo|hi|s[0-9a-f]{2,8})"
+    halves = {"lo": "0123", "hi": "4567"}
+
+    def elements(match: re.Match[str]) -> str:
+        pieces = [part.strip().split(".") for part in match[2].split(",")]
+        each = [f"{name}.s{i}" for name, which in pieces for i in halves.get(which, which[1:])]
+        return f"({match[1]})({', '.join(each)})"
+
+    def masked(match: re.Match[str]) -> str:
+        at = f"({match[1]})"
+        if lanes == 1:
+            return f"(inside ? *{at} : 0.0f)"
+        each = [f"inside.s{4 * row + i} ? {at}[{row} * stride + {i}] : 0.0f" for row in range(2) for i in range(4)]
+        return f"(floatL)({', '.join(each)})"
+
+    source = re.sub(rf"\((float8|int8)\)\(({parts}(?:, {parts})+)\)", elements, source)
+    gradient = r"AS_FLOATL\(LOAD_CELL\(int, \(__global const int \*\)(image_gradient[^,]*), stride\) & inside\)"
+    source = re.sub(gradient, masked, source)
+    source = source.replace(
+        "#define LANES 16\n", "#define LANES 8\n"
+    )  # the loss; halves of 16 floats are the same to it
+    loads = "((type##8)(LOAD4(type, p), LOAD4(type, (p) + (stride))))"
+    each = [f"(p)[{i}]" for i in range(4)] + [f"(p)[(stride) + {i}]" for i in range(4)]
+    return source.replace(loads, f"((type##8)({', '.join(each)}))")
+
+
+PARTS = {
+    "training": (training,),
+    "methods": (methods,),
+    "library": (library,),
+    "passes": (sorts, limits, frames, subgroups, by_two_launches, rendering, pictures, density),
+}
+"""The workload in parts that take a child each, by name."""
+
+
+def note_kernels() -> None:
+    """Print the name of each kernel when it is put on the queue, and wait for it: a crash is then the last one's."""
+    real = launch._enqueue  # noqa: SLF001
+
+    def noted(
+        device: Device, kernel: Kernel, size: tuple[int, ...], local: tuple[int, ...] | None, arguments: tuple[Any, ...]
+    ) -> None:
+        print(kernel.name, flush=True)
+        real(device, kernel, size, local, arguments)
+        device.finish()
+
+    launch._enqueue = noted  # noqa: SLF001
+
+
+def main(arguments: list[str]) -> int:
+    """Run what the arguments say on Oclgrind's device."""
+    note_kernels()
+    device = next(each for each in all_devices() if "Oclgrind" in each.name)
+    if arguments[0] == "planted":
+        planted(Device(device, Shape(lanes=1, items=64, chunks=4)))
+        return 0
+    shape = Shape(1, 1, chunks=4).relabelled(arguments[0])
+    if "plain" in arguments[1:]:
+        if shape.lanes not in (1, 8):
+            raise SystemExit(f"{shape.lanes} lanes: expected 1 or 8")
+        stand_in(shape.lanes)
+    opened = Device(device, shape)
+    print("probe_fma", flush=True)  # which a device runs before its first kernel, where it has lanes
+    if shape.items == 1:
+        opened.kind = "cpu"  # the launches too are then those of a CPU
+    for name in arguments[1:]:
+        for part in PARTS.get(name, ()):
+            part(opened)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of docs/other-programs.md, made from the marks `brings` of the tests: what other programs write, what is
+read of it, and the test that holds it.
+
+python3 tools/ci/other_programs.py            # write it anew
+python3 tools/ci/other_programs.py --check    # exit status 1 if it is another
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "other-programs.md"
+BEGIN, END = "<!-- made by tools/ci/other_programs.py -->\n", "<!-- end -->\n"
+MARK = "pytest.mark.brings"
+
+
+def rows() -> list[tuple[str, str, str, str]]:
+    """Program, what it writes, what is read, and the test, in this order."""
+    return sorted(row for path in sorted((ROOT / "tests").rglob("test_*.py")) for row in _marked(path))
+
+
+def _marked(path: Path) -> Iterator[tuple[str, str, str, str]]:
+    text = path.read_text("utf-8")
+    if MARK not in text:
+        return
+    for function in ast.walk(ast.parse(text)):
+        if isinstance(function, ast.FunctionDef):
+            for mark in function.decorator_list:
+                if isinstance(mark, ast.Call) and ast.unparse(mark.func) == MARK:
+                    program, writes, read = (str(ast.literal_eval(argument)) for argument in mark.args)
+                    yield program, writes, read, f"`{path.relative_to(ROOT / 'tests').as_posix()}`: `{function.name}`"
+
+
+def table() -> str:
+    """The table as Markdown."""
+    lines = ["| program | writes | read | tested by, in `tests/` |", "|---|---|---|---|"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows())]) + "\n"
+
+
+def page(text: str) -> str:
+    """The page with the table as it should be."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    return before + BEGIN + table() + END + after
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    asked = parser.parse_args()
+    now = PAGE.read_text("utf-8")
+    wanted = page(now)
+    if not asked.check:
+        PAGE.write_text(wanted, "utf-8")
+    elif now != wanted:
+        print(f"{PAGE}: has another table than the tests' marks, expected what tools/ci/other_programs.py writes")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

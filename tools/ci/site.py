@@ -1,0 +1,96 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""The site of README.md and docs/, with an API page from the docstrings; needs the extra `docs`.
+
+    .venv/bin/python tools/ci/site.py [FOLDER]
+
+Writes HTML to FOLDER, by default build/site: open its index.html. Exit status 1 where there is a warning, such as for a
+link that leads nowhere or a docstring that is not found. docs/mkdocs.yml has the settings.
+
+mkdocs takes one folder of pages and nothing beside it, so the pages are copied to a temporary one, where every link
+between them stays what it is; three things are added to the copy: a list of the decisions, the text of each example
+below the link to it, and formulas as MathML.
+"""
+
+from __future__ import annotations
+
+import html
+import logging
+import re
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from latex2mathml.converter import convert
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import MkDocsException
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE", ".github")
+"""Copied beside docs/, as pages link to them."""
+DECISIONS = "docs/decisions"
+EXAMPLE = re.compile(r"^\[[^]]+\]\((examples/\w+\.py)\)$", re.MULTILINE)
+"""A link to an example that is a line of its own."""
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+TAG = re.compile(r"\\tag\{(\w+)\}")
+
+
+def copy_pages(folder: Path) -> list[str]:
+    """Copy what is published to the folder; returns the decisions' pages, in order."""
+    shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in PAGES:
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
+        copy(ROOT / name, folder / name)
+    decisions = sorted((folder / DECISIONS).glob("*.md"))
+    lines = [f"- [{path.read_text('utf-8').partition(chr(10))[0].lstrip('# ')}]({path.name})" for path in decisions]
+    (folder / DECISIONS / "README.md").write_text("\n".join(["# Decisions", "", *lines, ""]), "utf-8")
+    for path in folder.rglob("*.md"):
+        text = path.read_text("utf-8").replace("decisions/)", "decisions/README.md)")
+        path.write_text(EXAMPLE.sub(lambda link: with_code(link, folder / "docs"), text), "utf-8")
+    return [f"{DECISIONS}/README.md", *(f"{DECISIONS}/{path.name}" for path in decisions)]
+
+
+def with_code(link: re.Match[str], docs: Path) -> str:
+    """A link to an example, with the example below it."""
+    return f"{link[0]}\n\n```python\n{(docs / link[1]).read_text('utf-8')}```"
+
+
+def formulas(text: str, **_: object) -> str:
+    """A page's HTML with its TeX as MathML, which browsers show by themselves. Numbers of equations go to the right."""
+
+    def mathml(found: re.Match[str]) -> str:
+        tex = html.unescape(found[2])
+        tag = TAG.search(tex)
+        number = f'<span style="float: right; clear: right">({tag[1]})</span>' if tag else ""
+        formula: str = convert(TAG.sub("", tex), display="block" if found[1] == "div" else "inline")
+        return number + formula
+
+    return FORMULA.sub(mathml, text)
+
+
+def main() -> int:
+    """Build the site; returns the exit status."""
+    logging.basicConfig(format="%(levelname)s %(message)s", level=logging.WARNING)
+    target = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "build/site").resolve()
+    with tempfile.TemporaryDirectory() as folder:
+        decisions = copy_pages(Path(folder))
+        config: MkDocsConfig = load_config(
+            str(ROOT / "docs/mkdocs.yml"), docs_dir=folder, site_dir=str(target), strict=True
+        )
+        assert config.nav is not None
+        next(part for part in config.nav if "Decisions" in part)["Decisions"] = decisions
+        config.plugins.events["page_content"].append(formulas)
+        try:
+            build(config)
+        except MkDocsException as error:
+            print(f"tools/ci/site.py: {error}", file=sys.stderr)
+            return 1
+    print(target / "index.html")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

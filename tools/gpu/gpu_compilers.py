@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles kernels for GPUs that are not here: clang, NVIDIA's assembler and disassembler, and what they say."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from gpu_assembly import Loop, parse_gcn, parse_sass
+
+from clsplat.device.drivers.driver_records import cache_folder
+from clsplat.device.source import kernel_source
+from clsplat.errors import ClsplatError
+
+CLANG = "19"
+"""Version of clang, of which the counts depend; 16 is the first that knows every target."""
+NVIDIA = "13.5.37"
+"""Version of the packages that have NVIDIA's assembler and disassembler."""
+PACKAGES = {"ptxas": "nvidia-cuda-nvcc", "nvdisasm": "nvidia-cuda-nvdisasm"}
+TARGETS = ("sm_75", "sm_89", "sm_90", "gfx90a", "gfx1030", "gfx1100")
+BUILTINS = Path(__file__).with_name("gpu_builtins.cl")
+FLAGS = ("-x", "cl", "-O3", "-nogpulib", "-Xclang", "-finclude-default-header", "-Wno-everything")
+
+
+class NoCompilerError(ClsplatError):
+    """A compiler is missing; the message says what to install."""
+
+    exit_status = 2
+
+
+@dataclass(frozen=True)
+class Built:
+    """A kernel for a target. registers: of an item; spills, stack, shared: bytes, of an item, an item and a group;
+    whole: the kernel as a loop that runs once."""
+
+    kernel: str
+    target: str
+    registers: int
+    spills: int
+    stack: int
+    shared: int
+    whole: Loop
+
+
+@dataclass(frozen=True)
+class Source:
+    """A kernel file and the options that the package builds it with."""
+
+    stem: str
+    options: tuple[str, ...]
+
+    @property
+    def items(self) -> int:
+        """Work-items of a group of kernels that co-operate."""
+        return next(int(each.partition("=")[2]) for each in self.options if each.startswith("-DITEMS="))
+
+    @property
+    def by_gaussian(self) -> bool:
+        """True for the gradient of blending in which an item has a Gaussian."""
+        return "-DBY_GAUSSIAN" in self.options
+
+    @property
+    def subgroup(self) -> int:
+        """Items that exchange values, 1 where none do."""
+        return next((int(each.partition("=")[2]) for each in self.options if each.startswith("-DSUBGROUP=")), 1)
+
+    def options_for(self, target: str) -> tuple[str, ...]:
+        """The options, with the target's way to exchange values."""
+        shuffle = "-DSHUFFLE_PTX" if target.startswith("sm_") else "-DSHUFFLE_AMD"
+        return tuple(shuffle if each.startswith("-DSHUFFLE") else each for each in self.options)
+
+    @property
+    def shape(self) -> str:
+        """The kernels' shape, as CLSPLAT_SHAPE has it."""
+        return f"1x{self.items}{'g' if self.by_gaussian else 's' if self.subgroup > 1 else ''}"
+
+    @property
+    def label(self) -> str:
+        """The stem, with the defines beside the shape."""
+        shape = ("-DITEMS=", "-DLANES=", "-DSUBGROUP=", "-DSHUFFLE", "-cl")
+        defines = [each[2:].removesuffix("=1") for each in self.options if not each.startswith(shape)]
+        return " ".join((self.stem, *defines))
+
+    @property
+    def used(self) -> Source:
+        """The same without defines that the text does not name: two of which this is the same are the same kernels, as
+        most files are in shapes that differ in the items of a group."""
+        words = set(re.findall(r"\w+", kernel_source(self.stem)))
+        names = {each: each.removeprefix("-D").partition("=")[0].partition("(")[0] for each in self.options}
+        kept = (each for each in self.options if not each.startswith("-D") or names[each] in words)
+        return Source(self.stem, tuple(kept))
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines of the text."""
+        return kernel_source(self.stem).splitlines()
+
+
+def clang() -> str:
+    """The compiler's path. Raises NoCompilerError."""
+    found = shutil.which(f"clang-{CLANG}") or shutil.which("clang") or ""
+    version = _run([found, "--version"]).stdout if found else ""
+    if re.search(rf"clang version {CLANG}\.", version) is None:
+        instead = f"; {found} is another version" if found else ""
+        raise NoCompilerError(f"no clang {CLANG} found{instead}: apt install clang-{CLANG}")
+    return found
+
+
+def compilers() -> str:
+    """The versions of clang and ptxas, in words."""
+    version = re.search(r"clang version (\S+)", _run([clang(), "--version"]).stdout)
+    return f"clang {version[1] if version else CLANG}, ptxas {NVIDIA}"
+
+
+@cache
+def nvidia(name: str) -> str:
+    """The path of ptxas or nvdisasm, in the cache folder; downloaded by pip where it is not. Raises NoCompilerError."""
+    path = cache_folder() / f"nvidia-{NVIDIA}" / name
+    if path.is_file():
+        return str(path)
+    package = f"{PACKAGES[name]}=={NVIDIA}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+        pip = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--only-binary", ":all:", "-d", scratch]
+        done = _run([*pip, package])
+        wheels = list(Path(scratch).glob("*.whl"))
+        if done.returncode or not wheels:
+            last = (done.stderr.strip() or "nothing was downloaded").splitlines()[-1]
+            raise NoCompilerError(f"no {name} found: {path} is not there, and pip download {package} failed: {last}")
+        with zipfile.ZipFile(wheels[0]) as wheel:
+            member = next(each for each in wheel.namelist() if each.endswith(f"bin/{name}"))
+            fresh = Path(wheel.extract(member, scratch))
+        fresh.chmod(0o755)
+        fresh.replace(path)
+    return str(path)
+
+
+def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+
+
+def run_checked(command: Sequence[str], what: str) -> str:
+    """Output of a command that has to succeed, both streams. Raises ClsplatError."""
+    done = _run(command)
+    if done.returncode:
+        told = [line for line in done.stderr.splitlines() if "error" in line or "fatal" in line]
+        raise ClsplatError(f"{what}: {(told or done.stderr.splitlines() or [f'status {done.returncode}'])[0]}")
+    return done.stdout + done.stderr
+
+
+def target_flags(target: str) -> tuple[str, ...]:
+    """Clang's options for a target."""
+    if target.startswith("sm_"):
+        return ("--target=nvptx64-nvidia-cuda", f"-march={target}")
+    return ("--target=amdgcn-amd-amdhsa", f"-mcpu={target}")
+
+
+def build_builtins(target: str, folder: Path) -> Path:
+    """Bitcode of the built-in functions. It names no lines, so that a call of one counts as its caller's line."""
+    path = folder / f"builtins-{target}.bc"
+    options = (*FLAGS, *target_flags(target), "-cl-std=CL1.2", "-cl-fp32-correctly-rounded-divide-sqrt")
+    run_checked([clang(), *options, "-c", "-emit-llvm", str(BUILTINS), "-o", str(path)], BUILTINS.name)
+    return path
+
+
+def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
+    """The kernels of a file. Raises ClsplatError where a compiler refuses it."""
+    what = f"{source.label} for {target}"
+    with tempfile.TemporaryDirectory(dir=builtins.parent) as scratch:
+        text, assembly, cubin = (Path(scratch) / f"{source.stem}.{end}" for end in ("cl", "s", "cubin"))
+        text.write_text(kernel_source(source.stem), encoding="utf-8")
+        link = ("-Xclang", "-mlink-builtin-bitcode", "-Xclang", str(builtins))
+        options = (*FLAGS, "-gline-tables-only", *target_flags(target), *source.options_for(target), *link)
+        run_checked([clang(), *options, "-S", str(text), "-o", str(assembly)], what)
+        written = assembly.read_text()
+        if missing := re.search(r"\b_Z(\d+)(\w+)", written):
+            name = missing[2][: int(missing[1])]
+            raise ClsplatError(f"{what}: {BUILTINS.name} has no body of the built-in function {name}")
+        if not target.startswith("sm_"):
+            return read_amd(written, target)
+        told = run_checked(
+            [nvidia("ptxas"), "-v", "-lineinfo", f"-arch={target}", str(assembly), "-o", str(cubin)], what
+        )
+        return read_nvidia(told, run_checked([nvidia("nvdisasm"), "-c", "-g", str(cubin)], what), target)
+
+
+_FUNCTION = re.compile(
+    r"Compiling entry function '(?P<name>\w+)'.*?"
+    r"(?P<stack>\d+) bytes stack frame, (?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads.*?"
+    r"Used (?P<registers>\d+) registers(?P<rest>[^\n]*)",
+    re.DOTALL,
+)
+
+
+def read_nvidia(told: str, sass: str, target: str) -> list[Built]:
+    """Kernels, from what `ptxas -v` has said and `nvdisasm -c` has written."""
+    wholes = parse_sass(sass)
+    built = []
+    for match in _FUNCTION.finditer(told):
+        shared = re.search(r"(\d+) bytes smem", match["rest"])
+        spills = int(match["stores"]) + int(match["loads"])
+        numbers = (int(match["registers"]), spills, int(match["stack"]), int(shared[1]) if shared else 0)
+        built.append(Built(match["name"], target, *numbers, wholes[match["name"]]))
+    return built
+
+
+def read_amd(assembly: str, target: str) -> list[Built]:
+    """Kernels, from the metadata that clang's assembly has."""
+    wholes = parse_gcn(assembly)
+    entries = assembly.partition("amdhsa.kernels:")[2].partition("amdhsa.target:")[0]
+    built = []
+    for entry in re.split(r"^  - ", entries, flags=re.MULTILINE)[1:]:
+        numbers = {key: int(value) for key, value in re.findall(r"^ +\.(\w+): +(\d+)$", entry, re.MULTILINE)}
+        name = re.search(r"^    \.name: +(\w+)$", entry, re.MULTILINE)
+        assert name is not None, "every kernel has one"
+        spills = 4 * (numbers.get("vgpr_spill_count", 0) + numbers.get("sgpr_spill_count", 0))
+        registers = numbers["vgpr_count"] + numbers.get("agpr_count", 0)
+        stack, shared = numbers["private_segment_fixed_size"], numbers["group_segment_fixed_size"]
+        built.append(Built(name[1], target, registers, spills, stack, shared, wholes[name[1]]))
+    return built
+
+
+def ask_package(shape: str, frames: Sequence[Mapping[str, Any]]) -> list[Any]:
+    """Launches of each frame that `gpu_variants.py` notes of the package. Raises ClsplatError."""
+    script = Path(__file__).with_name("gpu_variants.py")
+    command = [sys.executable, str(script), shape, *(json.dumps(frame) for frame in frames)]
+    root = str(script.parents[2])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        raise ClsplatError(f"{script.name} {shape}: ended with status {done.returncode}: {last}")
+    answer: list[Any] = json.loads(done.stdout.splitlines()[-1])
+    return answer

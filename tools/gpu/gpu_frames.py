@@ -1,0 +1,83 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Counts of real frames, from which `gpu_static.py` predicts: Gaussians, visible ones, pairs, pixels.
+
+    python tools/gpu/gpu_frames.py NAME=PATH...
+
+PATH is a run, a model or a scene, as `clsplat bench` takes it; its first view is drawn. Listed are the pairs of a tile
+and a Gaussian in the tiles' lists, walked those up to the last one that some pixel of the tile takes. Rows of
+gpu_frames.json of these names are replaced. Rows that nobody counted are of made-up frames, whose counts are assumed;
+one with `picture` is drawn and not trained on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np
+from measuring import require, tool
+
+from clsplat.bench.workload import Subject, load_subject
+from clsplat.device.buffers import upload
+from clsplat.device.context import open_device
+from clsplat.files.atomic import atomic_write
+from clsplat.layouts.columns import TILE
+from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.stages.device_gaussians import upload_gaussians
+
+FRAMES = Path(__file__).with_name("gpu_frames.json")
+
+
+def count(name: str, subject: Subject) -> dict[str, Any]:
+    """The row of a subject."""
+    device, camera = open_device(), subject.camera
+    rasterizer = Rasterizer(device)
+    gaussians = upload_gaussians(device, subject.gaussians)
+    frame = rasterizer.forward(gaussians, camera, upload(device, np.zeros(3, np.float32)), backward=False)
+    require(len(frame.bands) == 1, f"{name}: the frame needs more memory than there is, expected one band")
+    lists, counted = frame.part.lists, frame.part.counted
+    ranges = lists.ranges.get().astype(np.int64)
+    stops = frame.blended.stops.get()
+    tiles = stops.reshape(stops.shape[0] // TILE, TILE, stops.shape[1] // TILE, TILE)
+    last = np.maximum(tiles.max(axis=(1, 3)).ravel(), ranges[:, 0])
+    return {
+        "name": name,
+        "width": camera.width,
+        "height": camera.height,
+        "gaussians": len(subject.gaussians),
+        "sh_degree": subject.gaussians.sh_degree,
+        "visible": counted.visible,
+        "listed": counted.pairs,
+        "walked": int((last - ranges[:, 0]).sum()),
+        "key_bits": counted.key_bits,
+    }
+
+
+@tool("gpu_frames")
+def main(arguments: Sequence[str]) -> int:
+    """Count, and write the rows."""
+    parser = argparse.ArgumentParser(
+        prog="gpu_frames", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("subjects", metavar="NAME=PATH", nargs="+")
+    frames = {row["name"]: row for row in json.loads(FRAMES.read_text())["frames"]}
+    for text in parser.parse_args(arguments).subjects:
+        name, equals, path = text.partition("=")
+        require(bool(name and equals and path), f"{text}: expected NAME=PATH")
+        frames[name] = count(name, load_subject(Path(path)))
+        print(json.dumps(frames[name]))
+    rows = sorted(frames.values(), key=lambda row: (row.get("picture", False), row["gaussians"]))
+    atomic_write(FRAMES, (json.dumps({"frames": rows}, indent=2) + "\n").encode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Instructions that a wave runs of a kernel, from its loops and how often each runs (`gpu_rules.py`).
+
+A loop that no rule knows is an error, and so is a rule that no loop of a kernel has on any target.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from gpu_assembly import CLASSES, Loop
+from gpu_compilers import Built
+from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, Rule, Run
+
+from clsplat.errors import ClsplatError
+
+
+class UnknownLoopError(ClsplatError):
+    """A kernel or loop that no rule knows, or a rule that no loop has."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Instructions by class that a wave runs, on average. once: beside all loops; rounds: in them; rules: those that a
+    loop or branch has."""
+
+    once: Counter[str]
+    rounds: Counter[str]
+    rules: frozenset[Rule]
+
+
+def rules_of(kernel: str) -> tuple[Rule, ...]:
+    """The rules of a kernel. Raises UnknownLoopError."""
+    if kernel not in BY_PAIR and kernel not in BY_ITEM:
+        raise UnknownLoopError(f"{kernel}: no kernel of BY_PAIR or BY_ITEM in tools/gpu/gpu_rules.py")
+    return (BY_PAIR.get(kernel) or BY_ITEM[kernel]) + EVERYWHERE
+
+
+def _same(one: Loop, other: Loop, lines: Sequence[str]) -> bool:
+    """True for loops of one rule that are of the same lines, or one of the line that a rule has for its end; lines that
+    read alike are of several loops."""
+    texts = ({lines[number - 1] for number in each.sources if number} for each in (one, other))
+    return bool(one.sources & other.sources) or not set.intersection(*texts)
+
+
+def _unrolled(loop: Loop, rule: Rule, twins: Sequence[Loop]) -> float:
+    """Rounds of the text in one of the loop: by the rule's mark, or beside a loop of the same lines with less in it,
+    which does what is left over, by how often memory is used; infinite for that one."""
+
+    def uses(each: Loop) -> tuple[int, int]:
+        return each.counts["shared"] + each.counts["global"], each.size
+
+    longest, shortest = max(map(uses, twins)), min(map(uses, twins))
+    if uses(loop)[0] < longest[0] or (not longest[0] and uses(loop) < longest):
+        return math.inf
+    if rule.mark:
+        return max(loop.counts[rule.mark[0]] // rule.mark[1], 1)
+    return longest[0] / shortest[0] if shortest[0] else 1
+
+
+def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run) -> Cost:
+    """Instructions of a wave of the kernel. lines: the kernel's text. Raises UnknownLoopError."""
+    rounds: Counter[str] = Counter()
+    unknown: list[str] = []
+    parts = [rule for rule in rules if rule.part]
+    used: set[Rule] = set()
+    once = _share(built.whole, lines, parts, run, used)
+
+    def visit(outer: Loop, outer_rounds: float) -> None:
+        for loop in outer.inner:
+            if loop.size <= 1 and not loop.inner:  # a jump to itself behind the end
+                continue
+            matching = [rule for rule in rules if not rule.part and rule.opens(loop, lines)]
+            if len(matching) != 1:
+                unknown.append(_title(loop, lines))
+                continue
+            used.update(matching)
+            twins = [each for each in outer.inner if matching[0].opens(each, lines) and _same(each, loop, lines)]
+            times = outer_rounds if matching[0].inner else 1
+            factor = times * matching[0].rounds(run) / _unrolled(loop, matching[0], twins)
+            for kind, count in _share(loop, lines, parts, run, used).items():
+                rounds[kind] += factor * count  # type: ignore[assignment]
+            visit(loop, factor)
+
+    visit(built.whole, 1)
+    if unknown:
+        raise UnknownLoopError(
+            f"{built.kernel} for {built.target} in groups of {run.items}: no rule of tools/gpu/gpu_rules.py, or more "
+            f"than one, is for {'; '.join(unknown)}"
+        )
+    return Cost(once, rounds, frozenset(used))
+
+
+def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:
+    """Rules that no loop has, in words. used: by kernel, those of its loops on every target and in every shape."""
+    found = {kernel: set(rules) for kernel, rules in used.items()}
+    somewhere = set().union(*found.values()).intersection(EVERYWHERE)
+    return [
+        f"{kernel}: no loop of it is that of the rule `{rule.text}` in tools/gpu/gpu_rules.py"
+        for kernel, rules in found.items()
+        for rule in rules_of(kernel)
+        if rule not in rules | somewhere
+    ]
+
+
+def _title(loop: Loop, lines: Sequence[str]) -> str:
+    named = [f"`{lines[number - 1].strip()}`" for number in sorted(loop.sources) if number]
+    return f"the loop of {' or '.join(named) or 'an unknown line'} ({loop.size} instructions)"
+
+
+def _share(loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, used: set[Rule]) -> Counter[str]:
+    """Instructions by class of a round, each as often as it runs."""
+    counts: Counter[str] = Counter()
+    for block in loop.blocks:
+        sources = {each.source for each in block.body}
+        inside = [rule for rule in parts if any(rule.matches(number, lines) for number in sources)]
+        used.update(inside)
+        factor = min((rule.rounds(run) for rule in inside), default=1)
+        for each in block.body:
+            counts[each.kind] += factor  # type: ignore[assignment]
+    return counts
+
+
+def by_pair(cost: Cost, run: Run) -> Counter[str]:
+    """Instructions by class, of all waves of a group, for a pair."""
+    counts: Counter[str] = Counter()
+    for kind in CLASSES:
+        counts[kind] = cost.rounds[kind] * run.waves
+    return counts
+
+
+def loop_table(built: Built, lines: Sequence[str]) -> list[tuple[int, str, Counter[str]]]:
+    """Depth, title and instructions of each loop."""
+    return [
+        (depth - 1, _title(loop, lines), loop.counts) for depth, loop in built.whole.walk() if depth and loop.size > 1
+    ]

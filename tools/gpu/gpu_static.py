@@ -1,0 +1,350 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Registers, spills, memory and instructions of the kernels as GPUs' compilers make them, counted without a GPU.
+
+    python tools/gpu/gpu_static.py [--shapes 1x64] [--targets sm_89,gfx1100] [--stems blend,...] [--loops] [--json]
+    python tools/gpu/gpu_static.py --check
+    python tools/gpu/gpu_static.py --page
+    python tools/gpu/gpu_static.py --intel [--shapes 1x64] [--stems blend,...]
+
+The kernels are those of a training step, with the defines that the package gives them (`gpu_variants.py`). clang 19
+makes NVIDIA's and AMD's assembly of them; NVIDIA's is assembled by ptxas, of a package that pip fetches once into the
+cache folder. Division and sqrt are rounded correctly.
+
+Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from its loops (`gpu_rules.py`).
+--intel has a table of Intel's own compiler, which says less (`gpu_intel.py`). --page writes docs/gpu-static.md, with
+the times that `gpu_model.py` predicts; --check holds the ceilings below, the page's goals, and the page against what it
+would be now. Exit status 0: as expected, 1: a ceiling is broken or a goal is missed, the page is of older kernels, a
+loop or a rule is without the other, or a compiler refuses a kernel, 2: a compiler is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from gpu_assembly import CLASSES
+from gpu_compilers import TARGETS, Built, Source, ask_package, build_builtins, clang, compile_source, compilers, nvidia
+from gpu_devices import ARCHITECTURES, GPUS, occupancy
+from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
+from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
+from gpu_model import Stage, predict
+from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
+from gpu_rules import BY_PAIR, WALK, Rule, Run
+from measuring import require, tool
+
+from clsplat.progress import aligned
+
+SHAPES = ("1x32", "1x64", "1x128", "1x256")
+FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
+"""Shapes with another form of blending's gradient alone."""
+FRAMES = Path(__file__).with_name("gpu_frames.json")
+CHECKED = (("1x64", "1x32g"), ("sm_89", "gfx1100"))
+"""Shapes and targets of which the ceilings are held."""
+NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
+"""Kernel files of which nothing may lie in stack memory or be spilled, on sm_89."""
+NO_SCRATCH = ("blend", "blend_grad")
+"""The same on gfx1100."""
+MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
+"""Instructions of a warp for a pair, at most, on sm_89."""
+MOST_BY_GAUSSIAN = 500
+"""The same of blend_grad by Gaussian."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A kernel of a file, for a target and shape. pair: instructions for a pair by class, or None where it is not
+    counted so; rules: those that its loops have; unknown: the reason, where there is no rule for one."""
+
+    source: Source
+    built: Built
+    items: int
+    more_shared: int
+    pair: Counter[str] | None
+    rules: frozenset[Rule] = frozenset()
+    unknown: str = ""
+
+    @property
+    def a_pair(self) -> float | None:
+        """Instructions for a pair."""
+        return None if self.pair is None else sum(self.pair.values())
+
+    def told(self) -> dict[str, Any]:
+        """For JSON."""
+        built = self.built
+        loops = [
+            {"depth": depth, "loop": title, "instructions": dict(counts)}
+            for depth, title, counts in loop_table(built, self.source.lines)
+        ]
+        return {
+            "kernel": built.kernel,
+            "source": self.source.label,
+            "target": built.target,
+            "shape": self.source.shape,
+            "group": self.items,
+            "registers": built.registers,
+            "spills": built.spills,
+            "stack": built.stack,
+            "shared": built.shared + self.more_shared,
+            "occupancy": round(occupancy(built, self.items, self.more_shared), 3),
+            "instructions": built.whole.size + sum(loop.size for depth, loop in built.whole.walk() if depth),
+            "loops": loops,
+            "a_pair": None if self.pair is None else {kind: round(self.pair[kind], 1) for kind in CLASSES},
+        }
+
+
+_COMPILED: dict[tuple[Source, str], list[Built]] = {}
+"""The kernels of this process, by `Source.used` and target."""
+
+
+def sources_of(launches: Iterable[Mapping[str, Any]]) -> dict[Source, dict[str, tuple[int, int]]]:
+    """The kernel files of launches, and of each kernel the items of a group and the shared memory that it is given."""
+    found: dict[Source, dict[str, tuple[int, int]]] = {}
+    for launch in launches:
+        if "stem" in launch:
+            kernels = found.setdefault(Source(launch["stem"], tuple(launch["options"])), {})
+            if "kernel" in launch:
+                items = 1
+                for side in launch["local"] or (64,):
+                    items *= side
+                kernels[launch["kernel"]] = (items, launch["shared"])
+    return found
+
+
+def compiled(
+    sources: Mapping[Source, Mapping[str, tuple[int, int]]],
+    targets: Sequence[str],
+    jobs: int,
+    say: Callable[[str], None],
+) -> list[Row]:
+    """The rows of every source for every target. Raises ClsplatError."""
+    clang()
+    if any(target.startswith("sm_") for target in targets):
+        nvidia("ptxas")
+        nvidia("nvdisasm")
+    with tempfile.TemporaryDirectory(prefix="clsplat-gpu-") as scratch, ThreadPoolExecutor(jobs) as pool:
+        builtins = {target: build_builtins(target, Path(scratch)) for target in targets}
+        asked = {(source, target): (source.used, target) for target in targets for source in sources}
+        new = {used: each for each, used in asked.items() if used not in _COMPILED}
+        say(f"{len(new)} kernel files to compile")
+        built = pool.map(lambda each: compile_source(each[0], each[1], builtins[each[1]]), new.values())
+        _COMPILED.update(zip(new, built, strict=True))
+        return [
+            row_of(source, kernel, sources[source].get(kernel.kernel))
+            for (source, _), used in asked.items()
+            for kernel in _COMPILED[used]
+            if not sources[source] or kernel.kernel in sources[source]
+        ]
+
+
+def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
+    """The row of a kernel; launch: items of a group and shared memory, if it is known to be launched."""
+    items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
+    pair, rules, unknown = None, frozenset[Rule](), ""
+    if launch or built.kernel in BY_PAIR:
+        run = Run(source.items, ARCHITECTURES[built.target].wave, source.subgroup)
+        try:
+            cost = cost_of(built, source.lines, WALK if source.by_gaussian else rules_of(built.kernel), run)
+            rules, pair = cost.rules, by_pair(cost, run) if built.kernel in BY_PAIR else None
+        except UnknownLoopError as error:
+            unknown = str(error)
+    return Row(source, built, items, more_shared, pair, rules, unknown)
+
+
+def table(rows: Sequence[Row]) -> list[str]:
+    """Text table of the rows; behind each the defines that are not the shape's."""
+    head = (
+        "kernel",
+        "shape",
+        "target",
+        "registers",
+        "spills",
+        "stack",
+        "shared",
+        "occupancy",
+        "instructions",
+        "a pair",
+    )
+    lines: list[tuple[str, ...]] = [head]
+    for row in rows:
+        told = row.told()
+        numbers = [str(told[name]) for name in ("registers", "spills", "stack", "shared")]
+        pair = "unknown" if row.unknown else "-" if row.a_pair is None else f"{row.a_pair:.0f}"
+        last = (f"{told['occupancy']:.0%}", str(told["instructions"]), pair)
+        lines.append((row.built.kernel, told["shape"], row.built.target, *numbers, *last))
+    defines = ["", *(row.source.label.removeprefix(row.source.stem) for row in rows)]
+    return [f"{line} {text}".rstrip() for line, text in zip(aligned(lines), defines, strict=True)]
+
+
+def intel_lines(built: Sequence[IntelBuilt]) -> list[str]:
+    """Text table of what Intel's compiler says."""
+    lines: list[tuple[str, ...]] = [("kernel", "shape", "device", "items in step", "stack", "shared")]
+    for each in built:
+        numbers = (str(value) for value in (each.step, each.stack, each.shared))
+        lines.append((each.kernel, f"1x{each.source.items}", each.device, *numbers))
+    return list(aligned(lines))
+
+
+def loops_of(rows: Sequence[Row]) -> list[str]:
+    """The loops of each row, as a tree."""
+    lines = []
+    for row in rows:
+        lines.append(f"{row.source.label}: {row.built.kernel}, {row.source.shape}, {row.built.target}")
+        for depth, title, counts in loop_table(row.built, row.source.lines):
+            kinds = ", ".join(f"{counts[kind]} {kind}" for kind in CLASSES if counts[kind])
+            lines.append(f"{'  ' * (depth + 1)}{title}: {kinds}")
+        if row.pair:
+            kinds = ", ".join(f"{row.pair[kind]:.0f} {kind}" for kind in CLASSES if row.pair[kind])
+            lines.append(f"  for a pair: {kinds}")
+    return lines
+
+
+def broken(rows: Sequence[Row]) -> list[str]:
+    """The ceilings that are broken, in words."""
+    found = []
+    for row in rows:
+        built, stem = row.built, row.source.stem
+        where = f"{built.kernel}, {row.source.shape}, {built.target}"
+        bare = NO_STACK if built.target.startswith("sm_") else NO_SCRATCH
+        if stem in bare and (built.stack or built.spills):
+            found.append(f"{where}: {built.stack} bytes of stack and {built.spills} of spills, expected none")
+        most = MOST_BY_GAUSSIAN if row.source.by_gaussian else MOST_A_PAIR.get(built.kernel)
+        if most is not None and built.target.startswith("sm_") and row.a_pair is not None and row.a_pair > most:
+            found.append(f"{where}: {row.a_pair:.0f} instructions of a warp for a pair, expected at most {most}")
+        if row.unknown:
+            found.append(row.unknown)
+    stems = {row.source.stem for row in rows}
+    found += [
+        f"{stem}: no kernel file of a step; NO_STACK in gpu_static.py is to follow"
+        for stem in NO_STACK
+        if stem not in stems
+    ]
+    return found
+
+
+@tool("gpu_static")
+def main(arguments: Sequence[str]) -> int:
+    """Compile, count and print."""
+    parser = argparse.ArgumentParser(
+        prog="gpu_static", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--shapes", default="1x64", help=f"of the kernels, such as {','.join(SHAPES)}")
+    parser.add_argument("--targets", default=",".join(CHECKED[1]), help=f"of {','.join(TARGETS)}, or `all`")
+    parser.add_argument("--stems", default="", help="kernel files; all where not given")
+    parser.add_argument("--loops", action="store_true", help="print the loops of each kernel")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--check", action="store_true", help="hold the ceilings, the goals and the page")
+    parser.add_argument("--page", action="store_true", help="write the tables and the plot of docs/gpu-static.md")
+    parser.add_argument("--intel", action="store_true", help="Intel's GPUs in place of --targets")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="compilers at once")
+    options = parser.parse_args(arguments)
+    frames = json.loads(FRAMES.read_text())["frames"]
+    trained, _ = trained_and_picture(frames)
+    if options.page:
+        return make_page(frames, options.jobs)
+    if options.check:
+        return check(frames, options.jobs)
+    shapes = options.shapes.split(",")
+    targets = TARGETS if options.targets == "all" else options.targets.split(",")
+    for shape in shapes:
+        require(shape in SHAPES + FORMS, f"--shapes {shape}: expected one of {', '.join(SHAPES + FORMS)}")
+    for target in targets:
+        require(target in TARGETS, f"--targets {target}: expected one of {', '.join(TARGETS)}")
+    wanted = options.stems.split(",") if options.stems else []
+    rows: list[Row] = []
+    for shape in shapes:
+        asked = ask_package(shape, trained[-1:])[0]
+        sources = {
+            source: kernels for source, kernels in sources_of(asked).items() if not wanted or source.stem in wanted
+        }
+        if options.intel:
+            built = compiled_for_intel(sources, options.jobs, partial(note_of, shape))
+            print("\n".join(intel_lines(built)))
+            continue
+        rows += compiled(sources, targets, options.jobs, partial(note_of, shape))
+    if options.intel:
+        return 0
+    if options.json:
+        print(json.dumps([row.told() for row in rows], indent=2))
+    else:
+        print("\n".join(loops_of(rows) if options.loops else table(rows)))
+    for row in rows:
+        if row.unknown:
+            note(row.unknown)
+    return 0
+
+
+def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
+    """Print the rows that have ceilings, and what is broken, missed or stale."""
+    rows, predictions = counted(frames, jobs)
+    shapes, targets = CHECKED
+    held = [row for row in rows if row.source.shape in shapes and row.built.target in targets]
+    found = broken(held) + missed_goals(predictions, frames)
+    tables = tables_of(rows, predictions, frames, compilers())
+    if stale := stale_tables(PAGE.read_text("utf-8"), tables):
+        found.append(f"{PAGE.name}: of older kernels in {', '.join(stale)}; python tools/gpu/gpu_static.py --page")
+    print("\n".join([*table(held), "", *(found or ["every ceiling holds, and the page is today's"])]))
+    return int(bool(found))
+
+
+def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
+    """Count and predict everything, and write the page; without ocloc, Intel's table stays as it is."""
+    rows, predictions = counted(frames, jobs)
+    sources = dict.fromkeys(row.source for row in rows if row.source.stem in NO_STACK and not row.source.by_gaussian)
+    intel = compiled_for_intel(list(sources), jobs, note) if ocloc() else []
+    write_page(tables_of(rows, predictions, frames, compilers(), intel), predictions, frames)
+    return 0
+
+
+def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], Predictions]:
+    """The rows of a step's kernels in every shape for every target, and the stages of each frame on every GPU. Raises
+    UnknownLoopError for a loop without a rule and a rule without a loop."""
+    rows: list[Row] = []
+    used: dict[str, set[Rule]] = {}
+    predictions: dict[tuple[str, str, str], dict[str, Stage]] = {}
+    for shape in SHAPES:
+        steps = ask_package(shape, frames)
+        sources = sources_of(launch for step in steps for launch in step)
+        found = compiled(sources, TARGETS, jobs, partial(note_of, shape))
+        rows += found
+        for row in found:
+            used.setdefault(row.built.kernel, set()).update(row.rules)
+        for gpu in GPUS:
+            built = {(row.source, row.built.kernel): row.built for row in found if row.built.target == gpu.target}
+            for frame, step in zip(frames, steps, strict=True):
+                predictions[shape, gpu.name, frame["name"]] = predict(step, built, frame, gpu)
+    trained, _ = trained_and_picture(frames)
+    for shape in FORMS:
+        sources = sources_of(ask_package(shape, trained[-1:])[0])
+        formed = {source: kernels for source, kernels in sources.items() if source.shape == shape}
+        rows += compiled(formed, TARGETS, jobs, partial(note_of, shape))
+    if unused := unused_rules(used):
+        raise UnknownLoopError("; ".join(unused))
+    return rows, predictions
+
+
+def note_of(shape: str, text: str) -> None:
+    """Say where the work on a shape is."""
+    note(f"{shape}: {text}")
+
+
+def note(text: str) -> None:
+    """Print a line to standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

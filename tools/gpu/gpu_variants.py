@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Launches of kernels as the package itself asks for them, noted in a child process for `gpu_static.py`.
+
+    gpu_variants.py LANESxITEMS FRAME...    a training step of frames of these counts, in JSON, or a picture alone
+
+A step is not made: nothing is built, put on a queue or kept in memory, and the numbers that it reads back are the
+frame's. What the kernels would have been given is noted all the same.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+os.environ["CLSPLAT_TRUST_DRIVER"] = "1"  # nothing is launched, or the outcome does not matter
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import numpy as np
+import pyopencl as cl
+
+from clsplat.bench.stages import trainer_of
+from clsplat.bench.workload import Subject
+from clsplat.camera import Camera
+from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.device import buffers, profile
+from clsplat.device.buffers import DeviceArray
+from clsplat.device.context import Device, all_devices
+from clsplat.device.drivers.shapes import Shape
+from clsplat.device.program import Variant, variant_of
+from clsplat.gaussians import Gaussians
+from clsplat.layouts.columns import COUNTED, READBACK
+
+MEMORY = 64 << 30
+"""Bytes of the device that is made believe: a step's arrays are whole."""
+OPTIONS = "-cl-std=CL1.2 -cl-fp32-correctly-rounded-divide-sqrt"
+"""Options of a build: NVIDIA's and AMD's drivers say that they can divide and take roots with correct rounding."""
+
+
+SUBGROUPS = {"SUBGROUP": 32, "SHUFFLE_PTX": True}
+"""Defines of a shape with sub-groups; what compiles them puts in the target's way to exchange values."""
+
+
+def noted(variant: Variant) -> dict[str, Any]:
+    """A variant for JSON: stem and options."""
+    return {"stem": variant.stem, "options": list(variant.options)}
+
+
+class _Buffer:
+    """Stands for a buffer; it has a size alone."""
+
+    def __init__(self, context: object, flags: object, size: int) -> None:
+        del context, flags
+        self.size = size
+
+    def get_sub_region(self, origin: int, size: int) -> _Buffer:
+        del origin
+        return _Buffer(None, None, size)
+
+
+class _Kernel:
+    """Stands for a kernel: its variant and name."""
+
+    def __init__(self, variant: Variant, name: str) -> None:
+        self.variant, self.name = variant, name
+        self.tried: set[str] = set()
+        self.cl_kernel = self
+
+    def most_items(self, device: object) -> int:
+        del device
+        return 1024
+
+    def set_scalar_arg_dtypes(self, types: object) -> None:
+        del types
+
+
+class _Kernels:
+    """Stands for the kernels of a file."""
+
+    def __init__(self, variant: Variant) -> None:
+        self.variant = variant
+        self.made: dict[str, _Kernel] = {}
+
+    def __getattr__(self, name: str) -> _Kernel:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self.made.setdefault(name, _Kernel(self.variant, name))
+
+
+class Rehearsed:
+    """The launches of a step that is not made."""
+
+    def __init__(self, frame: Mapping[str, Any]) -> None:
+        self.frame = frame
+        self.launches: list[dict[str, Any]] = []
+
+    def install(self) -> None:
+        """Put the stand-ins in the place of the driver."""
+        rehearsed = self
+
+        def built(device: Device, stem: str, defines: Mapping[str, object]) -> _Kernels:
+            shape = {"LANES": device.shape.lanes, "ITEMS": device.shape.items}
+            return _Kernels(variant_of(stem, {**shape, **defines}, OPTIONS))
+
+        def enqueue(device: Device, kernel: Any, size: Any, local: Any, values: Any, *, wait: bool = False) -> None:
+            del device, wait
+            memory = sum(value.size for value in values if isinstance(value, cl.LocalMemory))
+            entry = {"kernel": kernel.name, **noted(kernel.variant), "size": size, "local": local, "shared": memory}
+            entry["scalars"] = [float(value) for value in values if isinstance(value, (int, float, np.number))]
+            rehearsed.launches.append(entry)
+
+        def add(recorder: profile.Recorder, name: str, event: object, nbytes: int) -> None:
+            del event
+            stack = recorder._stack  # noqa: SLF001
+            entry = {"stage": stack[0] if stack else profile.TRANSFERS_STAGE, "bytes": nbytes}
+            if rehearsed.launches and rehearsed.launches[-1]["kernel"] == name:
+                rehearsed.launches[-1].update(entry)
+            else:
+                rehearsed.launches.append({"kernel": name, **entry})
+
+        def note(array: DeviceArray, name: str) -> None:
+            if array.device.recorder.on:
+                array.device.recorder.add(name, None, array.nbytes)
+
+        def read_into(array: DeviceArray, host: np.ndarray) -> None:
+            host[...] = 0
+            if array.shape in ((len(COUNTED),), (len(READBACK),)):
+                host[: len(COUNTED)] = rehearsed.counted()
+            note(array, "read")
+
+        Device._built = built  # type: ignore[assignment,method-assign]  # noqa: SLF001
+        Device._with_subgroups = lambda self: dict(SUBGROUPS)  # type: ignore[method-assign]  # noqa: SLF001
+        Device.enqueue = enqueue  # type: ignore[assignment,method-assign]
+        profile.Recorder.add = add  # type: ignore[assignment,method-assign]
+        buffers._Buffer = _Buffer  # type: ignore[assignment,misc]  # noqa: SLF001
+        DeviceArray.read_into = read_into  # type: ignore[assignment,method-assign]
+
+        def begin_get(self: DeviceArray, into: np.ndarray | None = None) -> Callable[[], np.ndarray]:
+            del into
+            note(self, "read")
+            return lambda: np.zeros(self.shape, self.dtype)
+
+        DeviceArray.begin_get = begin_get  # type: ignore[method-assign]
+        DeviceArray.set = lambda array, values: note(array, "write")  # type: ignore[assignment,method-assign]
+        DeviceArray.send = lambda array, values: note(array, "write")  # type: ignore[assignment,method-assign]
+        DeviceArray.fill = lambda array, value: note(array, "fill")  # type: ignore[assignment,method-assign]
+
+    def counted(self) -> list[int]:
+        """The numbers that a forward pass reads back."""
+        least = 0x3F800000
+        largest = least + (1 << self.frame["key_bits"]) - 1
+        return [self.frame["visible"], self.frame["listed"], 2**32 - 1 - least, largest]
+
+
+def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The launches of a training step of this frame, or with `picture` of its forward pass, copies among them, each
+    with its stage and bytes."""
+    rehearsed = Rehearsed(frame)
+    rehearsed.install()
+    device = Device(all_devices()[0], shape).with_memory_limit(MEMORY)
+    device.kind, device.max_allocation, device.shares_memory = "gpu", MEMORY, False
+    width, height, count = frame["width"], frame["height"], frame["gaussians"]
+    camera = Camera(width, height, float(width), float(width), width / 2, height / 2, np.eye(3), np.zeros(3))
+    groups = ((3,), (4,), (3,), (), ((frame["sh_degree"] + 1) ** 2, 3))
+    means, quaternions, sizes, logits, sh = (np.zeros((count, *group), np.float32) for group in groups)
+    gaussians = Gaussians(means, quaternions, sizes, logits, sh)
+    photograph = np.zeros((height, width, 3), np.uint8)
+    trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
+    trainer.pending.on = False  # launches of as many items as have work, for bytes and times
+
+    def forward() -> None:
+        trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), backward=False)
+
+    work = forward if frame.get("picture") else trainer.train_step
+    work()  # the first makes what later ones find
+    rehearsed.launches.clear()
+    device.recorder.on = trainer.device.recorder.on = True
+    work()
+    device.recorder.on = False
+    return rehearsed.launches
+
+
+def main(arguments: list[str]) -> int:
+    """Print what the arguments ask for."""
+    shape = Shape(1, 1, chunks=64).relabelled(arguments[0])
+    print(json.dumps([step(shape, json.loads(frame)) for frame in arguments[1:]]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes of the experiments: the demo's, an RGB-D sequence, captures by the ray caster, disturbances of a scene."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32, Float64
+from clsplat.camera import Camera
+from clsplat.config.cli_defaults import TEST_EVERY
+from clsplat.config.training import TrainConfig
+from clsplat.demo.ray_caster import Floor, Surface, Wall, bake, cameras, render, still_life
+from clsplat.errors import InputError
+from clsplat.images.alpha import Image, composite
+from clsplat.images.reading import downscale, open_image, read_image
+from clsplat.images.writing import write_image
+from clsplat.reference.cameras import cam_from_pixel, pixel_grid
+from clsplat.reference.ppisp import light, spread
+from clsplat.runs.appearance import unmixing
+from clsplat.scenes.dataset import Lens
+from clsplat.scenes.readers.colmap_writer import write_model
+from clsplat.scenes.readers.transforms import COLMAP_FROM_OPENGL
+from clsplat.scenes.scene import Scene, View
+from clsplat.training.cameras.poses import Poses
+
+FARTHEST = 6.0
+"""Largest depth of an RGB-D camera that is used, metres."""
+ROUNDS = 3
+"""How many times the block crosses the picture in the course of the photographs."""
+RADIAL = (0.03, -0.012, 0.003, -0.0004)
+"""Distortion of the fisheye by a few pixels."""
+ANGLE = np.deg2rad(190)
+"""Angle of view of the fisheye."""
+FISHEYE_POINTS = 4000
+
+Capture = tuple[list[Camera], list[Float32], list[Float32]]
+"""Cameras, photographs and depths (H, W), 0 where a depth is not known."""
+
+
+def baked(seed: int) -> list[Surface]:
+    """The demo's surfaces with their light."""
+    surfaces = still_life()
+    bake(surfaces, seed)
+    return surfaces
+
+
+def nearest(surfaces: list[Surface], camera: Camera, rays: NDArray[Any]) -> tuple[Float32, NDArray[Any], Float32]:
+    """Distances (N,) along unit rays (N, 3) of the camera, the surface that each ray hits, and world directions."""
+    directions = (rays @ camera.rotation).astype(np.float32)
+    distances = np.stack([surface.distance(camera.position.astype(np.float32), directions) for surface in surfaces])
+    return distances.min(axis=0), distances.argmin(axis=0), directions
+
+
+def depth_of(surfaces: list[Surface], camera: Camera) -> Float32:
+    """The depth (H, W) along the axis that each pixel's centre shows, 0 where there is none."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=2).reshape(-1, 3)
+    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+    distances, _, _ = nearest(surfaces, camera, rays / lengths)
+    depth = np.where(np.isfinite(distances), distances / lengths[:, 0], 0)
+    return depth.reshape(camera.height, camera.width).astype(np.float32)
+
+
+def demo(width: int, photos: int, seed: int) -> Capture:
+    """The demo's scene."""
+    surfaces, views = baked(seed), cameras(photos, width, width * 3 // 4, seed)
+    with ThreadPoolExecutor(2) as pool:
+        pictures = [np.asarray(picture, np.float32) for picture in pool.map(partial(render, surfaces), views)]
+        return views, pictures, list(pool.map(partial(depth_of, surfaces), views))
+
+
+def rgbd(folder: Path, width: int, photos: int) -> Capture:
+    """An RGB-D sequence of frame-N.color.jpg, .depth.png (16 bit, mm) and .pose.txt, beside camera-intrinsics.txt.
+
+    A pixel has the depth of the map's nearest pixel.
+    """
+    matrix = np.loadtxt(folder / "camera-intrinsics.txt")
+    files = sorted(folder.glob("frame-*.color.jpg"))
+    views, pictures, depths = [], [], []
+    for file in files[:: max(len(files) // photos, 1)][:photos]:
+        stem = file.name.removesuffix(".color.jpg")
+        pose = np.linalg.inv(np.loadtxt(folder / f"{stem}.pose.txt")).astype(np.float64)
+        picture = read_image(file)
+        full = (picture.shape[1], picture.shape[0])
+        lens = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+        view = Camera(*full, *lens, pose[:3, :3], pose[:3, 3]).resized(width, width * full[1] // full[0])
+        source = open_image(folder / f"{stem}.depth.png")
+        levels = np.asarray(source.read_image("uint16")).reshape(full[1], full[0])
+        source.close()
+        rows = ((np.arange(view.height) + 0.5) * full[1] / view.height).astype(int)
+        columns = ((np.arange(view.width) + 0.5) * full[0] / view.width).astype(int)
+        depth = levels[rows][:, columns] / np.float32(1000)
+        views.append(view)
+        pictures.append(downscale(picture, view.width, view.height))
+        depths.append(np.where(depth < FARTHEST, depth, 0).astype(np.float32))
+    return views, pictures, depths
+
+
+def cut_out(surfaces: list[Surface], camera: Camera) -> Float32:
+    """The ray caster's picture (H, W, 4) of the surfaces alone, with straight alpha, four rays a pixel."""
+    fine = camera.resized(2 * camera.width, 2 * camera.height)
+    hit = (depth_of(surfaces, fine) > 0).astype(np.float32)[:, :, None]
+    both = np.concatenate([render(surfaces, fine, samples=1) * hit, hit], axis=2)
+    return downscale(both, camera.width, camera.height)
+
+
+def turntable(photos: int, seed: int) -> Capture:
+    """The still life's things, cut out of their surroundings."""
+    things = [surface for surface in baked(seed) if not isinstance(surface, Floor | Wall)]
+    views = cameras(photos, 160, 120, seed)
+    with ThreadPoolExecutor(2) as pool:
+        pictures = list(pool.map(partial(cut_out, things), views))
+        return views, pictures, list(pool.map(partial(depth_of, things), views))
+
+
+def write_transforms(folder: Path, capture: Capture, counts: tuple[int, int], seed: int) -> Path:
+    """Write nerfstudio's transforms.json with sparse.ply in it, and dense.ply: so many points, drawn at random from the
+    depths."""
+    for name in ("images", "depths"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    frames: list[dict[str, Any]] = []
+    points, colors = [], []
+    for index, (view, picture, depth) in enumerate(zip(*capture, strict=True)):
+        write_image(folder / "images" / f"{index:03d}.png", picture)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = view.rotation.T @ COLMAP_FROM_OPENGL, view.position
+        lens = {"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy, "w": view.width, "h": view.height}
+        np.save(folder / "depths" / f"{index:03d}.npy", depth)
+        files = {"file_path": f"images/{index:03d}.png", "depth_file_path": f"depths/{index:03d}.npy"}
+        frames.append({**files, **lens, "transform_matrix": matrix.tolist()})
+        if index % TEST_EVERY:  # none of the points are of held-out pictures
+            rows, columns = np.nonzero(depth)
+            z = depth[rows, columns].astype(float)
+            x, y = (columns + 0.5 - view.cx) / view.fx * z, (rows + 0.5 - view.cy) / view.fy * z
+            points.append((np.stack([x, y, z], axis=1) - view.translation) @ view.rotation)
+            colors.append(picture[rows, columns])
+    every, shades = np.concatenate(points), np.concatenate(colors)
+    for name, count in zip(("sparse", "dense"), counts, strict=True):
+        chosen = np.sort(np.random.default_rng(seed).permutation(len(every))[:count])
+        write_ply(folder / f"{name}.ply", every[chosen], shades[chosen])
+    document = {"ply_file_path": "sparse.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document), "utf-8")
+    return folder
+
+
+def write_ply(path: Path, points: Float64, colors: Float32) -> None:
+    """Write points (N, 3) with their colours in [0, 1]."""
+    rows = np.zeros(len(points), [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in "rgb"])
+    for axis in range(3):
+        rows["xyz"[axis]], rows["rgb"[axis]] = points[:, axis], np.rint(255 * colors[:, axis])
+    properties = [f"property float {name}" for name in "xyz"]
+    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
+    path.write_bytes(("\n".join(header) + "\n").encode() + rows.tobytes())
+
+
+def fisheye_of(pinhole: Camera, side: int) -> Camera:
+    """The fisheye in the place of a pinhole, with a circle of 190 degrees as wide as its square picture."""
+    theta = ANGLE / 2
+    reach = theta * (1 + sum(k * theta ** (2 * power) for power, k in enumerate(RADIAL, 1)))
+    focal, middle = side / 2 / reach, side / 2
+    lens = {"fx": focal, "fy": focal, "cx": middle, "cy": middle, "projection": "fisheye", "radial": RADIAL}
+    return replace(pinhole, width=side, height=side, **lens)
+
+
+def circle(camera: Camera) -> NDArray[np.bool_]:
+    """Pixels (H, W) that a fisheye of 190 degrees shows."""
+    rays = np.nan_to_num(cam_from_pixel(camera, pixel_grid(camera))[1])
+    inside: NDArray[np.bool_] = np.any(rays != 0, axis=1) & (rays[:, 2] > np.cos(ANGLE / 2))
+    return inside.reshape(camera.height, camera.width)
+
+
+def photograph(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32:
+    """The ray caster's picture of a camera of any projection, without gloss: samples^2 rays a pixel; black beyond 190
+    degrees."""
+    fine = camera.resized(camera.width * samples, camera.height * samples)
+    rays = np.nan_to_num(cam_from_pixel(fine, pixel_grid(fine))[1])
+    shown = circle(fine).ravel() if camera.projection == "fisheye" else np.any(rays != 0, axis=1)
+    distances, hit, directions = nearest(surfaces, camera, rays[shown])
+    seen = np.zeros_like(directions)
+    for index, surface in enumerate(surfaces):
+        chosen = np.flatnonzero((hit == index) & np.isfinite(distances))
+        points = camera.position.astype(np.float32) + distances[chosen, None] * directions[chosen]
+        seen[chosen] = surface.colour(points)
+    colours = np.zeros((len(rays), 3), np.float32)
+    colours[shown] = seen
+    linear = colours.reshape(camera.height, samples, camera.width, samples, 3).mean(axis=(1, 3))
+    return np.asarray(np.clip(linear, 0, 1) ** np.float32(1 / 1.6), np.float32)
+
+
+def write_colmap(folder: Path, surfaces: list[Surface], views: list[Camera]) -> Path:
+    """Write a COLMAP scene of the cameras' photographs, with points on the surfaces. Masks hide what lies around a
+    fisheye's circle."""
+    one, fisheye = views[0], views[0].projection == "fisheye"
+    for name in ("images", "masks") if fisheye else ("images",):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    numbers = (one.fx, one.fy, one.cx, one.cy)
+    size, names = (one.width, one.height), [f"{index:03d}.png" for index in range(len(views))]
+    lens = Lens("OPENCV_FISHEYE", *size, (*numbers, *one.radial)) if fisheye else Lens("PINHOLE", *size, numbers)
+    with ThreadPoolExecutor(2) as pool:
+        for name, picture in zip(names, pool.map(partial(photograph, surfaces), views), strict=True):
+            write_image(folder / "images" / name, picture)
+            if fisheye:
+                shown = np.repeat(circle(one)[:, :, None], 3, axis=2).astype(np.float32)
+                write_image(folder / "masks" / name, shown)
+    rng, points, colours = np.random.default_rng(1), [], []
+    for surface in surfaces:
+        places = rng.random((2, FISHEYE_POINTS // len(surfaces))).astype(np.float32)
+        points.append(surface.point(places[0], places[1])[0])
+        colours.append(np.clip(surface.colour(points[-1]), 0, 1) ** (1 / 1.6))
+    levels = (255 * np.concatenate(colours)).astype(np.uint8)
+    shades = (levels / np.float32(255)).astype(np.float32)
+    images = [(name, lens, view) for name, view in zip(names, views, strict=True)]
+    write_model(folder / "sparse" / "0", images, np.concatenate(points), shades)
+    return folder
+
+
+def pattern(width: int, height: int, seed: int) -> Float32:
+    """A picture (H, W, 3) of squares in random colours."""
+    side = max(width // 24, 1)
+    colours = np.random.default_rng(seed).random((height // side + 1, width // side + 1, 3)).astype(np.float32)
+    return np.asarray(colours.repeat(side, axis=0).repeat(side, axis=1)[:height, :width])
+
+
+def with_block(scene: Path, folder: Path, seed: int) -> Path:
+    """Write the COLMAP scene with a block on each photograph to train on, of pixels by the seed, and masks of it."""
+    if not (scene / "sparse" / "0").is_dir():
+        raise InputError(f"{scene / 'sparse' / '0'}: no such folder, expected a COLMAP scene")
+    for name in ("images", "masks", "sparse/0"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    try:
+        model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    except (ValueError, RuntimeError) as error:
+        raise InputError(f"{scene / 'sparse' / '0'}: {error}, expected a COLMAP model") from None
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    for index, image in enumerate(images):
+        picture = composite(read_image(scene / "images" / image.name, orient=False), (0, 0, 0))
+        image.name = f"{index:06d}.png"
+        if index % TEST_EVERY:
+            height, width = picture.shape[:2]
+            across, down = width // 3, height // 4
+            turn = ROUNDS * index / len(images) % 1
+            left, top = round(turn * (width - across)), round((0.5 + 0.4 * np.sin(7 * turn)) * (height - down))
+            mask = np.ones((height, width, 3), np.float32)
+            mask[top : top + down, left : left + across] = 0
+            picture = np.where(mask > 0, picture, pattern(width, height, seed))
+            write_image(folder / "masks" / image.name, mask)
+        write_image(folder / "images" / image.name, picture)
+    model.write(folder / "sparse" / "0")
+    return folder
+
+
+def without_colours(scene: Path, folder: Path) -> Path:
+    """Copy a COLMAP scene with grey points, and link its photographs."""
+    copied = shutil.copytree(scene / "sparse" / "0", folder / "sparse" / "0", dirs_exist_ok=True) / "points3D.bin"
+    data = bytearray(copied.read_bytes())
+    (count,), place = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        (track,) = struct.unpack_from("<Q", data, place + 43)
+        data[place + 32 : place + 35] = bytes([128, 128, 128])
+        place += 51 + 8 * track
+    copied.write_bytes(data)
+    if not (folder / "images").exists():
+        (folder / "images").symlink_to((scene / "images").resolve())
+    return folder
+
+
+def picked(scene: Scene, count: int) -> Scene:
+    """The scene with `count` of its training views, evenly by name, the first and the last among them."""
+    names = [view.name for view in scene.train_views]
+    places = np.rint(np.linspace(0, len(names) - 1, min(count, len(names)))).astype(int)
+    kept = {names[place] for place in places}
+    return replace(scene, views=[view for view in scene.views if view.split == "test" or view.name in kept])
+
+
+def in_units(scene: Scene, factor: float, offset: Float64) -> Scene:
+    """The scene with its world times factor, and then moved by offset (3,)."""
+
+    def moved(camera: Camera) -> Camera:
+        return replace(camera, translation=factor * camera.translation - camera.rotation @ offset)
+
+    views = [replace(view, camera=moved(view.camera)) for view in scene.views]
+    low, high = (factor * corner + offset for corner in scene.bounds)
+    return Scene(scene.name, views, factor * scene.points + offset, scene.point_colors, (low, high))
+
+
+def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:
+    """The scene with its training poses turned and shifted by percent of the extent, but for the two that are held."""
+    rng = np.random.default_rng(seed)
+    train = [view.name for view in scene.train_views]
+    held = {train[index] for index in Poses(TrainConfig(refine_poses=True), scene.train_views, scene.extent).held}
+
+    def off(view: View) -> View:
+        axis, direction = (each / np.linalg.norm(each) for each in rng.standard_normal((2, 3)))
+        if view.name not in train or view.name in held:
+            return view
+        motion = np.concatenate([np.radians(degrees) * axis, percent / 100 * scene.extent * direction])
+        return replace(view, camera=view.camera.moved(motion))
+
+    return replace(scene, views=[off(view) for view in scene.views])
+
+
+def refocused(scene: Scene, part: float) -> Scene:
+    """The scene with every focal length and principal point, across, off by this part of the focal length."""
+    change = (part, part, 0.0)
+    views = [
+        replace(view, camera=view.camera.refocused(*change), lens=view.lens.refocused(*change)) for view in scene.views
+    ]
+    return replace(scene, views=views)
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Changes of photographs: a gain each, mixes (6,) each, and octaves of light that their lens takes from corners."""
+
+    gains: Float64
+    mixes: Float64
+    corners: float
+
+    def on(self, place: int, view: View, pixels: Image) -> Image:
+        """The photograph number `place`, whose pixels are those of `view`."""
+        changed: Image = pixels * np.float32(self.gains[place])
+        if self.mixes.any():
+            changed = changed @ np.linalg.inv(unmixing(self.mixes[place])).T
+        if self.corners:
+            camera = view.camera
+            s = spread(camera.width, camera.height, (camera.cx, camera.cy))[:, :, None]
+            changed = changed * light(np.array([-self.corners / 2, -self.corners / 2, 0]), s)
+        return np.ascontiguousarray(changed, np.float32)
+
+    @property
+    def label(self) -> str:
+        """Part of a folder's name for changes beside gains."""
+        most = f"-mixes-{np.abs(self.mixes).max():.4f}" if self.mixes.any() else ""
+        return most + (f"-corners-{self.corners:g}" if self.corners else "")
+
+    @property
+    def none(self) -> Changes:
+        """No changes."""
+        return Changes(np.ones_like(self.gains), np.zeros_like(self.mixes), 0.0)
+
+
+def changed(scene: Scene, folder: Path, changes: Changes) -> Scene:
+    """The scene with changed photographs, which are EXR files of their working size."""
+    folder.mkdir(parents=True, exist_ok=True)
+    views: list[View] = []
+    for view in scene.views:
+        if not view.lens.is_pinhole:
+            raise InputError(f"{view.name}: taken through a lens that distorts, expected a scene of pinhole cameras")
+        path = folder / f"{len(views):04d}.exr"
+        if not path.exists():
+            write_image(path, changes.on(len(views), view, composite(view.load(), (0, 0, 0))))
+        lens = replace(view.lens, width=view.camera.width, height=view.camera.height)  # the file's size
+        views.append(replace(view, path=path, lens=lens))
+    return replace(scene, views=views)
+
+
+def write_strip(path: Path, pictures: Sequence[Float32], axis: int = 1) -> None:
+    """Write pictures side by side, or below each other."""
+    write_image(path, np.clip(np.concatenate(pictures, axis=axis), 0, 1).astype(np.float32))

@@ -1,0 +1,539 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The readers of files that others made, a valid file for each, and ways to spoil it; see `stress_files.py`."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import struct
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from hostile_meshes import make_obj, make_usd_mesh, read_volume
+from other_pictures import KINDS, other_picture
+from spoilers import MOST_BYTES, SPOILERS, spoil_place
+
+from clsplat.camera import Camera
+from clsplat.config.training import TrainConfig
+from clsplat.gaussians import Gaussians, group_shapes
+from clsplat.images.reading import image_size, read_image
+from clsplat.images.writing import write_image
+from clsplat.models import formats
+from clsplat.models.formats import ply
+from clsplat.models.info import model_info
+from clsplat.runs import run as runs_run
+from clsplat.runs import settings as runs_settings
+from clsplat.runs.checkpoints import write_checkpoint
+from clsplat.scenes import point_files
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.readers import colmap
+from clsplat.scenes.sfm import photos as sfm_photos
+from clsplat.scenes.sfm import reconstruct
+from clsplat.shots.read import choose_shot
+from clsplat.training import repro_bundle
+
+
+@dataclass(frozen=True)
+class Reader:
+    """make(folder) writes valid files; read(folder) reads them as the product does; files: those that are spoilt;
+    kinds: how, of SPOILERS; weight: its share of the cases."""
+
+    name: str
+    make: Callable[[Path], None]
+    read: Callable[[Path], object]
+    files: tuple[str, ...]
+    kinds: tuple[str, ...]
+    weight: float = 1.0
+
+
+# Valid files
+
+
+def _gaussians() -> Gaussians:
+    rng = np.random.default_rng(0)
+    shapes = ((7, 3), (7, 4), (7, 3), (7,), (7, 4, 3))
+    means, quaternions, sizes, logits, sh = (rng.standard_normal(shape).astype(np.float32) for shape in shapes)
+    return Gaussians(means, quaternions, sizes, logits, sh)
+
+
+def make_ply(folder: Path, form: str = "binary_little_endian") -> None:
+    """model.ply, SH degree 1, 7 Gaussians."""
+    path = folder / "model.ply"
+    ply.write(path, _gaussians())
+    head, mark, body = path.read_bytes().partition(b"end_header\n")
+    head = head.replace(b"binary_little_endian", form.encode())
+    table = np.frombuffer(body, "<f4").reshape(7, -1)
+    if form == "ascii":
+        body = "".join(" ".join(map(repr, map(float, row))) + "\n" for row in table).encode()
+    elif form == "binary_big_endian":
+        body = table.astype(">f4").tobytes()
+    path.write_bytes(head + mark + body)
+
+
+def make_cloud(folder: Path, form: str) -> None:
+    """cloud.ply, points with colours."""
+    rows = [(0.1 * i, -0.2 * i, 1.0, 10 * i, 255 - i, 7) for i in range(9)]
+    kinds = [("float", name) for name in "xyz"] + [("uchar", name) for name in ("red", "green", "blue")]
+    lines = ["ply", f"format {form} 1.0", "element vertex 9"] + [f"property {kind} {name}" for kind, name in kinds]
+    if form == "ascii":
+        body = "".join(" ".join(map(str, row)) + "\n" for row in rows).encode()
+    else:
+        body = b"".join(struct.pack("<3f3B", *row) for row in rows)
+    (folder / "cloud.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + body)
+
+
+def make_model(folder: Path, name: str, **options: Any) -> None:
+    """A model file of another format; options of its writer."""
+    formats.save(folder / name, _gaussians(), **options)
+
+
+def make_zip(folder: Path, name: str) -> None:
+    """model.zip with a model of this name in a folder, compressed as downloads are."""
+    with zipfile.ZipFile(folder / "model.zip", "w", zipfile.ZIP_DEFLATED) as archive, TemporaryDirectory() as made:
+        make_model(Path(made), name)
+        for file in sorted(Path(made).iterdir()):
+            archive.write(file, f"model/{file.name}")
+        archive.writestr("__MACOSX/model/._x.ply", b"x")
+
+
+def make_ksplat(folder: Path) -> None:
+    """model.ksplat of level 1: one section, a full bucket of 4 and one of 3, SH of degree 1."""
+    header, section = bytearray(4096), bytearray(1024)
+    struct.pack_into("<BBxx4IH", header, 0, 0, 1, 1, 1, 7, 7, 1)
+    struct.pack_into("<4IfHxxI4xIIH", section, 0, 7, 7, 4, 2, 5.0, 12, 32767, 1, 1, 1)
+    rng = np.random.default_rng(0)
+    rows = b"".join(
+        rng.integers(0, 65536, 3).astype("<u2").tobytes()
+        + rng.random(7).astype("<f2").tobytes()
+        + bytes([10, 20, 30, 200])
+        + rng.random(9).astype("<f2").tobytes()
+        for _ in range(7)
+    )
+    (folder / "model.ksplat").write_bytes(
+        bytes(header) + bytes(section) + struct.pack("<I6f", 3, *range(6)) + rows  # lengths, centres, Gaussians
+    )
+
+
+PICTURES = ("a.png", "b.png", "sub/c.png")
+
+
+def _picture(path: Path, width: int = 12, height: int = 9, channels: int = 3) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, np.random.default_rng(1).random((height, width, channels)).astype(np.float32))
+
+
+def make_colmap_text(folder: Path) -> None:
+    """A COLMAP model as text beside its pictures."""
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    cameras = "# comment\n1 PINHOLE 12 9 11.5 11 6 4.5\n2 OPENCV 12 9 11.5 11 6 4.5 0.01 -0.002 0.001 0.0005\n"
+    (sparse / "cameras.txt").write_text(cameras)
+    lines = [
+        f"{index + 1} 1 0 0 0 {0.1 * index} 0 {2 + index} {1 + index % 2} {name}\n1.5 2.5 -1 3.5 4.5 1\n"
+        for index, name in enumerate(PICTURES)
+    ]
+    (sparse / "images.txt").write_text("".join(lines))
+    points = "".join(f"{i + 1} {0.1 * i} 0.2 {3 + i} 10 200 30 0.5 1 0 2 1\n" for i in range(6))
+    (sparse / "points3D.txt").write_text(points)
+    for name in PICTURES:
+        _picture(folder / "images" / name)
+
+
+def make_colmap_binary(folder: Path) -> None:
+    """The same, binary."""
+    make_colmap_text(folder)
+    sparse = folder / "sparse" / "0"
+    for path in sparse.glob("*.txt"):
+        path.unlink()
+    cameras = struct.pack("<Q", 2) + struct.pack("<IiQQ4d", 1, 1, 12, 9, 11.5, 11, 6, 4.5)
+    cameras += struct.pack("<IiQQ8d", 2, 4, 12, 9, 11.5, 11, 6, 4.5, 0.01, -0.002, 0.001, 0.0005)
+    (sparse / "cameras.bin").write_bytes(cameras)
+    images = struct.pack("<Q", 3)
+    for index, name in enumerate(PICTURES):
+        images += struct.pack("<I7dI", index + 1, 1, 0, 0, 0, 0.1 * index, 0, 2 + index, 1 + index % 2)
+        images += name.encode() + b"\0" + struct.pack("<Q2dq", 1, 1.5, 2.5, -1)
+    (sparse / "images.bin").write_bytes(images)
+    points = struct.pack("<Q", 6)
+    for i in range(6):
+        points += struct.pack("<Q3d3BdQ2i", i + 1, 0.1 * i, 0.2, 3 + i, 10, 200, 30, 0.5, 1, 1, 0)
+    (sparse / "points3D.bin").write_bytes(points)
+
+
+def _frames(names: tuple[str, ...]) -> list[dict[str, Any]]:
+    return [
+        {"file_path": name, "transform_matrix": [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 2.0 + i], [0, 0, 0, 1]]}
+        for i, name in enumerate(names)
+    ]
+
+
+def make_transforms(folder: Path) -> None:
+    """A transforms.json of nerfstudio's kind, with points and a split, and keys of instant-ngp."""
+    for name in PICTURES:
+        _picture(folder / "images" / name)
+    make_cloud(folder, "ascii")
+    document = {
+        "fl_x": 11.5,
+        "fl_y": 11.0,
+        "cx": 6.0,
+        "cy": 4.5,
+        "w": 12,
+        "h": 9,
+        "k1": 0.01,
+        "p1": 0.001,
+        "aabb_scale": 4,
+        "camera_model": "OPENCV",
+        "ply_file_path": "cloud.ply",
+        "scale": 0.33,
+        "offset": [0.5, 0.5, 0.5],
+        "frames": _frames(tuple(f"images/{name}" for name in PICTURES)),
+        "test_filenames": ["images/a.png"],
+    }
+    (folder / "transforms.json").write_text(json.dumps(document, indent=1))
+
+
+def make_blender(folder: Path) -> None:
+    """transforms_train.json and transforms_test.json."""
+    for split, names in (("train", ("a", "b")), ("test", ("c",))):
+        for name in names:
+            _picture(folder / split / f"{name}.png", channels=4)
+        listed = {"camera_angle_x": 0.7, "frames": _frames(tuple(f"./{split}/{name}" for name in names))}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(listed))
+
+
+def make_camera_keys(folder: Path) -> None:
+    """A clsplat camera file of three keys, with all that a key can have."""
+    turn = [0.70710678, -0.70710678, 0, 0]
+    document = {
+        "clsplat_cameras": 1,
+        "width": 32,
+        "height": 18,
+        "fps": 24,
+        "first_frame": 1001,
+        "near": 0.01,
+        "far": 100,
+        "keys": [
+            {"frame": 1001, "position": [0, -4, 1], "world_from_cam": turn, "fov_x": 40},
+            {"frame": 1009, "position": [2, -4, 1], "world_from_cam": turn, "fov_x": 55, "roll": 5},
+            {
+                "seconds": 0.5,
+                "position": [3, -3, 1],
+                "world_from_cam": [0.65, -0.65, 0.27, -0.27],
+                "fx": 30,
+                "shift": [0.05, 0],
+            },
+        ],
+    }
+    (folder / "cameras.json").write_text(json.dumps(document, indent=1))
+
+
+def make_camera_path(folder: Path) -> None:
+    """nerfstudio's camera_path.json, four frames."""
+    poses = [[1, 0, 0, 0.1 * i, 0, 1, 0, 0.2, 0, 0, 1, 2.0 + i, 0, 0, 0, 1] for i in range(4)]
+    document = {
+        "camera_type": "perspective",
+        "render_width": 32,
+        "render_height": 18,
+        "fps": 24,
+        "seconds": 4,
+        "keyframes": [],
+        "camera_path": [{"camera_to_world": pose, "fov": 50, "aspect": 1.7} for pose in poses],
+    }
+    (folder / "camera_path.json").write_text(json.dumps(document, indent=1))
+
+
+def make_cameras_json(folder: Path) -> None:
+    """The cameras that the 3DGS authors' code writes of a training, two of them."""
+    rows = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+    lens = {"width": 24, "height": 18, "fy": 20.5, "fx": 20.5}
+    cameras = [
+        {"id": index, "img_name": f"{index:05d}", "position": [0.5, -2.0, index], "rotation": rows, **lens}
+        for index in range(2)
+    ]
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+
+
+UNREAD = ("pcx",)
+"""Of `other_pictures.KINDS` what OpenImageIO does not open."""
+FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
+
+
+def make_image(folder: Path, extension: str) -> None:
+    """One picture, with an EXIF orientation where the format has it."""
+    import OpenImageIO as oiio  # as clsplat.images.reading writes PNG and EXR alone
+
+    pixels = np.random.default_rng(2).random((19, 23, 3)).astype(np.float32)
+    spec = oiio.ImageSpec(23, 19, 3, oiio.FLOAT if extension in ("exr", "hdr") else oiio.UINT8)
+    spec.attribute("Orientation", 6)
+    path = folder / f"picture.{extension}"
+    output = oiio.ImageOutput.create(str(path))
+    if output is None or not output.open(str(path), spec) or not output.write_image(pixels) or not output.close():
+        raise RuntimeError(f"{path}: cannot be written: {oiio.geterror()}")
+
+
+def make_other_image(folder: Path, kind: str) -> None:
+    """A picture of a kind that its name does not say."""
+    (folder / "picture.png").write_bytes(other_picture(kind))
+
+
+def make_run(folder: Path) -> None:
+    """A run with metrics, an evaluation, two checkpoints and no model."""
+    run = runs_run.Run.create(folder / "run", TrainConfig(iterations=10))
+    for step in (1, 2):
+        run.append_metrics({"step": step, "loss": 0.1, "seconds": 0.5 * step})
+        arrays = {"parameters/means": np.ones((4, 3), np.float32), "statistics/seen": np.zeros(4, np.float32)}
+        state = {"rng": np.random.default_rng(0).bit_generator.state, "queue": [1, 2]}
+        run.save_checkpoint(step, arrays, state)
+    run.write_eval({"step": 2, "psnr": 20.0})
+    (folder / "run" / "model.ply").write_bytes(b"ply\n")
+
+
+def make_bundle(folder: Path) -> None:
+    """Write the bundle, of five Gaussians, of a training that gives up."""
+    shapes = group_shapes(5, 4)
+    arrays: dict[str, Any] = {
+        f"{kind}/{g}": np.ones(shapes[g], np.float32) for kind in ("parameters", "first", "second") for g in shapes
+    }
+    camera = Camera(12, 9, 11.5, 11.0, 6.0, 4.5, np.eye(3), np.zeros(3))
+    record = {
+        "stage": "adam",
+        "rates": dict.fromkeys(shapes, 0.001),
+        "camera": {name: getattr(camera, name) for name in repro_bundle.RECORDED_CAMERA_FIELDS},
+        "settings": runs_settings.config_text(TrainConfig(), None),
+    }
+    arrays |= {"photograph": np.zeros((9, 12, 3), np.uint8), "background": np.zeros(3, np.float32)}
+    arrays |= {"rotation": camera.rotation, "translation": camera.translation}
+    write_checkpoint(folder / "trouble-step-0000007.npz", 7, arrays, record)
+
+
+def make_photos(folder: Path) -> None:
+    """Photos for structure from motion."""
+    for name in ("a.png", "b.png"):
+        _picture(folder / "photos" / name)
+    make_image(folder / "photos", "jpg")
+
+
+def make_record(folder: Path) -> None:
+    """A result of structure from motion, as far as it is looked at before it is used again."""
+    make_photos(folder)
+    make_colmap_binary(folder)
+    (folder / "sfm.json").write_text(json.dumps({"fingerprint": "0", "photos": 3, "unregistered": ["c.png"]}))
+
+
+# Readers
+
+
+def read_model(path: Path) -> None:
+    """Read a model like `convert` and `info`."""
+    model_info(path)
+    formats.load(path).check()
+
+
+def read_scene(folder: Path) -> None:
+    """Everything of a scene that is looked at before training: cameras, points, every picture."""
+    scene = load_scene(folder)
+    if bad := [warning for warning in scene.warnings if not warning.isprintable()]:
+        raise AssertionError(f"a warning that is not a plain line: {bad[0][:300]!r}")
+    scene.check_pictures()
+    for view in scene.views:
+        view.load()
+        inside(folder, view.path)
+    _ = scene.extent
+
+
+def read_cameras(folder: Path, name: str) -> None:
+    """The frames that `clsplat render --cameras` would make of a file, and a path around them."""
+    path = folder / name
+    shot = choose_shot(path, size=(32, 18))
+    if all(camera.projection == "perspective" for camera in shot.cameras):
+        choose_shot(path, path="turntable", count=5, size=(32, 18))
+    if bad := [warning for warning in shot.warnings if not warning.isprintable()]:
+        raise AssertionError(f"a warning that is not a plain line: {bad[0][:300]!r}")
+    for camera in shot.cameras:
+        numbers = (camera.rotation, camera.translation, [camera.fx, camera.fy, camera.cx, camera.cy, camera.near])
+        if not all(np.isfinite(values).all() for values in numbers) or min(camera.fx, camera.fy) <= 0:
+            raise AssertionError(f"a camera {camera}")
+
+
+def inside(folder: Path, path: Path) -> None:
+    """Fails where a scene's picture is not below its folder, by its name: links were made by the folder's owner."""
+    if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder)):
+        raise AssertionError(f"reads {path}, outside {folder}")
+
+
+def read_picture(path: Path) -> None:
+    """Size and pixels."""
+    image_size(path)
+    image = read_image(path)
+    if image.dtype != np.float32 or image.ndim != 3 or image.shape[2] not in (3, 4) or not np.isfinite(image).all():
+        raise AssertionError(f"image {image.dtype} {image.shape}")
+
+
+def read_run(folder: Path) -> None:
+    """Settings, metrics and evaluation."""
+    run = runs_run.Run.open(folder / "run")
+    run.config.check()
+    run.read_metrics()
+    run.model_record()
+    run.truncate_metrics(1)
+
+
+def read_checkpoint(folder: Path) -> None:
+    """The checkpoint that training goes on from."""
+    path = folder / "run"
+    checkpoint = runs_run.Run(path, TrainConfig(), None, resuming=True).load_latest_checkpoint()
+    if checkpoint is not None:
+        total = sum(array.nbytes for array in checkpoint.arrays.values())
+        if total > MOST_BYTES:
+            raise AssertionError(f"{total} bytes of arrays")
+
+
+def read_photos(folder: Path) -> None:
+    """Read photos like structure from motion, up to the start of pycolmap."""
+    photos = sfm_photos.find_photos(folder / "photos")[0]
+    sfm_photos.stage_photos(folder / "photos", photos, folder / "staged", lambda _: None, 1)
+
+
+def read_record(folder: Path) -> None:
+    """Look if a result of structure from motion can be used again."""
+    reconstruct._is_finished(folder, folder / "photos", "0", overwrite=False)  # noqa: SLF001
+
+
+BYTES = ("flip", "truncate", "numbers", "insert", "remove", "repeat", "append", "zeros", "swap")
+LINES = ("words", "lines", "text")
+PLACES = ("places",)
+BINARY, TEXT = (*BYTES, *PLACES), (*BYTES, *LINES, *PLACES)
+DOCUMENT, ARCHIVE = (*BYTES, *LINES, "json", *PLACES), (*BYTES, "archive", *PLACES)
+SPARSE = tuple(f"sparse/0/{stem}" for stem in ("cameras", "images", "points3D"))
+BINARY_FILES, TEXT_FILES = tuple(f"{name}.bin" for name in SPARSE), tuple(f"{name}.txt" for name in SPARSE)
+USD = ("usda", "usdc") if find_spec("pxr") else ()
+
+
+def _model(folder: Path) -> None:
+    colmap.read_model(folder / "sparse" / "0")
+    colmap.read_cameras(folder)
+
+
+def _one_file(
+    name: str,
+    file: str,
+    make: Callable[[Path], None],
+    read: Callable[[Path], object],
+    kinds: tuple[str, ...],
+    weight: float = 1.0,
+) -> Reader:
+    """A reader that gets the path of a single file."""
+    return Reader(name, make, lambda folder: read(folder / file), (file,), kinds, weight)
+
+
+def _saved(name: str, kinds: tuple[str, ...]) -> Reader:
+    """A reader of a model file that clsplat writes."""
+    return _one_file(f"model-{name}", name, partial(make_model, name=name), read_model, kinds, 2)
+
+
+_ALL = (
+    _one_file("ply", "model.ply", make_ply, ply.read, TEXT, 4),
+    _one_file("ply-big", "model.ply", partial(make_ply, form="binary_big_endian"), ply.read, (*BYTES, *LINES)),
+    _one_file("ply-ascii", "model.ply", partial(make_ply, form="ascii"), ply.read, (*BYTES, *LINES), 2),
+    *(
+        _one_file(
+            f"cloud-{form[:6]}", "cloud.ply", partial(make_cloud, form=form), point_files.read_point_cloud, TEXT, 2
+        )
+        for form in ("ascii", "binary_little_endian")
+    ),
+    Reader("colmap-bin", make_colmap_binary, _model, BINARY_FILES, BINARY, 4),
+    Reader("colmap-txt", make_colmap_text, _model, TEXT_FILES, TEXT, 4),
+    Reader("scene-bin", make_colmap_binary, read_scene, BINARY_FILES, BYTES, 1),
+    Reader("scene-txt", make_colmap_text, read_scene, TEXT_FILES, (*LINES, *PLACES), 1),
+    Reader("scene-places", make_colmap_text, read_scene, tuple(f"images/{name}" for name in PICTURES), PLACES, 0.5),
+    Reader("transforms", make_transforms, read_scene, ("transforms.json",), DOCUMENT, 4),
+    Reader("blender", make_blender, read_scene, ("transforms_train.json", "transforms_test.json"), DOCUMENT, 2),
+    *(
+        Reader(f"cameras-{kind}", make, partial(read_cameras, name=name), (name,), DOCUMENT, 3)
+        for kind, make, name in (
+            ("keys", make_camera_keys, "cameras.json"),
+            ("path", make_camera_path, "camera_path.json"),
+            ("poses", make_transforms, "transforms.json"),
+            ("inria", make_cameras_json, "cameras.json"),
+        )
+    ),
+    *(
+        _one_file(f"image-{each}", f"picture.{each}", partial(make_image, extension=each), read_picture, BYTES)
+        for each in FORMATS
+    ),
+    *(
+        _one_file(f"other-{kind}", "picture.png", partial(make_other_image, kind=kind), read_picture, BYTES, 0.3)
+        for kind in KINDS
+        if kind not in UNREAD
+    ),
+    Reader("config", make_run, read_run, ("run/config.toml",), TEXT, 3),
+    Reader("records", make_run, read_run, ("run/metrics.jsonl", "run/eval.json"), DOCUMENT, 3),
+    Reader(
+        "checkpoint",
+        make_run,
+        read_checkpoint,
+        tuple(f"run/checkpoints/step-000000{n}.npz" for n in (2, 1)),
+        ARCHIVE,
+        3,
+    ),
+    _one_file("bundle", "trouble-step-0000007.npz", make_bundle, repro_bundle.read_bundle, ARCHIVE, 2),
+    Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), BINARY, 1),
+    Reader("record", make_record, read_record, ("sfm.json",), DOCUMENT, 1),
+    *(
+        _saved(name, TEXT if name == "model.compressed.ply" else BINARY)
+        for name in ("model.splat", "model.compressed.ply", "model.spz", "model.sog", "model.glb")
+    ),
+    *(_saved(f"model.{each}", TEXT) for each in USD),
+    _one_file("model-spz-2", "model.spz", partial(make_model, name="model.spz", version=2), read_model, BINARY, 2),
+    Reader(
+        "gltf",
+        partial(make_model, name="model.gltf"),
+        lambda folder: read_model(folder / "model.gltf"),
+        ("model.gltf", "model.bin"),
+        DOCUMENT,
+        3,
+    ),
+    Reader(
+        "sog-folder",
+        partial(make_model, name="meta.json"),
+        lambda folder: read_model(folder / "meta.json"),
+        ("meta.json", "means_l.webp", "quats.webp", "sh0.webp", "shN_centroids.webp"),
+        DOCUMENT,
+        3,
+    ),
+    _one_file("ksplat", "model.ksplat", make_ksplat, read_model, BINARY, 2),
+    *(
+        _one_file(f"zip-{name}", "model.zip", partial(make_zip, name=name), read_model, ARCHIVE, 1)
+        for name in ("model.ply", "meta.json")
+    ),
+    _one_file("mesh-obj", "mesh.obj", make_obj, read_volume, TEXT, 2),
+    *(
+        _one_file(f"mesh-{each}", f"mesh.{each}", partial(make_usd_mesh, name=f"mesh.{each}"), read_volume, TEXT, 0.5)
+        for each in USD
+    ),
+)
+READERS = {reader.name: reader for reader in _ALL}
+
+
+def spoil(reader: Reader, folder: Path, rng: random.Random) -> str:
+    """Spoil one or two of the reader's files in one to three ways; says how."""
+    said = []
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        path = folder / rng.choice(reader.files)
+        kind = rng.choice(reader.kinds)
+        if not path.is_file() or path.is_symlink() or path.stat().st_size > MOST_BYTES:
+            continue
+        said.append(f"{kind} of {path.relative_to(folder)}")
+        if kind == "places":
+            spoil_place(path, folder, rng)
+            continue
+        data = path.read_bytes()
+        path.write_bytes(SPOILERS[kind](data, rng))
+    return "; ".join(said)

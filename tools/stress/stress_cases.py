@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stressors of projection and its gradient: each makes Gaussians before one camera, and says how far it went."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.camera import Camera
+from clsplat.gaussians import Gaussians
+
+WIDTH, HEIGHT, FOCAL = 640, 360, 600.0
+DEGREE = 1
+"""Degree of the SH: enough for the gradient by the direction; the bands themselves are tested apart."""
+
+
+@dataclass
+class Cloud:
+    """Gaussians in float64, to be changed by a stressor: pixels (n, 2), depths (n,), axes (n, 3) as standard
+    deviations in pixels, quaternions (n, 4), logits (n,), sh (n, K, 3)."""
+
+    camera: Camera
+    pixels: Float64
+    depths: Float64
+    axes: Float64
+    quaternions: Float64
+    logits: Float64
+    sh: Float64
+    scales: Float64 | None = None
+
+    def gaussians(self) -> Gaussians:
+        """The Gaussians, with the means in the world, as float32."""
+        camera = self.camera
+        flat = (self.pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy) * self.depths[:, None]
+        means = (np.column_stack([flat, self.depths]) - camera.translation) @ camera.rotation
+        scales = self.scales if self.scales is not None else self.axes * np.abs(self.depths)[:, None] / camera.fx
+        with np.errstate(divide="ignore"):
+            arrays = (means, self.quaternions, np.log(scales), self.logits, self.sh)
+        places, turns, logs, logits, harmonics = (np.ascontiguousarray(array, np.float32) for array in arrays)
+        return Gaussians(places, turns, logs, logits, harmonics)
+
+
+@dataclass(frozen=True, eq=False)
+class Cases:
+    """A batch: `hurt` (n,) says how far each case goes, in the unit that the stressor names."""
+
+    gaussians: Gaussians
+    camera: Camera
+    hurt: Float64
+
+
+def rotation_of(axis: Float64, angle: float) -> Float64:
+    """Rodrigues."""
+    x, y, z = axis / np.linalg.norm(axis)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation: Float64 = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    return rotation
+
+
+def camera_of(rng: np.random.Generator) -> Camera:
+    """Turned and placed at random, fx and fy apart, the principal point near the middle."""
+    rotation = rotation_of(rng.normal(size=3), rng.uniform(-np.pi, np.pi))
+    cx, cy = WIDTH * rng.uniform(0.4, 0.6), HEIGHT * rng.uniform(0.4, 0.6)
+    position = rng.normal(size=3)
+    return Camera(WIDTH, HEIGHT, FOCAL, 1.1 * FOCAL, cx, cy, rotation, -rotation @ position)
+
+
+def cloud(rng: np.random.Generator, count: int) -> Cloud:
+    """Gaussians like those of a trained scene: axes of 0.3 to 30 pixels, opacities all over."""
+    return Cloud(
+        camera=camera_of(rng),
+        pixels=rng.uniform(-0.1, 1.1, (count, 2)) * (WIDTH, HEIGHT),
+        depths=rng.uniform(1.0, 10.0, count),
+        axes=10 ** rng.uniform(-0.5, 1.5, (count, 3)),
+        quaternions=rng.normal(size=(count, 4)) * rng.uniform(0.3, 3.0, (count, 1)),
+        logits=rng.normal(0.0, 2.0, count),
+        sh=rng.normal(0.0, 0.4, (count, (DEGREE + 1) ** 2, 3)),
+    )
+
+
+def _done(made: Cloud, hurt: Float64) -> Cases:
+    return Cases(made.gaussians(), made.camera, hurt)
+
+
+def ordinary(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    return _done(made, made.axes.max(axis=1))
+
+
+def scales(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    size = 10 ** rng.uniform(-12, 6, (count, 1))
+    made.scales = size * 10 ** rng.uniform(-0.5, 0.5, (count, 3))
+    return _done(made, size[:, 0])
+
+
+def anisotropy(rng: np.random.Generator, count: int) -> Cases:
+    """Needles and discs, the longest axis as long as the image at most."""
+    made = cloud(rng, count)
+    longest, ratio = 10 ** rng.uniform(0, 2.8, count), 10 ** rng.uniform(0, 8, count)
+    middle = np.where(rng.random(count) < 0.5, longest, longest / ratio)
+    made.axes = rng.permuted(np.stack([longest, middle, longest / ratio], axis=1), axis=1)
+    return _done(made, ratio)
+
+
+def giants(rng: np.random.Generator, count: int) -> Cases:
+    """Needles and discs far longer than the image."""
+    made = cloud(rng, count)
+    longest, ratio = 10 ** rng.uniform(2.8, 6, count), 10 ** rng.uniform(0, 8, count)
+    middle = np.where(rng.random(count) < 0.5, longest, longest / ratio)
+    made.axes = rng.permuted(np.stack([longest, middle, longest / ratio], axis=1), axis=1)
+    return _done(made, longest)
+
+
+def edge_on(rng: np.random.Generator, count: int) -> Cases:
+    """Needles that point at the camera and discs seen from the side, up to an angle."""
+    made = cloud(rng, count)
+    angle = 10 ** rng.uniform(-8, 0, count)
+    needle = rng.random(count) < 0.5
+    ratio = 10 ** rng.uniform(0, 8, count)
+    longest = 10 ** rng.uniform(0, 2.8, count)
+    flat = np.where(needle, longest / ratio, longest)
+    # the third axis is the needle's own, or the disc's normal
+    made.axes = np.stack([flat, flat, np.where(needle, longest, longest / ratio)], axis=1)
+    rays = np.column_stack([(made.pixels - (made.camera.cx, made.camera.cy)) / (FOCAL, 1.1 * FOCAL), np.ones(count)])
+    rays = rays @ made.camera.rotation
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.cross(rays, rng.normal(size=(count, 3)))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along, aside = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    target = np.where(needle[:, None], along * rays + aside * across, aside * rays + along * across)
+    # the shortest turn that takes z to the target, after a random one about z
+    turn = np.column_stack([1 + target[:, 2], -target[:, 1], target[:, 0], np.zeros(count)])
+    spin = rng.uniform(0, np.pi, count)
+    cos, sin = np.cos(spin), np.sin(spin)
+    w, x, y, _ = turn.T
+    made.quaternions = np.column_stack([w * cos, x * cos + y * sin, y * cos - x * sin, w * sin])
+    return _done(made, angle)
+
+
+def near_plane(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    apart = 10 ** rng.uniform(-7, 0, count)
+    made.depths = made.camera.near * (1 + rng.choice([-1.0, 1.0], count) * apart)
+    behind = rng.random(count) < 0.1
+    made.depths = np.where(behind, -rng.uniform(0, 10, count), made.depths)
+    made.scales = 10 ** rng.uniform(-4, -1, (count, 3))
+    return _done(made, apart)
+
+
+def off_frustum(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    angle, away = rng.uniform(0, 2 * np.pi, count), 10 ** rng.uniform(-1, 4, count)
+    made.pixels = (WIDTH, HEIGHT) * (0.5 + away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    made.axes *= np.maximum(away, 1)[:, None] * 10 ** rng.uniform(0, 1.5, (count, 1))
+    return _done(made, away)
+
+
+def depths(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    made.camera = replace(made.camera, near=1e-4)
+    made.depths = 10 ** rng.uniform(-3, 7, count)
+    return _done(made, made.depths)
+
+
+def opacities(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    threshold = np.float32(-np.log(254.0))
+    ulps = rng.integers(-3, 4, count) * np.spacing(threshold)
+    kinds = rng.integers(0, 4, count)
+    exact = rng.choice([-np.inf, np.inf, -3e38, 3e38, -100.0, 100.0, -87.0, 87.0, 0.0], count)
+    wide = rng.uniform(-100, 100, count)
+    made.logits = np.choose(kinds, [threshold + ulps, exact, wide, rng.uniform(-8, 20, count)])
+    return _done(made, np.clip(made.logits, -100, 100))
+
+
+def quaternions(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    length = 10 ** rng.uniform(-14, 14, count)
+    extreme = rng.random(count) < 0.1
+    length = np.where(extreme, rng.choice([0.0, 1e-45, 1e-40, 1e-30, 1e-20, 1e20, 1e30, 1e37], count), length)
+    made.quaternions *= (length / np.linalg.norm(made.quaternions, axis=1))[:, None]
+    return _done(made, length)
+
+
+def far_world(rng: np.random.Generator, count: int) -> Cases:
+    """Around a place far from the world's origin; what rounding the means to float32 does is no error of ours."""
+    made = cloud(rng, count)
+    offset = rng.normal(size=3)
+    offset *= 10 ** rng.uniform(3, 6.5) / np.linalg.norm(offset)
+    camera = made.camera
+    made.camera = replace(camera, translation=camera.translation - camera.rotation @ offset)
+    made.depths = 10 ** rng.uniform(0.5, 3, count)
+    return _done(made, np.full(count, np.linalg.norm(offset)))
+
+
+def off_centre(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    away = rng.uniform(-5, 5, 2)
+    made.camera = replace(made.camera, cx=WIDTH * (0.5 + away[0]), cy=HEIGHT * (0.5 + away[1]))
+    return _done(made, np.full(count, np.abs(away).max()))
+
+
+def focal_lengths(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    focal = float(10 ** rng.uniform(0, 6))
+    made.camera = replace(made.camera, fx=focal, fy=focal * rng.uniform(0.5, 2))
+    return _done(made, np.full(count, focal))
+
+
+def colours(rng: np.random.Generator, count: int) -> Cases:
+    made = cloud(rng, count)
+    factor = 10 ** rng.uniform(0, 8, count)
+    made.sh *= factor[:, None, None]
+    return _done(made, factor)
+
+
+def balls(rng: np.random.Generator, count: int) -> Cases:
+    """All three axes nearly or just alike: a rotation hardly shows, its gradient is a small difference."""
+    made = cloud(rng, count)
+    apart = 10 ** rng.uniform(-8, 0, count)
+    apart[rng.random(count) < 0.05] = 0
+    made.axes = made.axes[:, :1] * np.exp(apart[:, None] * rng.uniform(-1, 1, (count, 3)))
+    return _done(made, np.maximum(apart, 1e-8))
+
+
+def wild(rng: np.random.Generator, count: int) -> Cases:
+    """Any float32 there is, in one parameter or in all: nothing to compare with, only to survive."""
+    made = cloud(rng, count)
+    gaussians = made.gaussians()
+    everywhere = rng.random(count) < 0.2
+    group = rng.integers(0, 5, count)
+    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+    for index, array in enumerate(getattr(gaussians, name) for name in names):
+        rows = np.flatnonzero(everywhere | (group == index))
+        values = rng.integers(0, 2**32, (len(rows), *array.shape[1:]), np.uint32).view(np.float32)
+        special = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1e-45, 3.4e38, -3.4e38, 88.0, -104.0], np.float32)
+        pick = rng.random(values.shape) < 0.3
+        array[rows] = np.where(pick, rng.choice(special, values.shape), values)
+    return Cases(gaussians, made.camera, np.ones(count))
+
+
+Bounds = dict[str, float]
+
+PROJECTION: Bounds = {
+    "position": 2e-6,
+    "shape": 1e-4,
+    "offset": 1e-3,
+    "depth": 2e-7,
+    "opacity": 1e-6,
+    "extent": 1e-4,
+    "colour": 1e-6,
+}
+"""Largest error of any case. position: two floats carry a mean to 2^-44 of its way, and 6e-8 is lost where the part
+below a pixel is stored; a few roundings of that. shape: 3e-5 is what float32 alone may lose before the rotation is
+refined, and there are three such terms. offset: l12 is stored in float32, so that the end of a needle some 700 pixels
+from its mean and 0.55 wide is off by 700 / 0.55 * 2^-24 = 8e-5 from that alone, and shape times the extent of 3.3 comes
+to it. depth, opacity, colour: two to ten roundings of 6e-8. extent: of a budget log2(255 o) of 0.007 the rounding of
+log2 o, of size 8, leaves four digits."""
+GRADIENT_NORM, GRADIENT_TAIL = 1e-4, 1e-3
+"""Bounds in norm over a batch, and for the 99.9th percentile of Gaussians. The largest may be any: a gradient can
+vanish."""
+
+FRAME_TAIL = 5e-3
+"""GRADIENT_TAIL for one kind of frames, of a few thousand Gaussians: there chance has more single numbers near zero,
+and needles have the error of their ends. All kinds together have to be within GRADIENT_TAIL."""
+FRAME = 2e-5
+"""Bound of a pixel's colour outside the band, relative to the frame's brightest: a few dozen roundings of 6e-8, and the
+ends of needles, which are off as said of "offset", there by 64 / 0.55 * 2^-24 = 7e-6."""
+BAND_SHARE = 0.03
+"""Largest share of the pixels with a decision within 1e-4 of its threshold: in "faint" some 100 Gaussians at each pixel
+have alphas spread evenly over about 1 / 255, of which 2e-4 each are in the band; elsewhere there are a few."""
+
+
+@dataclass(frozen=True)
+class Stressor:
+    """unit: of `Cases.hurt`, for the plot; bounds: those that are not PROJECTION's, `why` with the reason; finite:
+    whether nothing but that is asked of the results."""
+
+    make: Callable[[np.random.Generator, int], Cases]
+    unit: str
+    bounds: Bounds = field(default_factory=dict)
+    why: str = ""
+    finite: bool = False
+
+
+STRESSORS: dict[str, Stressor] = {
+    "ordinary": Stressor(ordinary, "longest axis, px"),
+    "scales": Stressor(scales, "scale, world units"),
+    "anisotropy": Stressor(anisotropy, "longest axis / shortest axis"),
+    "giants": Stressor(giants, "longest axis, px"),
+    "edge_on": Stressor(edge_on, "angle to the ray (needles) or to its perpendicular (discs), rad"),
+    "near_plane": Stressor(near_plane, "|z / near - 1|"),
+    "off_frustum": Stressor(off_frustum, "distance from the middle, image sizes"),
+    "depths": Stressor(depths, "depth"),
+    "opacities": Stressor(opacities, "logit"),
+    "quaternions": Stressor(quaternions, "|q|"),
+    "far_world": Stressor(
+        far_world,
+        "distance from the world's origin",
+        {"position": 1e-5},
+        "3e6 units in two floats leave 3e6 * 2^-48 = 1e-8 a product and sum, four of them, times fy / z = 660 / 3",
+    ),
+    "off_centre": Stressor(off_centre, "principal point from the middle, image sizes"),
+    "focal_lengths": Stressor(focal_lengths, "focal length, px"),
+    "colours": Stressor(colours, "factor on the SH"),
+    "balls": Stressor(balls, "largest log ratio of two axes"),
+    "wild": Stressor(wild, "", finite=True),
+}

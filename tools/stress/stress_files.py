@@ -1,0 +1,312 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Hostile files: valid ones of every kind that is read, spoilt at random, given to their readers.
+
+    python tools/stress/stress_files.py [--cases 100000] [--seed 0] [--readers ply,scene,...] [--jobs N] [--keep FOLDER]
+    python tools/stress/stress_files.py --readers ply --first 1234 --cases 1        # a case again, by its number
+
+A case passes where the reader returns, or raises InputError: one line that names a file. Anything else is a failure:
+another exception, a warning of several lines, a crash of the process, more than --seconds of a core, or more than
+--memory MiB.
+The spoilt files of failures are kept in --keep. Exit status 1 where there was one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import multiprocessing
+import os
+import random
+import resource
+import shutil
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from hostile import READERS, Reader, spoil
+
+from clsplat.errors import ClsplatError
+
+MIB = 1 << 20
+SPOILING = 60
+"""Seconds beside --seconds after which a case counts as hung: it has to be made, and the machine may be busy."""
+
+
+@dataclass
+class Tally:
+    """Count of a reader's cases. slowest: seconds and number; peak: MiB beyond what the process had, and number."""
+
+    cases: int = 0
+    refused: int = 0
+    slowest: tuple[float, int] = (0.0, -1)
+    peak: tuple[float, int] = (0.0, -1)
+    failures: list[tuple[int, str]] = field(default_factory=list)
+
+
+def numbered(seed: int, reader: str, case: int) -> random.Random:
+    """The source of all that is random in a case."""
+    return random.Random(f"{seed} {reader} {case}")
+
+
+def verdict(reader: Reader, folder: Path) -> tuple[bool, str]:
+    """(Whether the reader refused the file, what is wrong with how it did, empty for nothing)."""
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        try:
+            reader.read(folder)
+        except ClsplatError as error:
+            message = str(error)
+            if error.exit_status != 2:
+                return True, f"{type(error).__name__}, expected InputError: {message[:300]}"
+            if "\n" in message or "\r" in message or not message.isprintable():
+                return True, f"an error that is not a plain line: {message[:300]!r}"
+            if str(folder) not in message:
+                return True, f"an error that names no file: {message[:300]}"
+            return True, ""
+        except BaseException as error:  # noqa: BLE001  # whatever it is, it is the finding
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            return True, f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {str(error)[:300]}"
+    bad = next((str(each.message) for each in heard if not str(each.message).isprintable()), None)
+    return False, f"a warning that is not a plain line: {bad[:300]!r}" if bad else ""
+
+
+@contextlib.contextmanager
+def spoilt(reader: Reader, valid: Path, folder: Path, seed: int, case: int) -> Iterator[str]:
+    """`folder` as a spoilt copy of the reader's valid files, while the block lasts; gives what was done to it."""
+    shutil.copytree(valid, folder, symlinks=True)
+    try:
+        yield spoil(reader, folder, numbered(seed, reader.name, case))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _status(name: str) -> float:
+    """MiB, of /proc/self/status."""
+    with open("/proc/self/status", encoding="ascii") as file:
+        return next(int(line.split()[1]) / 1024 for line in file if line.startswith(name))
+
+
+def _work(tasks: Connection, names: list[str], seed: int, memory: int, most_seconds: float, scratch: str) -> None:
+    """A worker: gets (reader, first, stop), answers ("case", number), then ("done", seconds, MiB, refused, trouble)."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    quiet = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(quiet, 1)  # decoders print
+    os.dup2(quiet, 2)
+    root = Path(tempfile.mkdtemp(prefix="worker-", dir=scratch))
+    readers = {name: READERS[name] for name in names}
+    valid = {}
+    for name, reader in readers.items():
+        valid[name] = root / f"{name}-valid"
+        valid[name].mkdir()
+        reader.make(valid[name])
+        reader.read(valid[name])  # what it needs is loaded before memory counts
+    with open("/proc/self/statm", encoding="ascii") as file:
+        size = int(file.read().split()[0]) * resource.getpagesize()
+    limit = size + memory * MIB
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    while (task := tasks.recv()) is not None:
+        name, first, stop = task
+        for case in range(first, stop):
+            tasks.send(("case", case))
+            try:
+                with spoilt(readers[name], valid[name], root / "case", seed, case):
+                    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+                    before, start = _status("VmRSS"), time.process_time()
+                    refused, trouble = verdict(readers[name], root / "case")
+                    seconds, peak = time.process_time() - start, _status("VmHWM") - before
+            except Exception as error:  # noqa: BLE001  # a defect of these tools, to be told as any other
+                seconds, peak, refused, trouble = 0.0, 0.0, False, f"no case: {type(error).__name__}: {error}"
+            if peak > memory and not trouble:
+                trouble = f"{peak:.0f} MiB of memory"
+            if seconds > most_seconds and not trouble:
+                trouble = f"{seconds:.0f} s"
+            tasks.send(("done", seconds, peak, refused, trouble))
+        tasks.send(("end",))
+
+
+class _Worker:
+    """A process that is started again where a case has ended it or taken too long."""
+
+    def __init__(self, names: list[str], seed: int, memory: int, seconds: float, scratch: str) -> None:
+        self.arguments, self.seconds = (names, seed, memory, seconds, scratch), seconds
+        self._start()
+
+    def _start(self) -> None:
+        self.pipe, other = multiprocessing.Pipe()
+        context = multiprocessing.get_context("spawn")  # what reading starts, threads above all, does not bear forking
+        self.process = context.Process(target=_work, args=(other, *self.arguments), daemon=True)
+        self.process.start()
+        other.close()
+
+    def run(self, name: str, first: int, stop: int, tally: Tally) -> None:
+        while first < stop:
+            self.pipe.send((name, first, stop))
+            case, trouble, started = first, "", False
+            try:
+                while True:
+                    if not self.pipe.poll(self.seconds + SPOILING if started else 120):
+                        trouble = f"not done after {self.seconds:g} s"
+                        break
+                    answer = self.pipe.recv()
+                    if answer[0] == "case":
+                        case, started = answer[1], True
+                    elif answer[0] == "end":
+                        return
+                    else:
+                        _count(tally, case, *answer[1:])
+            except (EOFError, ConnectionError):
+                self.process.join(10)
+                trouble = f"the process ended, status {self.process.exitcode}"
+            self.close()
+            _count(tally, case, self.seconds if "done" in trouble else 0.0, 0.0, True, trouble)
+            first = case + 1
+            self._start()
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def _count(tally: Tally, case: int, seconds: float, peak: float, refused: bool, trouble: str) -> None:
+    tally.cases += 1
+    tally.refused += refused
+    tally.slowest = max(tally.slowest, (seconds, case))
+    tally.peak = max(tally.peak, (peak, case))
+    if trouble:
+        tally.failures.append((case, trouble))
+
+
+def stress(
+    names: list[str],
+    cases: int,
+    *,
+    seed: int = 0,
+    first: int = 0,
+    jobs: int = 1,
+    memory: int = 1024,
+    seconds: float = 20.0,
+) -> dict[str, Tally]:
+    """Give `cases` spoilt files to the readers, shared among them by their weights; what each came to."""
+    weights = {name: READERS[name].weight for name in names}
+    share = {name: max(round(cases * weight / sum(weights.values())), 1) for name, weight in weights.items()}
+    chunks = [
+        (name, start, min(start + 500, first + share[name]))
+        for name in names
+        for start in range(first, first + share[name], 500)
+    ]
+    tallies = {name: [Tally() for _ in range(jobs)] for name in names}
+    lock = threading.Lock()
+
+    def work(index: int, scratch: str) -> None:
+        worker = _Worker(names, seed, memory, seconds, scratch)
+        try:
+            while True:
+                with lock:
+                    if not chunks:
+                        return
+                    name, start, stop = chunks.pop(0)
+                worker.run(name, start, stop, tallies[name][index])
+        finally:
+            worker.close()
+
+    memory_disk = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108  # a folder in it is made safely
+    with tempfile.TemporaryDirectory(prefix="clsplat-hostile-", dir=memory_disk) as scratch:
+        threads = [threading.Thread(target=work, args=(index, scratch)) for index in range(jobs)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    return {name: _sum(each) for name, each in tallies.items()}
+
+
+def _sum(parts: list[Tally]) -> Tally:
+    whole = Tally()
+    for part in parts:
+        whole.cases += part.cases
+        whole.refused += part.refused
+        whole.slowest, whole.peak = max(whole.slowest, part.slowest), max(whole.peak, part.peak)
+        whole.failures += part.failures
+    whole.failures.sort()
+    return whole
+
+
+def keep(folder: Path, name: str, case: int, seed: int) -> Path:
+    """The files of a case, made anew, in a folder of their own."""
+    target = folder / f"{name}-{case}"
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    READERS[name].make(target)
+    done = spoil(READERS[name], target, numbered(seed, name, case))
+    (target / "what-was-done.txt").write_text(done + "\n", encoding="utf-8", errors="replace")
+    return target
+
+
+def table(tallies: dict[str, Tally]) -> str:
+    """Text table, a line each."""
+    lines = [f"{'reader':14} {'cases':>8} {'refused':>8} {'slowest':>9} {'most memory':>12} {'failures':>9}"]
+    for name, tally in tallies.items():
+        lines.append(
+            f"{name:14} {tally.cases:8,} {tally.refused:8,} {tally.slowest[0]:7.2f} s {tally.peak[0]:8.0f} MiB "
+            f"{len(tally.failures):9,}"
+        )
+    total = _sum(list(tallies.values()))
+    lines.append(
+        f"{'all':14} {total.cases:8,} {total.refused:8,} {total.slowest[0]:7.2f} s {total.peak[0]:8.0f} MiB "
+        f"{len(total.failures):9,}"
+    )
+    return "\n".join(lines)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the cases; see the module."""
+    parser = argparse.ArgumentParser(prog="stress_files", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--cases", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="number of each reader's first case")
+    parser.add_argument("--readers", default=",".join(READERS), help=f"of {', '.join(READERS)}")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--memory", type=int, default=1024, help="MiB that a case may take")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of a core that a case may take")
+    parser.add_argument("--keep", type=Path, help="folder for the files of failures")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    names = options.readers.split(",")
+    if unknown := [name for name in names if name not in READERS]:
+        print(f"stress_files: error: no reader {unknown[0]!r}, expected of {', '.join(READERS)}", file=sys.stderr)
+        return 2
+    limits: dict[str, Any] = {"jobs": options.jobs, "memory": options.memory, "seconds": options.seconds}
+    tallies = stress(names, options.cases, seed=options.seed, first=options.first, **limits)
+    failed = sum(len(tally.failures) for tally in tallies.values())
+    if options.json:
+        print(json.dumps({name: vars(tally) for name, tally in tallies.items()}, indent=2))
+    else:
+        print(table(tallies))
+    for name, tally in tallies.items():
+        kinds = Counter(trouble.split(":")[0] + trouble.split(":")[-1][:60] for _, trouble in tally.failures)
+        for case, trouble in tally.failures[:20]:
+            kept = f", kept in {keep(options.keep, name, case, options.seed)}" if options.keep else ""
+            print(f"{name} {case}: {trouble}{kept}", file=sys.stderr)
+        if len(tally.failures) > 20:
+            print(f"{name}: {len(tally.failures)} failures, the commonest: {kinds.most_common(5)}", file=sys.stderr)
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

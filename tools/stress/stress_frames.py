@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blending and its gradient: tiny frames, and crops of large ones, pixel by pixel against the twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from planes import padded
+from stress_cases import DEGREE, Cloud, camera_of
+from stress_projection import in_order
+
+from clsplat.camera import Camera
+from clsplat.device.buffers import upload
+from clsplat.device.context import Device
+from clsplat.gaussians import Gaussians
+from clsplat.reference import render as reference
+from clsplat.reference.blend import blend
+from clsplat.reference.project import project
+from clsplat.reference.render import parameters
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
+
+Array = NDArray[Any]
+Scene = tuple[Gaussians, Camera]
+GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+BACKGROUND = (0.1, 0.2, 0.3)
+BAND = 1e-4
+"""Relative distance of alpha or transmittance to a threshold, within which float32 may decide the other way."""
+
+
+def scene_of(
+    rng: np.random.Generator, count: int, width: int, height: int, *, low: float = 0.5, high: float = 6.0
+) -> tuple[Cloud, Camera]:
+    """Gaussians all over an image of that size, with axes of `low` to `high` pixels."""
+    camera = replace(camera_of(rng), width=width, height=height, fx=50.0, fy=55.0)
+    camera = replace(camera, cx=width * rng.uniform(0.3, 0.7), cy=height * rng.uniform(0.3, 0.7))
+    cloud = Cloud(
+        camera=camera,
+        pixels=rng.uniform(-0.1, 1.1, (count, 2)) * (width, height),
+        depths=rng.uniform(1.0, 10.0, count),
+        axes=np.exp(rng.uniform(np.log(low), np.log(high), (count, 3))),
+        quaternions=rng.normal(size=(count, 4)),
+        logits=rng.normal(0.0, 2.0, count),
+        sh=rng.normal(0.0, 0.4, (count, (DEGREE + 1) ** 2, 3)),
+    )
+    return cloud, camera
+
+
+def _made(cloud: Cloud) -> Scene:
+    return cloud.gaussians(), cloud.camera
+
+
+def counts(rng: np.random.Generator) -> Scene:
+    """0, 1, 2^k - 1, 2^k, 2^k + 1."""
+    count = max(0, 2 ** int(rng.integers(0, 10)) + int(rng.integers(-1, 2)))
+    return _made(scene_of(rng, count, 40, 24)[0])
+
+
+def sizes(rng: np.random.Generator) -> Scene:
+    """1x1, 1xN, Nx1, and what is no multiple of a tile."""
+    width, height = (int(rng.choice([1, 1, 2, 15, 16, 17, 31, 33, 50])) for _ in range(2))
+    return _made(scene_of(rng, 48, width, height)[0])
+
+
+def equal_depth(rng: np.random.Generator) -> Scene:
+    cloud, camera = scene_of(rng, 64, 32, 32)
+    cloud.camera = replace(camera, rotation=np.eye(3), translation=np.zeros(3))  # else rounding has depths apart
+    cloud.depths[:] = rng.choice([1.0, 3.0, 1e4])
+    return _made(cloud)
+
+
+def saturated(rng: np.random.Generator) -> Scene:
+    """Alpha at its cap, pixels that end."""
+    cloud, _ = scene_of(rng, 64, 32, 24, low=2.0, high=12.0)
+    cloud.logits = rng.uniform(2, 30, 64)
+    return _made(cloud)
+
+
+def faint(rng: np.random.Generator) -> Scene:
+    """Around 1/255, in many layers."""
+    cloud, _ = scene_of(rng, 400, 24, 24, low=2.0, high=12.0)
+    cloud.logits = np.log(rng.uniform(0.8, 3, 400) / 254)
+    return _made(cloud)
+
+
+def needles(rng: np.random.Generator) -> Scene:
+    cloud, _ = scene_of(rng, 64, 64, 40)
+    cloud.axes = np.array([60.0, 0.01, 0.01]) * rng.uniform(0.2, 2, (64, 3))
+    return _made(cloud)
+
+
+def one_pixel(rng: np.random.Generator) -> Scene:
+    """10,000 whose means are on one pixel."""
+    cloud, _ = scene_of(rng, 10_000, 20, 20, low=0.2, high=2.0)
+    cloud.pixels = 10 + rng.uniform(0.4, 0.6, (10_000, 2))
+    cloud.logits = rng.uniform(-5.5, -3, 10_000)
+    return _made(cloud)
+
+
+def whole_image(rng: np.random.Generator) -> Scene:
+    """One Gaussian over all pixels, and some that are hidden or not."""
+    cloud, _ = scene_of(rng, 40, 100, 70)
+    cloud.axes[:2] = 10 ** rng.uniform(2, 4, (2, 3))
+    cloud.depths[0] = rng.choice([0.5, 20.0])
+    return _made(cloud)
+
+
+def off_frustum(rng: np.random.Generator) -> Scene:
+    """Means beside the image and behind the camera, that reach in."""
+    cloud, _ = scene_of(rng, 64, 40, 30, low=5.0, high=60.0)
+    angle = rng.uniform(0, 2 * np.pi, 64)
+    aside = 0.5 + rng.uniform(0.6, 2.5, (64, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    cloud.pixels = aside * (40, 30)
+    cloud.depths[:8] *= -1
+    return _made(cloud)
+
+
+def bright(rng: np.random.Generator) -> Scene:
+    """Colours far outside [0, 1]."""
+    cloud, _ = scene_of(rng, 64, 32, 24)
+    cloud.sh *= 10 ** rng.uniform(0, 6, (64, 1, 1))
+    return _made(cloud)
+
+
+SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
+    "counts": counts,
+    "sizes": sizes,
+    "equal_depth": equal_depth,
+    "saturated": saturated,
+    "faint": faint,
+    "needles": needles,
+    "one_pixel": one_pixel,
+    "whole_image": whole_image,
+    "off_frustum": off_frustum,
+    "bright": bright,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FrameOutcome:
+    """image: largest difference outside the band, relative to the frame's largest colour; pixels, band: how many, and
+    how many of them in the band; flips: largest relative difference in it; norms: by parameter group
+    (|difference|^2, |wanted|^2); each: by group, every Gaussian's relative error; finite."""
+
+    image: float
+    pixels: int
+    band: int
+    flips: float
+    norms: dict[str, tuple[float, float]]
+    each: dict[str, Array]
+    finite: bool
+
+
+def frame_of(device: Device, scene: Scene) -> tuple[Rasterizer, Any, ForwardPass, Array]:
+    """Rasterizer, parameters, frame, and the image (H, W, 3)."""
+    gaussians, camera = scene
+    rasterizer = Rasterizer(device)
+    on_device = upload_gaussians(device, gaussians)
+    frame = rasterizer.forward(on_device, camera, upload(device, np.array(BACKGROUND, np.float32)))
+    return (
+        rasterizer,
+        on_device,
+        frame,
+        frame.blended.image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0),
+    )
+
+
+def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutcome:
+    """A frame and its gradient for a random gradient of the image, which is 0 in the band."""
+    gaussians, camera = scene
+    rasterizer, on_device, frame, image = frame_of(device, scene)
+    wanted = reference.forward(gaussians, camera, BACKGROUND)
+    blended = wanted.blended
+    assert blended.margin is not None
+    band = blended.margin < BAND
+    scale = max(1.0, float(wanted.projected.colors.max(initial=0)))
+    error = np.abs(image - blended.image).max(axis=2) / scale
+    d_image = rng.normal(size=(camera.height, camera.width, 3))
+    d_image[band] = 0
+    got = back(rasterizer, on_device, frame, d_image)
+    by = reference.render_grad(gaussians, camera, d_image, BACKGROUND)
+    norms, each = {}, {}
+    finite = bool(np.isfinite(image).all())
+    for name in GROUPS:
+        found, want = getattr(got, name).astype(float), by.parameters[name]
+        finite &= bool(np.isfinite(found).all())
+        inner = tuple(range(1, want.ndim))
+        off, size = np.sqrt(((found - want) ** 2).sum(axis=inner)), np.sqrt((want**2).sum(axis=inner))
+        norms[name] = (float((off**2).sum()), float((size**2).sum()))
+        each[name] = off[size > 0] / size[size > 0]
+    out = error[~band].max(initial=0.0), int(band.size), int(band.sum()), error[band].max(initial=0.0)
+    return FrameOutcome(float(out[0]), out[1], out[2], float(out[3]), norms, each, finite)
+
+
+def back(rasterizer: Rasterizer, on_device: Any, frame: ForwardPass, d_image: Array) -> Gaussians:
+    """Gradients of the parameters."""
+    device = rasterizer.device
+    gradients = allocate_gaussians(device, on_device.count, on_device.coefficients, zero=True)
+    rasterizer.backward(on_device, frame, upload(device, padded(d_image)), gradients)
+    return download_gaussians(gradients)
+
+
+def compare_8k(device: Device, rng: np.random.Generator, *, count: int = 2000, crops: int = 12) -> FrameOutcome:
+    """A frame of 7680 x 4320 on some crops of it; no gradients, which have no dependence on the size."""
+    width, height, side = 7680, 4320, 64
+    cloud, _ = scene_of(rng, count, width, height, low=0.5, high=200.0)
+    cloud.camera = replace(cloud.camera, fx=6000.0, fy=6100.0)
+    cloud.axes[:2] = 10 ** rng.uniform(3, 4, (2, 3))
+    scene = _made(cloud)
+    _, _, _, image = frame_of(device, scene)
+    projected = project(*in_order(parameters(scene[0])), scene[1], DEGREE)
+    worst = flips = 0.0
+    band = 0
+    scale = max(1.0, float(projected.colors.max()))
+    for _ in range(crops):
+        x, y = (int(rng.choice(np.array([0, size - side, rng.integers(0, size - side)]))) for size in (width, height))
+        moved = replace(projected, means2d=projected.means2d - (x, y))
+        blended = blend(moved, side, side, BACKGROUND)
+        assert blended.margin is not None
+        near = blended.margin < BAND
+        error = np.abs(image[y : y + side, x : x + side] - blended.image).max(axis=2) / scale
+        worst, flips = max(worst, float(error[~near].max())), max(flips, float(error[near].max(initial=0)))
+        band += int(near.sum())
+    return FrameOutcome(worst, crops * side * side, band, flips, {}, {}, bool(np.isfinite(image).all()))

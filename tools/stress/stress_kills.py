@@ -1,0 +1,204 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Kills trainings with SIGKILL at random moments, resumes them until they are done, and compares the models' bytes.
+
+    python tools/stress/stress_kills.py [--kills 100] [--seed 0] [--device DEVICE] [--json]
+
+The scene is a small one made on the spot: 40 points, 8 pictures of 48x40. Training writes a checkpoint every second
+step, so that many kills come while one is being written. A process is killed after a random time, anywhere from its
+start (imports, building of kernels, reading the checkpoint) to its end. One that gets to its end is compared with an
+undisturbed training: model.ply byte for byte, and the steps in metrics.jsonl. Exit status 1 if one of them
+differs, or a process ends in any other way than by being killed or being done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+ITERATIONS, CHECKPOINT_EVERY = 240, 2
+SETTINGS = (
+    *("--iterations", str(ITERATIONS), "--checkpoint-every", str(CHECKPOINT_EVERY)),
+    *("--sh-degree", "2", "--sh-degree-every", "60", "--warmup", "20,40"),
+    *("--density.start", "30", "--density.every", "20", "--density.stop", "200", "--density.max-gaussians", "300"),
+    *("--density.gradient-threshold", "1e-3", "--density.opacity-reset-every", "90"),
+)
+VIEWS, WIDTH, HEIGHT, FOCAL, POINTS = 10, 48, 40, 50.0, 40
+WHILE_WRITING = 0.4
+"""Share of the kills that wait for the next checkpoint to be under way, which is a small part of the time."""
+DEADLINE = 300.0
+"""Seconds that a process may take, however busy the machine is."""
+
+
+@dataclass
+class Figures:
+    """kills: processes killed; writing: of them those that left a half-written file; before: those killed before their
+    first step; compared: trainings that were finished; seconds: of it all."""
+
+    kills: int = 0
+    writing: int = 0
+    before: int = 0
+    compared: int = 0
+    seconds: float = 0.0
+
+
+def write_scene(folder: Path) -> Path:
+    """Pictures of coloured blobs, drawn as discs, in a COLMAP folder of text files."""
+    from clsplat.camera import Camera
+    from clsplat.images.writing import write_image
+    from clsplat.scenes.dataset import Lens
+    from clsplat.scenes.readers.colmap_writer import write_model
+
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-0.8, 0.8, (POINTS, 3))
+    colours = rng.uniform(0.1, 1.0, (POINTS, 3)).astype(np.float32)
+    numbers = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    (folder / "images").mkdir(parents=True)
+    images = []
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for index, angle in enumerate(np.linspace(-0.8, 0.8, VIEWS)):
+        c, s = np.cos(angle), np.sin(angle)
+        rotation = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+        camera = Camera(WIDTH, HEIGHT, *numbers, rotation, np.array([0.0, 0.0, 4.0]))
+        seen = points @ rotation.T + camera.translation
+        image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+        for i in np.argsort(-seen[:, 2]):
+            u, v = FOCAL * seen[i, :2] / seen[i, 2] + (WIDTH / 2, HEIGHT / 2)
+            image[(x - u) ** 2 + (y - v) ** 2 < 9] = colours[i]
+        images.append((f"{index:02d}.png", Lens("PINHOLE", WIDTH, HEIGHT, numbers), camera))
+        write_image(folder / "images" / images[-1][0], image)
+    write_model(folder / "sparse" / "0", images, points, colours)
+    return folder
+
+
+def half_written(run: Path) -> set[str]:
+    """Checkpoints that are being written, or were when a process died."""
+    folder = run / "checkpoints"
+    return {entry.name for entry in os.scandir(folder) if entry.name.startswith(".")} if folder.is_dir() else set()
+
+
+class Kills:
+    """Trainings of one scene in one folder."""
+
+    def __init__(self, folder: Path, device: str | None, seed: int) -> None:
+        self.folder, self.random, self.figures = folder, random.Random(seed), Figures()
+        self.more = ("--device", device) if device else ()
+        self.scene = write_scene(folder / "scene")
+        self.whole = folder / "whole"
+        self.end_of(self.start(folder / "first"))  # which builds the kernels
+        start = time.monotonic()
+        self.end_of(self.start(self.whole))
+        self.lifetime = time.monotonic() - start
+        self.model = (self.whole / "model.ply").read_bytes()
+        self.steps = self.steps_of(self.whole)
+
+    def start(self, run: Path) -> subprocess.Popen[str]:
+        """A training, or the rest of one."""
+        command = [sys.executable, "-m", "clsplat", "train", "-o", str(run), *self.more]
+        command += ["--resume"] if (run / "config.toml").exists() else [str(self.scene), *SETTINGS]
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+    def end_of(self, process: subprocess.Popen[str]) -> None:
+        """Wait until it is done. Raises RuntimeError with its last words where it fails."""
+        _, said = process.communicate(timeout=DEADLINE)
+        if process.returncode != 0:
+            raise RuntimeError(f"a training ended with status {process.returncode}: {said.strip()[-400:]}")
+
+    @staticmethod
+    def steps_of(run: Path) -> list[int]:
+        """The steps in metrics.jsonl."""
+        return [json.loads(line)["step"] for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+    def kill_once(self, run: Path) -> bool:
+        """Start or go on, and kill at a random moment. Whether there was something to kill."""
+        before = half_written(run)
+        process = self.start(run)
+        try:
+            # Mostly while it trains, which is the later part; the start is the same every time.
+            wait = self.lifetime * self.random.uniform(0.0, 0.25 if self.random.random() < 0.2 else 0.9)
+            process.wait(timeout=wait)
+        except subprocess.TimeoutExpired:
+            end = time.monotonic() + 10.0
+            if self.random.random() < WHILE_WRITING:
+                while time.monotonic() < end and process.poll() is None and not half_written(run) - before:
+                    pass
+                time.sleep(self.random.uniform(0, 1e-3))
+            process.kill()
+            process.communicate(timeout=DEADLINE)
+            if process.returncode == 0:  # done, while a checkpoint was waited for
+                return False
+            self.figures.kills += 1
+            self.figures.writing += bool(half_written(run) - before)
+            self.figures.before += not list(run.glob("checkpoints/step-*.npz"))
+            return True
+        self.end_of(process)
+        return False
+
+    def compare(self, run: Path) -> None:
+        """Raise RuntimeError where a finished run is not what it would have been."""
+        if (run / "model.ply").read_bytes() != self.model:
+            raise RuntimeError(f"after {self.figures.kills} kills model.ply differs")
+        if (steps := self.steps_of(run)) != self.steps:
+            raise RuntimeError(f"after {self.figures.kills} kills metrics.jsonl has the steps {steps}")
+        if left := list(run.rglob(".*.clsplat-tmp")):
+            raise RuntimeError(f"a half-written file has stayed: {left[0].name}")
+        self.figures.compared += 1
+
+    def survive(self, count: int) -> Figures:
+        """So many kills; every training that ends by itself is compared, and at last the one that is left."""
+        start, run = time.monotonic(), self.folder / "run"
+        while self.figures.kills < count:
+            if not self.kill_once(run):
+                self.compare(run)
+                shutil.rmtree(run)
+            print(f"{self.figures.kills} kills, {self.figures.compared} trainings", file=sys.stderr, flush=True)
+        if run.exists():
+            self.end_of(self.start(run))
+            self.compare(run)
+        self.figures.seconds = time.monotonic() - start
+        return self.figures
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line above."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--kills", metavar="N", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    if options.kills < 1:
+        parser.error(f"--kills {options.kills}: expected at least 1")
+    with tempfile.TemporaryDirectory(prefix="clsplat-kills-") as folder:
+        try:
+            figures = Kills(Path(folder), options.device, options.seed).survive(options.kills)
+        except (RuntimeError, subprocess.TimeoutExpired) as error:
+            print(f"stress_kills: error: {error}", file=sys.stderr)
+            return 1
+    if options.json:
+        print(json.dumps(asdict(figures), indent=2))
+        return 0
+    print(
+        f"{figures.kills} kills survived in {figures.seconds:.0f} s: {figures.writing} while a file was being written, "
+        f"{figures.before} before the first checkpoint; {figures.compared} trainings finished, each with the bytes "
+        "of an undisturbed one"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
