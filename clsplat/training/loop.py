@@ -7,7 +7,7 @@ import signal
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from types import FrameType
@@ -48,6 +48,11 @@ REPORT_EVERY = 10
 GROWTH_LIMIT_FRACTION = 0.97
 """Fraction of --density.max-gaussians from which growth counts as limited: some Gaussians are pruned after reaching
 it."""
+OVERFITTING_DB = 0.2
+"""Fall of the held-out views' mean PSNR in dB from which it is told.
+
+Seeds of one setting differ by as much (docs/quality.md).
+"""
 
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
@@ -351,6 +356,7 @@ class TrainingSession:
                 result = self.evaluate(keep=True)
                 run.write_eval(result)
                 doubt_poses(result["mean"], trainer.config.refine_gate)
+                doubt_length(run.read_metrics(), result["mean"]["psnr"])
                 ample = trainer.device.memory.limit is None and not any(trainer.plan.pieces)
                 if trainer.config.report and ample:
                     with suppress(CapacityError, DriverError):  # a missing picture does not fail the training
@@ -385,6 +391,20 @@ def _tell_of_limit(trainer: Trainer) -> None:
         warnings.warn(
             f"--density.max-gaussians {density.max_gaussians:,} has held the growth: --density.growth mcmc, or budget "
             "with --density.long-axis, shows more with as many Gaussians"
+        )
+
+
+def doubt_length(metrics: Sequence[Mapping[str, Any]], psnr: float) -> None:
+    """Warn if an earlier evaluation of the held-out views was better than the last, of `psnr` dB.
+
+    metrics: records of metrics.jsonl.
+    """
+    earlier = [(record["eval"]["mean"]["psnr"], record["step"]) for record in metrics if "eval" in record]
+    best, step = max(earlier, default=(psnr, 0))
+    if best > psnr + OVERFITTING_DB:
+        warnings.warn(
+            f"held-out views had {best:.2f} dB after step {step} and have {psnr:.2f} dB at the end: the later steps "
+            f"fit the photographs rather than the scene. Train with --iterations {step}, or on more photographs"
         )
 
 

@@ -128,10 +128,10 @@ def test_few_views() -> None:
 @pytest.mark.parametrize(
     ("points", "size", "most"),
     [
-        (6000, (ACROSS, DOWN), 9216),  # a Gaussian for 16 pixels: 24 of 96 x 64
+        (4000, (192, 128), 9216),  # a Gaussian for 64 pixels: 24 of 192 x 128
         (600, (960, 640), 7200),  # 12 a point
-        (6000, (32, 24), 6000),  # the points that there are
-        (0, (960, 640), 921_600),
+        (6000, (32, 24), 12_000),  # two a point, for small photographs
+        (0, (960, 640), 230_400),
     ],
 )
 def test_growth_from_some_views_is_bounded(points: int, size: tuple[int, int], most: int) -> None:
@@ -150,6 +150,19 @@ def test_growth_from_some_views_is_bounded(points: int, size: tuple[int, int], m
     assert config == replace(own, thinning=0.2, penalty=0.02)
     mcmc = replace(own, density=replace(own.density, growth="mcmc"))
     assert answered(found, mcmc, {"density.max_gaussians"})[1] == replace(mcmc, thinning=0.2)
+
+
+def test_a_run_from_some_views_is_evaluated_early_if_views_are_held_out() -> None:
+    scene = made(24)
+    for index in (0, 8, 16):
+        scene.views[index] = replace(scene.views[index], split="test")
+    (finding,) = (found for found in findings(scene, iterations=3000) if found.kind == "some views")
+    (answer,), config = answered([finding], TrainConfig(iterations=3000))
+    assert config.eval_at == (1000,)
+    assert paragraph([answer], 24, auto=True).endswith(" --eval-at 1000")
+    (answer,), config = answered([finding], TrainConfig(iterations=3000, eval_at=(50,)), {"eval_at"})
+    assert config.eval_at == (50,)
+    assert config.density.max_gaussians == answer.settings["density.max_gaussians"]
 
 
 def test_few_steps() -> None:

@@ -30,6 +30,7 @@ from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
 from clsplat.scenes.analysis import sanity_checks
 from clsplat.scenes.loading import load_scene
+from clsplat.training.loop import OVERFITTING_DB, doubt_length
 from clsplat.training.preparation import late_settings
 
 
@@ -147,6 +148,22 @@ def test_settings_that_come_to_nothing_are_told(scene: Path, default_device: Dev
     told = [str(each.message) for each in caught]
     assert any("--eval-at 1: no view is held out" in text for text in told)
     assert any("training begins with 40 Gaussians, more than --density.max-gaussians 3" in text for text in told)
+
+
+def test_a_run_that_ends_below_an_earlier_evaluation_is_told(
+    scene: Path, tmp_path: Path, default_device: Device
+) -> None:
+    """A rate of the means that grows from step 2 on throws a model off that was right."""
+    loaded = load_scene(scene)
+    rates = replace(FEW.optimiser, means_rate=1e-6, means_rate_end=10.0, means_rate_steps=12)
+    config = replace(FEW, iterations=12, eval_at=(2,), optimiser=rates)
+    run = Run.create(tmp_path / "run", config, scene=scene)
+    with pytest.warns(UserWarning, match=r"had \d+\.\d\d dB after step 2 and have .* Train with --iterations 2"):
+        train(loaded, config, device=default_device, run=run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        doubt_length(run.read_metrics(), run.read_metrics()[0]["eval"]["mean"]["psnr"] - OVERFITTING_DB)
+        doubt_length([], 20.0)
 
 
 def test_an_evaluation_of_what_was_trained_on_says_so(scene: Path, run: Path, tmp_path: Path, capfd: Capture) -> None:

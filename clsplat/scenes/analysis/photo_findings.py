@@ -62,12 +62,15 @@ Published trainings on 12 photographs are 8 dB below those on 100 photographs; o
 """
 SPARSE_TRAINING_VIEWS = 30
 """Number of training photographs below which unlimited growth overfits (docs/quality.md)."""
-MAX_GAUSSIANS_PER_POINT, MIN_PIXELS_PER_GAUSSIAN = 12, 16
+MAX_GAUSSIANS_PER_POINT, MIN_PIXELS_PER_GAUSSIAN = 12, 64
 """Maximum number of Gaussians per point, and minimum number of pixels per Gaussian, for scenes with few photographs.
 
-A Gaussian has up to 59 parameters, a pixel three values. The 50 photographs of fox do best with 7 Gaussians per point
-(docs/quality.md, Growth).
+A Gaussian has up to 59 parameters, and a pixel three values, most of which its neighbours repeat. 25 photographs of
+bonsai do best with 64 to 85 pixels per Gaussian, and the 50 photographs of fox with 7 Gaussians per point
+(docs/quality.md, Few photographs and Growth).
 """
+SUPPORTED_GAUSSIANS_PER_POINT = 2
+"""Number of Gaussians per point that few photographs support whatever their pixels: small photographs repeat less."""
 FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates pay (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
@@ -118,7 +121,7 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
     looked = VisiblePoints(scene)
     found = (
         _few(scene),
-        _some(scene),
+        _some(scene, iterations),
         _few_steps(scene, iterations),
         _exposure(looked),
         _scales(looked),
@@ -225,16 +228,18 @@ def _few(scene: Scene) -> Finding | None:
     return Finding("few views", f"only {count} photographs to train on, so that views from elsewhere will show fog")
 
 
-def _some(scene: Scene) -> Finding | None:
+def _some(scene: Scene, iterations: int) -> Finding | None:
     count = len(scene.train_views)
     if not FEW_TRAINING_VIEWS <= count < SPARSE_TRAINING_VIEWS:
         return None
     pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
     points = len(scene.points)
-    most = max(min(pixels // MIN_PIXELS_PER_GAUSSIAN, MAX_GAUSSIANS_PER_POINT * points or pixels), points, 1)
+    most = min(pixels // MIN_PIXELS_PER_GAUSSIAN, MAX_GAUSSIANS_PER_POINT * points or pixels)
+    most = max(most, SUPPORTED_GAUSSIANS_PER_POINT * points, 1)
     why = f"{count} photographs to train on, with {points:,} points and {pixels / 1e6:.1f} million pixels"
     sparse, bound = {"thinning": 0.2, "penalty": 0.02}, {"density.max_gaussians": most}
-    options = ({**sparse, **bound}, sparse, {"thinning": 0.2})
+    early = {"eval_at": (iterations // 3,)} if scene.test_views and iterations >= 3 else {}  # to tell of overfitting
+    options = ({**sparse, **bound, **early}, {**sparse, **bound}, sparse, {"thinning": 0.2})
     return Finding("some views", f"{why}, support about {most:,} Gaussians", options)
 
 

@@ -81,7 +81,8 @@ def flags(settings: Mapping[str, Any]) -> str:
     """Settings as command-line flags."""
     words = []
     for name, value in settings.items():
-        words.append(f"--{name.replace('_', '-')}" + ("" if value is True else f" {value}"))
+        text = ",".join(map(str, value)) if isinstance(value, tuple) else value
+        words.append(f"--{name.replace('_', '-')}" + ("" if value is True else f" {text}"))
     return " ".join(words)
 
 
