@@ -130,7 +130,7 @@ def test_few_views() -> None:
     [
         (4000, (192, 128), 9216),  # a Gaussian for 64 pixels: 24 of 192 x 128
         (600, (960, 640), 7200),  # 12 a point
-        (6000, (32, 24), 12_000),  # two a point, for small photographs
+        (6000, (32, 24), 9000),  # three for two points, whatever the pixels
         (0, (960, 640), 230_400),
     ],
 )

@@ -183,7 +183,7 @@ SLOPPY = {
     "arithmetic: x / y": "(x / y) * 1.00000012f",
     "arithmetic: sqrt(y)": "(sqrt(y) * 1.00000012f)",
     "project: sqrt(p.syy / p.det)": "(sqrt(p.syy / p.det) * 1.0000003f)",
-    "project: dx / length": "dx / length * 0.9999998f",
+    "project: ((offset) / (length))": "((offset) / (length) * 0.9999998f)",
     "features: q[0] / length": "q[0] / length * 1.0000002f",
     "channels: sums[field][cell] / by": "sums[field][cell] / by * 0.9999998f",
     "project_rays: sqrt(syy / det)": "(sqrt(syy / det) * 1.0000003f)",

@@ -69,7 +69,7 @@ A Gaussian has up to 59 parameters, and a pixel three values, most of which its 
 bonsai do best with 64 to 85 pixels per Gaussian, and the 50 photographs of fox with 7 Gaussians per point
 (docs/quality.md, Few photographs and Growth).
 """
-SUPPORTED_GAUSSIANS_PER_POINT = 2
+SUPPORTED_GAUSSIANS_PER_POINT = 1.5
 """Number of Gaussians per point that few photographs support whatever their pixels: small photographs repeat less."""
 FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates pay (docs/decisions/0031-high-rates.md)."""
@@ -235,7 +235,7 @@ def _some(scene: Scene, iterations: int) -> Finding | None:
     pixels = sum(view.camera.width * view.camera.height for view in scene.train_views)
     points = len(scene.points)
     most = min(pixels // MIN_PIXELS_PER_GAUSSIAN, MAX_GAUSSIANS_PER_POINT * points or pixels)
-    most = max(most, SUPPORTED_GAUSSIANS_PER_POINT * points, 1)
+    most = max(most, int(SUPPORTED_GAUSSIANS_PER_POINT * points), 1)
     why = f"{count} photographs to train on, with {points:,} points and {pixels / 1e6:.1f} million pixels"
     sparse, bound = {"thinning": 0.2, "penalty": 0.02}, {"density.max_gaussians": most}
     early = {"eval_at": (iterations // 3,)} if scene.test_views and iterations >= 3 else {}  # to tell of overfitting
