@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All steps that make a frame: framing, samples, colour, and strips if it is large.
+"""All passes that make a frame: kernels, linear light, filter, samples, strips and warp, and last the file's colours.
 
 The order is always the same. The kernels render in the model's colour space. The result is converted to linear light,
-filtered and averaged, and then converted to the output's space. A strip is a window of the picture, and passes all
-steps on its own.
+filtered and averaged, and then converted to the output's space. A strip is a window of the picture, and goes through
+all passes on its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import PictureConfig, SamplingConfig, WarpConfig
+from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.frame.deep import (
     Convert,
     DrawDeep,
@@ -44,6 +46,46 @@ BLANK_COLOUR_TOLERANCE = 1e-6
 rounded."""
 
 
+DrawAt = Callable[[float], Draw]
+"""The Draw of a frame at a time in frames from the frame. The time is 0 if nothing moves."""
+Pass = Callable[[DrawAt], DrawAt]
+"""A step of a frame: it makes its pictures from those of the step before."""
+
+
+@dataclass(frozen=True)
+class FrameRequest:
+    """A frame that a job's pipeline draws.
+
+    at: camera of the whole frame, in its final size, at a time in frames from the frame.
+    after, before: cameras of the next and the previous frame, for motion.
+    lens: warps the picture.
+    sampling: of this frame, None for the job's.
+    cut: of the frame's holdout, for every sample of the frame.
+    models: the Gaussians at a time, None for the pipeline's own.
+    moved: Gaussians that motion and backward motion lead to, None if these stand still.
+    """
+
+    at: Callable[[float], Camera]
+    after: Camera | None = None
+    before: Camera | None = None
+    lens: Places | None = None
+    sampling: SamplingConfig | None = None
+    cut: Cut | None = None
+    models: Callable[[float], Gaussians] | None = None
+    moved: tuple[Gaussians | None, Gaussians | None] = (None, None)
+
+
+def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
+    """A pass that changes the picture of each time on its own."""
+    return lambda draw: lambda time: apply(draw(time))
+
+
+def _at_its_samples(at: Callable[[float], Camera], sampling: SamplingConfig, draw: DrawAt) -> DrawAt:
+    """A pass that averages the samples of shutter and lens."""
+    (middle, cameras), times = sample_cameras(at, sampling), sample_moments(sampling)
+    return lambda time: sampled(draw(time), middle, cameras, lambda index: draw(times[index]))
+
+
 class FramePipeline:
     """Renders the frames of one job."""
 
@@ -70,75 +112,73 @@ class FramePipeline:
         self._renderer, self._gaussians, self._background = renderer, gaussians, background
         self._mattes = mattes or {}
 
-    def draw(
-        self,
-        at: Callable[[float], Camera],
-        after: Camera | None = None,
-        before: Camera | None = None,
-        lens: Places | None = None,
-        sampling: SamplingConfig | None = None,
-        cut: Cut | None = None,
-        models: Callable[[float], Gaussians] | None = None,
-        moved: tuple[Gaussians | None, Gaussians | None] = (None, None),
-    ) -> tuple[Draw, Callable[[Planes], Planes]]:
+    def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a frame, and the conversion of its planes to the file's colours, which needs no device.
 
         The camera that is drawn gives only size and window, of the picture or of a strip.
-        at: camera of the whole frame, in its final size, at a time in frames from the frame; the time is 0 if nothing
-          moves.
-        after, before: cameras of the next and the previous frame, for motion.
-        lens: warps the picture.
-        sampling: of this frame, None for the job's.
-        cut: of the frame's holdout, for every sample of the frame.
-        models: the Gaussians at a time, None for the pipeline's own.
-        moved: Gaussians that motion and backward motion lead to, None if these stand still.
         """
-        sampling = sampling or self.config.sampling
-        config, colours, space = self.config, self.colours, self.colours.model
-        in_light = self._made_in_light(sampling) or lens is not None
+        draw = self._by_kernels(frame)
+        for apply in self._passes(frame):
+            draw = apply(draw)
+        colours = self.colours
+        space = colours.light if self._in_light(frame) else colours.model
+        return draw(self._sampling(frame).middle), lambda planes: self._with_ranks(
+            converted(planes, colours, space, colours.output)
+        )
 
-        def drawn_at(time: float, moved: tuple[Gaussians | None, Gaussians | None] = (None, None)) -> Draw:
+    def _by_kernels(self, frame: FrameRequest) -> DrawAt:
+        def draw_at(time: float) -> Draw:
             def draw(camera: Camera, names: Collection[str]) -> Planes:
-                gaussians = self._gaussians if models is None else models(time)  # when they are drawn, not before
-                cameras, mattes = (self._background, after, before), self._mattes
-                return drawn_by(self._renderer, gaussians, *cameras, cut, *moved, mattes)(camera, names)
+                gaussians = self._gaussians if frame.models is None else frame.models(time)  # when drawn, not before
+                cameras, mattes = (self._background, frame.after, frame.before), self._mattes
+                return drawn_by(self._renderer, gaussians, *cameras, frame.cut, *frame.moved, mattes)(camera, names)
 
-            return supersampled(self._in_light(draw), config.framing) if in_light else draw
+            return draw
 
-        if in_light:
-            space = colours.light
-        draw = drawn_at(sampling.middle, moved)
+        return draw_at
+
+    def _passes(self, frame: FrameRequest) -> list[Pass]:
+        """The passes of a frame, the first after the kernels first."""
+        sampling, framing = self._sampling(frame), self.config.framing
+        passes: list[Pass] = []
+        if self._in_light(frame):
+            passes += [at_each_time(self._to_light), at_each_time(lambda draw: supersampled(draw, framing))]
         if sampling.on:
-            times = sample_moments(sampling)
-            light = None if models is None else lambda index: drawn_at(times[index])
-            draw = sampled(draw, *sample_cameras(at, sampling), light)
-        if lens is not None:
-            device, straight = self._renderer.device, draw
+            passes.append(partial(_at_its_samples, frame.at, sampling))
+        if frame.lens is not None:
+            warp = Warp(frame.lens, frame.at(sampling.middle))
+            passes += [
+                at_each_time(partial(self._in_strips, frame)),
+                at_each_time(lambda draw: warped(draw, warp)),
+            ]
+        return passes
 
-            def rows(camera: Camera, names: Collection[str]) -> Planes:
-                planes = held_bytes(cut(camera)) if cut else 0
-                return in_strips(straight, strip_rows(device, camera, names, config.framing, planes))(camera, names)
+    def _to_light(self, draw: Draw) -> Draw:
+        """The same picture in linear light."""
+        colours = self.colours
+        return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
-            draw = warped(rows, Warp(lens, at(sampling.middle)))
-        return draw, lambda planes: self._with_ranks(converted(planes, colours, space, colours.output))
+    def _in_strips(self, frame: FrameRequest, draw: Draw) -> Draw:
+        """The same picture in strips that leave memory for the rest."""
+        device, framing = self._renderer.device, self.config.framing
 
-    def draw_deep(
-        self,
-        bins: int,
-        at: Callable[[float], Camera],
-        lens: Places | None = None,
-        sampling: SamplingConfig | None = None,
-        models: Callable[[float], Gaussians] | None = None,
-    ) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
+        def drawn(camera: Camera, names: Collection[str]) -> Planes:
+            planes = held_bytes(frame.cut(camera)) if frame.cut else 0
+            return in_strips(draw, strip_rows(device, camera, names, framing, planes))(camera, names)
+
+        return drawn
+
+    def draw_deep(self, bins: int, frame: FrameRequest) -> tuple[DrawDeep, Convert, Callable[[Camera], int]]:
         """Deep counterpart of `draw`: the DrawDeep, and the conversion of its colours to the file's.
 
         Also returns a function from a camera to the rows of its strips.
         """
-        sampling = sampling or self.config.sampling
-        colours, device = self.colours, self._renderer.device
-        space = colours.light if self._made_in_light(sampling) or lens is not None else colours.model
+        sampling, colours, device = self._sampling(frame), self.colours, self._renderer.device
+        space = colours.light if self._in_light(frame) else colours.model
+        middle, cameras = sample_cameras(frame.at, sampling)
 
-        def drawn_at(time: float) -> DrawDeep:
+        def draw_at(time: float) -> DrawDeep:
+            models = frame.models
             draw = drawn_in_slices(self._renderer, lambda: models(time) if models else self._gaussians, bins)
             return draw if space == colours.model else deep_converted(draw, between(colours.model, space))
 
@@ -148,12 +188,11 @@ class FramePipeline:
         def rows(camera: Camera) -> int:
             return deep_rows(device, camera, bins, len(cameras))
 
-        draw, (middle, cameras) = drawn_at(sampling.middle), sample_cameras(at, sampling)
+        draw = draw_at(sampling.middle)
         if len(cameras) > 1:
-            draws = [drawn_at(time) for time in sample_moments(sampling)]
-            draw = deep_sampled(draws, cameras, Merge(device, bins))
-        if lens is not None:
-            draw = deep_warped(deep_in_strips(draw, rows), Warp(lens, middle), Merge(device, bins))
+            draw = deep_sampled([draw_at(time) for time in sample_moments(sampling)], cameras, Merge(device, bins))
+        if frame.lens is not None:
+            draw = deep_warped(deep_in_strips(draw, rows), Warp(frame.lens, middle), Merge(device, bins))
         return draw, between(space, colours.output), rows
 
     def _with_ranks(self, planes: Planes) -> Planes:
@@ -163,25 +202,23 @@ class FramePipeline:
             for name, plane in planes.items()
         }
 
-    def _in_light(self, draw: Draw) -> Draw:
-        """The same picture in linear light."""
-        colours = self.colours
-        return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
+    def _sampling(self, frame: FrameRequest) -> SamplingConfig:
+        """Sampling of the frame, or of the job."""
+        return frame.sampling or self.config.sampling
 
-    def _made_in_light(self, sampling: SamplingConfig) -> bool:
-        """True if frames are averages of several, in linear light."""
-        return sampling.on or self.config.framing.supersample > 1
+    def _in_light(self, frame: FrameRequest) -> bool:
+        """True if the frame's pixels are means of several, which are taken in linear light."""
+        return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
-    def is_blank(self, planes: Planes, sampling: SamplingConfig | None = None) -> bool | None:
+    def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
         """True if planes of `draw`, before conversion, show only the background; None if no channel can tell."""
-        sampling = sampling or self.config.sampling
         for name in ("alpha", "count", "depth"):
             if name in planes:
                 return not planes[name].any()
         if "rgb" not in planes:
             return None
         behind = np.array(self._background, np.float32).reshape(1, 1, 3)
-        if self._made_in_light(sampling) or self.config.warp != WarpConfig():
+        if self._in_light(frame):
             behind = self.colours.convert(behind, None, self.colours.model, self.colours.light)
         return bool(np.abs(planes["rgb"] - behind).max() <= BLANK_COLOUR_TOLERANCE)
 

@@ -17,7 +17,7 @@ from clsplat.errors import DriverError
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.draw import Planes
 from clsplat.frame.mattes import Matte
-from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.strips import check_parts, in_strips, strip_rows, write_in_strips
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import TILE
@@ -137,16 +137,22 @@ class FrameRenderer:
         start, options, pipeline = time.monotonic(), self.options, self._pipeline
         camera, names, encoding = picture_camera(task, options), options.channels, options.encoding
         gaussians, moved = self._placed(task)
-        sampling = sampling_of(task, options)
+        frame = FrameRequest(
+            task.at,
+            camera_after(task, options),
+            camera_before(task, options),
+            lens_of(task, options),
+            sampling_of(task, options),
+            cut := cut_of(task, options),
+            gaussians,
+            moved,
+        )
         if options.deep is not None:
             bins, above = options.deep.bins, header(task, options)
-            slices, convert, rows_of = pipeline.draw_deep(bins, task.at, lens_of(task, options), sampling, gaussians)
+            slices, convert, rows_of = pipeline.draw_deep(bins, frame)
             empty = write_deep(task.path, slices, camera, rows_of(camera), bins, encoding, above, convert)
             return RenderedFrame(None, time.monotonic() - start, measured=Measured(empty))
-        around = camera_after(task, options), camera_before(task, options)
-        cut = cut_of(task, options)
-        models = (gaussians, moved)
-        draw, finish = pipeline.draw(task.at, *around, lens_of(task, options), sampling, cut, *models)
+        draw, finish = pipeline.draw(frame)
         rows = self._rows(camera, held_bytes(cut(camera)) if cut else 0)
         if rows < camera.height and not task.is_video:
             check_parts(camera, encoding, views)  # again: a deep holdout's memory depends on its number of surfaces
@@ -154,14 +160,14 @@ class FrameRenderer:
 
             def finished(strip: Camera, names: Collection[str]) -> Planes:
                 planes = draw(strip, names)
-                blanks.append(pipeline.is_blank(planes, sampling))
+                blanks.append(pipeline.is_blank(planes, frame))
                 return finish(planes)
 
             write_in_strips(task.path, finished, camera, names, rows, encoding, header(task, options))
             nothing = None if None in blanks else all(blanks)
             return RenderedFrame(None, time.monotonic() - start, measured=Measured(nothing))
         planes = in_strips(draw, rows)(camera, names)
-        blank = pipeline.is_blank(planes, sampling)
+        blank = pipeline.is_blank(planes, frame)
         return RenderedFrame(planes, time.monotonic() - start, finish, Measured(blank))
 
     def _placed(self, task: Task) -> tuple[Callable[[float], Gaussians], tuple[Gaussians | None, Gaussians | None]]:

@@ -23,7 +23,7 @@ from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
 from clsplat.frame.deep import render_deep
 from clsplat.frame.deep_exr import write_deep
-from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR
@@ -160,7 +160,7 @@ def write(
     **how: Any,
 ) -> None:
     pipeline = FramePipeline(renderer, gaussians, PictureConfig(colour or ColourConfig()))
-    draw, convert, rows = pipeline.draw_deep(bins, lambda _: camera)
+    draw, convert, rows = pipeline.draw_deep(bins, FrameRequest(lambda _: camera))
     write_deep(path, draw, camera, rows(camera), bins, convert=convert, **how)
 
 

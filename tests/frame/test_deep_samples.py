@@ -17,7 +17,7 @@ from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.pictures import ColourConfig, PictureConfig, SamplingConfig
 from clsplat.frame.lens import ByMap, Warp
-from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.samples import sample_cameras
 from clsplat.frame.window import crop
 from clsplat.gaussians import Gaussians
@@ -59,7 +59,7 @@ def deep(
     lens: ByMap | None = None,
 ) -> Float32:
     """(bins, H, W, 5)."""
-    draw, *_ = pipeline.draw_deep(bins, at, lens)
+    draw, *_ = pipeline.draw_deep(bins, FrameRequest(at, lens=lens))
     return draw(camera).transpose(0, 2, 3, 1)
 
 
@@ -71,7 +71,7 @@ def pipeline_of(sampling: SamplingConfig | None = None, gaussians: Gaussians = S
 @pytest.mark.parametrize("kind", KINDS)
 def test_flattened_it_is_the_mean(kind: str) -> None:
     pipeline, camera = pipeline_of(KINDS[kind]), moving(KINDS[kind].middle)
-    slices, draw = deep(pipeline, camera), pipeline.draw(moving)[0]
+    slices, draw = deep(pipeline, camera), pipeline.draw(FrameRequest(moving))[0]
     flat = draw(camera, ("rgb", "alpha"))
     wanted = np.concatenate([flat["rgb"], flat["alpha"][:, :, None]], axis=2)
     # each sample's slices lose a few units of 6e-8, and so does each of two merges
@@ -120,7 +120,7 @@ def test_bent(zoom: float) -> None:
     # by hand: the mean of bilinear samples of the flat picture
     places, window = warp.of_window(camera)
     assert window is not None and window.window is not None and warp.samples == (1 if zoom == 1 else 2)
-    flat = pipeline.draw(moving)[0](window, ("rgb", "alpha"))
+    flat = pipeline.draw(FrameRequest(moving))[0](window, ("rgb", "alpha"))
     straight = np.concatenate([flat["rgb"], flat["alpha"][:, :, None]], axis=2).astype(np.float64)
     at = np.nan_to_num(places - (window.window.x, window.window.y) - 0.5)
     x, y = np.floor(at[..., 0]).astype(int), np.floor(at[..., 1]).astype(int)
@@ -140,7 +140,7 @@ def test_bent_and_blurred(monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline, camera = pipeline_of(KINDS["shutter"]), moving(0)
     source = ByMap(shifted_map(camera.width, camera.height))
     slices = deep(pipeline, camera, lens=source)
-    flat = pipeline.draw(moving, lens=source)[0](camera, ("rgb", "alpha"))
+    flat = pipeline.draw(FrameRequest(moving, lens=source))[0](camera, ("rgb", "alpha"))
     assert np.abs(flattened(slices)[..., 3] - flat["alpha"]).mean() < 0.01  # that is between pixels by a cubic
     monkeypatch.setattr("clsplat.frame.deep.DEEP_MERGE_FLOATS", 1 << 16)
     monkeypatch.setattr("clsplat.frame.deep._WARP_BATCH_PIXELS", 200)

@@ -17,7 +17,7 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import ColourConfig, Encoding, FramingConfig, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import Planes
-from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.strips import write_in_strips
 from clsplat.frame.window import framed
 from clsplat.images.colour import LINEAR, linear_to_srgb, srgb_to_linear
@@ -40,7 +40,7 @@ def picture_camera(pipeline: FramePipeline, at: Callable[[float], Camera]) -> Ca
 
 
 def drawn(pipeline: FramePipeline, at: Callable[[float], Camera], names: tuple[str, ...]) -> Planes:
-    draw, finish = pipeline.draw(at)
+    draw, finish = pipeline.draw(FrameRequest(at))
     return finish(draw(picture_camera(pipeline, at), names))
 
 
@@ -104,7 +104,7 @@ def test_all_of_it_to_a_file_in_strips(tmp_path: Path) -> None:
     names = ("rgb", "alpha", "depth", "motion")
     pipeline = FramePipeline(Renderer(), CLOUD, config)
     after = sliding(1.0)
-    (draw, finish), camera = pipeline.draw(sliding, after), picture_camera(pipeline, sliding)
+    (draw, finish), camera = pipeline.draw(FrameRequest(sliding, after)), picture_camera(pipeline, sliding)
     file = Encoding(depth="float"), FrameFileHeader(window=camera.window)
     write_channels(tmp_path / "whole.exr", finish(draw(camera, names)), *file)
     write_in_strips(tmp_path / "strips.exr", lambda strip, _: finish(draw(strip, names)), camera, names, 16, *file)

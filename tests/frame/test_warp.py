@@ -19,7 +19,7 @@ from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.frame.lens import ByLens, ByMap, Warp, distorted_places, undistorted_places
-from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.frame.strips import in_strips
 from clsplat.frame.warp import cubic, nearest, warped
 from clsplat.images.stmap import StMap, read_stmap, write_stmap
@@ -208,7 +208,7 @@ def test_strips_have_the_pixels_of_the_whole(default_device: Device) -> None:
     gaussians, camera = scenes.random_cloud(300, 3, WIDTH, HEIGHT)
     camera = replace(camera, fx=90.0, fy=88.0, cx=47.0, cy=33.0)
     names = ("rgb", "alpha", "depth", "id")
-    draw, _ = FramePipeline(Renderer(default_device), gaussians).draw(lambda _: camera, lens=ByLens(LENS))
+    draw, _ = FramePipeline(Renderer(default_device), gaussians).draw(FrameRequest(lambda _: camera, lens=ByLens(LENS)))
     whole, parts = draw(camera, names), in_strips(draw, 16)(camera, names)
     assert whole["alpha"].max() > 0.5
     for name in names:

@@ -30,7 +30,7 @@ from clsplat.cli.bench import parse_size
 from clsplat.config.pictures import ColourConfig, Encoding, PictureConfig, SamplingConfig
 from clsplat.device.context import open_device
 from clsplat.frame.deep_exr import write_deep
-from clsplat.frame.pipeline import FramePipeline
+from clsplat.frame.pipeline import FramePipeline, FrameRequest
 from clsplat.gaussians import Gaussians
 from clsplat.images.frame_files import FrameFileHeader, deep_spec
 from clsplat.rendering.renderer import Renderer
@@ -62,7 +62,7 @@ def main(arguments: list[str]) -> int:
     config = PictureConfig(ColourConfig(colorspace="lin_rec709"), sampling=lens)
 
     def made(path: Path, renderer: Renderer, camera: Camera) -> None:
-        draw, convert, rows = FramePipeline(renderer, gaussians, config).draw_deep(bins, lambda _: camera)
+        draw, convert, rows = FramePipeline(renderer, gaussians, config).draw_deep(bins, FrameRequest(lambda _: camera))
         write_deep(path, draw, camera, rows(camera), bins, encoding, None, convert)
 
     with TemporaryDirectory() as folder:
