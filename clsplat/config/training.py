@@ -169,7 +169,7 @@ class DensityConfig:
         )
         check_kinds(self, "--density.")
         check_rules(self, "--density.", rules)
-        if self.growth != "paper" and self.max_gaussians == DensityConfig.max_gaussians:
+        if self.fills and self.max_gaussians == DensityConfig.max_gaussians:
             raise InputError(
                 f"--density.growth {self.growth}: expected --density.max-gaussians too, the number of Gaussians to "
                 "grow to"
@@ -179,6 +179,11 @@ class DensityConfig:
                 "--density.growth mcmc: moves Gaussians and prunes none before the end, expected no "
                 "--density.prune-every"
             )
+
+    @property
+    def fills(self) -> bool:
+        """True if the number of Gaussians rises to max-gaussians, whatever their gradients."""
+        return self.growth in ("budget", "mcmc")
 
 
 @dataclass(frozen=True)

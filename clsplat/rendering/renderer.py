@@ -61,8 +61,7 @@ ChannelResult = dict[str, NDArray[Any]]
 
 depth, median, first: (H, W) float32, along the camera's axis.
 count, index: (H, W) int32; index is -1 for empty pixels.
-normal, position: (H, W, 3), in world coordinates, if they were asked for.
-motion: (H, W, 2), pixels, if it was asked for.
+Others, if they were asked for: (H, W) or (H, W, floats) float32, as docs/channels.md defines them.
 """
 
 
@@ -173,7 +172,7 @@ class Renderer:
         camera : Camera
             In world coordinates.
         wanted : collection of str
-            Any of "normal", "position", "motion" and "backward".
+            Features by their names in the kernels (`clsplat.config.channels`).
         after, before : Camera, optional
             Cameras for motion and backward motion. None means the view's own.
         moved, earlier : Gaussians, optional
@@ -187,8 +186,7 @@ class Renderer:
             Image and alpha.
         channels : dict
             depth, median and first (H, W) float32, along the camera's axis, world units; count and index (H, W) int32,
-            index -1 for empty pixels. If asked for, also normal and position (H, W, 3), in world coordinates, and
-            motion and backward (H, W, 2), pixels.
+            index -1 for empty pixels. Also the features asked for, (H, W) or (H, W, floats) float32.
 
         Raises
         ------

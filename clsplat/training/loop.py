@@ -387,7 +387,7 @@ def _tell_of_limit(trainer: Trainer) -> None:
     """Warn if the limit has stopped the paper's growth, which started below it."""
     density, scene = trainer.config.density, trainer.scene
     most, began = GROWTH_LIMIT_FRACTION * density.max_gaussians, len(scene.points) or trainer.config.random_points
-    if density.growth == "paper" and began < most <= trainer.parameters.count:
+    if not density.fills and began < most <= trainer.parameters.count:
         warnings.warn(
             f"--density.max-gaussians {density.max_gaussians:,} has held the growth: --density.growth mcmc, or budget "
             "with --density.long-axis, shows more with as many Gaussians"

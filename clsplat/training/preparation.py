@@ -91,7 +91,7 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
     last, expected = config.iterations, f"expected at most --iterations {config.iterations}"
     ends = f"training ends at step {last}"
     density = config.density
-    if density.every and density.growth != "paper" and density.stop > last:
+    if density.every and density.fills and density.stop > last:
         yield (
             f"--density.growth {density.growth}: --density.max-gaussians {density.max_gaussians:,} is reached at "
             f"--density.stop {density.stop}, {ends}; {expected}, such as {5 * last // 7}"
