@@ -127,7 +127,7 @@ def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> Non
         if not quick:
             start = time.perf_counter()
             for path in sorted(kernel_root().glob("*.cl")):
-                device.kernels(path.stem, **DEFAULT_DEFINES.get(path.stem, {}))
+                device.kernels(path.stem, DEFAULT_DEFINES.get(path.stem, {}))
             tell(built=time.perf_counter() - start)
         digests: dict[str, str] = {}
         for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name), digests=digests):

@@ -61,7 +61,7 @@ def adam(
         if size == 0:
             continue
         if config.sparse:
-            kernel = device.kernels("adam", WIDTH=size // rows).adam_visible
+            kernel = device.kernels("adam", {"WIDTH": size // rows}).adam_visible
             launch_items(device, kernel, -(-rows // lanes), rows, *constants, tile_counts, *arrays)
         else:
             kernel = device.kernels("adam").adam
@@ -89,7 +89,7 @@ def add_view(
     for group in PARAMETER_GROUPS:
         size = sums[group].size
         if size and (sh_rest or group != "sh_rest"):
-            kernel = device.kernels("adam", WIDTH=size // rows).add_view
+            kernel = device.kernels("adam", {"WIDTH": size // rows}).add_view
             launch_items(device, kernel, size, np.uint64(size), tile_counts, gradients[group], sums[group])
     if shown is not None:
         launch_items(device, device.kernels("adam").join_view, rows, rows, tile_counts, shown)

@@ -69,7 +69,7 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
 def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
     """Divide the photograph's gains out of planes (3 or more, rows, stride), the first three of them colours."""
     _, rows, stride = target.shape
-    kernel = device.kernels("appearance", LANES=1).remove_gains
+    kernel = device.kernels("appearance", {"LANES": 1}).remove_gains
     launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
 
 
@@ -92,7 +92,7 @@ def gain_gradient(
         work.array("appearance_partials", (3, down, stride)),
         work.array(f"appearance_columns_{place}", (3, stride)),
     )
-    kernels = device.kernels("appearance", LANES=1)
+    kernels = device.kernels("appearance", {"LANES": 1})
     sizes = (height, stride, rows * stride, down)
     launch_grid(device, kernels.gain_sums, (stride, down), *sizes, image, gradient, partials)
     launch_grid(device, kernels.column_sums, (stride, 3), stride, down, partials, columns)
@@ -119,7 +119,7 @@ def step_gains(
     slow: fraction of the rate for mixes.
     A step by capacity that has stopped changes nothing.
     """
-    kernels, (photographs, entries) = device.kernels("appearance", LANES=1), gains.logs.shape
+    kernels, (photographs, entries) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
     count = photographs * entries
     constants = (
         rate / (1 - APPEARANCE_BETA1**step),

@@ -87,6 +87,6 @@ def camera_gradient(
     sizes = (height, stride, rows * stride, down, *taken.place(width, height))
     kernel = device.kernels("ppisp").camera_sums
     launch_grid(device, kernel, (stride // device.shape.lanes, down), *sizes, image, gradient, partials)
-    kernel = device.kernels("appearance", LANES=1).column_sums
+    kernel = device.kernels("appearance", {"LANES": 1}).column_sums
     launch_grid(device, kernel, (stride, sums), stride, down, partials, columns)
     return columns

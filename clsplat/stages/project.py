@@ -94,9 +94,9 @@ def project(
             defines["THINNED"] = True
             thinned = (start, *thinning_numbers(thinning))
         if rays:
-            kernel, lanes = device.kernels("project_rays", LANES=1, **defines).project_rays, 1
+            kernel, lanes = device.kernels("project_rays", {"LANES": 1, **defines}).project_rays, 1
         else:
-            kernel, lanes = device.kernels("project", **defines).project, device.shape.lanes
+            kernel, lanes = device.kernels("project", defines).project, device.shape.lanes
         launch_items(
             device,
             kernel,
@@ -161,7 +161,7 @@ def add_slots(
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
         sums.fill(0.0)
-    kernel, items = device.kernels("project_grad", **fields.defines).add_slots, n if slots.values.shape[0] else 0
+    kernel, items = device.kernels("project_grad", fields.defines).add_slots, n if slots.values.shape[0] else 0
     launch_items(device, kernel, items, n, tile_counts, slots.first_slots, slots.values, sums)
     return sums
 
@@ -195,7 +195,7 @@ def project_grad(
     n = gaussians.count
     launch_items(
         device,
-        device.kernels("project_grad", **defines).project_grad,
+        device.kernels("project_grad", defines).project_grad,
         -(-n // build.lanes) if slots.values.shape[0] else 0,
         *_inputs(gaussians, camera_array, projected, slots),
         *(model[group] for model in (gaussians, gradients) for group in PARAMETER_GROUPS),
@@ -264,10 +264,10 @@ def project_step(
     build = _build(device)
     defines |= build.defines
     if build.lanes > 1:
-        kernel = device.kernels("project_grad", ROWS=CPU_STEP_ROWS, **defines).project_step
+        kernel = device.kernels("project_grad", {"ROWS": CPU_STEP_ROWS, **defines}).project_step
         launch_groups(device, kernel, -(-parameters.count // CPU_STEP_ROWS), 1, *arguments)
     else:
-        kernel = device.kernels("project_grad", ROWS=DEFAULT_GROUP_ITEMS, **defines).project_step
+        kernel = device.kernels("project_grad", {"ROWS": DEFAULT_GROUP_ITEMS, **defines}).project_step
         launch_items(device, kernel, parameters.count, *arguments)
 
 

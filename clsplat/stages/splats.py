@@ -76,7 +76,7 @@ def splats(
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))
     launch_items(
         device,
-        device.kernels("splats", **({"LISTED": True} if listed else {})).splats,
+        device.kernels("splats", {"LISTED": True} if listed else {}).splats,
         -(-n // device.shape.lanes),
         n,
         -(-width // TILE),
@@ -114,7 +114,7 @@ def splats_grad(
     defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **fields.defines}
     launch_items(
         device,
-        device.kernels("splats_grad", **defines).splats_grad,
+        device.kernels("splats_grad", defines).splats_grad,
         n,
         n,
         width,
@@ -137,6 +137,6 @@ def add_values(
 ) -> None:
     """Fill `count` columns of d_values (n, width), beginning at `first`, with the sums of slots (pairs, count)."""
     n, width = d_values.shape
-    kernel = device.kernels("splats_grad", LANES=1, VALUES=count).add_values
+    kernel = device.kernels("splats_grad", {"LANES": 1, "VALUES": count}).add_values
     counts = (projected.tile_counts, slots.first_slots)
     launch_items(device, kernel, n, n, width, first, *counts, slots.values, d_values)

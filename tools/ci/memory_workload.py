@@ -340,7 +340,7 @@ def limits(device: Device) -> None:
     items, lanes = tile_items(device), device.shape.lanes
     copied = max(lanes, 4)
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
-    kernels = device.kernels("peak", ITEMS=items)
+    kernels = device.kernels("peak", {"ITEMS": items})
     for kernel in (kernels.limit_blend, kernels.limit_blend_grad):
         launch.launch_groups(device, kernel, 1, items, 2, splats, sums)
     sums.get()
