@@ -10,10 +10,12 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.device.profile import stage
 from clsplat.layouts.columns import TILE
-from clsplat.stages.appearance import Gains
+from clsplat.stages.appearance import GainEntries, Gains
 
 COLOUR_ENTRIES, VIGNETTE_ENTRIES = 9, 3
 """Entries of a photograph, three gains and six mixes; entries of a lens."""
+VIGNETTE_GAINS = GainEntries(first_row=COLOUR_ENTRIES, centred=False)
+"""Entries of a lens, behind the photograph's in column sums."""
 PPISP_PIXEL_BYTES = 8
 """Bytes of the partial sums, per pixel with padding."""
 

@@ -11,7 +11,7 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.layouts.columns import PLAIN_SLOTS, SLOT, SPLAT, TILE, SlotFields
+from clsplat.layouts.columns import SLOT, SPLAT, TILE
 from clsplat.stages.project import Projected, Slots
 
 SPLAT_VALUES = 3
@@ -102,16 +102,14 @@ def splats_grad(
     gradients: ScreenGradients,
     *,
     kept: int = SPLAT_VALUES,
-    fields: SlotFields = PLAIN_SLOTS,
 ) -> None:
-    """Fill every row of the gradients from the pairs' slots.
+    """Fill every row of the gradients from the pairs' slots, which may include absolute gradients.
 
     kept: number of leading values whose gradients the slots hold.
-    fields: fields of the slots, which may include absolute gradients.
     """
     assert slots.first_slots is not None, "there are no bands here"
     n, width = gradients.values.shape
-    defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **fields.defines}
+    defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **slots.fields.defines}
     launch_items(
         device,
         device.kernels("splats_grad", defines).splats_grad,
@@ -127,7 +125,7 @@ def splats_grad(
         gradients.conics,
         gradients.opacities,
         gradients.values,
-        *([gradients.absolute] if fields.absolute else []),
+        *([gradients.absolute] if slots.fields.absolute else []),
     )
 
 
