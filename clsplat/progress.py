@@ -206,9 +206,16 @@ class FrameProgress(_Bar):
         if self.lines is None or self.style == "none":
             return
         if self.style == "json":
-            names = ("frame", "name", "path", "seconds", "skipped")
-            values: dict[str, Any] = {name: getattr(record, name) for name in names}
-            text = json.dumps({**values, "done": self.done, "total": self.total})
+            line = {
+                "frame": record.frame,
+                "name": record.name,
+                "path": record.path,
+                "seconds": record.seconds,
+                "skipped": record.skipped,
+                "done": self.done,
+                "total": self.total,
+            }
+            text = json.dumps(line)
         elif self.style == "openjd":
             did = "is there" if record.skipped else f"took {record.seconds:.2f} s"
             text = f"openjd_progress: {100 * self.done / self.total:.1f}\nopenjd_status: frame {record.frame} {did}"

@@ -27,7 +27,7 @@ from clsplat.progress import Progress, aligned, no_progress
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
-from clsplat.rendering.memory_needs import plan_step
+from clsplat.rendering.memory_needs import StepMemory, plan_step
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.renderer import held_sh
 from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
@@ -161,7 +161,7 @@ class _Comparison:
         self.rasterizers = {name: Rasterizer(device, config, work) for name, config in tried.items()}
         size = (model.count, model.coefficients, [self._camera])
         for rasterizer in self.rasterizers.values():
-            rasterizer.follow(plan_step(device, *size, rasterizer.config, fields=PLAIN_SLOTS))
+            rasterizer.follow(plan_step(device, *size, rasterizer.config, StepMemory(PLAIN_SLOTS)))
 
     def draw(self, rasterizer: Rasterizer) -> ForwardPass:
         held = self._models[held_kind(rasterizer.config)]

@@ -10,6 +10,7 @@ from math import inf, isclose, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from typing_extensions import NotRequired, TypedDict
 from tyro.conf import Positional, arg
 
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
@@ -37,6 +38,48 @@ NEAR_PLANE_RELATIVE_TOLERANCE = 0.05
 """Relative tolerance of near planes. A file without one gets it from positions, which a format may have rounded."""
 MAX_MATRIX_FILE_BYTES = 1 << 16
 """Size limit in bytes of a matrix file."""
+
+
+class ModelFile(TypedDict):
+    """A model file in the report of --json."""
+
+    path: str
+    format: str
+    bytes: int
+    gaussians: int
+    sh_degree: int
+
+
+class ViewComparison(TypedDict):
+    """PSNR in dB of a view before and after conversion, and between the two renders."""
+
+    name: str
+    before: float
+    after: float
+    between: float
+
+
+class SceneComparison(TypedDict):
+    """Means over the views of --scene, and the least PSNR between the renders of a view."""
+
+    before: float
+    after: float
+    between: float
+    least_between: float
+    views: list[ViewComparison]
+
+
+class ConversionReport(TypedDict):
+    """The report of --json.
+
+    errors: largest and mean error of each attribute (`difference.errors`).
+    scene: with --scene.
+    """
+
+    source: ModelFile
+    target: ModelFile
+    errors: dict[str, dict[str, float]]
+    scene: NotRequired[SceneComparison]
 
 
 @dataclass(frozen=True)
@@ -143,7 +186,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
             "Gaussians outside the picture as a haze"
         )
     written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
-    result: dict[str, Any] = {
+    result: ConversionReport = {
         "source": _described(source, format_of(source), original),
         "target": _described(verb.target, target_format, read),
         "errors": difference.errors(written, read),
@@ -185,11 +228,16 @@ def _check(verb: ConvertVerb) -> None:
         raise InputError(f"{flags}: for measuring on a scene, expected --scene with it")
 
 
-def _described(path: Path, form: Format, gaussians: Gaussians) -> dict[str, Any]:
+def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
     from clsplat.models.info import size
 
-    file = {"path": str(path), "format": form.name, "bytes": size(path, form)}
-    return file | {"gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
+    return {
+        "path": str(path),
+        "format": form.name,
+        "bytes": size(path, form),
+        "gaussians": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+    }
 
 
 def _edited(
@@ -329,10 +377,10 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
 
 def _measured(
     verb: ConvertVerb, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
-) -> dict[str, Any]:
+) -> SceneComparison:
     """PSNR in dB before and after conversion, against the photographs and against each other.
 
-    The result has each view's values and their means. The cameras of the converted model move with it.
+    The cameras of the converted model move with it.
     """
     import numpy as np
 
@@ -357,12 +405,22 @@ def _measured(
     views = scene.test_views or scene.views
     cameras = [view.camera for view in views]
     moved = cameras if matrix is None else [edit.transform_camera(camera, matrix) for camera in cameras]
-    records: list[dict[str, Any]] = []
+    records: list[ViewComparison] = []
     for view, before, after in zip(views, images(original, cameras), images(read, moved), strict=True):
         pixels, counts = photograph_of(view)
         truth = composite(pixels, background)
-        pairs = {"before": (before, truth), "after": (after, truth), "between": (before, after)}
-        scores = {key: psnr(*pair, counts) for key, pair in pairs.items()}
-        records.append({"name": view.name, **scores})
-    mean = {key: float(np.mean([record[key] for record in records])) for key in ("before", "after", "between")}
-    return {**mean, "least_between": min(record["between"] for record in records), "views": records}
+        records.append(
+            {
+                "name": view.name,
+                "before": psnr(before, truth, counts),
+                "after": psnr(after, truth, counts),
+                "between": psnr(before, after, counts),
+            }
+        )
+    return {
+        "before": float(np.mean([record["before"] for record in records])),
+        "after": float(np.mean([record["after"] for record in records])),
+        "between": float(np.mean([record["between"] for record in records])),
+        "least_between": min(record["between"] for record in records),
+        "views": records,
+    }

@@ -17,12 +17,13 @@ from clsplat.config.training import Missing, TrainConfig
 from clsplat.errors import CapacityError, InputError, warn
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from clsplat.camera import Camera
+    from clsplat.evaluation.held_out import Evaluation
     from clsplat.runs.run import Run
     from clsplat.scenes.scene import Scene, View
 
@@ -151,7 +152,7 @@ def _warn_of_doubts(
         warn(text)
 
 
-def _print_result(result: dict[str, Any], *, as_json: bool) -> None:
+def _print_result(result: Evaluation, *, as_json: bool) -> None:
     if as_json:
         print(json.dumps(result, indent=2))
         return
@@ -168,13 +169,13 @@ def tell_of_lpips() -> None:
         print(f"no LPIPS: {reason}", file=sys.stderr)
 
 
-def print_summary(result: dict[str, Any]) -> None:
+def print_summary(result: Evaluation) -> None:
     """Print the mean scores of eval.json, if it has any."""
     if result["views"]:
         print(f"{len(result['views'])} held-out views  {_scores(result['mean'])}  {result['gaussians']:,} Gaussians")
 
 
-def _scores(record: dict[str, Any]) -> str:
+def _scores(record: Mapping[str, object]) -> str:
     names = {
         "psnr": "PSNR {:.2f} dB",
         "psnr_corrected": "colour-corrected {:.2f} dB",

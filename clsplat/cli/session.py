@@ -16,6 +16,7 @@ from clsplat.progress import StageProgress
 if TYPE_CHECKING:
     from clsplat.config.training import Lenses, Missing
     from clsplat.device.context import Device, DeviceInfo
+    from clsplat.evaluation.held_out import Evaluation
     from clsplat.gaussians import Gaussians
     from clsplat.rendering.renderer import Renderer
     from clsplat.scenes.analysis.photo_findings import Finding
@@ -46,7 +47,7 @@ class Services:
     train: Callable[..., Gaussians] = imported("clsplat.api.train")
     renderer: Callable[..., Renderer] = imported("clsplat.rendering.renderer.Renderer")
     open_frame_renderer: Callable[..., Any] = imported("clsplat.sequence.frame_renderer.open_frame_renderer")
-    run_demo: Callable[..., dict[str, Any]] = imported("clsplat.demo.run.run_demo")
+    run_demo: Callable[..., Evaluation] = imported("clsplat.demo.run.run_demo")
 
 
 def load_scene(

@@ -352,6 +352,13 @@ class TrainConfig:
         check_rules(self, "--", rules)
         for name, steps in (("warmup", self.warmup), ("eval-at", self.eval_at)):
             check_steps(f"--{name}", steps)
+        self._check_together()
+        self.optimiser.check()
+        self.density.check()
+        self.rasterizer.check()
+
+    def _check_together(self) -> None:
+        """Raise InputError naming the first setting that contradicts another."""
         if self.eval_at and self.eval_at[-1] > self.iterations:
             late = next(step for step in self.eval_at if step > self.iterations)
             raise InputError(
@@ -378,9 +385,6 @@ class TrainConfig:
             )
         if self.depth != "maps" and self.depth_maps != "metric":
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
-        self.optimiser.check()
-        self.density.check()
-        self.rasterizer.check()
 
     @property
     def refines(self) -> bool:

@@ -7,7 +7,6 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from clsplat.api import train
 from clsplat.config.cli_defaults import DEMO_ITERATIONS
@@ -15,6 +14,7 @@ from clsplat.config.training import TrainConfig
 from clsplat.demo.ray_caster import write_photos
 from clsplat.device.context import open_device
 from clsplat.errors import InputError, examples
+from clsplat.evaluation.held_out import Evaluation
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import is_file
 from clsplat.gaussians import Gaussians
@@ -34,7 +34,7 @@ DEMO_MARKER_FILE_NAME = ".clsplat-demo"
 DEMO_FOLDERS = ("photos", "scene", "run", "turntable")
 
 
-def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS) -> dict[str, Any]:
+def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS) -> Evaluation:
     """Make photos/, scene/, run/ and turntable/ below `output`, and return the evaluation, as in eval.json.
 
     Finished steps of an interrupted demo are reused.
@@ -54,7 +54,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
         run = Run.create(output / "run", config, scene=scene_folder, resume=False, overwrite=True)
         with TrainProgress(iterations) as progress:
             train(scene, config, device=opened, run=run, on_step=progress)
-        result: dict[str, Any] = json.loads(run.eval_path.read_text("utf-8"))
+        result: Evaluation = json.loads(run.eval_path.read_text("utf-8"))
         gaussians, renderer = Gaussians.load(run.model_path), Renderer(opened)
         turntable_folder = output / "turntable"
         turntable_folder.mkdir(exist_ok=True)

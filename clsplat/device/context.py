@@ -173,8 +173,8 @@ class Device:
         forks.check()
         return self._queue
 
-    def kernels(self, stem: str, **defines: object) -> Kernels:
-        """The kernels of `stem`.cl in this device's shape, built at the first call."""
+    def kernels(self, stem: str, defines: Mapping[str, object] = {}) -> Kernels:
+        """The kernels of `stem`.cl in this device's shape with these defines, built at the first call."""
         if self._why_another:  # warned about when used, not before, as the self-test may still choose another shape
             tell_once(self._why_another)
         if self._switches:

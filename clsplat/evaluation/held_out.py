@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import NotRequired, TypedDict
 
 from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import metrics
@@ -19,6 +20,41 @@ from clsplat.images.alpha import Image, composite
 from clsplat.images.colour import displayed
 from clsplat.images.writing import write_image
 from clsplat.scenes.scene import View
+
+
+class ViewScores(TypedDict):
+    """Record of a held-out view in eval.json. Optional scores are there if they were measured.
+
+    counted: fraction of the pixels that count, if the view has a mask.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    counted: NotRequired[float]
+    psnr_corrected: NotRequired[float]
+    psnr_aligned: NotRequired[float]
+    lpips: NotRequired[float]
+
+
+_AveragedScore = Literal["psnr", "psnr_corrected", "psnr_aligned", "ssim", "lpips"]
+_AVERAGED_SCORES: tuple[_AveragedScore, ...] = ("psnr", "psnr_corrected", "psnr_aligned", "ssim", "lpips")
+
+
+class Evaluation(TypedDict):
+    """Content of eval.json.
+
+    step, gaussians, seconds: of the model (`EvaluatedModel`).
+    mean: mean scores of the views, by name; empty without views.
+    lpips_missing: the reason if there is no LPIPS.
+    """
+
+    step: int | None
+    gaussians: int
+    seconds: float | None
+    mean: dict[str, float]
+    views: list[ViewScores]
+    lpips_missing: NotRequired[str]
 
 
 @dataclass(frozen=True)
@@ -40,7 +76,7 @@ def evaluate(
     space: str = "sRGB",
     corrected: bool = False,
     aligned: Callable[[View], Image] | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Measure every view. Returns the content of eval.json.
 
     render: a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`.
@@ -50,11 +86,10 @@ def evaluate(
     corrected: also measure PSNR after an affine fit of colours.
     aligned: renders with the view's pose fitted to the model, whose PSNR is measured too.
 
-    Without views the mean is empty. Masked pixels count in no score (`metrics.ssim`); "counted" is the fraction of
-    pixels that count. "lpips_missing" is the reason if there is no LPIPS. Raises ClsplatError if a render is not
-    finite. Raises InputError, which names the view, if it is too small, and for an unknown colour space.
+    Masked pixels count in no score (`metrics.ssim`). Raises ClsplatError if a render is not finite. Raises InputError,
+    which names the view, if it is too small, and for an unknown colour space.
     """
-    records: list[dict[str, Any]] = []
+    records: list[ViewScores] = []
     names = picture_names([view.name for view in views])
     for view, name in zip(views, names, strict=True):
         pixels, counts = photograph_of(view)
@@ -66,9 +101,15 @@ def evaluate(
             path = save_dir / name
             path.parent.mkdir(parents=True, exist_ok=True)
             write_image(path, displayed(image, space))
-    keys = [key for key in ("psnr", "psnr_corrected", "psnr_aligned", "ssim", "lpips") if records and key in records[0]]
-    mean = {key: float(np.mean([record[key] for record in records])) for key in keys}
-    result: dict[str, Any] = {**asdict(model), "mean": mean, "views": records}
+    keys = [key for key in _AVERAGED_SCORES if records and key in records[0]]
+    mean: dict[str, float] = {key: float(np.mean([record[key] for record in records])) for key in keys}
+    result: Evaluation = {
+        "step": model.step,
+        "gaussians": model.gaussians,
+        "seconds": model.seconds,
+        "mean": mean,
+        "views": records,
+    }
     if records and (reason := metrics.lpips_missing()):
         result["lpips_missing"] = reason
     return result
@@ -82,14 +123,14 @@ def _scores(
     *,
     corrected: bool,
     aligned: Callable[[View], Image] | None,
-) -> dict[str, Any]:
+) -> ViewScores:
     """Record of one view in eval.json.
 
     image, truth: its render, and its photograph over the same background.
     counts: (H, W), the pixels that count; None for all.
     """
     try:
-        record: dict[str, Any] = {
+        record: ViewScores = {
             "name": view.name,
             "psnr": metrics.psnr(image, truth, counts),
             "ssim": metrics.ssim(image, truth, counts),

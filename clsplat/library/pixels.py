@@ -173,7 +173,7 @@ class ListedPixels:
                 planes = planes_from_pixels(device, self._work, by_image, by_alpha)
                 pixels = (self._inputs, self._blended, planes)
                 slots = blend_grad(capped, self._work, listed.lists, *pixels, fields=fields)
-                splats_grad(device, listed.projected, Slots(slots, listed.first_slots), gradients, fields=fields)
+                splats_grad(device, listed.projected, Slots(slots, listed.first_slots, fields), gradients)
             else:
                 of_pass = ValuePass(listed.lists, listed.projected, gaussians.values, self._background, self._blended)
                 given = (by_image, by_alpha, gradients)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import TypedDict
 
 from clsplat.arrays import Float32
 from clsplat.camera import DEFAULT_NEAR_PLANE
@@ -23,6 +24,41 @@ from clsplat.models.formats import Format, resolve
 INFO_PERCENTILES = (0, 1, 50, 99, 100)
 MAX_FLOAT64_LOG = 709.0
 """Largest log scale whose exponential fits float64."""
+
+
+class Bounds(TypedDict):
+    """Bounding box of the means in world units, the length of its diagonal, and percentiles of each coordinate."""
+
+    min: list[float]
+    max: list[float]
+    extent: float
+    p1: list[float]
+    p99: list[float]
+
+
+class ValueStatistics(TypedDict, total=False):
+    """Statistics of the finite Gaussians; empty without any.
+
+    scale, opacity: by percentile.
+    """
+
+    bounds: Bounds
+    scale: dict[str, float]
+    opacity: dict[str, float]
+
+
+class ModelStatistics(ValueStatistics):
+    """Statistics of all Gaussians.
+
+    sh_degree_used: the highest band with a coefficient other than 0.
+    """
+
+    gaussians: int
+    not_finite: int
+    zero_quaternions: int
+    sh_degree: int
+    sh_degree_used: int
+    origin: list[float]
 
 
 def model_info(path: Path) -> dict[str, Any]:
@@ -46,7 +82,7 @@ def size(path: Path, form: Format) -> int:
     return sum(file.stat().st_size for file in (path, *form.side_files(path)) if is_file(file))
 
 
-def _summary(blocks: Iterator[Gaussians], path: Path) -> dict[str, Any]:
+def _summary(blocks: Iterator[Gaussians], path: Path) -> ModelStatistics:
     """Statistics over all blocks. Warns about doubtful values, as loading does.
 
     Means, log scales and opacity logits are held for the percentiles: 28 bytes a Gaussian.
@@ -62,19 +98,36 @@ def _summary(blocks: Iterator[Gaussians], path: Path) -> dict[str, Any]:
         used = max([used, *(band for band in range(1, degree + 1) if block.sh[:, band**2 : (band + 1) ** 2].any())])
         parts.append([array[good] for array in (block.means, block.log_scales, block.opacity_logits)])
     m, s, o = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    result: dict[str, Any] = {"gaussians": len(m) + not_finite, "not_finite": not_finite}
-    result |= {"zero_quaternions": unturned}
-    result |= {"sh_degree": degree, "sh_degree_used": used}
+    finite: ValueStatistics = {}
     if len(m):
         for doubt in soundness.doubts(o, s):
             warn(f"{path}: {doubt}")
-        low, high = m.min(axis=0).astype(np.float64), m.max(axis=0).astype(np.float64)
-        inner = np.percentile(m, (1, 99), axis=0)
-        result["bounds"] = {"min": low.tolist(), "max": high.tolist(), "extent": float(np.linalg.norm(high - low))}
-        result["bounds"] |= {"p1": inner[0].tolist(), "p99": inner[1].tolist()}
-        result["scale"] = _percentiles(np.exp(np.minimum(s.astype(np.float64), MAX_FLOAT64_LOG)))
-        result["opacity"] = _percentiles(packing.opacities(o))
-    return result | {"origin": origin.tolist()}
+        finite = {
+            "bounds": _bounds(m),
+            "scale": _percentiles(np.exp(np.minimum(s.astype(np.float64), MAX_FLOAT64_LOG))),
+            "opacity": _percentiles(packing.opacities(o)),
+        }
+    return {
+        "gaussians": len(m) + not_finite,
+        "not_finite": not_finite,
+        "zero_quaternions": unturned,
+        "sh_degree": degree,
+        "sh_degree_used": used,
+        **finite,
+        "origin": origin.tolist(),
+    }
+
+
+def _bounds(means: Float32) -> Bounds:
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    p1, p99 = np.percentile(means, (1, 99), axis=0)
+    return {
+        "min": low.tolist(),
+        "max": high.tolist(),
+        "extent": float(np.linalg.norm(high - low)),
+        "p1": p1.tolist(),
+        "p99": p99.tolist(),
+    }
 
 
 def _percentiles(values: NDArray[Any]) -> dict[str, float]:

@@ -15,7 +15,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import SlotFields
 from clsplat.models.edit import drop_sh
-from clsplat.rendering.memory_needs import plan_step
+from clsplat.rendering.memory_needs import StepMemory, plan_step
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.stages.device_gaussians import host_gaussians, upload_gaussians
 from clsplat.stages.project import add_slots
@@ -34,7 +34,7 @@ def largest_contributions(
     """
     config = config or RasterizerConfig()
     alpha_alone = drop_sh(gaussians, 0)  # colour does not matter
-    plan = plan_step(device, len(gaussians), 1, cameras, config, fields=CONTRIBUTION_SLOT_FIELDS)
+    plan = plan_step(device, len(gaussians), 1, cameras, config, StepMemory(CONTRIBUTION_SLOT_FIELDS))
     rasterizer = Rasterizer(device, config)
     rasterizer.antialias(on=gaussians.antialiased)
     rasterizer.follow(plan)
@@ -53,5 +53,5 @@ def sums_of_weights(rasterizer: Rasterizer, frame: ForwardPass) -> Float32:
     slots = rasterizer.pair_gradients(frame, frame.blended.image, fields=CONTRIBUTION_SLOT_FIELDS)
     sums, tile_counts = slots.values, frame.projected.tile_counts
     if slots.first_slots is not None:
-        sums = add_slots(rasterizer.device, rasterizer.work, tile_counts, slots, None, fields=CONTRIBUTION_SLOT_FIELDS)
+        sums = add_slots(rasterizer.device, rasterizer.work, tile_counts, slots, None)
     return np.where(tile_counts.get() > 0, sums.get()[:, -1], np.float32(0))

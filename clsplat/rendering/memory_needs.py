@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
@@ -25,6 +25,26 @@ _VISIBLE_MARK_BYTES = 4
 """Bytes per Gaussian in a step with several views: the mark that some view shows it."""
 _SMALL_ARRAYS_BYTES = 4096
 """Bytes of camera, background, totals and other small arrays."""
+
+
+@dataclass(frozen=True)
+class StepMemory:
+    """Memory of a training step in addition to a frame's, by its settings.
+
+    fields: the columns of a slot.
+    photographs: pixels of all photographs that may stay on the device.
+    turns: the `turns` of `stages.loss`.
+    masks: True if photographs have masks, or there is an alpha loss.
+    row_bytes: bytes per Gaussian of the training's components.
+    pixel_bytes: bytes per pixel of the training's components.
+    """
+
+    fields: SlotFields
+    photographs: int = 0
+    turns: int = 1
+    masks: bool = False
+    row_bytes: int = 0
+    pixel_bytes: int = 0
 
 
 def plan_frame(
@@ -54,46 +74,36 @@ def plan_step(
     coefficients: int,
     cameras: Iterable[Camera],
     config: RasterizerConfig,
+    step: StepMemory,
     *,
-    fields: SlotFields,
-    photographs: int = 0,
-    turns: int = 1,
     models: int = MODELS,
-    masks: bool = False,
-    row_bytes: int = 0,
-    pixel_bytes: int = 0,
 ) -> Plan:
     """Memory plan of a training step with any of the cameras. Raises CapacityError.
 
-    fields: the columns of a slot.
-    photographs: pixels of all photographs that may stay on the device.
-    turns: the `turns` of `stages.loss`.
     models: arrays per parameter, if not as in a step of one view.
-    masks: True if photographs have masks, or there is an alpha loss.
-    row_bytes: bytes per Gaussian of the training's components.
-    pixel_bytes: bytes per pixel of the training's components.
     """
-    planes, extra = 0, masks * (target.MASK_PIXEL_BYTES + loss_terms.ALPHA_PIXEL_BYTES + turns)
+    planes, extra = 0, step.masks * (target.MASK_PIXEL_BYTES + loss_terms.ALPHA_PIXEL_BYTES + step.turns)
     for camera in cameras:
         pixels = _plane_bytes(
-            camera, _pixel_bytes(planes=pixel_bytes) + target.TARGET_PIXEL_BYTES + loss.LOSS_PIXEL_BYTES + extra
+            camera, _pixel_bytes(planes=step.pixel_bytes) + target.TARGET_PIXEL_BYTES + loss.LOSS_PIXEL_BYTES + extra
         )
-        planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, turns))
+        planes = max(planes, pixels + loss.scratch_bytes(device, camera.height, tiles_of(camera)[0] * TILE, step.turns))
     frame = _frame_need(device, gaussians, floats_of(coefficients), planes, config)
+    fields = step.fields
     screen = project.SCREEN_GRADIENT_BYTES + 4 * fields.contributions
     statistics = density.gaussian_bytes(contributions=fields.contributions)
-    step = replace(
+    need = replace(
         frame,
-        row=frame.row + screen + statistics + (_VISIBLE_MARK_BYTES if models > MODELS else 0) + row_bytes,
+        row=frame.row + screen + statistics + (_VISIBLE_MARK_BYTES if models > MODELS else 0) + step.row_bytes,
         banded=frame.banded + 4 * fields.floats,
         model=models * frame.model,
         pair=frame.pair + blend.gradient_pair_bytes(fields),
         most_pairs=min(device.max_allocation // (4 * fields.floats), MAX_PAIRS_PER_BAND),
         photographs=0
         if device.shares_memory
-        else (target.SOURCE_PIXEL_BYTES + masks * target.MASK_PIXEL_BYTES) * photographs,
+        else (target.SOURCE_PIXEL_BYTES + step.masks * target.MASK_PIXEL_BYTES) * step.photographs,
     )
-    return _plan(device, step)
+    return _plan(device, need)
 
 
 def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:

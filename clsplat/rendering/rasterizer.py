@@ -292,7 +292,7 @@ class Rasterizer:
         slots = self.pair_gradients(frame, image_gradient, fields=fields)
         screen = self.screen(gaussians.count, fields)
         arrays = (gaussians, frame.camera_array, frame.projected, slots, gradients, screen)
-        project_grad(self.device_of(frame.camera), *arrays, fields=fields, by_lens=by_lens)
+        project_grad(self.device_of(frame.camera), *arrays, by_lens=by_lens)
         return screen
 
     def screen(self, count: int, fields: SlotFields) -> Screen:
@@ -313,7 +313,7 @@ class Rasterizer:
 
         def slots(part: TileBand) -> Slots:
             values = blend_grad(device, work, part.lists, *pixels, fields=fields)
-            return Slots(values, part.counted.first_slots)
+            return Slots(values, part.counted.first_slots, fields)
 
         if len(frame.bands) == 1:
             return slots(frame.part)
@@ -321,8 +321,8 @@ class Rasterizer:
 
         def add(part: TileBand) -> None:
             nonlocal sums
-            sums = add_slots(device, work, part.counted.tile_counts, slots(part), sums, fields=fields)
+            sums = add_slots(device, work, part.counted.tile_counts, slots(part), sums)
 
         self.by_band(frame, add)
         assert sums is not None, "an image has a tile"
-        return Slots(sums)
+        return Slots(sums, fields=fields)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.config.checks import parse_bytes
 from clsplat.config.rasterizer import RasterizerConfig
@@ -23,7 +23,7 @@ from clsplat.layouts.columns import DEEP_SLICE
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.sh_storage import check_half, coefficients_in_use, needed_degrees
-from clsplat.stages.channels import DEPTH_PLANES, Features, Motion
+from clsplat.stages.channels import DEPTH_PLANES, Channels, Features, Motion
 from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.device_camera import pack_camera
 from clsplat.stages.device_gaussians import (
@@ -197,23 +197,16 @@ class Renderer:
         """
         features = Features.of(wanted)
         camera.check()
-        after, before = after or camera, before or camera
-        _check_motion("motion", camera, after, asked="motion" in wanted)
-        _check_motion("backward", camera, before, asked="backward" in wanted)
-        origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
-        moved, earlier = (moved if "motion" in wanted else None), (earlier if "backward" in wanted else None)
-        sets = sum(one is not None for one in (moved, earlier))
+        ahead = _motion_end("motion", camera, after, moved, asked="motion" in wanted)
+        back = _motion_end("backward", camera, before, earlier, asked="backward" in wanted)
+        sets = sum(end.gaussians is not None for end in (ahead, back))
         on_device, camera = self._placed(gaussians, camera, features.floats, held_bytes(holdout), moved=sets)
         frame = self._forward(on_device, camera, background)
-        cameras = self._sent(after, gaussians, moved), self._sent(before, gaussians, earlier)
+        motion = self._motion(gaussians, on_device, ahead, back)
         held = self._hold_out(frame, holdout)
-        motion = Motion(*cameras, self._moved(on_device, moved), self._moved(on_device, earlier))
         planes = self._rasterizer.channels(on_device, frame, features, motion, held)
-        height, width = camera.height, camera.width
-        means, whole = (array.get()[:, :height, :width].transpose(1, 2, 0) for array in (planes.means, planes.whole))
-        if contiguous:
-            means, whole = np.ascontiguousarray(means), np.ascontiguousarray(whole)
-        named = _in_the_world(features.named(means, whole), camera, origin)
+        pixels = _pixels_of(planes, camera, contiguous=contiguous)
+        named = _in_the_world(features.named(*pixels), camera, gaussians)
         return self._result(frame, contiguous=contiguous), named
 
     def render_shares(
@@ -278,16 +271,24 @@ class Renderer:
         alpha: Float32 = np.float32(1) - frame.blended.transmittance.get()[:height, :width]
         return RenderResult(np.ascontiguousarray(image) if contiguous else image, alpha)
 
-    def _sent(self, camera: Camera, gaussians: Gaussians | AnyGaussians, then: Gaussians | None) -> DeviceArray:
-        """A camera of motion on the device, relative to the origin of the means at its time."""
-        counted = gaussians if then is None else then
-        local = counted.local(camera) if isinstance(counted, Gaussians) else camera
+    def _motion(
+        self, gaussians: Gaussians | AnyGaussians, on_device: AnyGaussians, ahead: _MotionEnd, back: _MotionEnd
+    ) -> Motion:
+        """Both ends of motion, their means stored on the same side as the model."""
+        cameras = self._sent(ahead, gaussians), self._sent(back, gaussians)
+        return Motion(*cameras, self._moved(on_device, ahead), self._moved(on_device, back))
+
+    def _sent(self, end: _MotionEnd, gaussians: Gaussians | AnyGaussians) -> DeviceArray:
+        """The camera of an end of motion on the device, relative to the origin of the means there."""
+        counted = gaussians if end.gaussians is None else end.gaussians
+        local = counted.local(end.camera) if isinstance(counted, Gaussians) else end.camera
         return upload(self.device, pack_camera(local))
 
-    def _moved(self, gaussians: AnyGaussians, moved: Gaussians | None) -> AnyGaussians | None:
-        """The means of `moved`, on the device or on the host like the Gaussians. Raises ValueError if their number
-        differs.
+    def _moved(self, gaussians: AnyGaussians, end: _MotionEnd) -> AnyGaussians | None:
+        """The means at an end of motion, on the device or on the host like the Gaussians. Raises ValueError if their
+        number differs.
         """
+        moved = end.gaussians
         if moved is None:
             return None
         if len(moved) != gaussians.count:
@@ -333,17 +334,41 @@ class Renderer:
         return self._held, gaussians.local(camera)
 
 
-def _check_motion(name: str, camera: Camera, other: Camera, *, asked: bool) -> None:
-    """Check the camera that motion leads to. Raises InputError, which names the channel."""
+@dataclass(frozen=True, eq=False)
+class _MotionEnd:
+    """The moment that motion or backward motion leads to.
+
+    camera: in world coordinates.
+    gaussians: the Gaussians with their means at that moment; None if they do not move, or the channel is not wanted.
+    """
+
+    camera: Camera
+    gaussians: Gaussians | None
+
+
+def _motion_end(
+    name: str, camera: Camera, other: Camera | None, gaussians: Gaussians | None, *, asked: bool
+) -> _MotionEnd:
+    """The end of the motion from a camera to another, or to itself. Raises InputError, which names the channel."""
+    other = other or camera
     other.check()
     if asked and camera.model.without_motion:
         raise InputError(f"{name} is not defined for {camera.model.without_motion}")
     if asked and other.projection != camera.projection:
         raise InputError(f"{name} goes from a camera to one that is {other.projection}, expected {camera.projection}")
+    return _MotionEnd(other, gaussians if asked else None)
 
 
-def _in_the_world(named: ChannelResult, camera: Camera, origin: Float64) -> ChannelResult:
+def _pixels_of(planes: Channels, camera: Camera, *, contiguous: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The image's pixels of both arrays of planes on the host, with the plane axis last."""
+    arrays = (planes.means, planes.whole)
+    means, whole = (array.get()[:, : camera.height, : camera.width].transpose(1, 2, 0) for array in arrays)
+    return (np.ascontiguousarray(means), np.ascontiguousarray(whole)) if contiguous else (means, whole)
+
+
+def _in_the_world(named: ChannelResult, camera: Camera, gaussians: Gaussians | AnyGaussians) -> ChannelResult:
     """The channels with depths along the camera's axis, and positions in world coordinates."""
+    origin = gaussians.origin if isinstance(gaussians, Gaussians) else np.zeros(3)
     if (of_distances := camera.depths_of_distances()) is not None:
         named |= {name: named[name] * of_distances for name in ("depth", *DEPTH_PLANES)}
     if "position" in named and origin.any():  # as precise as float32 allows

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from clsplat.camera import CAMERA_MODELS
 from clsplat.device.context import Device, all_devices
@@ -48,9 +47,9 @@ DEFAULT_DEFINES: dict[str, dict[str, object]] = {
 
 
 @cache
-def stored_digests() -> dict[str, Any]:
+def stored_digests() -> dict[str, str | dict[str, str]]:
     """Digests by scene and stage: one for all drivers and shapes, or by shape if the order of sums depends on it."""
-    digests: dict[str, Any] = json.loads(DIGESTS_PATH.read_text())["digests"]
+    digests: dict[str, str | dict[str, str]] = json.loads(DIGESTS_PATH.read_text())["digests"]
     return digests
 
 
@@ -127,7 +126,7 @@ def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> Non
         if not quick:
             start = time.perf_counter()
             for path in sorted(kernel_root().glob("*.cl")):
-                device.kernels(path.stem, **DEFAULT_DEFINES.get(path.stem, {}))
+                device.kernels(path.stem, DEFAULT_DEFINES.get(path.stem, {}))
             tell(built=time.perf_counter() - start)
         digests: dict[str, str] = {}
         for result in run(device, quick=quick, stages=stages, say=lambda name: tell(begins=name), digests=digests):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,24 +18,30 @@ from clsplat.layouts.columns import READBACK
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 
-def updates_sh_rest(config: OptimiserConfig, step: int) -> bool:
-    """True if step number `step` (from 1) updates the higher SH bands."""
-    return step % config.sh_rest_every == 0
+@dataclass(frozen=True, eq=False)
+class AdamStep:
+    """A step of Adam: its constants, its number from 1, and the learning rate of each group."""
 
+    config: OptimiserConfig
+    number: int
+    rates: Mapping[str, float]
 
-def corrected(config: OptimiserConfig, step: int, group: str, rate: float) -> tuple[float, float]:
-    """Return rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) of a group's t-th update, in step number `step` (from
-    1)."""
-    updates = step // config.sh_rest_every if group == "sh_rest" else step
-    return rate / (1.0 - config.beta1**updates), (1.0 - config.beta2**updates) ** -0.5
+    @property
+    def updates_sh_rest(self) -> bool:
+        """True if the step updates the higher SH bands."""
+        return self.number % self.config.sh_rest_every == 0
+
+    def corrected(self, group: str) -> tuple[float, float]:
+        """Return rate / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) of the group's t-th update."""
+        config = self.config
+        updates = self.number // config.sh_rest_every if group == "sh_rest" else self.number
+        return self.rates[group] / (1.0 - config.beta1**updates), (1.0 - config.beta2**updates) ** -0.5
 
 
 @stage("adam", adam=4)
 def adam(
     device: Device,
-    step: int,
-    rates: Mapping[str, float],
-    config: OptimiserConfig,
+    step: AdamStep,
     parameters: DeviceGaussians,
     gradients: DeviceGaussians,
     first: DeviceGaussians,
@@ -42,26 +49,27 @@ def adam(
     tile_counts: DeviceArray,
     readback: DeviceArray | None = None,
 ) -> None:
-    """Step number `step` (from 1) with the constants of `config` and a rate per group; leaves the gradients zero.
+    """Take a step along the gradients, and leave them zero.
 
-    tile_counts: (n,) uint32, 0 where the view does not show a Gaussian, for `config.sparse`.
+    tile_counts: (n,) uint32, 0 where the view does not show a Gaussian, for `OptimiserConfig.sparse`.
     readback: (READBACK_SIZE,) uint32; its last four count the elements that got no step, by reason (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
     counts = readback.buffer  # a raw buffer, not an array that each step processes: it is touched only on a fault
+    config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes
     for group, about in PARAMETER_GROUPS.items():
-        if group == "sh_rest" and not updates_sh_rest(config, step):
+        if group == "sh_rest" and not step.updates_sh_rest:
             continue
-        rate, root = corrected(config, step, group, rates[group])
+        rate, root = step.corrected(group)
         constants = (rate, root, beta1, beta2, epsilon, about.limit**2, counts)
         arrays = (parameters[group], gradients[group], first[group], second[group])
         size, rows = parameters[group].size, parameters.count
         if size == 0:
             continue
         if config.sparse:
-            kernel = device.kernels("adam", WIDTH=size // rows).adam_visible
+            kernel = device.kernels("adam", {"WIDTH": size // rows}).adam_visible
             launch_items(device, kernel, -(-rows // lanes), rows, *constants, tile_counts, *arrays)
         else:
             kernel = device.kernels("adam").adam
@@ -89,7 +97,7 @@ def add_view(
     for group in PARAMETER_GROUPS:
         size = sums[group].size
         if size and (sh_rest or group != "sh_rest"):
-            kernel = device.kernels("adam", WIDTH=size // rows).add_view
+            kernel = device.kernels("adam", {"WIDTH": size // rows}).add_view
             launch_items(device, kernel, size, np.uint64(size), tile_counts, gradients[group], sums[group])
     if shown is not None:
         launch_items(device, device.kernels("adam").join_view, rows, rows, tile_counts, shown)

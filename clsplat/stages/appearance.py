@@ -20,6 +20,23 @@ GAINS_PIXEL_BYTES = 2
 APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 
 
+@dataclass(frozen=True)
+class GainEntries:
+    """Entries of gains, and how they learn.
+
+    first_row: of the entries in column sums.
+    mix_rate: fraction of the rate for mixes.
+    centred: the mean of each entry is subtracted after a step.
+    """
+
+    first_row: int = 0
+    mix_rate: float = 1.0
+    centred: bool = True
+
+
+PLAIN_GAINS = GainEntries()
+
+
 @dataclass(frozen=True, eq=False)
 class Gains:
     """Gains of all photographs, (photographs, entries) float32 each.
@@ -69,7 +86,7 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
 def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
     """Divide the photograph's gains out of planes (3 or more, rows, stride), the first three of them colours."""
     _, rows, stride = target.shape
-    kernel = device.kernels("appearance", LANES=1).remove_gains
+    kernel = device.kernels("appearance", {"LANES": 1}).remove_gains
     launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
 
 
@@ -92,7 +109,7 @@ def gain_gradient(
         work.array("appearance_partials", (3, down, stride)),
         work.array(f"appearance_columns_{place}", (3, stride)),
     )
-    kernels = device.kernels("appearance", LANES=1)
+    kernels = device.kernels("appearance", {"LANES": 1})
     sizes = (height, stride, rows * stride, down)
     launch_grid(device, kernels.gain_sums, (stride, down), *sizes, image, gradient, partials)
     launch_grid(device, kernels.column_sums, (stride, 3), stride, down, partials, columns)
@@ -108,29 +125,25 @@ def step_gains(
     step: int,
     rate: float,
     readback: DeviceArray,
-    *,
-    at: int = 0,
-    slow: float = 1.0,
-    centred: bool = True,
+    entries: GainEntries = PLAIN_GAINS,
 ) -> None:
-    """Adam's step number `step` (from 1); then subtract the mean of each entry if `centred`.
+    """Adam's step number `step` (from 1) along the column sums of the entries.
 
-    at: first row of the entries in `columns`.
-    slow: fraction of the rate for mixes.
     A step by capacity that has stopped changes nothing.
     """
-    kernels, (photographs, entries) = device.kernels("appearance", LANES=1), gains.logs.shape
-    count = photographs * entries
+    kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
+    count = photographs * width
     constants = (
         rate / (1 - APPEARANCE_BETA1**step),
-        slow,
+        entries.mix_rate,
         (1 - APPEARANCE_BETA2**step) ** -0.5,
         APPEARANCE_BETA1,
         APPEARANCE_BETA2,
         APPEARANCE_EPSILON,
     )
-    sizes, matrix = (count, entries, photograph, columns.shape[1], at), (gains.begins, gains.others, gains.weights)
+    sizes = (count, width, photograph, columns.shape[1], entries.first_row)
+    matrix = (gains.begins, gains.others, gains.weights)
     read = (readback, columns, gains.start, *matrix, gains.logs)
     launch_items(device, kernels.move_gains, count, *sizes, *constants, *read, gains.moved, gains.first, gains.second)
     settled = (gains.moved, gains.logs, gains.gains)
-    launch_items(device, kernels.centre_gains, count, count, entries, int(centred), readback, *settled)
+    launch_items(device, kernels.centre_gains, count, count, width, int(entries.centred), readback, *settled)

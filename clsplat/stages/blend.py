@@ -96,7 +96,7 @@ def launch_tiles(
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """
     items = tile_items(device)
-    built = getattr(device.kernels(stem, ITEMS=items, **defines), kernel or stem)
+    built = getattr(device.kernels(stem, {"ITEMS": items, **defines}), kernel or stem)
     launch_groups(device, built, lists.band.tiles, items, lists.band.first, tiles_x, *arguments)
 
 

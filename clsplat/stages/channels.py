@@ -127,7 +127,7 @@ def features(
         means_after, means_before = (part if other is None else next(means) for other in moments)
         launch_items(
             device,
-            device.kernels("features", LANES=1, **wanted.defines).features,
+            device.kernels("features", {"LANES": 1, **wanted.defines}).features,
             part.count,
             part.count,
             camera_array,

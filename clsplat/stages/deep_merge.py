@@ -30,6 +30,6 @@ def deep_merge(device: Device, work: Workspace, pictures: DeviceArray, weights: 
     left = work.array("deep_left", (count * bins, pixels))
     planes = work.array("deep_merged", (bins, DEEP_FLOATS, pixels))
     share = np.float32(1 / (DEEP_LEVELS * bins))
-    kernel = device.kernels("deep_merge", LANES=1).deep_merge
+    kernel = device.kernels("deep_merge", {"LANES": 1}).deep_merge
     launch_items(device, kernel, pixels, pixels, count, bins, share, pictures, weights, sources, left, planes)
     return planes

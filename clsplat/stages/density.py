@@ -113,7 +113,7 @@ def add_statistics(
     """Add one view: the norm of each visible mean's gradient, in NDC like the paper's threshold."""
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
-    kernels = device.kernels("density", **({"RAYS": True} if rays else {}))
+    kernels = device.kernels("density", {"RAYS": True} if rays else {})
     to_ndc = (0.5 * camera.width, 0.5 * camera.height)
     view, sums = (projected.tile_counts, screen.gradients), (statistics.gradient_sums, statistics.seen)
     sizes = (*to_ndc, camera.fx) if rays else to_ndc

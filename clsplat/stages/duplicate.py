@@ -168,7 +168,7 @@ def _compact(
     groups, chunk = chunking(device, n)
     sums = work.array("visible_sums", (2, groups), np.uint32)
     limit, defines = ((), {}) if capacity is None else ((capacity,), {"BY_CAPACITY": True})
-    kernels, chunks = device.kernels("duplicate", **defines), (groups, device.shape.items, n, chunk)
+    kernels, chunks = device.kernels("duplicate", defines), (groups, device.shape.items, n, chunk)
     launch_groups(device, kernels.visible_sums, *chunks, shown, tile_counts, sums, readback)
     arrays = (shown, tile_counts, projected.splats, sums, *by_gaussian, readback, *limit)
     launch_groups(device, kernels.compact_visible, *chunks, *arrays)
@@ -227,7 +227,7 @@ def duplicate(
     """Sort the visible Gaussians by depth and emit their pairs in that order."""
     visible, pairs = counted.visible, counted.pairs
     shown, listed = counted.elements(visible, "VISIBLE"), counted.elements(pairs, "PAIRS")
-    kernels = device.kernels("duplicate", **shown.defines)
+    kernels = device.kernels("duplicate", shown.defines)
     _, order = sort(device, work, "depth", counted.depth_keys, counted.key_bits, counted.least_key, shown)
     gaussian_from_rank = work.array("gaussian_from_rank", (visible,), np.uint32)
     counts = work.array("rank_counts", (visible,), np.uint32)

@@ -212,7 +212,7 @@ def ewa(device: Device, gaussians: EwaInputs, camera: PlacedEwaCamera, projected
     defines |= {} if gaussians.opacities is None else {"OPACITIES": True}
     launch_items(
         device,
-        device.kernels("ewa", **defines).ewa,
+        device.kernels("ewa", defines).ewa,
         -(-n // device.shape.lanes),
         n,
         camera.fields,
@@ -252,7 +252,7 @@ def ewa_grad(
     defines |= {} if parts is None else {"BY_CAMERA": True}
     launch_items(
         device,
-        device.kernels("ewa_grad", **defines).ewa_grad,
+        device.kernels("ewa_grad", defines).ewa_grad,
         -(-padded(n) // device.shape.lanes),
         n,
         padded(n),

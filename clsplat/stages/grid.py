@@ -58,7 +58,7 @@ def apply_grid(
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     sizes = (photograph, stride, rows * stride, *_spans(width, height))
-    kernel = device.kernels("grid", LANES=1).slice
+    kernel = device.kernels("grid", {"LANES": 1}).slice
     launch_grid(device, kernel, (stride, rows), *sizes, grids.grids, image, seen)
     return seen
 
@@ -85,7 +85,7 @@ def grid_gradient(
     plane, (across, down) = rows * stride, _spans(width, height)
     lines = work.array("appearance_lines", (height, GRID_SHAPE[2], 12, GRID_SHAPE[0]))
     by_grid = work.array(f"appearance_by_grid_{place}", GRID_SHAPE)
-    kernels = device.kernels("grid", LANES=1)
+    kernels = device.kernels("grid", {"LANES": 1})
     sizes, sources = (width, stride, plane, across), (image, gradient)
     launch_grid(device, kernels.line_sums, (GRID_SHAPE[2], height, 3), *sizes, *sources, lines)
     launch_items(
@@ -110,7 +110,7 @@ def step_grid(
 
     A step by capacity that has stopped changes nothing.
     """
-    kernel = device.kernels("grid", LANES=1).move_grid
+    kernel = device.kernels("grid", {"LANES": 1}).move_grid
     constants = (
         rate / (1 - APPEARANCE_BETA1**visit),
         (1 - APPEARANCE_BETA2**visit) ** -0.5,
@@ -125,5 +125,5 @@ def step_grid(
 @stage("appearance")
 def centre_grids(device: Device, grids: Grids, readback: DeviceArray) -> None:
     """Make the mean of all grids the identity. A step by capacity that has stopped changes nothing."""
-    kernel = device.kernels("grid", LANES=1).centre_grids
+    kernel = device.kernels("grid", {"LANES": 1}).centre_grids
     launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.grids)

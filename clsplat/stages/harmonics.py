@@ -90,7 +90,7 @@ def centre_array(device: Device, position: Float64) -> DeviceArray:
 def harmonics(device: Device, given: Harmonics, colours: DeviceArray) -> None:
     """Fill colours (n, 3), with 0 for masked rows. Equation (167) of docs/gradients.md."""
     n = given.count
-    kernel = device.kernels("harmonics", **given.defines).harmonics
+    kernel = device.kernels("harmonics", given.defines).harmonics
     launch_items(device, kernel, -(-n // device.shape.lanes), n, *given.arguments, colours)
 
 
@@ -125,11 +125,10 @@ def harmonics_grad(
     }
     if by_centre and d_directions is None:
         d_directions = work.array("harmonics_by_direction", (n, 3))
+    defines = {**given.defines, **{name: True for name, on in wanted.items() if on}}
     launch_items(
         device,
-        device.kernels(
-            "harmonics_grad", **given.defines, **{name: True for name, on in wanted.items() if on}
-        ).harmonics_grad,
+        device.kernels("harmonics_grad", defines).harmonics_grad,
         -(-padded(n) // device.shape.lanes),
         n,
         padded(n),

@@ -38,7 +38,7 @@ def noise(
     highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(
         device,
-        device.kernels("noise", LANES=1).add_noise,
+        device.kernels("noise", {"LANES": 1}).add_noise,
         gaussians.count,
         gaussians.count,
         np.uint32(first_row),

@@ -71,7 +71,7 @@ def _splats() -> NDArray[np.float32]:
 def _pairs_per_second(
     device: Device, name: str, items: int, seconds: float, repeat: int, defines: Mapping[str, object]
 ) -> float:
-    kernel = getattr(device.kernels("peak", ITEMS=items, **defines), name)
+    kernel = getattr(device.kernels("peak", {"ITEMS": items, **defines}), name)
     groups = _GROUPS_PER_COMPUTE_UNIT[device.kind] * int(device.cl_device.max_compute_units)
     splats = upload(device, _splats())
     sums = allocate(device, (groups * items,), np.float32)
@@ -94,6 +94,6 @@ def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
     copy.fill(0.0)  # so that its pages exist
-    kernel = device.kernels("peak", ITEMS=tile_items(device), NARROW=True).limit_copy
+    kernel = device.kernels("peak", {"ITEMS": tile_items(device), "NARROW": True}).limit_copy
     runs = [device.timed(lambda: launch_items(device, kernel, n // copied, n, source, copy)) for _ in range(repeat + 1)]
     return 8e3 * n / min(ms for _, ms in runs)

@@ -33,6 +33,6 @@ def planes_from_pixels(
     rows, stride = padded_size(width, height)
     given = [] if d_alpha is None else [d_alpha]
     planes = work.array("image_gradient", (3 + len(given), rows, stride))
-    kernel = device.kernels("pixels", **({"ALPHA_GRADIENT": True} if given else {})).planes_from_pixels
+    kernel = device.kernels("pixels", {"ALPHA_GRADIENT": True} if given else {}).planes_from_pixels
     launch_items(device, kernel, width * height, width, height, depth, stride, d_pixels, *given, planes)
     return planes

@@ -40,7 +40,7 @@ def pose_rows(
     """
     launch_items(
         device,
-        device.kernels("pose", LANES=1).pose_rows,
+        device.kernels("pose", {"LANES": 1}).pose_rows,
         -(-gaussians.count // POSE_ROWS),
         gaussians.count,
         first_row // POSE_ROWS,
@@ -59,7 +59,7 @@ def lens_rows(
 ) -> None:
     """Sum the lens gradients (n, LENS_NUMBERS) of these Gaussians (`project_grad`) into `sums`, like `pose_rows`."""
     (n,) = tile_counts.shape
-    kernel = device.kernels("pose", LANES=1).lens_rows
+    kernel = device.kernels("pose", {"LANES": 1}).lens_rows
     launch_items(device, kernel, -(-n // POSE_ROWS), n, first_row // POSE_ROWS, tile_counts, by_lens, sums)
 
 
@@ -69,7 +69,7 @@ def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
 
     It is by the rotation and translation of `Camera.moved`, or by ln fx, ln fy, cx and cy.
     """
-    kernel, numbers, level = device.kernels("pose", LANES=1).pose_sums, sums.shape[1], 0
+    kernel, numbers, level = device.kernels("pose", {"LANES": 1}).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:
         level += 1
         fewer = work.array(f"sums_of_{numbers}_{level}", (-(-sums.shape[0] // POSE_ROWS), numbers))

@@ -10,10 +10,12 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.device.profile import stage
 from clsplat.layouts.columns import TILE
-from clsplat.stages.appearance import Gains
+from clsplat.stages.appearance import GainEntries, Gains
 
 COLOUR_ENTRIES, VIGNETTE_ENTRIES = 9, 3
 """Entries of a photograph, three gains and six mixes; entries of a lens."""
+VIGNETTE_GAINS = GainEntries(first_row=COLOUR_ENTRIES, centred=False)
+"""Entries of a lens, behind the photograph's in column sums."""
 PPISP_PIXEL_BYTES = 8
 """Bytes of the partial sums, per pixel with padding."""
 
@@ -87,6 +89,6 @@ def camera_gradient(
     sizes = (height, stride, rows * stride, down, *taken.place(width, height))
     kernel = device.kernels("ppisp").camera_sums
     launch_grid(device, kernel, (stride // device.shape.lanes, down), *sizes, image, gradient, partials)
-    kernel = device.kernels("appearance", LANES=1).column_sums
+    kernel = device.kernels("appearance", {"LANES": 1}).column_sums
     launch_grid(device, kernel, (stride, sums), stride, down, partials, columns)
     return columns

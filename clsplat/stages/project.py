@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from clsplat.camera import Camera
-from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.command_buffer import AnewWord, LaunchParameter
 from clsplat.device.context import Device
@@ -20,7 +18,7 @@ from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.optimisation.dropout import Thinning
 from clsplat.optimisation.step_noise import Exploration
-from clsplat.stages.adam import corrected, updates_sh_rest
+from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
@@ -94,9 +92,9 @@ def project(
             defines["THINNED"] = True
             thinned = (start, *thinning_numbers(thinning))
         if rays:
-            kernel, lanes = device.kernels("project_rays", LANES=1, **defines).project_rays, 1
+            kernel, lanes = device.kernels("project_rays", {"LANES": 1, **defines}).project_rays, 1
         else:
-            kernel, lanes = device.kernels("project", **defines).project, device.shape.lanes
+            kernel, lanes = device.kernels("project", defines).project, device.shape.lanes
         launch_items(
             device,
             kernel,
@@ -119,18 +117,19 @@ def project(
 class Slots:
     """Partial gradients of the pairs.
 
-    values: (pairs, SlotFields.floats), or (n, SlotFields.floats) if already summed by Gaussian.
+    values: (pairs, fields.floats), or (n, fields.floats) if already summed by Gaussian.
     first_slots: (n), where each Gaussian's slots begin; None if already summed.
     """
 
     values: DeviceArray
     first_slots: DeviceArray | None = None
+    fields: SlotFields = PLAIN_SLOTS
 
     def rows(self, start: int, stop: int) -> Slots:
         """The slots of the Gaussians [start, stop)."""
         if self.first_slots is None:
-            return Slots(self.values.rows(start, stop))
-        return Slots(self.values, self.first_slots.rows(start, stop))
+            return replace(self, values=self.values.rows(start, stop))
+        return replace(self, first_slots=self.first_slots.rows(start, stop))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,8 +151,6 @@ def add_slots(
     tile_counts: DeviceArray,
     slots: Slots,
     sums: DeviceArray | None,
-    *,
-    fields: SlotFields = PLAIN_SLOTS,
 ) -> DeviceArray:
     """Add one band's slots to the sums by Gaussian (n, floats). Bands must come in order; `sums` is None for the
     first."""
@@ -161,7 +158,7 @@ def add_slots(
     if sums is None:
         sums = work.array("slot_sums", (n, slots.values.shape[1]))
         sums.fill(0.0)
-    kernel, items = device.kernels("project_grad", **fields.defines).add_slots, n if slots.values.shape[0] else 0
+    kernel, items = device.kernels("project_grad", slots.fields.defines).add_slots, n if slots.values.shape[0] else 0
     launch_items(device, kernel, items, n, tile_counts, slots.first_slots, slots.values, sums)
     return sums
 
@@ -176,45 +173,39 @@ def project_grad(
     gradients: DeviceGaussians,
     screen: Screen,
     *,
-    fields: SlotFields = PLAIN_SLOTS,
     sh_rest: bool = True,
     explore: Exploration | None = None,
     by_lens: DeviceArray | None = None,
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` and `screen` from the pairs' slots.
 
-    fields: the fields of the slots.
     sh_rest: also compute the higher SH bands.
     explore: its penalties are added.
     by_lens: (n, 4), receives each Gaussian's gradient by the lens of a flat camera.
     """
     weights, build = penalty_weights(explore), _build(device)
-    defines = {**_defines(gaussians, slots, fields, sh_rest=sh_rest), **build.defines}
+    defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
     defines |= {"PENALTIES": True} if weights else {}
     defines |= {} if by_lens is None else {"LENS": True}
     n = gaussians.count
     launch_items(
         device,
-        device.kernels("project_grad", **defines).project_grad,
+        device.kernels("project_grad", defines).project_grad,
         -(-n // build.lanes) if slots.values.shape[0] else 0,
         *_inputs(gaussians, camera_array, projected, slots),
         *(model[group] for model in (gaussians, gradients) for group in PARAMETER_GROUPS),
         screen.gradients,
-        *([screen.contributions] if fields.contributions else []),
+        *([screen.contributions] if slots.fields.contributions else []),
         *([] if by_lens is None else [by_lens]),
         *weights,
     )
 
 
-def step_numbers(
-    config: OptimiserConfig, step: int, rates: Mapping[str, float], explore: Exploration | None
-) -> tuple[float, ...]:
+def step_numbers(step: AdamStep, explore: Exploration | None) -> tuple[float, ...]:
     """Arguments of `project_step` that change with the step: penalty weights, two roots of Adam, and each group's
     rate."""
     by_group = {
-        group: (0.0, 0.0)
-        if group == "sh_rest" and not updates_sh_rest(config, step)
-        else corrected(config, step, group, rates[group])
+        group: (0.0, 0.0) if group == "sh_rest" and not step.updates_sh_rest else step.corrected(group)
         for group in PARAMETER_GROUPS
     }
     roots = by_group["means"][1], by_group["sh_rest"][1]
@@ -224,9 +215,7 @@ def step_numbers(
 @stage("project_grad", project_step=18)
 def project_step(
     device: Device,
-    step: int,
-    rates: Mapping[str, float],
-    config: OptimiserConfig,
+    step: AdamStep,
     model: tuple[DeviceGaussians, ...],
     camera_array: DeviceArray,
     projected: Projected,
@@ -234,26 +223,24 @@ def project_step(
     screen: Screen,
     readback: DeviceArray,
     *,
-    fields: SlotFields = PLAIN_SLOTS,
     explore: Exploration | None = None,
 ) -> None:
     """`project_grad` and `stages.adam.adam` in one kernel, without gradients in memory.
 
     model: parameters, first and second moments. The two functions document the other arguments.
     """
-    parameters = model[0]
-    sh_rest = updates_sh_rest(config, step)
-    defines = {**_defines(parameters, slots, fields, sh_rest=sh_rest), "ADAM": True}
+    parameters, config = model[0], step.config
+    defines = {**_defines(parameters, slots, sh_rest=step.updates_sh_rest), "ADAM": True}
     if config.sparse:
         defines["SPARSE"] = True
-    numbers = [LaunchParameter(number) for number in step_numbers(config, step, rates, explore)]
+    numbers = [LaunchParameter(number) for number in step_numbers(step, explore)]
     weights = len(penalty_weights(explore))
     if weights:
         defines["PENALTIES"] = True
     arguments = (
         *_inputs(parameters, camera_array, projected, slots),
         screen.gradients,
-        *([screen.contributions] if fields.contributions else []),
+        *([screen.contributions] if slots.fields.contributions else []),
         *numbers[:weights],
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
@@ -264,10 +251,10 @@ def project_step(
     build = _build(device)
     defines |= build.defines
     if build.lanes > 1:
-        kernel = device.kernels("project_grad", ROWS=CPU_STEP_ROWS, **defines).project_step
+        kernel = device.kernels("project_grad", {"ROWS": CPU_STEP_ROWS, **defines}).project_step
         launch_groups(device, kernel, -(-parameters.count // CPU_STEP_ROWS), 1, *arguments)
     else:
-        kernel = device.kernels("project_grad", ROWS=DEFAULT_GROUP_ITEMS, **defines).project_step
+        kernel = device.kernels("project_grad", {"ROWS": DEFAULT_GROUP_ITEMS, **defines}).project_step
         launch_items(device, kernel, parameters.count, *arguments)
 
 
@@ -288,9 +275,9 @@ def _build(device: Device) -> _Build:
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 
-def _defines(gaussians: DeviceGaussians, slots: Slots, fields: SlotFields, *, sh_rest: bool) -> dict[str, object]:
+def _defines(gaussians: DeviceGaussians, slots: Slots, *, sh_rest: bool) -> dict[str, object]:
     wanted = {"ADDED_UP": slots.first_slots is None, "NO_SH_REST": not sh_rest and gaussians.coefficients > 1}
-    return {**fields.defines, **{name: True for name, needed in wanted.items() if needed}}
+    return {**slots.fields.defines, **{name: True for name, needed in wanted.items() if needed}}
 
 
 def _inputs(

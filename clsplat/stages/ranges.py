@@ -47,6 +47,6 @@ def tile_lists(device: Device, work: Workspace, pairs: Pairs, band: Band, *, all
     slot_from_sorted = work.array("slot_from_sorted", (count,), np.uint32)
     gaussian_from_sorted = work.array("gaussian_from_sorted", (count,), np.uint32)
     arrays = (keys, pair_from_sorted, pairs.pair_ids, ranges, slot_from_sorted, gaussian_from_sorted)
-    kernel = device.kernels("ranges", **elements.defines).ranges
+    kernel = device.kernels("ranges", elements.defines).ranges
     launch_items(device, kernel, count, *elements.arguments, *arrays)
     return TileLists(band, ranges, gaussian_from_sorted, slot_from_sorted)

@@ -51,7 +51,7 @@ def sampling_limits(
     """
     for start, stop, (part,) in parts(work, gaussians):
         for index, group in enumerate(cameras):
-            kernel = device.kernels("sampling", LANES=1, **group.model.defines).sampling_limits
+            kernel = device.kernels("sampling", {"LANES": 1, **group.model.defines}).sampling_limits
             arrays = (group.values, part["means"], least.rows(start, stop))
             launch_items(device, kernel, part.count, part.count, group.values.shape[0], int(index > 0), *arrays)
 
@@ -59,6 +59,6 @@ def sampling_limits(
 @stage("sampling", limit_scales=1)
 def limit_scales(device: Device, work: Workspace, gaussians: AnyGaussians, least: DeviceArray) -> None:
     """Raise log scales below `least` (n,) to that value."""
-    kernel = device.kernels("sampling", LANES=1).limit_scales
+    kernel = device.kernels("sampling", {"LANES": 1}).limit_scales
     for start, stop, (part,) in parts(work, gaussians, keep=True):
         launch_items(device, kernel, part.count, part.count, least.rows(start, stop), part["log_scales"])

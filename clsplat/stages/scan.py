@@ -72,7 +72,7 @@ def scan(
     elements = elements or Elements(values.shape[0])
     groups, chunk = chunking(device, elements.most)
     sums = work.array("scan_sums", (groups,), np.uint32)
-    kernels, items = device.kernels("scan", **elements.defines), device.shape.items
+    kernels, items = device.kernels("scan", elements.defines), device.shape.items
     chunks = (groups, items, *elements.arguments, chunk)
     if groups > 1:
         launch_groups(device, kernels.scan_sums, *chunks, values, sums)

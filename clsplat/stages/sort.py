@@ -57,7 +57,7 @@ def radix_sort(
     n, items = keys.shape[0], device.shape.sort_items
     elements = elements or Elements(n)
     groups, chunk = chunking(device, n, items)
-    kernels = device.kernels("sort_radix", ITEMS=items, **elements.defines)
+    kernels = device.kernels("sort_radix", {"ITEMS": items, **elements.defines})
     alone = groups == items == 1
     passes = max(-(-bits // (WIDE_DIGIT_BITS if alone else _widest_digit(device, n))), 1)
     digit_bits = -(-bits // passes) or 1
@@ -103,7 +103,7 @@ def bitonic_sort(
     keys_out = work.array(f"{name}_keys0", (n,), np.uint32)
     positions_out = work.array(f"{name}_positions0", (n,), np.uint32)
     local = cl.LocalMemory(4 * padded)
-    kernel = device.kernels("sort_bitonic", **elements.defines).bitonic_sort
+    kernel = device.kernels("sort_bitonic", elements.defines).bitonic_sort
     arrays = (keys, keys_out, positions_out, local, local)
     launch_groups(device, kernel, 1, device.shape.items, *elements.arguments, padded, *arrays)
     return keys_out, positions_out

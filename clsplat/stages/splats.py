@@ -11,7 +11,7 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_items
 from clsplat.device.profile import stage
-from clsplat.layouts.columns import PLAIN_SLOTS, SLOT, SPLAT, TILE, SlotFields
+from clsplat.layouts.columns import SLOT, SPLAT, TILE
 from clsplat.stages.project import Projected, Slots
 
 SPLAT_VALUES = 3
@@ -76,7 +76,7 @@ def splats(
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))
     launch_items(
         device,
-        device.kernels("splats", **({"LISTED": True} if listed else {})).splats,
+        device.kernels("splats", {"LISTED": True} if listed else {}).splats,
         -(-n // device.shape.lanes),
         n,
         -(-width // TILE),
@@ -102,19 +102,17 @@ def splats_grad(
     gradients: ScreenGradients,
     *,
     kept: int = SPLAT_VALUES,
-    fields: SlotFields = PLAIN_SLOTS,
 ) -> None:
-    """Fill every row of the gradients from the pairs' slots.
+    """Fill every row of the gradients from the pairs' slots, which may include absolute gradients.
 
     kept: number of leading values whose gradients the slots hold.
-    fields: fields of the slots, which may include absolute gradients.
     """
     assert slots.first_slots is not None, "there are no bands here"
     n, width = gradients.values.shape
-    defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **fields.defines}
+    defines: dict[str, object] = {"LANES": 1, "VALUES": kept, **slots.fields.defines}
     launch_items(
         device,
-        device.kernels("splats_grad", **defines).splats_grad,
+        device.kernels("splats_grad", defines).splats_grad,
         n,
         n,
         width,
@@ -127,7 +125,7 @@ def splats_grad(
         gradients.conics,
         gradients.opacities,
         gradients.values,
-        *([gradients.absolute] if fields.absolute else []),
+        *([gradients.absolute] if slots.fields.absolute else []),
     )
 
 
@@ -137,6 +135,6 @@ def add_values(
 ) -> None:
     """Fill `count` columns of d_values (n, width), beginning at `first`, with the sums of slots (pairs, count)."""
     n, width = d_values.shape
-    kernel = device.kernels("splats_grad", LANES=1, VALUES=count).add_values
+    kernel = device.kernels("splats_grad", {"LANES": 1, "VALUES": count}).add_values
     counts = (projected.tile_counts, slots.first_slots)
     launch_items(device, kernel, n, n, width, first, *counts, slots.values, d_values)

@@ -59,7 +59,7 @@ def target(
         defines["MASKED"], render = True, (blended.image, blended.stops)
     if alpha:
         defines["ALPHA"] = True
-    kernels = device.kernels("target", **defines)
+    kernels = device.kernels("target", defines)
     sizes = (width, height, channels, stride, rows * stride)
     across = stride // TILE if device.shape.lanes > 1 else stride
     launch_grid(device, kernels.target, (across, rows), *sizes, source, background, planes, *render)

@@ -99,7 +99,7 @@ def values_grad(
         if pairs:
             launch_tiles(device, "values_grad", defines, lists, tiles_x, height, depth, first, *arrays)
         if geometry:
-            splats_grad(device, of.projected, Slots(slots, first_slots), gradients, kept=count, fields=fields)
+            splats_grad(device, of.projected, Slots(slots, first_slots, fields), gradients, kept=count)
         else:
             add_values(device, of.projected, Slots(slots, first_slots), gradients.values, first, count)
 

@@ -25,7 +25,7 @@ from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.layouts.columns import SPLAT
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.adam import adam, add_view, updates_sh_rest
+from clsplat.stages.adam import adam, add_view
 from clsplat.stages.device_gaussians import (
     AnyGaussians,
     DeviceGaussians,
@@ -105,11 +105,11 @@ class _AddedView(GradientStep):
         assert rows.gradients is not None, "the batch asks for them"
         parameters, sums = rows.model
         shown = None if self.shown is None else self.shown.rows(rows.start, rows.stop)
-        sh_rest = updates_sh_rest(self.config.optimiser, self.step)
-        add_view(self.device, rows.projected.tile_counts, rows.gradients, sums, shown, sh_rest=sh_rest)
+        step, counts = self.adam_step, rows.projected.tile_counts
+        add_view(self.device, counts, rows.gradients, sums, shown, sh_rest=step.updates_sh_rest)
         if self.device.only_tries:
-            models, counts = (parameters, sums, rows.gradients, rows.gradients), rows.projected.tile_counts
-            adam(self.device, self.step, self.rates, self.config.optimiser, *models, counts, self.rasterizer.readback)
+            models = (parameters, sums, rows.gradients, rows.gradients)
+            adam(self.device, step, *models, counts, self.rasterizer.readback)
             if self.explore is not None:
                 noise(self.device, self.explore, parameters, 0, self.rasterizer.readback)
 
@@ -210,7 +210,7 @@ class Replica:
         """
         parameters, photograph = self.parameters, self.photographs.bring(inputs.view, factor)
         assert parameters is not None, "taken before the view"
-        n, sh_rest = parameters.count, updates_sh_rest(step.config.optimiser, step.step)
+        n, sh_rest = parameters.count, step.adam_step.updates_sh_rest
         shapes = group_shapes(n, parameters.coefficients)
         gradients = {g: self._host(place, g, shapes[g]) for g in PARAMETER_GROUPS if g != "sh_rest" or sh_rest}
         arrays = {"tile_counts": self._host(place, "tile_counts", (n,), np.uint32)}
@@ -299,6 +299,7 @@ class Batch:
         own: dict[int, Sequence[DeviceArray | None]] = {}
         settings = (device, self.rasterizer, config, number, rates, step.fields, shown, own)
         step_of_view = _AddedView(*settings, explore=explore and explore.of_view())
+        adam_step = step_of_view.adam_step
         first, *others = shares(len(views), 1 + len(self.replicas))
         transfers = self._send(model[0])
         pending: list[tuple[int, Future[ViewOutcome]]] = []
@@ -321,13 +322,13 @@ class Batch:
         for start, stop, (parameters, moments, squares, gradients) in parts(work, *model, sums, keep=True):
             counts = self.rasterizer.readback if shown is None else shown.rows(start, stop)
             models = (parameters, gradients, moments, squares)
-            adam(device, number, rates, optimiser, *models, counts, self.rasterizer.readback)
+            adam(device, adam_step, *models, counts, self.rasterizer.readback)
             if explore is not None:
                 noise(device, explore.scaled(sqrt(batch)), parameters, start, self.rasterizer.readback)
         for inputs in views:
             for part, gradient in zip(inputs.parts, own[inputs.place], strict=True):
                 part.update(gradient, self.rasterizer.readback)
-        self._sent = None if updates_sh_rest(optimiser, number) else model[0]
+        self._sent = None if adam_step.updates_sh_rest else model[0]
         return Losses(tuple(losses))
 
     def _room_for(self, device: Device, parameters: AnyGaussians) -> tuple[AnyGaussians, DeviceArray | None]:

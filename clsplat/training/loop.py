@@ -21,7 +21,7 @@ from clsplat.device import cl
 from clsplat.device.drivers.worker_process import TrialInterrupted
 from clsplat.errors import CapacityError, ClsplatError, DriverError
 from clsplat.evaluation.depths import keep_depths
-from clsplat.evaluation.held_out import EvaluatedModel, evaluate
+from clsplat.evaluation.held_out import EvaluatedModel, Evaluation, evaluate
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.images.colour import photos_space
@@ -239,7 +239,7 @@ class TrainingSession:
         result = Renderer(self.trainer.device, config=self.trainer.config.rasterizer).render(model, camera)
         return result.image, result.alpha
 
-    def evaluate(self, *, keep: bool) -> dict[str, Any]:
+    def evaluate(self, *, keep: bool) -> Evaluation:
         """Evaluate the held-out views.
 
         keep: keep their renders in the run's test/.

@@ -17,12 +17,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import NotRequired, TypedDict
 
-from clsplat.camera import Camera
+from clsplat.camera import Camera, Projection
 from clsplat.config.training import TrainConfig
 from clsplat.device import cl
 from clsplat.device.context import Device, open_device
@@ -55,23 +56,76 @@ from clsplat.version import package_version
 if TYPE_CHECKING:
     from clsplat.training.trainer import Trainer
 
-_INTRINSICS = ("fx", "fy", "cx", "cy", "near")
-RECORDED_CAMERA_FIELDS = ("width", "height", *_INTRINSICS, "projection", "radial", "by_rays")
 _MODEL_KINDS = ("parameters", "first", "second")
+
+
+class RecordedCamera(TypedDict):
+    """A camera in a bundle, except for its pose."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    near: float
+    projection: Projection
+    radial: tuple[float, ...]
+    by_rays: bool
+
+
+class StepRecord(TypedDict):
+    """The step of a bundle.
+
+    view: name of its photograph.
+    settings: text of config.toml.
+    versions, device: of the machine that trained.
+    depth_factor: factor of the known depths, if they are compared.
+    of: number of the bundle's Gaussians, and of the training's.
+    reproduced: True if the bundle has the trouble.
+    """
+
+    step: int
+    view: str
+    stage: str
+    message: str
+    rates: dict[str, float]
+    camera: RecordedCamera
+    settings: str
+    versions: dict[str, str]
+    device: dict[str, str]
+    depth_factor: NotRequired[float]
+    of: NotRequired[tuple[int, int]]
+    reproduced: NotRequired[bool]
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """One training step.
 
-    record: step, stage, name of the view, rates, size, versions, device.
     models: parameters and moments by group.
     """
 
-    record: dict[str, Any]
+    record: StepRecord
     config: TrainConfig
     inputs: ViewInputs
     models: dict[str, HostGaussians]
+
+
+def recorded_camera(camera: Camera) -> RecordedCamera:
+    """The record of a camera."""
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "near": camera.near,
+        "projection": camera.projection,
+        "radial": camera.radial,
+        "by_rays": camera.by_rays,
+    }
 
 
 def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
@@ -79,13 +133,13 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
     photograph = trainer.photographs.load(incident.view, trainer.sizes.factor(incident.step))
     camera = trainer.camera(incident.view, photograph.shape[1], photograph.shape[0])
     device = trainer.device
-    record: dict[str, Any] = {
+    record: StepRecord = {
         "step": incident.step,
         "view": incident.name,
         "stage": incident.stage,
         "message": str(incident),
         "rates": trainer.rates(),
-        "camera": {name: getattr(camera, name) for name in RECORDED_CAMERA_FIELDS},
+        "camera": recorded_camera(camera),
         "settings": config_text(trainer.config, None),
         "versions": {
             "clsplat": package_version(),
@@ -142,16 +196,20 @@ def read_bundle(path: Path) -> Bundle:
 
 def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
     """Raises nearly any exception for arrays and values that make no step. Sizes follow from the photograph's."""
-    record, arrays = {**saved.state, "step": saved.step}, saved.arrays
+    record, arrays = cast("StepRecord", {**saved.state, "step": saved.step}), saved.arrays
     record["rates"] = {group: float(record["rates"][group]) for group in PARAMETER_GROUPS}
     config, _ = parse_config(record["settings"], path)
     photograph = arrays["photograph"]
     height, width, channels = photograph.shape
     lens, pose = record["camera"], (arrays["rotation"].reshape(3, 3), arrays["translation"].reshape(3))
-    fx, fy, cx, cy, near = (float(lens[name]) for name in _INTRINSICS)
+    fx, fy, cx, cy, near = map(float, (lens["fx"], lens["fy"], lens["cx"], lens["cy"], lens["near"]))
     k1, k2, k3, k4 = map(float, lens["radial"])
-    more = {"projection": lens["projection"], "radial": (k1, k2, k3, k4), "by_rays": bool(lens["by_rays"])}
-    camera = Camera(width, height, fx, fy, cx, cy, *pose, near, **more)
+    camera = Camera(
+        *(width, height, fx, fy, cx, cy, *pose, near),
+        projection=lens["projection"],
+        radial=(k1, k2, k3, k4),
+        by_rays=bool(lens["by_rays"]),
+    )
     if photograph.dtype not in (np.uint8, np.float32) or channels not in (3, 4, 5):
         raise ValueError(f"a photograph {photograph.shape} of {photograph.dtype}")
     camera.check()

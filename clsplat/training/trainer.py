@@ -18,7 +18,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.optimisation.density_rules import FRESH
-from clsplat.rendering.memory_needs import MODELS, plan_step
+from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import PairCapacity, Rasterizer
 from clsplat.rendering.renderer import Renderer, RenderResult
@@ -141,6 +141,14 @@ class Trainer:
     def _make_plan(self, count: int) -> Plan:
         """Plan the device's memory for `count` Gaussians with their final number of SH coefficients."""
         needs, batch = self.strategy.needs(), self.batch
+        memory = StepMemory(
+            fields=slot_fields(needs, nearness=bool(self.config.depth_use)),
+            photographs=sum(view.camera.width * view.camera.height for view in self.views),
+            turns=self.pending.turns,
+            masks=self.config.mask_use != NO_MASKS,
+            row_bytes=sum(component.row_bytes for component in self.components),
+            pixel_bytes=sum(component.pixel_bytes for component in self.components),
+        )
 
         def plan(device: Device, models: int) -> Plan:
             return plan_step(
@@ -149,12 +157,7 @@ class Trainer:
                 (self.config.sh_degree + 1) ** 2,
                 [view.camera for view in self.scene.views],
                 self.config.rasterizer,
-                fields=slot_fields(needs, nearness=bool(self.config.depth_use)),
-                photographs=sum(view.camera.width * view.camera.height for view in self.views),
-                turns=self.pending.turns,
-                masks=self.config.mask_use != NO_MASKS,
-                row_bytes=sum(component.row_bytes for component in self.components),
-                pixel_bytes=sum(component.pixel_bytes for component in self.components),
+                memory,
                 models=models,
             )
 

@@ -7,7 +7,8 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+
+from typing_extensions import NotRequired, TypedDict
 
 from clsplat.config.pictures import DEFAULT_VIDEO_FPS
 from clsplat.errors import InputError
@@ -17,6 +18,31 @@ from clsplat.viewer.pose import Pose
 
 MAX_KEY_FRAMES = 10_000
 MAX_PATH_FILES = 10_000
+
+
+class KeyFrame(TypedDict):
+    """A key of a camera file. fov_y: degrees."""
+
+    frame: int
+    position: list[float]
+    world_from_cam: list[float]
+    fov_y: float
+
+
+class CameraFileHead(TypedDict):
+    """Head of a camera file. loop_frames: frames until the path is at its first key again, if it returns there."""
+
+    clsplat_cameras: int
+    width: int
+    height: int
+    fps: float
+    loop_frames: NotRequired[int]
+
+
+class CameraFile(CameraFileHead):
+    """A camera file of key frames."""
+
+    keys: list[KeyFrame]
 
 
 def add_key(keys: list[Pose], pose: Pose) -> None:
@@ -49,10 +75,10 @@ def path_document(
     if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):
         raise InputError(f"{apart} seconds at {fps} frames a second: expected up to 3600 and up to 1000")
     step = max(round(apart * fps), 1)
-    contents: dict[str, Any] = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
+    head: CameraFileHead = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
     if loop and len(keys) > 1:
-        contents["loop_frames"] = step * len(keys)
-    contents["keys"] = [
+        head["loop_frames"] = step * len(keys)
+    frames: list[KeyFrame] = [
         {
             "frame": 1 + step * index,
             "position": [float(value) for value in pose.position],
@@ -61,6 +87,7 @@ def path_document(
         }
         for index, pose in enumerate(keys)
     ]
+    contents: CameraFile = {**head, "keys": frames}
     return json.dumps(contents, indent=2) + "\n"
 
 

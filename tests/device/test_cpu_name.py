@@ -61,7 +61,7 @@ if sys.argv[3] == "mended":
 else:
     context.name_processor = lambda device: ""
 opened = context.open_device(sys.argv[1])
-opened.kernels("probe", FMA_BY_CONTRACTION=True)
+opened.kernels("probe", {"FMA_BY_CONTRACTION": True})
 """
 
 

@@ -20,7 +20,7 @@ import sys
 from clsplat.device.context import open_device
 device = open_device(sys.argv[1]).with_shape(sys.argv[2])
 for stem, defines in (("duplicate", {}), ("duplicate", {"RAYS": 1}), ("scan", {}), ("sort_radix", {})):
-    device.kernels(stem, **defines)
+    device.kernels(stem, defines)
 """
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,10 +33,10 @@ def failing_at(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException)
     """What needs the text or the kernel of this name ends so, as where its trial does."""
     real_kernels, real_enqueue = Device.kernels, launch._enqueue
 
-    def kernels(self, stem, **defines):
+    def kernels(self, stem, defines: Mapping[str, object] = {}):
         if name in [f"{key}={value}" for key, value in defines.items()]:
             raise error
-        return real_kernels(self, stem, **defines)
+        return real_kernels(self, stem, defines)
 
     def enqueue(device, kernel, *given):
         if name == kernel.name:

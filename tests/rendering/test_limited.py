@@ -25,13 +25,14 @@ from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import SlotFields
-from clsplat.rendering.memory_needs import plan_frame, plan_step
+from clsplat.rendering.memory_needs import StepMemory, plan_frame, plan_step
 from clsplat.rendering.memory_plan import Need, plan
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
+from clsplat.stages.adam import AdamStep
 from clsplat.stages.density import new_statistics
 from clsplat.stages.device_gaussians import HostGaussians, upload_gaussians
 from clsplat.stages.loss import loss
@@ -202,7 +203,7 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     gaussians, camera = random_cloud(6000, 11, 100, 80)
     fields = SlotFields(absolute=True, contributions=True)
     config = RasterizerConfig()
-    need = plan_step(device, 6000, 16, [camera], config, fields=fields).need
+    need = plan_step(device, 6000, 16, [camera], config, StepMemory(fields)).need
     rasterizer = Rasterizer(device, config)
     rasterizer.capacity = capacity or rasterizer.capacity
     model, first, second = (upload_gaussians(device, gaussians) for _ in range(3))
@@ -214,7 +215,7 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     slots, screen = rasterizer.pair_gradients(frame, result.gradient, fields=fields), rasterizer.screen(6000, fields)
     view = (frame.camera_array, frame.projected, slots, screen, rasterizer.readback)
     rates = dict.fromkeys(PARAMETER_GROUPS, 1e-3)
-    project_step(device, 1, rates, OptimiserConfig(), (model, first, second), *view, fields=fields)
+    project_step(device, AdamStep(OptimiserConfig(), 1, rates), (model, first, second), *view)
     assert len(frame.bands) == 1 if capacity is None else len(frame.bands) > 2
     pairs = frame.part.pairs.tile_keys.shape[0] if capacity is None else capacity
     rows = need.row + need.model + (need.banded if capacity else 0)

@@ -15,7 +15,7 @@ from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.layouts.columns import READBACK, REFUSED
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
-from clsplat.stages.adam import adam, add_view
+from clsplat.stages.adam import AdamStep, adam, add_view
 from clsplat.stages.device_gaussians import allocate_gaussians
 
 
@@ -38,7 +38,7 @@ def test_steps(shaped_device: Device, count: int) -> None:
             wanted[group] = reference(
                 wanted[group][0], gradient.astype(np.float64), *wanted[group][1:], step, rates[group], 0.9, 0.999, 1e-15
             )
-        adam(shaped_device, step, rates, OptimiserConfig(), p, g, m, v, counts)
+        adam(shaped_device, AdamStep(OptimiserConfig(), step, rates), p, g, m, v, counts)
     for group in PARAMETER_GROUPS:
         # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step, of which there were four.
         assert_close(p[group].get(), wanted[group][0], relative=1e-6, absolute=1e-4 * rates[group])
@@ -76,9 +76,7 @@ def test_no_gradient_no_step(device: Device) -> None:
     p["means"].fill(0.5)
     adam(
         device,
-        1,
-        dict.fromkeys(PARAMETER_GROUPS, 0.1),
-        OptimiserConfig(),
+        AdamStep(OptimiserConfig(), 1, dict.fromkeys(PARAMETER_GROUPS, 0.1)),
         p,
         g,
         m,
@@ -107,8 +105,8 @@ def test_sparse_steps_are_those_of_the_visible(shaped_device: Device, count: int
             dense[index][group].set(values)
             sparse[index][group].set(values)
     rates = dict.fromkeys(PARAMETER_GROUPS, 0.1)
-    adam(shaped_device, 3, rates, OptimiserConfig(), *dense, counts)
-    adam(shaped_device, 3, rates, OptimiserConfig(sparse=True), *sparse, counts)
+    adam(shaped_device, AdamStep(OptimiserConfig(), 3, rates), *dense, counts)
+    adam(shaped_device, AdamStep(OptimiserConfig(sparse=True), 3, rates), *sparse, counts)
     for (group, index), values in before.items():
         got = sparse[index][group].get()
         np.testing.assert_array_equal(got[visible], dense[index][group].get()[visible], err_msg=group)
@@ -125,7 +123,7 @@ def test_sh_rest_waits_for_its_step(device: Device) -> None:
     for step in range(1, 8):
         g["sh_rest"].fill(0.5 * step if step % 3 == 0 else 0.0)
         before = p["sh_rest"].get()
-        adam(device, step, dict.fromkeys(PARAMETER_GROUPS, 0.1), config, p, g, m, v, counts)
+        adam(device, AdamStep(config, step, dict.fromkeys(PARAMETER_GROUPS, 0.1)), p, g, m, v, counts)
         if step % 3:
             np.testing.assert_array_equal(p["sh_rest"].get(), before)
         else:
@@ -165,7 +163,7 @@ def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: 
                     array[g].set(values)
             shown = upload(device, np.ones(count, np.uint32))
             counts = found if spoilt else upload(device, np.zeros(len(READBACK), np.uint32))
-            adam(device, 5, rates, OptimiserConfig(sparse=sparse), *arrays, shown, counts)
+            adam(device, AdamStep(OptimiserConfig(sparse=sparse), 5, rates), *arrays, shown, counts)
             models.append([{g: array[g].get() for g in PARAMETER_GROUPS} for array in arrays])
         before_them = len(READBACK) - len(REFUSED)
         assert found.get().tolist() == [0] * before_them + [int(index == place) for index in range(len(REFUSED))], name

@@ -16,6 +16,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import PLAIN_SLOTS, READBACK
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
+from clsplat.stages.adam import AdamStep
 from clsplat.stages.density import add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.project import project_step
@@ -124,7 +125,7 @@ def test_a_pass_that_stops_changes_nothing(shaped_device: Device, cause: str) ->
     gradient = upload(shaped_device, np.ones(frame.blended.image.shape, np.float32))
     slots, screen = rasterizer.pair_gradients(frame, gradient), rasterizer.screen(held.count, PLAIN_SLOTS)
     view = (frame.camera_array, frame.projected, slots, screen, rasterizer.readback)
-    project_step(shaped_device, 3, RATES, OptimiserConfig(), (held, *moments), *view)
+    project_step(shaped_device, AdamStep(OptimiserConfig(), 3, RATES), (held, *moments), *view)
     statistics = new_statistics(shaped_device, held.count)
     add_statistics(shaped_device, statistics, frame.camera, frame.projected, screen)
     after = [model[group].get() for model in (held, *moments) for group in PARAMETER_GROUPS]

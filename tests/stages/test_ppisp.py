@@ -15,8 +15,8 @@ from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
 from clsplat.reference import appearance, ppisp
 from clsplat.runs.appearance import held_out_looks, unmixing
-from clsplat.stages.appearance import Gains, step_gains
-from clsplat.stages.ppisp import COLOUR_ENTRIES, VIGNETTE_ENTRIES, PhotoLens, camera_gradient, develop
+from clsplat.stages.appearance import GainEntries, Gains, step_gains
+from clsplat.stages.ppisp import COLOUR_ENTRIES, VIGNETTE_ENTRIES, VIGNETTE_GAINS, PhotoLens, camera_gradient, develop
 
 Array = np.ndarray
 
@@ -81,8 +81,8 @@ def test_steps_of_colours_and_of_lenses(shaped_device: Device) -> None:
         state = appearance.step(*state, by_entries, number, rates)
         through = appearance.step(*through, by_lenses, number, 0.02, centred=False)
         of_step = upload(shaped_device, columns), number
-        step_gains(shaped_device, colours, number % 4, *of_step, 0.01, readback, slow=0.1)
-        step_gains(shaped_device, vignettes, number % 2, *of_step, 0.02, readback, at=COLOUR_ENTRIES, centred=False)
+        step_gains(shaped_device, colours, number % 4, *of_step, 0.01, readback, GainEntries(mix_rate=0.1))
+        step_gains(shaped_device, vignettes, number % 2, *of_step, 0.02, readback, VIGNETTE_GAINS)
     # Eleven steps; a sum of 16 floats that nearly cancel is good to 1e-5 of itself.
     assert_close(colours.logs.get(), state[0], absolute=1e-5)
     assert_close(colours.gains.get()[:, :3], np.exp2(state[0][:, :3]), absolute=1e-5)

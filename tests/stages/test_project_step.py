@@ -21,7 +21,7 @@ from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, group_shapes
 from clsplat.layouts.columns import PLAIN_SLOTS, READBACK, REFUSED, WIDEST_SLOTS, SlotFields
 from clsplat.optimisation.step_noise import Exploration
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
-from clsplat.stages.adam import adam, updates_sh_rest
+from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.project import Screen, Slots, add_slots, project_grad, project_step
 
@@ -39,6 +39,10 @@ class Case:
     added_up: bool = False
     step: int = 5
     explore: Exploration | None = None
+
+    @property
+    def adam_step(self) -> AdamStep:
+        return AdamStep(self.optimiser, self.step, RATES)
 
 
 CASES = {
@@ -88,9 +92,9 @@ def steps(
     assert frame.part.counted.first_slots is not None
     if spoil == "gradient" and pairs:
         values[frame.part.counted.first_slots.get()[np.argmax(counts)]] = np.nan
-    slots = Slots(upload(device, values), frame.part.counted.first_slots)
+    slots = Slots(upload(device, values), frame.part.counted.first_slots, case.fields)
     if case.added_up:
-        slots = Slots(add_slots(device, work, frame.projected.tile_counts, slots, None, fields=case.fields))
+        slots = Slots(add_slots(device, work, frame.projected.tile_counts, slots, None), fields=case.fields)
     results = []
     for fused in (True, False):
         rng = np.random.default_rng(count)
@@ -126,17 +130,15 @@ def after_step(
     contributions = upload(device, np.zeros(count, np.float32)) if case.fields.contributions else None
     screen = Screen(upload(device, np.zeros((count, 2), np.float32)), contributions)
     if fused:
-        step = (case.step, RATES, case.optimiser)
         view = (camera_array, projected, slots, screen)
-        project_step(device, *step, model, *view, readback, fields=case.fields, explore=case.explore)
+        project_step(device, case.adam_step, model, *view, readback, explore=case.explore)
     else:
         gradients = allocate_gaussians(device, count, coefficients, zero=True)
-        sh_rest = updates_sh_rest(case.optimiser, case.step)
         view = (camera_array, projected, slots)
-        also = {"fields": case.fields, "sh_rest": sh_rest, "explore": case.explore}
+        also = {"sh_rest": case.adam_step.updates_sh_rest, "explore": case.explore}
         project_grad(device, parameters, *view, gradients, screen, **also)
         models = (parameters, gradients, first, second)
-        adam(device, case.step, RATES, case.optimiser, *models, projected.tile_counts, readback)
+        adam(device, case.adam_step, *models, projected.tile_counts, readback)
     view_arrays = {"screen": screen.gradients.get(), "counts": readback.get()}
     if contributions is not None:
         view_arrays["contributions"] = contributions.get()
@@ -161,7 +163,7 @@ def test_one_launch_has_the_bits_of_two(shaped_device: Device, name: str) -> Non
     moved = (arrays[0]["means"] != gaussians.means).any(axis=1)
     assert moved[0]
     assert moved[20] != case.optimiser.sparse, "a hidden Gaussian moves by its moments"
-    waits = not updates_sh_rest(case.optimiser, case.step)
+    waits = not case.adam_step.updates_sh_rest
     assert (arrays[0]["sh_rest"].tobytes() == gaussians.sh[:, 1:].tobytes()) == (waits or case.degree == 0)
 
 

@@ -128,8 +128,8 @@ def test_the_gradient_against_the_twin(device: Device, count: int, kept: int, de
         one.array.fill(np.nan)
     gradients = ScreenGradients(*(one.array for one in by))
     projected = Projected(made.splats, upload(device, tiles))
-    slots = Slots(upload(device, rows), upload(device, first))
-    splats_grad(device, projected, slots, gradients, kept=kept, fields=fields)
+    slots = Slots(upload(device, rows), upload(device, first), fields)
+    splats_grad(device, projected, slots, gradients, kept=kept)
     moments = sums[:, :6] * np.array([1, 1 / WHITEN, 1 / WHITEN, *[1 / WHITEN**2] * 3])
     drawn = flat.opacities > 1 / 255
     wanted = twin.splats_grad(flat.conics.astype(np.float64), flat.opacities.astype(np.float64), moments)

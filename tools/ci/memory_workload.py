@@ -43,7 +43,7 @@ from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.supervision.depth_samples import KnownDepth
 from clsplat.stages import scan as stages_scan
-from clsplat.stages.adam import adam, add_view
+from clsplat.stages.adam import AdamStep, adam, add_view
 from clsplat.stages.appearance import Gains, step_gains
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.density import DeviceMarker, carry, gather, new_statistics
@@ -157,7 +157,7 @@ def by_two_launches(device: Device) -> None:
     )
     for sparse in (False, True):
         rates, config = dict.fromkeys(PARAMETER_GROUPS, 0.1), OptimiserConfig(sparse=sparse)
-        adam(device, 1, rates, config, model, gradients, first, second, counts, readback)
+        adam(device, AdamStep(config, 1, rates), model, gradients, first, second, counts, readback)
     add_view(device, counts, gradients, first, upload(device, np.zeros(11, np.uint32)))
     if not all(np.isfinite(model[group].get()).all() for group in PARAMETER_GROUPS):
         raise SystemExit("Adam's step is not finite")
@@ -340,7 +340,7 @@ def limits(device: Device) -> None:
     items, lanes = tile_items(device), device.shape.lanes
     copied = max(lanes, 4)
     splats, sums = upload(device, _splats()), allocate(device, (items,), np.float32)
-    kernels = device.kernels("peak", ITEMS=items)
+    kernels = device.kernels("peak", {"ITEMS": items})
     for kernel in (kernels.limit_blend, kernels.limit_blend_grad):
         launch.launch_groups(device, kernel, 1, items, 2, splats, sums)
     sums.get()

@@ -305,7 +305,7 @@ def make_bundle(folder: Path) -> None:
     record = {
         "stage": "adam",
         "rates": dict.fromkeys(shapes, 0.001),
-        "camera": {name: getattr(camera, name) for name in repro_bundle.RECORDED_CAMERA_FIELDS},
+        "camera": repro_bundle.recorded_camera(camera),
         "settings": runs_settings.config_text(TrainConfig(), None),
     }
     arrays |= {"photograph": np.zeros((9, 12, 3), np.uint8), "background": np.zeros(3, np.float32)}

@@ -23,7 +23,7 @@ from clsplat.optimisation.step_noise import Exploration, step_key
 from clsplat.reference.adam import adam as exact_adam
 from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
 from clsplat.reference.noise import displacements
-from clsplat.stages.adam import adam
+from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.blend import Blended
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.device_gaussians import allocate_gaussians
@@ -158,7 +158,7 @@ def steps(device: Device, rng: np.random.Generator, many: int) -> Result:
                 array[group].set(values)
             before = (gradient.astype(float), first.astype(float), second.astype(float))
             wanted[group] = exact_adam(np.zeros(shapes[group]), *before, step, rate)[0]
-        adam(device, step, rates, OptimiserConfig(), p, g, m, v, counts)
+        adam(device, AdamStep(OptimiserConfig(), step, rates), p, g, m, v, counts)
         for group in PARAMETER_GROUPS:
             off = np.abs(p[group].get() - wanted[group]) / np.maximum(np.abs(wanted[group]), rate)
             worst = max(worst, float(off.max()))

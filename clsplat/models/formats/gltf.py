@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from typing_extensions import NotRequired, TypedDict
 
 from clsplat.errors import InputError, warn
 from clsplat.files.atomic import atomic_write, atomic_writer
@@ -233,6 +234,13 @@ def _blocks(attributes: Iterable[Rows], count: int) -> Iterator[memoryview]:
             yield np.ascontiguousarray(block, block.dtype.newbyteorder("<")).data
 
 
+class GaussianNode(TypedDict):
+    """The node of the written mesh. translation: the model's origin, if it has one."""
+
+    mesh: int
+    translation: NotRequired[list[float]]
+
+
 def _document(
     path: Path, gaussians: Gaussians, spz_compression: bool, color_space: str
 ) -> tuple[dict[str, Any], Iterable[bytes | memoryview]]:
@@ -253,7 +261,7 @@ def _document(
         accessors.append(accessor)
     said: dict[str, Any] = {"kernel": "ellipse", "colorSpace": color_space}
     places = {name: index for index, name in enumerate(attributes)}
-    node: dict[str, Any] = {"mesh": 0}
+    node: GaussianNode = {"mesh": 0}
     if gaussians.origin.any():
         node["translation"] = (gaussians.origin * LUF_SIGNS).tolist()
     used = [GAUSSIAN_EXTENSION]

@@ -37,7 +37,7 @@ from clsplat.selftest.cases.ppisp import of_ppisp
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped, joined
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
-from clsplat.stages.adam import adam
+from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.blend import blend, blend_grad
 from clsplat.stages.density import DensityStatistics, DeviceMarker, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
@@ -313,7 +313,7 @@ def _adam(bench: CaseBench) -> StageOutcome:
                 for arrays in made.values()
             ]
             parameters, gradients, first, second = models
-            adam(device, step, _RATES_BY_GROUP, config, parameters, gradients, first, second, moving)
+            adam(device, AdamStep(config, step, _RATES_BY_GROUP), parameters, gradients, first, second, moving)
             return models
 
         def take(models: list[DeviceGaussians]) -> list[Array]:
@@ -356,7 +356,7 @@ def _steps_off(bench: CaseBench, config: OptimiserConfig, made: Mapping[str, Map
     }
     readback = upload(device, np.zeros(len(READBACK), np.uint32))
     three = (model["parameters"], model["first"], model["second"])
-    project_step(device, step, _RATES_BY_GROUP, config, three, *view, screen, readback)
+    project_step(device, AdamStep(config, step, _RATES_BY_GROUP), three, *view, screen, readback)
     wrong, rows = int(readback.get().sum()), bench.visible if config.sparse else np.ones(n, np.bool_)
     for group, rate in _RATES_BY_GROUP.items():
         p, m, v = (before[kind][group].astype(np.float64) for kind in before)

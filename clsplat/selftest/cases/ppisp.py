@@ -10,8 +10,15 @@ from clsplat.layouts.columns import READBACK
 from clsplat.reference import appearance, ppisp
 from clsplat.selftest.harness import Array, CaseBench, StageOutcome, cropped
 from clsplat.selftest.scenes import evenly
-from clsplat.stages.appearance import Gains, step_gains
-from clsplat.stages.ppisp import COLOUR_ENTRIES, VIGNETTE_ENTRIES, PhotoLens, camera_gradient, develop
+from clsplat.stages.appearance import GainEntries, Gains, step_gains
+from clsplat.stages.ppisp import (
+    COLOUR_ENTRIES,
+    VIGNETTE_ENTRIES,
+    VIGNETTE_GAINS,
+    PhotoLens,
+    camera_gradient,
+    develop,
+)
 
 PPISP_TAKEN = PhotoLens(photograph=1, lens=1, centre=(0.4375, 0.5625))
 PPISP_STEP, PPISP_RATE, PPISP_MIX_RATE_FACTOR = 5, 0.03125, 0.125
@@ -34,8 +41,8 @@ def of_ppisp(bench: CaseBench) -> StageOutcome:
         develop(device, colours, vignettes, PPISP_TAKEN, target, *size)
         columns = camera_gradient(device, bench.work, PPISP_TAKEN, image, gradient, *size)
         step = (columns, PPISP_STEP, PPISP_RATE, readback)
-        step_gains(device, colours, PPISP_TAKEN.photograph, *step, slow=PPISP_MIX_RATE_FACTOR)
-        step_gains(device, vignettes, PPISP_TAKEN.lens, *step, at=COLOUR_ENTRIES, centred=False)
+        step_gains(device, colours, PPISP_TAKEN.photograph, *step, GainEntries(mix_rate=PPISP_MIX_RATE_FACTOR))
+        step_gains(device, vignettes, PPISP_TAKEN.lens, *step, VIGNETTE_GAINS)
         return colours, vignettes, target, columns
 
     def take(results: tuple[Gains, Gains, DeviceArray, DeviceArray]) -> list[Array]:

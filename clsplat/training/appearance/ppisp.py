@@ -14,11 +14,12 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import only_tried
-from clsplat.stages.appearance import Gains, rows_on, step_gains
+from clsplat.stages.appearance import GainEntries, Gains, rows_on, step_gains
 from clsplat.stages.ppisp import (
     COLOUR_ENTRIES,
     PPISP_PIXEL_BYTES,
     VIGNETTE_ENTRIES,
+    VIGNETTE_GAINS,
     PhotoLens,
     camera_gradient,
     develop,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 MIX_RATE_FRACTION = 0.3
 """Fraction of the gains' rate that mixes use. At the full rate they absorb colours of the scene."""
+_COLOUR_GAINS = GainEntries(mix_rate=MIX_RATE_FRACTION)
 
 VIGNETTE_CHECKPOINT_ARRAYS = ("logs", "first", "second")
 """Arrays of the vignettes' `Gains` in a checkpoint."""
@@ -92,10 +94,8 @@ class ViewColours(ViewPart):
         """Take Adam's step of the photograph's entries and its lens's entries."""
         assert own is not None, "made by `gradient`"
         row, lens, step = self.taken.photograph, self.taken.lens, self.step
-        step_gains(self.device, self.colours, row, own, step, self.rate, readback, slow=MIX_RATE_FRACTION)
-        step_gains(
-            self.device, self.vignettes, lens, own, step, self.lens_rate, readback, at=COLOUR_ENTRIES, centred=False
-        )
+        step_gains(self.device, self.colours, row, own, step, self.rate, readback, _COLOUR_GAINS)
+        step_gains(self.device, self.vignettes, lens, own, step, self.lens_rate, readback, VIGNETTE_GAINS)
 
 
 def centre(view: View) -> tuple[float, float]:

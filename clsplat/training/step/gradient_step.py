@@ -16,7 +16,7 @@ from clsplat.layouts.columns import SlotFields
 from clsplat.optimisation.dropout import thinning_of
 from clsplat.optimisation.step_noise import Exploration
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
-from clsplat.stages.adam import adam, updates_sh_rest
+from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.noise import noise
@@ -68,6 +68,11 @@ class GradientStep:
     turn: int = 0
     room: PairCapacity | None = None
     explore: Exploration | None = None
+
+    @property
+    def adam_step(self) -> AdamStep:
+        """Adam's step of this number."""
+        return AdamStep(self.config.optimiser, self.step, self.rates)
 
     def run(
         self,
@@ -176,8 +181,7 @@ class GradientStep:
                 rows.slots,
                 rows.gradients,
                 rows.screen,
-                fields=self.fields,
-                sh_rest=updates_sh_rest(self.config.optimiser, self.step),
+                sh_rest=self.adam_step.updates_sh_rest,
                 explore=self.explore,
                 by_lens=rows.by_lens,
             )
@@ -205,23 +209,22 @@ class GradientStep:
 
     def update(self, rows: StepRows) -> None:
         """Take Adam's step of some rows, with the gradient of projection if it is not computed yet."""
-        optimiser, readback = self.config.optimiser, self.rasterizer.readback
+        step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model
             models = (parameters, rows.gradients, first, second)
-            adam(self.device, self.step, self.rates, optimiser, *models, rows.projected.tile_counts, readback)
+            adam(self.device, step, *models, rows.projected.tile_counts, readback)
         else:
             view = (rows.camera_array, rows.projected, rows.slots, rows.screen, readback)
-            arguments = (rows.device, self.step, self.rates, optimiser, rows.model, *view)
-            fields, explore = self.fields, self.explore
+            explore = self.explore
             arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
-            key = (*map(ref, rows.model), rows.projected, *arrays, updates_sh_rest(optimiser, self.step))
+            key = (*map(ref, rows.model), rows.projected, *arrays, step.updates_sh_rest)
             penalised = explore is not None and explore.penalised
             self.replayed(
                 rows.parameters,
-                (*key, rows.device, rows.camera_array, fields, penalised),
-                lambda: project_step(*arguments, fields=fields, explore=explore),
-                step_numbers(optimiser, self.step, self.rates, explore),
+                (*key, rows.device, rows.camera_array, penalised),
+                lambda: project_step(rows.device, step, rows.model, *view, explore=explore),
+                step_numbers(step, explore),
             )
         if self.explore is not None:
             noise(self.device, self.explore, rows.parameters, rows.start, readback)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from clsplat.device.launch import only_tried
 from clsplat.rendering.rasterizer import ForwardPass
-from clsplat.stages.adam import updates_sh_rest
 from clsplat.stages.density import DensityStatistics, add_contributions, add_statistics
 from clsplat.stages.loss import Loss
 from clsplat.training.density import StatisticsNeeds
@@ -52,9 +51,8 @@ class StepMonitor(StepProbe):
         """Rehearse every kernel that changes the state, before the first row changes. A driver may fail in any of
         them."""
         step, parameters = self.step, rows.parameters
-        sh_rest = updates_sh_rest(step.config.optimiser, step.step)
         size = (parameters.count, parameters.coefficients)
-        build = (sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
+        build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
         key = (*size, *build, *self.inputs.camera.model.defines.items())
         if key not in self.rehearsed:
             with only_tried(step.device), only_tried(step.rasterizer.device), only_tried(rows.device):
