@@ -192,7 +192,7 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
     return (
         *TRAINING_STAGES,
         *(() if config.mask_use == NO_MASKS else MASK_STAGES),
-        *APPEARANCE_STAGES[config.appearance],
+        *(() if config.appearance == "none" else APPEARANCE_STAGES),
         *(DEPTH_STAGES if config.depth_use else ()),
         *(POSE_STAGES if config.refine_poses else ()),
         *(LENS_STAGES if config.refine_lenses else ()),

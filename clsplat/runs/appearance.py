@@ -21,6 +21,8 @@ MAX_APPEARANCE_BYTES = 1 << 28
 MAX_LOG2_GAIN = 16.0
 MAX_CHANNEL_MIX = 0.25
 """Below this limit the matrix of any six mixes can be inverted."""
+KINDS_WITH_GAINS = ("exposure", "ppisp")
+"""Settings of --appearance whose files have gains, which a render can take."""
 EXPECTED_APPEARANCE_FILE = "what clsplat train --appearance writes"
 
 MAX_CENTRE_PICTURE_SIZES = 100.0
@@ -49,10 +51,11 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
             f"--appearance {photograph}: {model} has learnt no appearances (no appearance.json), expected a run of "
             "clsplat train --appearance exposure or ppisp"
         )
-    if _kind(path) == "grid":
+    kind = _kind(path)
+    if isinstance(kind, str) and kind not in KINDS_WITH_GAINS:
         raise InputError(
-            f"--appearance {photograph}: {path} is of bilateral grids, which are for training alone; expected a run of "
-            "clsplat train --appearance exposure or ppisp"
+            f"--appearance {photograph}: {path} is of --appearance {kind}, which is for training alone; expected a run "
+            f"of clsplat train --appearance {' or '.join(KINDS_WITH_GAINS)}"
         )
     rows = _read(path, "photographs") | _read(path, "held_out")
     found = [name for name in rows if photograph in (name, *_ends(name))]

@@ -19,13 +19,8 @@ MASK_STAGES = ("masks",)
 """Stages for training photographs with masks or alpha, in addition to TRAINING_STAGES."""
 BACKWARD_STAGES = ("loss", "blend_grad", "project_grad", "adam", "statistics")
 """Stages that training needs in addition to a frame's."""
-APPEARANCE_STAGES: dict[str, tuple[str, ...]] = {
-    "none": (),
-    "exposure": ("appearance",),
-    "ppisp": ("appearance", "ppisp"),
-    "grid": ("grid",),
-}
-"""Stages of the appearance model that training needs in addition to TRAINING_STAGES, by setting."""
+APPEARANCE_STAGES = ("appearance", "ppisp", "grid")
+"""Stages that training with learnt appearance needs, in addition to TRAINING_STAGES."""
 DEPTH_STAGES = ("depth",)
 """Stages that training with depth comparison needs."""
 POSE_STAGES = ("pose",)
@@ -37,7 +32,7 @@ LIBRARY_STAGES = ("ewa", "harmonics", "splats", "values")
 TRAINING_STAGES = (*FORWARD_STAGES, *BACKWARD_STAGES)
 SELFTEST_STAGES = (
     *(*FORWARD_STAGES, *CHANNEL_STAGES, *DEEP_STAGES, *HOLDOUT_STAGES, *RAY_STAGES, *MASK_STAGES, *BACKWARD_STAGES),
-    *("appearance", "ppisp", "grid", *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *LIBRARY_STAGES),
+    *(*APPEARANCE_STAGES, *DEPTH_STAGES, *POSE_STAGES, *LENS_STAGES, *LIBRARY_STAGES),
 )
 INDEX_STAGES = ("project", "duplicate", "sort", "ranges")
 """Stages whose counts and lists index the arrays of later stages."""

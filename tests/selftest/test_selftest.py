@@ -123,7 +123,7 @@ def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last
         RAY_STAGES,
         MASK_STAGES,
         BACKWARD_STAGES,
-        *APPEARANCE_STAGES.values(),
+        APPEARANCE_STAGES,
         DEPTH_STAGES,
         POSE_STAGES,
         LENS_STAGES,
