@@ -54,20 +54,15 @@ __kernel void add_slots(const uint n, __global const uint *tile_counts, __global
 }
 #endif
 
-#ifdef PENALTIES
-#define WEIGHTS , opacity_weight, scale_weight
-#else
-#define WEIGHTS
-#endif
 #ifdef LENS
 #define LENS_ROWS , by_lens
 #else
 #define LENS_ROWS
 #endif
 #ifdef CONTRIBUTIONS
-#define VIEW_ARRAYS screen, contributions LENS_ROWS WEIGHTS
+#define VIEW_ARRAYS screen, contributions LENS_ROWS
 #else
-#define VIEW_ARRAYS screen LENS_ROWS WEIGHTS
+#define VIEW_ARRAYS screen LENS_ROWS
 #endif
 
 #ifndef ADAM
@@ -87,18 +82,14 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
                            ,
                            __global float *by_lens
 #endif
-#ifdef PENALTIES
-                           ,
-                           const float opacity_weight, const float scale_weight
-#endif
-) {
+                               PENALTY_PARAMETERS) {
   const uint first_row = get_global_id(0) * LANES;
   if (first_row >= n) return;
   int shown[LANES];
   Gradients d;
   if (!gradients_of(n, first_row, coefficients, camera, tile_counts, first_slots, slots, splats, means, quaternions,
                     log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
-                    d_sh_rest + (size_t)3 * (coefficients - 1) * first_row, shown, &d))
+                    d_sh_rest + (size_t)3 * (coefficients - 1) * first_row, shown, &d PENALTY_WEIGHTS))
     return;
   for (uint lane = 0; lane < LANES; ++lane) {
     const size_t i = first_row + lane;
@@ -152,13 +143,12 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 __kernel void
 project_step(const uint n, const int coefficients, __constant float *camera, __global const uint *tile_counts,
              __global const uint *first_slots, __global const float *slots, __global const float *splats,
-             __global float *screen,
+             __global float *screen
 #ifdef CONTRIBUTIONS
-             __global float *contributions,
+             ,
+             __global float *contributions
 #endif
-#ifdef PENALTIES
-             const float opacity_weight, const float scale_weight,
-#endif
+                 PENALTY_PARAMETERS,
              const float beta1, const float beta2, const float epsilon, const float root, const float root_sh_rest,
              const float rate_means, const float rate_quaternions, const float rate_log_scales,
              const float rate_opacity_logits, const float rate_sh_dc, const float rate_sh_rest, const float limit2,
@@ -188,7 +178,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
     int *seen = shown + block * LANES;
     const int any = gradients_of(n, begin + block * LANES, coefficients, camera, tile_counts, first_slots, slots,
                                  splats, means, quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS,
-                                 by_sh_rest + block * LANES * sh_width, seen, &d);
+                                 by_sh_rest + block * LANES * sh_width, seen, &d PENALTY_WEIGHTS);
     for (uint lane = 0; lane < LANES; ++lane) {
       const uint i = block * LANES + lane;
       const int one = any && seen[lane];
@@ -225,7 +215,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   int any = 0, shown[1] = {0};
   if (me < rows)
     any = gradients_of(n, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
-                       quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, shown, &d);
+                       quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, shown, &d PENALTY_WEIGHTS);
   in_view[me] = shown[0];
   UNROLL for (int k = 0; k < 3; ++k) by_mean[3 * me + k] = any ? d.mean[k].all : 0.0f;
   UNROLL for (int k = 0; k < 4; ++k) by_quaternion[4 * me + k] = any ? d.quaternion[k].all : 0.0f;

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from clsplat.config.training import TrainConfig
+
 
 @dataclass(frozen=True)
 class Exploration:
@@ -27,9 +29,11 @@ class Exploration:
     key: tuple[int, int] = (0, 0)
 
     @property
-    def penalised(self) -> bool:
-        """True if the gradient includes penalties."""
-        return self.opacity > 0 or self.scale > 0
+    def weights(self) -> tuple[float, ...]:
+        """Weights of the penalties, in the order of PENALTY_PARAMETERS (kernels/shared/project_grad.h); empty without
+        penalties."""
+        weights = (self.opacity, self.scale)
+        return weights if any(weight > 0 for weight in weights) else ()
 
     def of_view(self) -> Exploration:
         """The terms that each view of a batch applies: the penalties, without noise."""
@@ -38,6 +42,37 @@ class Exploration:
     def scaled(self, factor: float) -> Exploration:
         """The same with `factor` times the noise."""
         return replace(self, amount=factor * self.amount)
+
+
+NO_EXPLORATION = Exploration()
+"""Neither penalties nor noise."""
+
+
+def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, extent: float) -> Exploration:
+    """Penalties and noise of step number `step`, of `count` Gaussians.
+
+    Noise is for growth mcmc, until the cooldown, in units in which the scene's extent is 1.
+    means_rate, extent: world units.
+    """
+    density = config.density
+    if density.growth != "mcmc":
+        penalty = config.penalty
+        return _penalties(penalty, penalty, count, extent) if penalty > 0 else NO_EXPLORATION
+    cools = step > config.iterations - config.optimiser.cooldown
+    return replace(
+        _penalties(density.opacity_weight, density.scale_weight, count, extent),
+        amount=0.0 if cools else density.noise_rate * means_rate / extent**2,
+        dead=density.min_opacity,
+        key=step_key(config.seed, step),
+    )
+
+
+def _penalties(opacity: float, scale: float, count: int, extent: float) -> Exploration:
+    """Weights of the sums over the Gaussians in view, from weights of the means over all `count`.
+
+    Scales are relative to the scene's extent (docs/gradients.md, (91)).
+    """
+    return Exploration(opacity=opacity / count, scale=scale / (3 * count * extent))
 
 
 def step_key(seed: int, step: int) -> tuple[int, int]:

@@ -25,7 +25,6 @@ def highest_logit(dead: float) -> float:
     return log(highest / (1 - highest)) if highest < 1 else inf
 
 
-@stage("noise", add_noise=1)
 def noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
@@ -33,8 +32,15 @@ def noise(
 
     first_row: row of their first in the model.
     """
-    if explore.amount == 0:
-        return
+    if explore.amount != 0:
+        _add_noise(device, explore, gaussians, first_row, readback)
+
+
+@stage("noise", add_noise=1)
+def _add_noise(
+    device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
+) -> None:
+    """Launch add_noise: a stage of its own, so that a step without noise records none."""
     highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(
         device,

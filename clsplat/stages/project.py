@@ -17,7 +17,7 @@ from clsplat.device.profile import stage
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
 from clsplat.optimisation.dropout import Thinning
-from clsplat.optimisation.step_noise import Exploration
+from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
@@ -174,7 +174,7 @@ def project_grad(
     screen: Screen,
     *,
     sh_rest: bool = True,
-    explore: Exploration | None = None,
+    explore: Exploration = NO_EXPLORATION,
     by_lens: DeviceArray | None = None,
 ) -> None:
     """Fill the visible Gaussians' rows of `gradients` and `screen` from the pairs' slots.
@@ -183,7 +183,7 @@ def project_grad(
     explore: its penalties are added.
     by_lens: (n, 4), receives each Gaussian's gradient by the lens of a flat camera.
     """
-    weights, build = penalty_weights(explore), _build(device)
+    weights, build = explore.weights, _build(device)
     defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
     defines |= {"PENALTIES": True} if weights else {}
     defines |= {} if by_lens is None else {"LENS": True}
@@ -201,7 +201,7 @@ def project_grad(
     )
 
 
-def step_numbers(step: AdamStep, explore: Exploration | None) -> tuple[float, ...]:
+def step_numbers(step: AdamStep, explore: Exploration) -> tuple[float, ...]:
     """Arguments of `project_step` that change with the step: penalty weights, two roots of Adam, and each group's
     rate."""
     by_group = {
@@ -209,7 +209,7 @@ def step_numbers(step: AdamStep, explore: Exploration | None) -> tuple[float, ..
         for group in PARAMETER_GROUPS
     }
     roots = by_group["means"][1], by_group["sh_rest"][1]
-    return (*penalty_weights(explore), *roots, *(rate for rate, _ in by_group.values()))
+    return (*explore.weights, *roots, *(rate for rate, _ in by_group.values()))
 
 
 @stage("project_grad", project_step=18)
@@ -223,7 +223,7 @@ def project_step(
     screen: Screen,
     readback: DeviceArray,
     *,
-    explore: Exploration | None = None,
+    explore: Exploration = NO_EXPLORATION,
 ) -> None:
     """`project_grad` and `stages.adam.adam` in one kernel, without gradients in memory.
 
@@ -234,7 +234,7 @@ def project_step(
     if config.sparse:
         defines["SPARSE"] = True
     numbers = [LaunchParameter(number) for number in step_numbers(step, explore)]
-    weights = len(penalty_weights(explore))
+    weights = len(explore.weights)
     if weights:
         defines["PENALTIES"] = True
     arguments = (
@@ -256,11 +256,6 @@ def project_step(
     else:
         kernel = device.kernels("project_grad", {"ROWS": DEFAULT_GROUP_ITEMS, **defines}).project_step
         launch_items(device, kernel, parameters.count, *arguments)
-
-
-def penalty_weights(explore: Exploration | None) -> tuple[float, ...]:
-    """Weights of the penalties on opacity and scale; empty without penalties."""
-    return (explore.opacity, explore.scale) if explore is not None and explore.penalised else ()
 
 
 class _Build(NamedTuple):

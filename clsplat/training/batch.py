@@ -110,8 +110,7 @@ class _AddedView(GradientStep):
         if self.device.only_tries:
             models = (parameters, sums, rows.gradients, rows.gradients)
             adam(self.device, step, *models, counts, self.rasterizer.readback)
-            if self.explore is not None:
-                noise(self.device, self.explore, parameters, 0, self.rasterizer.readback)
+            noise(self.device, self.explore, parameters, 0, self.rasterizer.readback)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,10 +294,9 @@ class Batch:
         optimiser, number = scaled(self.config.optimiser, batch), -(-step.step // batch)
         config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
         sums, shown = self._room_for(device, model[0])
-        explore = step.explore
         own: dict[int, Sequence[DeviceArray | None]] = {}
         settings = (device, self.rasterizer, config, number, rates, step.fields, shown, own)
-        step_of_view = _AddedView(*settings, explore=explore and explore.of_view())
+        step_of_view = _AddedView(*settings, explore=step.explore.of_view())
         adam_step = step_of_view.adam_step
         first, *others = shares(len(views), 1 + len(self.replicas))
         transfers = self._send(model[0])
@@ -323,8 +321,7 @@ class Batch:
             counts = self.rasterizer.readback if shown is None else shown.rows(start, stop)
             models = (parameters, gradients, moments, squares)
             adam(device, adam_step, *models, counts, self.rasterizer.readback)
-            if explore is not None:
-                noise(device, explore.scaled(sqrt(batch)), parameters, start, self.rasterizer.readback)
+            noise(device, step.explore.scaled(sqrt(batch)), parameters, start, self.rasterizer.readback)
         for inputs in views:
             for part, gradient in zip(inputs.parts, own[inputs.place], strict=True):
                 part.update(gradient, self.rasterizer.readback)

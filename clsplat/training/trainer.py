@@ -18,6 +18,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.optimisation.density_rules import FRESH
+from clsplat.optimisation.step_noise import exploration_of
 from clsplat.rendering.memory_needs import MODELS, StepMemory, plan_step
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import PairCapacity, Rasterizer
@@ -261,7 +262,7 @@ class Trainer:
             self.step,
             rates,
             slot_fields(self.strategy.needs(self.step), nearness=bool(self.config.depth_use)),
-            explore=self.strategy.exploration(self.step, rates["means"], self.parameters.count, self.scene.extent),
+            explore=exploration_of(self.config, self.step, rates["means"], self.parameters.count, self.scene.extent),
         )
 
     def _run(

@@ -18,6 +18,15 @@
 #define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
 #endif
 
+// Weights of the penalties as parameters and as arguments, after a comma each. `Exploration.weights` has their order.
+#ifdef PENALTIES
+#define PENALTY_PARAMETERS , const float opacity_weight, const float scale_weight
+#define PENALTY_WEIGHTS , opacity_weight, scale_weight
+#else
+#define PENALTY_PARAMETERS
+#define PENALTY_WEIGHTS
+#endif
+
 // Gradients of LANES Gaussians by their parameters. The gradient by an SH coefficient is its basis value times the one
 // by colour. `colour` is red, green and blue, each zero where clamped.
 typedef struct {
@@ -39,13 +48,10 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #ifdef LENS
                                __global float *by_lens,
 #endif
-#ifdef PENALTIES
-                               const float opacity_weight, const float scale_weight,
-#endif
 #ifdef SH_GRADIENT
                                SH_GRADIENT *d_sh_rest,
 #endif
-                               int *shown, Gradients *d) {
+                               int *shown, Gradients *d PENALTY_PARAMETERS) {
   uint row[LANES];
   for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < n ? first_row + lane : n - 1;
   const uint lanes_used = n - first_row < LANES ? n - first_row : LANES;

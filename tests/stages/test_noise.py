@@ -115,6 +115,16 @@ def test_what_stays(device: Device) -> None:
     assert_same_bits(held["means"].get(), gaussians.means, "means")
 
 
+def test_a_step_without_noise_launches_nothing(default_device: Device) -> None:
+    device, gaussians, stages = default_device.with_shape(), faint(10), []
+    for explore in (Exploration(opacity=0.3, scale=0.7), LOUD):
+        held, readback = upload_gaussians(device, gaussians), counts(device)
+        with device.recorder.recording(wait=True) as recorded:
+            noise(device, explore, held, 0, readback)
+        stages.append({name: record.launches for name, record in recorded.items()})
+    assert stages == [{}, {"noise": 1}]
+
+
 def test_the_twins_penalty_by_finite_differences() -> None:
     explore, rng = Exploration(opacity=0.3, scale=0.7), np.random.default_rng(1)
     scales, logits, step = rng.normal(-2, 1, (9, 3)), rng.normal(0, 3, 9), 1e-6

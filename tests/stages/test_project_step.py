@@ -19,7 +19,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, group_shapes
 from clsplat.layouts.columns import PLAIN_SLOTS, READBACK, REFUSED, WIDEST_SLOTS, SlotFields
-from clsplat.optimisation.step_noise import Exploration
+from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
@@ -38,7 +38,7 @@ class Case:
     fields: SlotFields = PLAIN_SLOTS
     added_up: bool = False
     step: int = 5
-    explore: Exploration | None = None
+    explore: Exploration = NO_EXPLORATION
 
     @property
     def adam_step(self) -> AdamStep:

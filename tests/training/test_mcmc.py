@@ -21,6 +21,7 @@ from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import ClsplatError
 from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.optimisation.step_noise import exploration_of
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
@@ -207,13 +208,12 @@ def test_nothing_alive_stops_it(scene: Scene, default_device: Device) -> None:
 
 def test_no_noise_in_the_cooldown_and_none_in_other_units() -> None:
     config = replace(CONFIG, optimiser=OptimiserConfig(cooldown=8))
-    strategy = Mcmc(config)
-    amounts = {step: strategy.exploration(step, 2e-3, 100, 5.0).amount for step in (1, 40, 41, 48)}
+    amounts = {step: exploration_of(config, step, 2e-3, 100, 5.0).amount for step in (1, 40, 41, 48)}
     assert amounts == {1: 5e5 * 2e-3 / 25, 40: 5e5 * 2e-3 / 25, 41: 0.0, 48: 0.0}
-    assert strategy.exploration(1, 2e-3, 100, 5.0).key != strategy.exploration(2, 2e-3, 100, 5.0).key
-    larger = strategy.exploration(1, 20e-3, 100, 50.0)
+    assert exploration_of(config, 1, 2e-3, 100, 5.0).key != exploration_of(config, 2, 2e-3, 100, 5.0).key
+    larger = exploration_of(config, 1, 20e-3, 100, 50.0)
     assert larger.amount * 10**2 == pytest.approx(10 * amounts[1]), "ten times as far where all is ten times as large"
-    assert larger.scale * 10 == pytest.approx(strategy.exploration(1, 2e-3, 100, 5.0).scale)
+    assert larger.scale * 10 == pytest.approx(exploration_of(config, 1, 2e-3, 100, 5.0).scale)
 
 
 # Training

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compare import assert_same_bits
 from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
 from tiny import short, write_scene
 
@@ -15,10 +16,12 @@ from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
-from clsplat.optimisation.step_noise import Exploration
+from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration, exploration_of
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
+from clsplat.training.density import StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
+from clsplat.training.trainer import Trainer
 
 CONFIG = replace(short(iterations=40), penalty=0.5)
 """With a penalty so large that a short training shows it."""
@@ -32,9 +35,10 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 def test_weights_are_shares_of_the_means() -> None:
     """The same in any unit of length, and whatever the number of Gaussians; none without the setting."""
     wanted = Exploration(opacity=0.5 / 100, scale=0.5 / (3 * 100 * 4.0))
-    assert strategy_of(CONFIG).exploration(7, 1e-3, 100, 4.0) == wanted
-    assert not wanted.amount and wanted.penalised, "no noise"
-    assert strategy_of(replace(CONFIG, penalty=0.0)).exploration(7, 1e-3, 100, 4.0) is None
+    assert exploration_of(CONFIG, 7, 1e-3, 100, 4.0) == wanted
+    assert not wanted.amount and wanted.weights, "no noise"
+    assert exploration_of(replace(CONFIG, penalty=0.0), 7, 1e-3, 100, 4.0) == NO_EXPLORATION
+    assert NO_EXPLORATION.weights == ()
 
 
 def test_the_model_is_fainter_and_its_gaussians_smaller(scene: Scene, default_device: Device, tmp_path: Path) -> None:
@@ -49,6 +53,37 @@ def test_the_model_is_fainter_and_its_gaussians_smaller(scene: Scene, default_de
     assert same == count
     assert fainter < 0.98 * opacity
     assert smaller < 0.98 * scale
+
+
+class Still(Strategy):
+    """A user's own strategy, which leaves the model's rows alone."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        del config
+
+    def needs(self, step: int = 0) -> StatisticsNeeds:
+        del step
+        return StatisticsNeeds()
+
+    def is_due(self, step: int) -> bool:
+        del step
+        return False
+
+
+def test_a_strategy_of_your_own_keeps_the_penalty(scene: Scene, default_device: Device) -> None:
+    """The bits of the paper's strategy without densification, which has the penalty too."""
+    still = replace(CONFIG, density=DensityConfig(every=0))
+    models = []
+    for penalty, strategy in ((0.5, strategy_of), (0.5, Still), (0.0, Still)):
+        trainer = Trainer(scene, replace(still, penalty=penalty), default_device, strategy=strategy)
+        for _ in range(12):
+            trainer.train_step()
+        models.append(trainer.gaussians().arrays())
+    wanted, own, without = models
+    for name, values in wanted.items():
+        assert_same_bits(own[name], values, name)
+    for name in ("opacity_logits", "log_scales"):
+        assert (own[name] < without[name]).mean() > 0.5, name
 
 
 def test_stopping_and_going_on_gives_the_same_bytes(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.optimisation.density_rules import MarkRules
-from clsplat.optimisation.step_noise import Exploration
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +79,6 @@ class ModelState:
     marker: Marker
 
 
-def penalties(opacity: float, scale: float, count: int, extent: float) -> Exploration:
-    """Weights of the sums over the Gaussians in view, from weights of the means over all `count`.
-
-    Scales are relative to the scene's extent (docs/gradients.md, (91)).
-    """
-    return Exploration(opacity=opacity / count, scale=scale / (3 * count * extent))
-
-
 SPLIT_GROUPS = ("means", "quaternions", "log_scales")
 """Parameter groups that halves are computed from, by default."""
 
@@ -140,13 +131,6 @@ class Strategy:
 
     def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
         """Plan at the end of step number `model.step`, after Adam's step."""
-        return None
-
-    def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration | None:  # noqa: ARG002
-        """Penalties and noise of step number `step`, of `count` Gaussians.
-
-        means_rate, extent: world units.
-        """
         return None
 
     def at_end(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002

@@ -14,8 +14,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
 from clsplat.optimisation.density_rules import MarkRules, edge
-from clsplat.optimisation.step_noise import Exploration
-from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
+from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, StatisticsNeeds, Strategy
 
 HALF_OFFSET_DEVIATIONS, LONG_AXIS_HALF_RATIO, SHORT_AXIS_HALF_RATIO, HALF_OPACITY_RATIO = 1.35, 0.55, 0.893, 0.6
 """Halves along the longest axis (Improved-GS, Deng et al. 2025).
@@ -29,7 +28,7 @@ class Adaptive(Strategy):
     """The strategy of Kerbl et al., with the extensions of `DensityConfig`."""
 
     def __init__(self, config: TrainConfig) -> None:
-        self.config, self.white, self.penalty = config.density, config.background == "white", config.penalty
+        self.config, self.white = config.density, config.background == "white"
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
         """Gradients while Gaussians are densified; the others while this or a later pruning uses them."""
@@ -41,10 +40,6 @@ class Adaptive(Strategy):
             absolute=config.absolute_gradients,
             contributions=prunes,
         )
-
-    def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration | None:  # noqa: ARG002
-        """Penalties only, at any step."""
-        return penalties(self.penalty, self.penalty, count, extent) if self.penalty > 0 else None
 
     def is_due(self, step: int) -> bool:
         """True if Gaussians are densified or pruned, or opacities are reset."""

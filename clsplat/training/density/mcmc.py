@@ -8,7 +8,6 @@ device.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from math import inf
@@ -20,8 +19,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
 from clsplat.optimisation.density_rules import MarkRules
-from clsplat.optimisation.step_noise import Exploration, step_key
-from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, StatisticsNeeds, Strategy, penalties
+from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 
 MAX_GAUSSIANS_PER_PLACE = 51
@@ -35,11 +33,13 @@ SCORE_ALL_RULES = MarkRules(gradient=-inf, large=-inf)
 
 
 class Mcmc(Strategy):
-    """Relocation and growth every `every` steps, noise and penalties each step, and removal of invisible Gaussians at
-    the end."""
+    """Relocation and growth every `every` steps, and removal of invisible Gaussians at the end.
+
+    `exploration_of` gives the noise and the penalties of each step.
+    """
 
     def __init__(self, config: TrainConfig) -> None:
-        self.train, self.config = config, config.density
+        self.config = config.density
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
         """Gradients while the model grows or Gaussians move."""
@@ -115,17 +115,6 @@ class Mcmc(Strategy):
         means, turned = groups["means"][parents], groups["quaternions"][parents]
         groups["means"][left] = means + spread * draw_offsets(turned, log_scales[left], rng)
         return changed
-
-    def exploration(self, step: int, means_rate: float, count: int, extent: float) -> Exploration:
-        """Penalties at any step, noise until the cooldown; in units in which the scene's extent is 1."""
-        config, train = self.config, self.train
-        cools = step > train.iterations - train.optimiser.cooldown
-        return replace(
-            penalties(config.opacity_weight, config.scale_weight, count, extent),
-            amount=0.0 if cools else config.noise_rate * means_rate / extent**2,
-            dead=config.min_opacity,
-            key=step_key(train.seed, step),
-        )
 
     def at_end(self, model: ModelState) -> RowPlan | None:
         """Drop Gaussians that are invisible in every picture."""

@@ -14,7 +14,7 @@ from clsplat.device.context import Device
 from clsplat.gaussians import group_shapes
 from clsplat.layouts.columns import SlotFields
 from clsplat.optimisation.dropout import thinning_of
-from clsplat.optimisation.step_noise import Exploration
+from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration
 from clsplat.rendering.rasterizer import ForwardPass, PairCapacity, Rasterizer
 from clsplat.stages.adam import AdamStep, adam
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostGaussians, parts
@@ -67,7 +67,7 @@ class GradientStep:
     _: KW_ONLY
     turn: int = 0
     room: PairCapacity | None = None
-    explore: Exploration | None = None
+    explore: Exploration = NO_EXPLORATION
 
     @property
     def adam_step(self) -> AdamStep:
@@ -219,15 +219,13 @@ class GradientStep:
             explore = self.explore
             arrays = (*vars(rows.slots).values(), *vars(rows.screen).values())
             key = (*map(ref, rows.model), rows.projected, *arrays, step.updates_sh_rest)
-            penalised = explore is not None and explore.penalised
             self.replayed(
                 rows.parameters,
-                (*key, rows.device, rows.camera_array, penalised),
+                (*key, rows.device, rows.camera_array, bool(explore.weights)),
                 lambda: project_step(rows.device, step, rows.model, *view, explore=explore),
                 step_numbers(step, explore),
             )
-        if self.explore is not None:
-            noise(self.device, self.explore, rows.parameters, rows.start, readback)
+        noise(self.device, self.explore, rows.parameters, rows.start, readback)
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
