@@ -103,20 +103,45 @@ class Window:
 class Camera:
     """A camera and its pose. It is a pinhole unless `projection` says otherwise.
 
-    Attributes ---------- width, height : int Image size, pixels. fx, fy : float Pixels per unit of the projected
-    coordinates, see Notes. cx, cy : float Principal point, pixels from the image's top left corner; the first pixel's
-    centre is at (0.5, 0.5). rotation : (3, 3) float64 x_cam = rotation @ x_world + translation (COLMAP's
-    `cam_from_world`). translation : (3,) float64 World units. near, far : float World units. Gaussians are drawn if the
-    depths of their means are between them. Depth is z; for fisheye and equirectangular it is the distance. The default
-    near, DEFAULT_NEAR_PLANE, stands for the model's (`Gaussians.near`). projection : str "perspective", "orthographic",
-    "equirectangular" or "fisheye" (equidistant). window : Window, optional Set if the picture is a part of a frame, or
-    extends beyond it. width and height are then the picture's, and cx and cy are measured from the frame's corner.
-    radial : (k1, k2, k3, k4) Coefficients of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP). All
-    0: equidistant. by_rays : bool True for a perspective camera that draws Gaussians along the rays of its pixels, like
-    fisheye and panorama. For a model that was trained so (`Gaussians.by_rays`).
+    Attributes
+    ----------
+    width : int
+        Width of the picture, pixels.
+    height : int
+        Height of the picture, pixels.
+    fx : float
+        Horizontal focal length: pixels per unit of the projected coordinates (see Notes).
+    fy : float
+        Vertical focal length, in the same unit.
+    cx : float
+        Principal point, pixels from the image's left edge; the centre of the first pixel is at 0.5.
+    cy : float
+        Principal point, pixels from the image's upper edge; the centre of the first pixel is at 0.5.
+    rotation : (3, 3) float64
+        x_cam = rotation @ x_world + translation, COLMAP's `cam_from_world`; no unit.
+    translation : (3,) float64
+        Translation of `cam_from_world`, world units.
+    near : float
+        Least depth of a drawn Gaussian's mean, world units. With the default, DEFAULT_NEAR_PLANE, the model's near
+        plane applies (`Gaussians.near`).
+    far : float
+        Largest depth of a drawn Gaussian's mean, world units.
+    projection : str
+        "perspective", "orthographic", "equirectangular" or "fisheye" (equidistant).
+    window : Window, optional
+        Place of the picture in its frame, pixels, if the picture is a part of a frame or extends beyond it. Then width
+        and height are the picture's, and cx and cy are measured from the frame's corner.
+    radial : (4,) float
+        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP), no unit. All 0:
+        equidistant.
+    by_rays : bool
+        True for a perspective camera that draws Gaussians along the rays of its pixels, like fisheye and panorama. Use
+        it for a model that was trained so (`Gaussians.by_rays`).
 
     Notes
     -----
+    Depth is z; for fisheye and equirectangular cameras it is the distance.
+
     The projected coordinates are, by projection (docs/cameras.md has the equations):
 
     - perspective: x/z and y/z.
