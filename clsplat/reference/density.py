@@ -39,7 +39,7 @@ def rows(
     The order is: remaining rows, clones, first halves, second halves.
     """
     found, largest = scores(rules, statistics), log_scales.max(axis=1)
-    value, row = rules.strongest
+    value, row = rules.cut_off
     wanted = (found > np.float32(value)) | ((found == np.float32(value)) & (np.arange(len(found)) <= row))
     wanted &= found >= 0
     large = largest > np.float32(rules.large)

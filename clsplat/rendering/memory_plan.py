@@ -69,7 +69,7 @@ class Plan:
     pairs: largest number of (tile, Gaussian) pairs at once.
     gathers: True if rows are moved on the device.
     allowed: memory limit, bytes.
-    groups: estimated number of groups of tiles.
+    bands: estimated number of bands of tiles, which are listed and blended one after the other.
     photographs: bytes of photographs that stay on the device.
     """
 
@@ -79,13 +79,13 @@ class Plan:
     pairs: int
     gathers: bool
     allowed: int
-    groups: int
+    bands: int
     photographs: int = 0
 
     @property
     def pieces(self) -> tuple[bool, bool]:
         """True for each part that is divided: parameters, image."""
-        return self.streamed, self.groups > 1
+        return self.streamed, self.bands > 1
 
     @property
     def tight(self) -> bool:
@@ -97,8 +97,8 @@ class Plan:
         how = []
         if self.streamed:
             how.append(f"parameters are streamed, {self.rows:,} Gaussians at a time")
-        if self.groups > 1:
-            how.append(f"the image is done in about {self.groups} groups of tiles")
+        if self.bands > 1:
+            how.append(f"the image is done in about {self.bands} bands of tiles")
         needed, allowed = mebibytes(self.need.total), mebibytes(self.allowed)
         return f"about {needed} of device memory needed, {allowed} allowed: " + (", ".join(how) or "all at once")
 
@@ -118,8 +118,8 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     def made(rows: int, *, streamed: bool) -> Plan:
         pairs = min((room - rows * need.model) // need.pair, need.most_pairs)
         gathers = not streamed and need.total + need.moving + photographs <= budget
-        groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
-        return Plan(need, rows, streamed, pairs, gathers, budget, groups, photographs)
+        bands = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
+        return Plan(need, rows, streamed, pairs, gathers, budget, bands, photographs)
 
     whole = made(need.gaussians, streamed=False)
     enough = min(need.pairs // 8, need.gaussians) + 1

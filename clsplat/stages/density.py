@@ -204,7 +204,7 @@ def _listed(device: Device, marker: DeviceMarker, rules: MarkRules) -> DeviceRow
     edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
     for start, stop, (part,) in parts(marker.work, columns):
         some, arrays = stop - start, (scratch.scores, marker.statistics.radii, *part.arrays.values(), scratch.marks)
-        launch_items(device, kernels.density_marks, some, n, start, some, *rules.strongest, *edges, *arrays)
+        launch_items(device, kernels.density_marks, some, n, start, some, *rules.cut_off, *edges, *arrays)
     scan(device, marker.work, scratch.marks, scratch.places, counts)
     launch_items(device, kernels.density_rows, n, n, scratch.marks, scratch.places, scratch.rows, counts)
     total, splits = (int(number) for number in counts.get())

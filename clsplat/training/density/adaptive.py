@@ -108,7 +108,7 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
         )
         if config.max_screen_radius > 0:
             rules = replace(rules, radius=edge(lambda radius: radius > config.max_screen_radius))
-    listed = model.marker.rows(replace(rules, strongest=_strongest(config, model, rules)))
+    listed = model.marker.rows(replace(rules, cut_off=_cut_off(config, model, rules)))
     if config.long_axis:
         return RowPlan(listed=listed, halves=long_halves, halved=(*SPLIT_GROUPS, "opacity_logits"), new_statistics=True)
     return RowPlan(listed=listed, halves=partial(draw_halves, config, rng=model.rng), new_statistics=True)
@@ -134,10 +134,10 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
     return rules
 
 
-def _strongest(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
-    """Score and row of the weakest Gaussian that still fits when cloned or split, for `MarkRules`.
+def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
+    """Score and row of the weakest Gaussian that may still be cloned or split, for `MarkRules.cut_off`.
 
-    The marker computes scores only if room may be short.
+    Scores are computed only if the cap may leave too little room for all Gaussians that pass the other rules.
     """
     room = config.max_gaussians - model.count
     if config.growth == "budget":

@@ -102,7 +102,7 @@ class GradientStep:
         own = [part.gradient(work, frame.blended.image, result.gradient, *size) for part in inputs.parts]
         slots = self.replayed(
             model[0],
-            (frame.part, frame.background, result.gradient, self.fields),
+            (frame.listed, frame.background, result.gradient, self.fields),
             lambda: rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
         )
         probe.pair_gradients(slots)
@@ -138,7 +138,7 @@ class GradientStep:
         keys = tuple(term.key for term in terms)
         if None in keys:
             return compared()
-        return self.replayed(of, (frame.part, image.buffer, inputs.kept, keys, self.turn), compared)
+        return self.replayed(of, (frame.listed, image.buffer, inputs.kept, keys, self.turn), compared)
 
     def _rows(
         self,

@@ -82,8 +82,8 @@ class SpeculativeSteps:
     def seen(self, frame: ForwardPass) -> None:
         """Note a step's frame, as soon as it is launched."""
         self._frame = frame
-        if frame.part.counted.arriving is None:
-            self._count(frame.part.counted.pairs if len(frame.bands) == 1 else None)
+        if frame.listed.counted.arriving is None:
+            self._count(frame.listed.counted.pairs if len(frame.bands) == 1 else None)
 
     def _count(self, pairs: int | None) -> None:
         self._most = None if pairs is None else max(pairs, self._most or 0)
@@ -118,7 +118,7 @@ class SpeculativeSteps:
         if not room:
             return result
         assert self._frame is not None, "each step has a frame"
-        counted, under_way = self._frame.part.counted, self._device.under_way
+        counted, under_way = self._frame.listed.counted, self._device.under_way
         assert counted.arriving is not None, "it was launched by capacity"
         assert counted.on_device is not None, "it was launched by capacity"
         step = _Step(run, turn, result, counted.on_device, counted.arriving, before, list(under_way))
