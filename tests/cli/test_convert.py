@@ -493,7 +493,7 @@ def test_models_that_do_not_go_together(model: Path, tmp_path: Path, capsys: Cap
     placed.save(near)
     assert convert(model, tmp_path / "a.ply", "--merge", light) == 0
     assert (
-        f"warning: --merge {light}: its colours are {colour.LINEAR}, but those of {model} are sRGB"
+        f"warning: --merge {light}: its colours are {colour.LINEAR}, and are taken for sRGB, the colours of {model}"
         in capsys.readouterr().err
     )
     assert convert(model, tmp_path / "b.ply", "--merge", far) == 0
