@@ -122,7 +122,7 @@ def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> Non
     end_with_parent()
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(shape)
-    device.rehearsal.say = lambda kernel: tell(begins=kernel)
+    device.trials.say = lambda kernel: tell(begins=kernel)
     try:
         if not quick:
             start = time.perf_counter()
@@ -135,7 +135,7 @@ def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> Non
     except DriverError as error:
         tell(failed=str(error))
     else:
-        tell(done=device.rehearsal.done)
+        tell(done=device.trials.done)
 
 
 if __name__ == "__main__":

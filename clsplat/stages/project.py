@@ -12,7 +12,7 @@ import numpy as np
 from clsplat.camera import Camera
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace
-from clsplat.device.command_buffer import AnewWord, LaunchParameter
+from clsplat.device.command_buffer import LaunchParameter, LaunchParameterWord
 from clsplat.device.context import Device
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS, launch_groups, launch_items
 from clsplat.device.profile import stage
@@ -62,7 +62,7 @@ def thinning_numbers(thinning: Thinning | None) -> tuple[float, ...]:
     """Arguments of `project` that change with the step."""
     if thinning is None:
         return ()
-    return (*map(AnewWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
+    return (*map(LaunchParameterWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
 
 
 @stage("project")

@@ -272,7 +272,7 @@ def test_what_a_driver_compiles_anew_is_tried_anew(default_device: Device, monke
     variant = Variant("fill", TEXT, ("-cl-std=CL1.2",))
     kernel = Kernels(variant, build(device.context, device.cl_device, variant)[0]).fill
     tried: list[str] = []
-    monkeypatch.setattr(device.rehearsal, "launch", lambda *given: tried.append(given[-1]))
+    monkeypatch.setattr(device.trials, "launch", lambda *given: tried.append(given[-1]))
     monkeypatch.setattr(device, "compiles_by_size", True)
     out = allocate(device, (1 << 17,), np.uint32)
     for groups, items in ((1, 64), (2, 64), (2, 32), (1 << 10, 64), (1 << 11, 32), (3, 16)):

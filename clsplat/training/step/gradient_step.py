@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gradient of one view and Adam's step along it: the work of a training step, which `repro_bundle` repeats."""
+"""The gradient of one view and Adam's step along it: the work of a training step, which `repro_bundle` can replay."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ R = TypeVar("R")
 
 
 class StepProbe:
-    """Observer of a step. Each method is called after its stage is launched. By default none does anything."""
+    """Observer of a step. Each method is called after its stage is launched. By default no method does anything."""
 
     def forward(self, frame: ForwardPass) -> None:
         """The view is rendered."""
@@ -80,9 +80,9 @@ class GradientStep:
     ) -> Loss:
         """Update the model (parameters, first and second moments) by a view.
 
-        gradients: room for the gradients of the rows on the device at once, for a probe or a share that reads them.
-        They are zero before and after. The model has the same bits without them.
-        reads_loss: the loss will be read.
+        gradients: arrays for the gradients of the rows on the device at once, if a probe or a part reads them. They are
+        zero before and after. The model has the same bits without them.
+        reads_loss: True if the loss will be read.
         """
         rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
         frame = rasterizer.forward(
@@ -150,7 +150,7 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
     ) -> StepRows:
-        """Rows of a part of the model, with room for their gradients."""
+        """Rows [start, stop) of the model, with arrays for their gradients."""
         by_lens = (part.lens_gradients(stop - start) for part in inputs.parts)
         return StepRows(
             start,
@@ -192,14 +192,14 @@ class GradientStep:
     ) -> R:
         """`Workspace.replayed` if the step is by capacity.
 
-        A step with exact counts has new arrays each time, so its tape would never be reused.
+        A step with exact counts has new arrays each time, so its command buffer would never be reused.
         """
         if self.room is None:
             return make()
         return self.rasterizer.work.replayed(of, key, make, numbers)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Take Adam's step of the view's shares, along their own gradients."""
+        """Take Adam's step of the view's parts, along their own gradients."""
         for part, gradient in zip(inputs.parts, own, strict=True):
             part.update(gradient, self.rasterizer.readback)
 
@@ -228,7 +228,7 @@ class GradientStep:
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
-    """Room for a view's gradients of the rows that are on the device at once.
+    """Arrays for a view's gradients of the rows that are on the device at once.
 
     zero: fill it with zeros, as `GradientStep.run` requires.
     """
@@ -243,6 +243,6 @@ def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = Fa
 def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:
     """Slot fields that these statistics need.
 
-    nearness: depths are compared.
+    nearness: True if depths are compared.
     """
     return SlotFields(needs.absolute, needs.contributions, nearness)

@@ -54,7 +54,8 @@ class ImageCache:
     def load(self, index: int, factor: float) -> NDArray[Any]:
         """View `index` at 1/factor of its size; do not write to it.
 
-        (H, W, 3 or 4), straight alpha, or 5 channels with its mask, 0 where a pixel does not count.
+        The shape is (H, W, 3), or 4 channels with straight alpha, or 5 with a mask that is 0 for pixels that do not
+        count.
         """
         if factor != self._factor:
             self._factor = factor
