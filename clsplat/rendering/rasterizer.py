@@ -53,15 +53,15 @@ class ListedBand:
 
 
 MAX_COUNTED_PASSES = 3
-"""Passes by capacity whose counts are kept: the current one, the one before, and one that is repeated."""
+"""Number of passes by capacity whose counts are kept: the current one, the one before, and one that is repeated."""
 
 
 @dataclass(frozen=True)
 class PairCapacity:
-    """Arrays of a pass by capacity.
+    """Capacity of a pass that is launched before its number of pairs is known.
 
-    pairs: number of pairs that fit.
-    turn: index below MAX_COUNTED_PASSES of the pass's counts.
+    pairs: number of pairs that fit in its arrays.
+    turn: place of its counts, below MAX_COUNTED_PASSES.
     """
 
     pairs: int
@@ -88,7 +88,7 @@ class ForwardPass:
 
     @property
     def inputs(self) -> ImageInputs:
-        """Input of the stages that make more of the image."""
+        """Input of the stages that compute more from this pass, such as channels and the gradient."""
         camera = self.camera
         return ImageInputs(self.projected.splats, self.background, camera.width, camera.height, self.camera_array)
 
@@ -127,7 +127,8 @@ class Rasterizer:
         }
 
     def follow(self, plan: Plan) -> None:
-        """Use as much memory as the plan allows. If that is tight, free the arrays of an earlier plan."""
+        """Use at most as much memory as the plan allows. If memory is tight, the arrays of an earlier plan are
+        freed."""
         self.work.tight = self.device.memory.limit is not None or plan.tight
         if self.work.tight:
             self.work.clear()
@@ -166,8 +167,8 @@ class Rasterizer:
 
         background: (3,) float32, on the host or the device.
         backward: True if a gradient will follow. If False, the work that only a gradient needs is left out.
-        room: run by capacity, without waiting for the number of pairs. If there are more pairs than `room` holds, the
-        pass has no effect (docs/decisions/0025-launch-by-capacity.md).
+        room: capacity with which to run without waiting for the number of pairs. If there are more pairs, the pass has
+        no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
         """
@@ -185,7 +186,7 @@ class Rasterizer:
             inputs = ImageInputs(projected.splats, background, camera.width, camera.height, camera_array)
             listed = None
             for band in bands:
-                del listed  # its arrays may have to be freed for larger ones
+                del listed  # this band may need the memory for larger arrays
                 listed = self._list(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
                 blended = blend(device, work, listed.lists, inputs, record=record, nearness=nearness)
             assert listed is not None, "an image has a tile"

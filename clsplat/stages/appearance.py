@@ -24,13 +24,13 @@ APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 class Gains:
     """Gains of all photographs, (photographs, entries) float32 each.
 
-    logs: logs to base 2; mixes after the first three entries, if there are more.
-    start: their initial values.
+    logs: logarithms of the gains to base 2 in the first three entries; further entries are mixes.
+    start: initial values of `logs`.
     first, second: Adam's moments.
     gains: 2^logs.
     moved: scratch.
-    begins (photographs + 1,), others, weights (n,): rows of a matrix, stored like a `csr_array`. The matrix times the
-    distances of the gains from their start is added to the gradient.
+    begins (photographs + 1,), others, weights (n,): a matrix, stored like a `csr_array`. The matrix times `logs -
+    start` is added to the gradient, which pulls the gains to their start.
     """
 
     logs: DeviceArray
@@ -56,7 +56,7 @@ class Gains:
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
     """The begins, others and weights of a matrix; None gives a zero matrix."""
     matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
-    spare = np.zeros(1)  # an array has at least one element
+    spare = np.zeros(1)  # device arrays need at least one element
     parts = {
         "begins": matrix.indptr.astype(np.int32),
         "others": np.append(matrix.indices, spare).astype(np.int32),
@@ -67,7 +67,7 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
 
 @stage("appearance", remove_gains=1)
 def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
-    """Divide the photograph's gains out of planes (3 or more, rows, stride), the first three of them colours."""
+    """Divide the first three planes, the colours, of (3 or more, rows, stride) by the photograph's gains."""
     _, rows, stride = target.shape
     kernel = device.kernels("appearance", LANES=1).remove_gains
     launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
@@ -113,11 +113,12 @@ def step_gains(
     slow: float = 1.0,
     centred: bool = True,
 ) -> None:
-    """Adam's step number `step` (from 1); then subtract the mean of each entry if `centred`.
+    """Adam's step number `step` (from 1). If `centred`, the mean over the photographs is then subtracted from each
+    entry.
 
     at: first row of the entries in `columns`.
-    slow: fraction of the rate for mixes.
-    A step by capacity that has stopped changes nothing.
+    slow: fraction of the rate that mixes use.
+    If the step's pass by capacity has stopped, nothing changes.
     """
     kernels, (photographs, entries) = device.kernels("appearance", LANES=1), gains.logs.shape
     count = photographs * entries

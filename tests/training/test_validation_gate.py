@@ -162,7 +162,7 @@ def test_the_warning_has_the_figures_and_a_way_on() -> None:
     assert gate.record()["best"] == 100
     assert gate.record()["ended"] == 300
     lenses = replace(CONFIG, refine_poses=False, refine_lenses=True)
-    assert judged([25, 24, 23], lenses)[1][0].endswith("try a smaller --lens-reach, or none of --refine-lenses")
+    assert judged([25, 24, 23], lenses)[1][0].endswith("try a smaller --lens-reach, or train without --refine-lenses")
     late = judged([*[25] * 8, 24, 24])[1]
     assert "no step is left to go back" in late[0]
 

@@ -36,8 +36,8 @@ class RefinedLenses:
         for view in views:
             if not view.lens.is_pinhole or not view.camera.model.flat:
                 raise InputError(
-                    f"--refine-lenses: {view.name} was taken through {view.lens.model}, which bends pictures; "
-                    "expected photographs without distortion, as `clsplat sfm` and COLMAP's image_undistorter write them"
+                    f"--refine-lenses: {view.name} was taken through {view.lens.model}, which bends pictures; expected "
+                    "photographs without distortion, as `clsplat sfm` and COLMAP's image_undistorter write them"
                 )
         self._rows = {lens: row for row, lens in enumerate(dict.fromkeys(view.lens for view in views))}
         self._of_view = [self._rows[view.lens] for view in views]
