@@ -25,7 +25,7 @@ from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records, shapes, worker_process
 from clsplat.device.program import Kernels, Variant, build
 from clsplat.errors import DeviceError, DriverError
-from clsplat.files.locks import locked
+from clsplat.files.locks import briefly_locked
 from clsplat.selftest import driver_check
 from clsplat.selftest.driver_check import DriverReport
 from clsplat.selftest.result import SELFTEST_STAGES
@@ -63,11 +63,11 @@ def test_a_lock_is_waited_for_and_not_for_ever(tmp_path: Path) -> None:
     order = []
 
     def later() -> None:
-        with locked(path):
+        with briefly_locked(path):
             order.append("second")
 
     other = threading.Thread(target=later)
-    with locked(path):
+    with briefly_locked(path):
         other.start()
         time.sleep(0.1)
         order.append("first")
@@ -76,11 +76,11 @@ def test_a_lock_is_waited_for_and_not_for_ever(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     (tmp_path / "words.json.lock").write_bytes(b"of one that was killed")
     os.utime(tmp_path / "words.json.lock", (0, 0))
-    with locked(path):
+    with briefly_locked(path):
         assert (tmp_path / "words.json.lock").read_bytes() != b"of one that was killed"
-    with locked(path):  # held for longer than anybody waits
+    with briefly_locked(path):  # held for longer than anybody waits
         begun = time.monotonic()
-        with locked(path, seconds=0.2):
+        with briefly_locked(path, seconds=0.2):
             assert time.monotonic() - begun < 10
 
 

@@ -24,7 +24,7 @@ from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import reason_of
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import parse_json
-from clsplat.files.locks import locked
+from clsplat.files.locks import briefly_locked
 from clsplat.version import package_version
 
 BREAK_KERNEL_VARIABLE = "CLSPLAT_BREAK_KERNEL"
@@ -157,7 +157,7 @@ def remember(
         _unwritten.setdefault(path, []).append((driver_key(device), shape, addition))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with locked(path):
+            with briefly_locked(path):
                 saved = _read()
                 for oldest in list(saved)[:-MAX_DRIVER_RECORDS]:
                     del saved[oldest]
