@@ -23,7 +23,7 @@ static inline float ndc_norm(__global const float *screen, const size_t i, const
 // sigma. Here and below, a view with a value that is not finite does not count.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
 #ifdef RAYS
-                                 const float pixels, // per radian
+                                 const float pixels, // pixels per radian
 #endif
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums, __global float *seen,
@@ -46,8 +46,8 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   radii[i] = radii[i] > radius ? radii[i] : radius;
 }
 
-// contributions (n): of the Gaussians with tiles, in pixels; area: full-size pixels per pixel -> totals, largest (n),
-// over the views.
+// contributions (n) of the Gaussians with tiles to this view, in pixels; area: full-size pixels per pixel -> totals,
+// largest (n): sum and maximum over the views.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
                                       __global float *largest) {
