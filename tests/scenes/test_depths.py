@@ -204,7 +204,7 @@ def test_a_scene_of_nerfstudio_names_its_maps(tmp_path: Path) -> None:
     scene = with_depths(load_scene(path), MAPS)
     nearness, weights = planes(scene, 1)
     np.testing.assert_allclose(nearness[weights > 0], 1 / depth_of(1)[depth_of(1) > 0], rtol=2e-4)
-    with pytest.raises(InputError, match="wants to know which photographs show a point, expected a COLMAP model"):
+    with pytest.raises(InputError, match="needs to know which photographs show a point, expected a COLMAP model"):
         with_depths(replace(load_scene(path), source=tmp_path), POINTS)
 
 

@@ -18,7 +18,7 @@ from clsplat.images.depth_maps import read_map
 from clsplat.scenes.dataset import Lens, pixels_of
 
 NO_DEPTH_VALUE = 65535
-"""Value that some sensors write for unknown depth in metric maps of integers; 0 is another."""
+"""Value that some sensors write for unknown depth in metric maps of integers. 0 also means unknown."""
 
 
 @dataclass(frozen=True, eq=False)
