@@ -228,6 +228,6 @@ class CameraModel:
         The step is along the plane's axes.
 
         gradients: (N, 2, 2), by the covariance.
-        low_pass: in square pixels.
+        low_pass: variance added to the projected covariance, square pixels.
         """
         raise NotImplementedError(self.projection)

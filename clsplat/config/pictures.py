@@ -283,8 +283,8 @@ class Encoding:
     """Encoding of pictures.
 
     bits: 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
-    quality: of JPEG.
-    prores: of MOV.
+    quality: quality of JPEG files.
+    prores: ProRes profile of MOV files.
     """
 
     depth: ExrDepth = DEFAULT_EXR_DEPTH

@@ -24,10 +24,10 @@ from clsplat.files.names import ON_WINDOWS
 
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 ABANDONED_FILE_SECONDS = 600.0
-"""Seconds without a write after which a temporary file of another machine counts as abandoned."""
+"""Seconds without a write after which a temporary file from another machine counts as abandoned."""
 DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 DISK_PROBE_BYTES = 1 << 16
-"""Bytes that are written to find out whether a disk has room."""
+"""Number of bytes that are written to find out whether a disk has room."""
 WINDOWS_RETRY_SECONDS = 2.0
 """Seconds in which a file on Windows that another program has open is tried again: a virus scanner or an indexer lets
 go of a new file within one."""
@@ -41,7 +41,7 @@ def machine_mark() -> str:
 
 
 def temporary_name(target: Path) -> Path:
-    """A new name beside a file, which says what machine and process writes there."""
+    """A new name for a file beside `target`. The name has marks of this machine and process."""
     token = f"{machine_mark()}{os.getpid():08x}{secrets.token_hex(4)}"
     return target.with_name(f".{target.name}.{token}{TEMPORARY_SUFFIX}")
 

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 from clsplat.errors import InputError, WriteError, reason_of
 
 MAX_DOCUMENT_BYTES = 32 << 20
-"""Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
+"""Largest size of a JSON or TOML file, bytes. As Python objects its content takes up to 24 times as much memory."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 MAX_LFS_POINTER_BYTES = 1024
 """First bytes, and most bytes, of the note that Git LFS leaves in place of a file

@@ -40,7 +40,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.stages.holdout import held_bytes
 
 BLANK_COLOUR_TOLERANCE = 1e-6
-"""Largest difference from the background's colour where nothing is seen, since averages of equal samples are
+"""Largest difference from the background's colour at which a pixel counts as empty, since averages of equal samples are
 rounded."""
 
 
@@ -60,8 +60,8 @@ class FramePipeline:
         """Prepare colours, and check the settings of a job.
 
         recorded: the model's colour space (`colour.recorded_space`).
-        background: in that space, black if alpha is written.
-        mattes: by the names of their channels.
+        background: colour of the background in that space; black if alpha is written.
+        mattes: mattes by the names of their channels.
         Raises InputError for settings and colour spaces that do not fit together.
         """
         self.config = config or PictureConfig()
@@ -83,13 +83,13 @@ class FramePipeline:
     ) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a frame, and the conversion of its planes to the file's colours, which needs no device.
 
-        The camera that is drawn gives only size and window, of the picture or of a strip.
+        The camera that is passed to the Draw gives only size and window, of the picture or of a strip.
         at: camera of the whole frame, in its final size, at a time in frames from the frame; the time is 0 if nothing
           moves.
         after, before: cameras of the next and the previous frame, for motion.
         lens: warps the picture.
-        sampling: of this frame, None for the job's.
-        cut: of the frame's holdout, for every sample of the frame.
+        sampling: sampling of this frame; None means the job's.
+        cut: cuts the surfaces of the frame's holdout, for every sample of the frame; None without one.
         models: the Gaussians at a time, None for the pipeline's own.
         moved: Gaussians that motion and backward motion lead to, None if these stand still.
         """

@@ -62,7 +62,7 @@ class Surfaces:
 class Holdout:
     """Holdout of a frame.
 
-    surfaces: of the file's data window.
+    surfaces: surfaces in the file's data window.
     x, y: pixel of the frame where that window begins.
     size: width and height of the frame.
     """

@@ -340,7 +340,7 @@ def check_given(covars: object, quaternions: object, scales: object) -> None:
 class GivenShapes:
     """The checked shapes of n Gaussians: quaternions (n, 4) and scales (n, 3), or covariances (n, 6).
 
-    covariance_layout: of the caller's covariances, "upper" for (n, 6) or "full" for (n, 3, 3); empty for none.
+    covariance_layout: layout of the caller's covariances, "upper" for (n, 6) or "full" for (n, 3, 3); empty for none.
     """
 
     quaternions: Float32 | None = None

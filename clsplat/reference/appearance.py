@@ -47,7 +47,7 @@ def step(
 ) -> tuple[Float64, Float64, Float64]:
     """Logs and moments (photographs, entries) after Adam's step along by_logs.
 
-    rate: of all entries, or of each.
+    rate: learning rate of all entries, or of each.
     centred: then subtract each entry's mean.
     """
     first, second = 0.9 * first + 0.1 * by_logs, 0.999 * second + 0.001 * by_logs**2

@@ -67,7 +67,7 @@ class BlendGradients:
 class Layer:
     """One Gaussian on the pixels of its box.
 
-    position: in the order.
+    position: position in the order of depth.
     before, after: transmittance in front of it and behind it.
     added: the pixels to which it is added.
     margin: as in `BlendedTwin`, infinite where nothing is decided.

@@ -276,7 +276,7 @@ def project_grad(
 ) -> dict[str, Float64]:
     """Gradients by means (N, 3), covariances (N, 3, 3), viewmat (4, 4) and intrinsics (3, 3): equations (159) to (166).
 
-    gradients: by means2d, depths, conics and compensations; each is optional.
+    gradients: gradients by means2d, depths, conics and compensations; each is optional.
 
     The gradient by the covariances is symmetric. Culled Gaussians have none.
     """

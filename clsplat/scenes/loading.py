@@ -64,7 +64,7 @@ def load_scene(
         there are no other pictures.
     lenses: "undistort" turns fisheyes into pinhole cameras, "native" keeps them.
     work_dir: output of structure from motion, by default NAME_colmap next to `path`.
-    progress: called with a text and a fraction or None.
+    progress: function that is called with a text and a fraction or None.
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
         are not used, and structure from motion finds no features in left-out pixels.
     missing: how many listed pictures may be missing, "few" (a tenth), "skip" (any number but not all) or "error"

@@ -52,8 +52,8 @@ SAME_PLACE_TOLERANCE = 1e-12
 class View:
     """A photograph and its camera.
 
-    name: as in the data set, with extension, unique in the scene.
-    camera: at the working size.
+    name: name in the data set, with extension, unique in the scene.
+    camera: its camera at the working size.
     path: the file.
     split: "train" or "test".
     lens: the lens that took the file, at the file's size.

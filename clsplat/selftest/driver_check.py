@@ -33,9 +33,9 @@ from clsplat.selftest.result import FORWARD_STAGES, SELFTEST_STAGES, TRAINING_ST
 class DriverReport:
     """The self-test result of a device.
 
-    digests: of each stage's output, by "scene/stage".
+    digests: digest of each stage's output, by "scene/stage".
     build_seconds: None if the kernels were not built first.
-    end: how the process ended before its work was done, or empty.
+    end: description of the process's end if it came before the work was done, or empty.
     crashed: True if the driver caused that.
     hung: True if the process did not come back.
     kernels: the kernels that were built and launched, named as in `device.sandbox`.

@@ -71,8 +71,8 @@ def run(
 
     It stops early if the next stage would read or write outside its arrays.
 
-    say: is called with the name of each stage before it runs.
-    digests: receives the digests of this run by "scene/stage".
+    say: function that is called with the name of each stage before it runs.
+    digests: dictionary that receives the digests of this run, by "scene/stage".
     """
     benches = [CaseBench(device, frozen) for frozen in scenes(quick=quick)]
     for name in stages:

@@ -75,7 +75,7 @@ def cameras_around(
     """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene, facing its
     centre.
 
-    up: of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
+    up: up direction (3,), of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
     size: width and height in pixels; a side that is None follows from the other at the default aspect ratio.
     Raises InputError for a model without Gaussians.
     """

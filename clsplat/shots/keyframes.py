@@ -35,7 +35,7 @@ class Key:
 def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | None = None) -> list[Camera]:
     """Interpolate cameras at `frames`. Before the first key and after the last, the camera is that key's.
 
-    keys: at rising frames, with cameras of one size and projection.
+    keys: key frames at rising frames, with cameras of one size and projection.
     loop: number of frames after which the first key repeats; must exceed the span of the keys.
     Rotations take the shorter arc from key to key; rolls turn through their full difference. Raises ValueError for no
     keys, or frames that do not rise.

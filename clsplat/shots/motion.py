@@ -69,7 +69,8 @@ def _values(camera: Camera) -> Float64:
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: Iterable[float]) -> Moments:
     """Cameras of a shot that has `moment`, evaluated around the frame `number`.
 
-    times: in frames from that frame. Times between the first and the last at which the source has values are added.
+    times: times in frames from that frame. Times between the first and the last at which the source has values are
+    added.
     """
     assert shot.moment is not None
     moment, wanted = shot.moment, list(times)

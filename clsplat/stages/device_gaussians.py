@@ -20,7 +20,7 @@ from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shap
 class ShStorage:
     """Storage of the SH coefficients in a model that is only rendered.
 
-    coefficients: per channel.
+    coefficients: number of coefficients per channel.
     degrees: (n,) uint8, the highest degree evaluated for each Gaussian; None evaluates all.
     half: store the bands above 0 as float16.
     """

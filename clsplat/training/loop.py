@@ -66,7 +66,7 @@ class StepReport:
     """Report of a step.
 
     step: number of steps done.
-    loss, psnr: of that step's view, or of all views of its batch.
+    loss, psnr: loss and PSNR of that step's view, or of all views of its batch.
     seconds: training time so far; evaluations, checkpoints and other work do not count.
     """
 

@@ -111,7 +111,7 @@ class TrainedModel:
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | None:
         """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
 
-        changes: called after the kernels have been tried in the sandbox, just before the first change.
+        changes: function that is called after the kernels have been tried in the sandbox, just before the first change.
         """
         listed = plan.listed
         if plan.rows is not None:

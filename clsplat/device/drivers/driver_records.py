@@ -147,7 +147,7 @@ def remember(
     """Add to the driver's entry for a shape, LANESxITEMS.
 
     failed: None keeps the recorded failure.
-    trial: see `Entry`.
+    trial: the failed trial, as in `Entry`.
 
     If the folder is not writable, it warns; each process then tests everything again.
     """

@@ -61,7 +61,7 @@ def palette(
     Two-level k-means: clusters first, and in each a share of the palette that grows with its squared error. The cost is
     n d sqrt(size) instead of n d size.
 
-    progress: called with the finished fraction.
+    progress: function that is called with the finished fraction.
     """
     count, width = vectors.shape
     size = min(size, count)

@@ -243,7 +243,7 @@ def _near_of(gaussians: Gaussians) -> float:
 def save(path: str | os.PathLike[str], gaussians: Gaussians, **options: Any) -> None:
     """Write a model file atomically, in the format of its name.
 
-    options: for the format's `write`; unknown ones are ignored.
+    options: keyword arguments of the format's `write`; unknown ones are ignored.
     Raises InputError for a suffix that cannot be written.
     """
     write = format_of_name(path, writable=True).write

@@ -43,7 +43,7 @@ class KnownDepth:
     def at(self, camera: Camera, lens: Lens) -> tuple[NDArray[np.int64], Float32, Float32]:
         """Pixels with known depth in a picture of the camera's size.
 
-        lens: of the depth map, and of a camera that is not a pinhole camera.
+        lens: lens of the depth map, and of a camera that is not a pinhole camera.
         Returns ascending pixel indices (k,), inverse depths in 1 / world units, and weights.
         """
         if self.path is not None:

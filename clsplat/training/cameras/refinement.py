@@ -37,7 +37,7 @@ class CameraSums(ViewPart):
 
     `add_rows` receives all rows, in order.
     pose, lens: True for each gradient to sum.
-    move: called with the sums after Adam's step.
+    move: function that is called with the sums after Adam's step.
     """
 
     wants_gradients = True

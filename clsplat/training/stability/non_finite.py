@@ -111,7 +111,7 @@ class NonFiniteMonitor:
     def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Repair | None:
         """Repair, or None, after a check of every number, including numbers that `adam` has not visited.
 
-        arrays: by "parameters/means" and so on.
+        arrays: arrays by "parameters/means" and so on.
         """
         host = {
             kind: {g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS} for kind in ("parameters", "first", "second")

@@ -53,8 +53,8 @@ class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in a rasterizer's memory.
 
     fields: the slot fields that the step fills.
-    turn: see `loss`.
-    room: see `Rasterizer.forward`.
+    turn: `turn` of `stages.loss.loss`.
+    room: `room` of `Rasterizer.forward`.
     explore: noise and penalties of the step.
     """
 

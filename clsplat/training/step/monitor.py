@@ -25,7 +25,7 @@ class StepMonitor(StepProbe):
 
     number: number of views so far, including this one.
     rehearsed: keys of the steps whose kernels were tried; this step's key is added.
-    changes: called before the model changes.
+    changes: function that is called before the model changes.
     """
 
     step: GradientStep

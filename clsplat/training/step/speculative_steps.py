@@ -54,7 +54,8 @@ def by_capacity(device: Device) -> bool:
 class SpeculativeSteps:
     """A training's steps launched by capacity, at most two at a time, and the capacity of the next one.
 
-    begin: called before a step is repeated, which begins by repairing the trouble that `monitor` has noticed.
+    begin: function that is called before a step is repeated, which begins by repairing the trouble that `monitor` has
+    noticed.
     redone: number of repeated steps.
     """
 
