@@ -113,7 +113,7 @@ class View:
         return undistort(image, self.lens, self.camera.resized(width, height))
 
     def check(self) -> Thumbnail:
-        """Thumbnail of the picture. Raises InputError where `load` would."""
+        """Thumbnail of the picture. Raises InputError if `load` would."""
         image = self._read()
         if self.mask is not None:
             self.mask.applied(image, orient=self.upright)

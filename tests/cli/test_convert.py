@@ -286,11 +286,11 @@ def test_a_model_is_changed_in_place_only_if_asked(model: Path, capsys: Capture)
     for target in (model, model.parent / "." / "x" / ".." / model.name):
         (model.parent / "x").mkdir(exist_ok=True)
         assert convert(model, target, "--prune-opacity", "0.5") == 2
-        assert "is what is read, and would be replaced by what is made of it" in capsys.readouterr().err
+        assert "is read, and would be replaced by the result" in capsys.readouterr().err
     other = model.with_name("b.ply")
     random_gaussians(3).save(other)
     assert convert(model, other, "--merge", other) == 2
-    assert "b.ply: is what is read" in capsys.readouterr().err
+    assert "b.ply: is read" in capsys.readouterr().err
     assert model.read_bytes() == before
     assert convert(model, model, "--prune-opacity", "0.5", "--overwrite") == 0
     assert 0 < len(Gaussians.load(model)) < 300

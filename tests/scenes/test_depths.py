@@ -231,7 +231,7 @@ def test_what_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match=r"03\.png"):
         with_depths(scene, MAPS)
     (maps / "03.png").unlink()
-    with pytest.warns(UserWarning, match=r"of 1 photograph\(s\) no depths are known \(03\.png\)"):
+    with pytest.warns(UserWarning, match=r"no depths are known for 1 photograph\(s\) \(03\.png\)"):
         assert with_depths(scene, MAPS).views[3].depth is None
     with pytest.raises(InputError, match="--depth-maps relative"):
         with_depths(scene, RELATIVE)
@@ -243,7 +243,7 @@ def test_maps_in_which_nothing_is_known(folder: Path) -> None:
     add_maps(folder)
     for name, level in (("03", 0), ("04", 65535)):
         write_levels(folder / "depths" / f"{name}.png", np.full((HEIGHT, WIDTH), level, np.uint16))
-    with pytest.warns(UserWarning, match=r"of 2 photograph\(s\) no depths are known \(03\.png, 04\.png\)"):
+    with pytest.warns(UserWarning, match=r"no depths are known for 2 photograph\(s\) \(03\.png, 04\.png\)"):
         with_depths(load_scene(folder), MAPS)
 
 

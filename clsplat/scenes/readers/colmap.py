@@ -172,7 +172,7 @@ def _named(path: Path, name: str) -> str:
 
 
 class _Binary:
-    """Reader of little-endian records. Raises InputError where the file ends."""
+    """Reader of little-endian records. Raises InputError if the file ends before the end of a record."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file = path, file
