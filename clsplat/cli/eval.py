@@ -140,7 +140,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn if a measured view was also trained on, and if pictures look wrong."""
+    """Warn of views whose scores are not held-out scores of the run's scene, and of pictures that look wrong."""
     from clsplat.runs import scene_record
     from clsplat.scenes.analysis import sanity_checks
 

@@ -191,12 +191,12 @@ class SamplingConfig:
 
     @property
     def has_lens(self) -> bool:
-        """True if the camera is more than a pinhole."""
+        """True if the lens has a size, so that there is depth of field."""
         return bool(self.aperture) or self.f_stop is not None
 
     @property
     def on(self) -> bool:
-        """True if a frame is more than one sample."""
+        """True if a frame is the mean of several samples."""
         return self.moves or self.has_lens
 
     @property

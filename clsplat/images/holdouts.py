@@ -139,7 +139,8 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """HELD of each surface. An opaque surface hides everything behind its front, so it gets no length."""
+    """HOLDOUT_SURFACE_FIELDS of each surface. An opaque surface hides everything behind its front, so it gets no
+    length."""
     rows = np.zeros((len(begin), len(HOLDOUT_SURFACE_FIELDS)), np.float32)
     rows[:, 0], rows[:, 2] = begin, 1 - alpha
     rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)

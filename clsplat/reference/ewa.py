@@ -19,11 +19,11 @@ from clsplat.reference.project import ALPHA_MIN
 BOX_STANDARD_DEVIATIONS = 3.33
 """Half size of a Gaussian's box in standard deviations, if its opacity does not make it smaller."""
 TWIN_EWA_CLAMP_FRACTION = 0.15
-"""Fraction of the image's side: how far beyond an edge the Jacobian is evaluated.
+"""Distance beyond an edge up to which the Jacobian is evaluated, as a fraction of the image's side.
 
 `stages.ewa` has its own: a twin takes no number of a formula from the code that it checks."""
 SERIES_TANGENT_SQUARED = 1e-3
-"""For a fisheye: (r / z)^2 up to which differences are computed by their series."""
+"""Largest (r / z)^2 of a fisheye at which differences are computed by their series."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +220,8 @@ def project(
 
 
 def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
-    """Of a fisheye: the gradient (N, 3) by the points in the camera, and that by the focal lengths (2,) through the
-    means on the image.
+    """For a fisheye, the gradient (N, 3) by the points in the camera, and the gradient (2,) by the focal lengths
+    through the means on the image.
 
     d_j: (N, 2, 3), by the Jacobians.
     """
@@ -250,8 +250,8 @@ def _pinhole_grad(
     d_means2d: Float64,
     d_j: Float64,
 ) -> tuple[Float64, Float64, Float64]:
-    """Of a pinhole camera: the gradients by the points and the focal lengths, as `_fisheye_grad`, and the part (2,) by
-    the principal point that the clamp takes away.
+    """For a pinhole camera, the gradients by the points and the focal lengths, like `_fisheye_grad`, and the part (2,)
+    by the principal point that the clamp takes away.
     """
     z = points[:, 2]
     jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]

@@ -38,9 +38,9 @@ At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pi
 MIN_POINTS_IN_FAR_VIEW, MIN_POINT_SPREAD_IN_FAR_VIEW = 10, 0.08
 """Minimum number of points in the picture of a distant camera, and their standard deviation as a fraction of a side.
 
-A picture with at least that many points, spread at least so far, shows the same as the others from further away, or
+With at least so many points, spread at least so far, the picture shows the same as the others from further away, or
 another reconstructed part. Points all over the picture have a standard deviation of 0.29. The picture of an outlier
-shows no points, or all of them in one pixel.
+shows no points, or has every point in one pixel.
 """
 MIN_FAR_GROUP_NEIGHBOURS = 2
 """Minimum number of other cameras near a distant one that form a group with it. Wrong poses are scattered."""

@@ -17,8 +17,8 @@ from clsplat.errors import InputError
 from clsplat.shots.shot import Frame, Shot
 
 NEIGHBOUR_FRAMES = 2
-"""Frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets its
-tangent."""
+"""Number of frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets
+its tangent."""
 
 
 @dataclass(frozen=True, eq=False)

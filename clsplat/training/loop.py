@@ -263,7 +263,7 @@ class TrainingSession:
         )
 
     def record(
-        self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, judged: bool = False
+        self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, validated: bool = False
     ) -> None:
         """Pass the report on, and record it with the data that clsplat.report needs."""
         if self.on_step is not None:
@@ -276,7 +276,7 @@ class TrainingSession:
         trainer = self.trainer
         if stages is not None:
             record["stages"] = stages
-        if judged:
+        if validated:
             record["gate"] = trainer.cameras.gate.record()
         if not self.recorded:
             record["session"] = telemetry.session(trainer.device, self.first_step)
@@ -324,14 +324,14 @@ class TrainingSession:
             trainer.mend(look=True)
         if self.go_back():
             return
-        judged = trainer.judge()
+        validated = trainer.validate()
         if sanity_checks.FIRST_RENDER_CHECK_STEP in steps and trainer.step < config.iterations:
             self.doubt()
         if reports:
             evaluating = self.evaluates(steps)
             report = self.report(result)
             if report is not None:
-                self.record(report, evaluating=evaluating, stages=stages, judged=judged)
+                self.record(report, evaluating=evaluating, stages=stages, validated=validated)
         if config.checkpoint_every > 0 and _reached(config.checkpoint_every, steps):
             self.save()
 

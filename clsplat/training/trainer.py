@@ -37,7 +37,7 @@ from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch, Losses
 from clsplat.training.cameras.refinement import Cameras
-from clsplat.training.cameras.validation import ValidationViews, judge
+from clsplat.training.cameras.validation import ValidationViews, validate
 from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
@@ -99,7 +99,7 @@ class Trainer:
         self.rasterizer.antialias(on=config.antialiased)
         self.photographs = ImageCache(self.views, device)
         self.renderer = Renderer(device, self.rasterizer)
-        self.judges = ValidationViews(scene, device, config)
+        self.validation_views = ValidationViews(scene, device, config)
         self.depths = DepthTargets(config, self.views, scene.extent, scene.near, self._pixels)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = by_doubling(config.warmup)
@@ -124,7 +124,7 @@ class Trainer:
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
-        self.cameras = Cameras(self.config, self.scene, self.rasterizer.work, len(self.judges.views))
+        self.cameras = Cameras(self.config, self.scene, self.rasterizer.work, len(self.validation_views.views))
         self.origin, self.near = initial.origin, self.scene.near
         asked = self.config.perspective
         self.by_rays = asked == "rays" or (asked == "auto" and any(view.camera.model.along_rays for view in self.views))
@@ -207,7 +207,7 @@ class Trainer:
         if self.mark is None or self._looks_at_steps:
             self._note()
         self.mend()
-        self.judge()
+        self.validate()
         if not self.controlled:
             self._control_density()
             self.controlled = True
@@ -333,7 +333,7 @@ class Trainer:
         self.mark = None
 
     def _watched_in_batch(self, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Probe of a view in a batch. Before that, the statistics of the earlier views are completed."""
+        """Probe of a view in a batch. It may begin an epoch, so the statistics of earlier views must be complete."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(inputs, step, self.step)
@@ -344,13 +344,13 @@ class Trainer:
         background = background_colour(self.config.background)
         return self.renderer.render(self.parameters, self.local(camera), background)
 
-    def judge(self) -> bool:
+    def validate(self) -> bool:
         """Validate the refined cameras, if that is due. True if they were measured."""
         if not self.cameras.gate.is_due(self.step):
             return False
         self.settle()
         look = held_out_looks(self.appearance.record())
-        judge(self.cameras, self.judges, self.step, lambda camera: self.draw(camera).image, look)
+        validate(self.cameras, self.validation_views, self.step, lambda camera: self.draw(camera).image, look)
         return True
 
     def _note(self, *, begun: bool = False) -> None:
@@ -386,13 +386,13 @@ class Trainer:
         """Parameters, first and second moments, by their names in a checkpoint."""
         return self.model.kinds()
 
-    def _apply(self, remedy: Repair | None) -> None:
-        if remedy is None:
+    def _apply(self, repair: Repair | None) -> None:
+        if repair is None:
             return
-        for kind, groups in remedy.moments.items():
+        for kind, groups in repair.moments.items():
             for group, values in groups.items():
                 self.models()[kind][group].set(values)
-        self._rearrange(RowPlan(remedy.rows))
+        self._rearrange(RowPlan(repair.rows))
 
     def rates(self) -> dict[str, float]:
         """Learning rate of each group at this step."""
@@ -437,7 +437,7 @@ class Trainer:
                 self._note()
             self._rearrange(self.strategy.before_step(self._state(step)))
         if steps:
-            self.mark = None  # also because the strategy may have drawn random numbers
+            self.mark = None  # the strategy may also have drawn random numbers
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
@@ -501,9 +501,9 @@ class Trainer:
         self.mend(look=True)
         arrays = self._arrays()
         if (
-            remedy := self.monitor.examine_all(arrays)
+            repair := self.monitor.examine_all(arrays)
         ) is not None:  # finds non-finite values in Gaussians that no step has visited
-            self._apply(remedy)
+            self._apply(repair)
             arrays = self._arrays()
         state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.monitor.retries)}
         views = {"views": self.last_views} if self.last_views > 1 else {}

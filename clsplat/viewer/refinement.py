@@ -18,7 +18,7 @@ REST_INTERVAL_RATIO = 3.0
 MOTION_PICTURE_SECONDS = 0.04
 """Time budget in seconds of a picture in motion, encoding included. The browser's own time is not included."""
 MAX_UNPREPARED_EXACT_SECONDS = 0.6
-"""If an exact picture takes longer than this, seconds, intermediate pictures of growing size are shown first."""
+"""Seconds of an exact picture beyond which intermediate pictures of growing size are shown first."""
 MIN_MOTION_SCALE = 1 / 8
 """Smallest scale relative to the page. A coarser picture would be unrecognisable."""
 PAGE_JPEG_QUALITIES = (60, 95)

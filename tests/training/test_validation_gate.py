@@ -122,7 +122,7 @@ def judged(values: list[float], config: TrainConfig = CONFIG) -> tuple[CameraGat
     gate, said = CameraGate(config, 2), []
     for index, (step, value) in enumerate(zip(steps_of(config), values, strict=False)):
         assert gate.is_due(step)
-        back, text = gate.judge(step, value, arrays(index))
+        back, text = gate.validate(step, value, arrays(index))
         assert (back is not None) == (gate.ended == step)
         if back is not None:
             best = int(np.argmax(values[: index + 1]))
@@ -191,7 +191,7 @@ def test_a_checkpoint_has_all_of_it(values: list[float]) -> None:
     assert (again.measured, again.ended) == (gate.measured, gate.ended)
     assert again.arrays().keys() == gate.arrays().keys()
     for step, value in zip(steps_of(CONFIG)[len(values) :], (19, 19, 30), strict=False):
-        mine, theirs = gate.judge(step, value, arrays(9)), again.judge(step, value, arrays(9))
+        mine, theirs = gate.validate(step, value, arrays(9)), again.validate(step, value, arrays(9))
         assert mine[1] == theirs[1]
         assert (mine[0] is None) == (theirs[0] is None)
         for name, array in (mine[0] or {}).items():

@@ -15,7 +15,7 @@ from clsplat.arrays import Float32
 CODEBOOK_SAMPLES = 1 << 16
 LLOYD_ITERATIONS = 20
 DISTANCE_TILE_ROWS = 64
-"""Vectors, and centres, in one block of the distance computation."""
+"""Number of vectors, and of centres, in one block of the distance computation."""
 PRINCIPAL_AXIS_SAMPLES, POWER_ITERATIONS = 128, 30
 """Sampled vectors, and power iterations, for the direction of largest variance."""
 

@@ -55,7 +55,7 @@ class ValidationViews:
         return float(np.mean(found)) if found else 0.0
 
 
-def judge(cameras: Cameras, judges: ValidationViews, step: int, draw: Draw, look: Look) -> None:
+def validate(cameras: Cameras, validation_views: ValidationViews, step: int, draw: Draw, look: Look) -> None:
     """Measure the held-out views with the refined cameras. If the gate rejects the cameras, warn and go back to earlier
     ones.
 
@@ -63,11 +63,11 @@ def judge(cameras: Cameras, judges: ValidationViews, step: int, draw: Draw, look
     The better result counts. The given poses are right if only some training poses were wrong, and the moved ones if
     the whole world has drifted.
     """
-    seen = [cameras.lenses.seen(view.lens, view.camera) for view in judges.views]
-    psnr = judges.psnr(draw, look, seen)
+    seen = [cameras.lenses.seen(view.lens, view.camera) for view in validation_views.views]
+    psnr = validation_views.psnr(draw, look, seen)
     if (drift := cameras.drift()) is not None:
-        psnr = max(psnr, judges.psnr(draw, look, [drift.taken_along(camera) for camera in seen]))
-    best, warning = cameras.gate.judge(step, psnr, cameras.refined_arrays())
+        psnr = max(psnr, validation_views.psnr(draw, look, [drift.taken_along(camera) for camera in seen]))
+    best, warning = cameras.gate.validate(step, psnr, cameras.refined_arrays())
     if best is not None:
         cameras.go_back(best)
     if warning:

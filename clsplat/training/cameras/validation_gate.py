@@ -128,7 +128,7 @@ class CameraGate:
         known = [each for each in self.measured if self.ended is None or each[0] <= self.ended]
         return max(known, key=lambda each: each[1])
 
-    def judge(
+    def validate(
         self, step: int, psnr: float, cameras: Mapping[str, NDArray[Any]]
     ) -> tuple[dict[str, NDArray[Any]] | None, str]:
         """Record a measurement in dB.
