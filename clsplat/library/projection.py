@@ -222,11 +222,11 @@ def fully_fused_projection(
     width, height : int
         Image size, pixels.
     eps2d : float
-        Added to the diagonal of each projected covariance, px^2.
+        Low-pass filter: variance that is added to the diagonal of each projected covariance, px^2.
     near_plane, far_plane : float
-        World units.
+        Least and largest depth of a Gaussian that is not culled, world units.
     radius_clip : float
-        Gaussians whose radii are not larger are culled, pixels.
+        Gaussians whose radii are at most this are culled, pixels.
     calc_compensations : bool
         Also compute sqrt(det(covariance without eps2d) / det(covariance with eps2d)).
     camera_model : str

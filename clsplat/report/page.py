@@ -39,11 +39,11 @@ from clsplat.version import package_version
 MAX_PICTURED_VIEWS = 8
 """Default number of held-out views with pictures."""
 MAX_EMBEDDED_RECORDS = 2000
-"""Number of metrics.jsonl records whose numbers are embedded in the page."""
+"""Largest number of metrics.jsonl records whose numbers are embedded in the page."""
 MAX_TABLE_VIEWS = 200
-"""Number of views in the table."""
+"""Largest number of views in the table."""
 MAX_COLOURED_STAGES = 7
-"""Number of stages with their own colour. The smaller ones are drawn together."""
+"""Largest number of stages with a colour of their own. The smaller stages are drawn together."""
 SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
 
 

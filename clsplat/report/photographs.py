@@ -21,7 +21,7 @@ from clsplat.scenes.analysis.sanity_checks import spread
 from clsplat.scenes.scene import Scene, View
 
 MAX_MASKED_PHOTOGRAPHS = 6
-"""Number of masked photographs shown."""
+"""Largest number of masked photographs that are shown."""
 SMALL_PICTURE_SIDE_PX = 320
 """Pixels of the longer side of small pictures."""
 

@@ -22,7 +22,7 @@ SCORE_NAMES = ("psnr", "ssim", "lpips")
 CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 """Keys of every record in metrics.jsonl."""
 MAX_NAME_CHARACTERS = 200
-"""Characters that are shown of the name of a view, a stage or a device."""
+"""Largest number of characters that are shown of the name of a view, a stage or a device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
 """Limits for foreign files; clsplat itself writes fewer entries. The last samples and sessions are kept."""
 MAX_DRAWN_VALUE = 1e30
@@ -92,7 +92,7 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
     """Read all numbers of a run's folder.
 
     model: content of model.ply, if already loaded.
-    describe: read the model.
+    describe: True to read and describe the model.
     Raises InputError if metrics.jsonl cannot be read. Anything else missing or damaged becomes a note.
     """
     records = [
@@ -140,7 +140,7 @@ def number(value: object) -> float | None:
 
 
 def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """Each setting with the name of its flag."""
+    """The name of the flag and the value of each setting."""
     for setting in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
         value, name = getattr(config, setting.name), prefix + setting.name.replace("_", "-")
         if is_dataclass(value):
