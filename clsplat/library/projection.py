@@ -224,7 +224,7 @@ def fully_fused_projection(
     eps2d : float
         Low-pass filter: variance that is added to the diagonal of each projected covariance, px^2.
     near_plane, far_plane : float
-        Least and largest depth of a Gaussian that is not culled, world units.
+        Gaussians whose depth is not strictly between these are culled, world units.
     radius_clip : float
         Gaussians whose radii are at most this are culled, pixels.
     calc_compensations : bool

@@ -285,7 +285,7 @@ def rasterize(
     width, height : int or sequence of int
         Pixels, of all cameras or one number per camera.
     near_plane, far_plane : float
-        Least and largest depth of a Gaussian that is drawn, world units.
+        Gaussians whose depth is not strictly between these are not drawn, world units.
     radius_clip : float
         Gaussians whose radii are at most this are not drawn, pixels.
     eps2d : float

@@ -33,9 +33,9 @@ class EwaViewTwin:
     viewmat: (4, 4), camera from world.
     intrinsics: (3, 3); the skew is ignored.
     model: pinhole, ortho or fisheye.
-    near, far: world units.
-    eps2d: px^2.
-    radius_clip: pixels.
+    near, far: Gaussians whose depth is not strictly between these are culled, world units.
+    eps2d: px^2, added to the diagonal of the projected covariance.
+    radius_clip: pixels; Gaussians with no larger radius are culled.
     """
 
     viewmat: Float64

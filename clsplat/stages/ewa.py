@@ -39,7 +39,7 @@ class EwaCamera:
     viewmat: (4, 4), camera from world. Its first three rows need not be a rotation and a translation.
     intrinsics: (3, 3), fx, fy, cx and cy in pixels; a skew is ignored.
     width, height: pixels.
-    near, far: world units.
+    near, far: Gaussians whose depth is not strictly between these are culled, world units.
     eps2d: px^2, added to the diagonal of the projected covariance.
     radius_clip: pixels; Gaussians with no larger radius are culled.
     model: one of EWA_CAMERA_MODELS.

@@ -66,7 +66,7 @@ def fully_fused_projection(
     eps2d : float
         Low-pass filter: added to each variance on the image, px^2.
     near_plane, far_plane : float
-        Least and largest depth of a Gaussian that is in view, world units.
+        Gaussians whose depth is not strictly between these are not in view, world units.
     radius_clip : float
         Splats whose radii are at most this are not in view, pixels.
     packed : bool

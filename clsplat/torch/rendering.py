@@ -113,7 +113,7 @@ def rasterization(
     width, height : int
         Pixels. Sizes and numbers may be tensors of one element, and sizes may be floats such as 40.0.
     near_plane, far_plane : float
-        Least and largest depth of a Gaussian that is drawn, in units of the scene.
+        Gaussians whose depth is not strictly between these are not drawn, in units of the scene.
     radius_clip : float
         Splats whose radii are at most this are not drawn, pixels.
     eps2d : float
