@@ -133,9 +133,8 @@ def run_tasks(
     Each renderer has a thread, which takes the next free frame.
     sharing: claims of frames, if other jobs may render some of these frames meanwhile; their frames are awaited at the
     end.
-    on_done: function that is called in this thread for each frame when its file is complete, not always in order; for a
-    video in order, when the frame has been encoded. The first error of any thread is raised here, after all threads
-    have ended.
+    on_done: called in this thread for each frame when its file is complete, not always in order. For a video it is
+    called in order, when the frame has been encoded. The first error of any thread is raised at the end of all threads.
     """
     if not tasks:
         return

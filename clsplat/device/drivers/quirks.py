@@ -258,8 +258,8 @@ def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
     """Pin each PoCL thread to the processor of its number, in this process and its children.
 
     Otherwise two threads that wake up together share a processor for whole kernels while another processor idles.
-    Threads are not pinned if the process may use only some processors, or PoCL is set to use fewer: then two processes
-    of one thread each would share the first processor. A variable that is already set is kept.
+    Threads are not pinned if the process may use only some processors, or PoCL is set to use fewer. Two processes
+    of one thread each would then share the first processor. A variable that is already set is kept.
     """
     if sys.platform != "linux" or any(name in environment for name in (_POCL_AFFINITY, *_POCL_COUNTS)):
         return
