@@ -44,8 +44,8 @@ class DensityStatistics:
 
     CONTRIBUTION_STATISTICS are contributions to the images of the training views, in pixels. They are counted per
     epoch, whether or not Gaussians are densified. There is the total over the views and the largest in one view, each
-    for the current epoch and for the last whole one. They are infinite for Gaussians that did not exist, or were not measured, in some view
-    of the epoch. They are None if no rule uses them.
+    for the current epoch and for the last whole one. They are infinite for Gaussians that did not exist, or were not
+    measured, in some view of the epoch. They are None if no rule uses them.
     """
 
     gradient_sums: DeviceArray
