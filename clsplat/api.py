@@ -52,22 +52,23 @@ def train(
     scene : Scene
         Photographs with cameras, see `load_scene`.
     config : TrainConfig, optional
-        Settings, which are written to the run. None means the run's, or else the defaults.
+        Settings, which are written to the run. None means the run's settings, or the defaults without a run.
     device : Device, str or sequence of Device, optional
         An open device, or a name as `clsplat devices` lists them. Several devices, or names separated by commas, share
         the views of a step (`TrainConfig.batch`).
     max_device_mem : str or int, optional
         Largest amount of each device's memory to use, in bytes or such as "256MiB".
     run : Run, optional
-        A folder for metrics, checkpoints, held-out renders and the model. None writes nothing.
+        A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool
-        Continue from the run's latest checkpoint. If False, a run that has been trained is refused.
+        Continue from the run's latest checkpoint. If False, a run that already has a trained model is refused.
     on_step : callable, optional
         Called with a report every REPORT_EVERY steps.
     on_plan : callable, optional
         Called with the memory plan before the first step and after each change.
     between : callable, optional
-        Called before each step. It may render the trainer's model, and its time is not counted.
+        Called before each step with the trainer and a function that returns True after Ctrl-C. It may render the
+        trainer's model. Its time does not count as training time.
 
     Returns
     -------
@@ -79,8 +80,8 @@ def train(
     InputError
         If the scene has no views, is not the resumed run's scene, or another process writes the run.
     ClsplatError
-        If numbers are repeatedly not finite (docs/decisions/0016-never-a-nan.md). Values that were repaired give a
-        warning.
+        If values are repeatedly not finite (docs/decisions/0016-never-a-nan.md). Values that could be repaired cause
+        only a warning.
     Interrupted
         A KeyboardInterrupt, on Ctrl-C, SIGTERM or SIGHUP, after a checkpoint has been written.
 

@@ -75,21 +75,21 @@ JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
 """World units: the default near plane, for cameras and models without their own."""
 MIN_NEAR_PLANES_PER_EXTENT = 100.0
-"""A scene whose extent is less than this many near planes gets a smaller near plane."""
+"""A scene gets a smaller near plane if its extent is less than this many times the default one."""
 ROTATION_TOLERANCE = 1e-2
-"""Largest allowed difference between R^T R and 1. Poses are typed with few digits, or are float32."""
+"""Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
-"""Pixels. Well below this, float32 has no digits left for a position."""
+"""Exclusive upper limit of focal lengths, pixels. Already below it float32 cannot store a position to a pixel."""
 
 
 @dataclass(frozen=True)
 class Window:
     """Place of a picture in its frame, in pixels.
 
-    x, y: its first pixel, negative beyond the frame's left and upper edges.
+    x, y: frame coordinates of the picture's first pixel; negative if it lies left of or above the frame.
     width, height: size of the frame.
     clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
-    follows a Gaussian's mean. Larger only for a picture that shows more.
+    follows a Gaussian's mean. It is larger than the default only for a picture that shows more than that.
     """
 
     x: int
@@ -103,20 +103,45 @@ class Window:
 class Camera:
     """A camera and its pose. It is a pinhole unless `projection` says otherwise.
 
-    Attributes ---------- width, height : int Image size, pixels. fx, fy : float Pixels per unit of the projected
-    coordinates, see Notes. cx, cy : float Principal point, pixels from the image's top left corner; the first pixel's
-    centre is at (0.5, 0.5). rotation : (3, 3) float64 x_cam = rotation @ x_world + translation (COLMAP's
-    `cam_from_world`). translation : (3,) float64 World units. near, far : float World units. Gaussians are drawn if the
-    depths of their means are between them. Depth is z; for fisheye and equirectangular it is the distance. The default
-    near, DEFAULT_NEAR_PLANE, stands for the model's (`Gaussians.near`). projection : str "perspective", "orthographic",
-    "equirectangular" or "fisheye" (equidistant). window : Window, optional Set if the picture is a part of a frame, or
-    extends beyond it. width and height are then the picture's, and cx and cy are measured from the frame's corner.
-    radial : (k1, k2, k3, k4) Coefficients of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP). All
-    0: equidistant. by_rays : bool True for a perspective camera that draws Gaussians along the rays of its pixels, like
-    fisheye and panorama. For a model that was trained so (`Gaussians.by_rays`).
+    Attributes
+    ----------
+    width : int
+        Width of the picture, pixels.
+    height : int
+        Height of the picture, pixels.
+    fx : float
+        Horizontal focal length: pixels per unit of the projected coordinates (see Notes).
+    fy : float
+        Vertical focal length, in the same unit.
+    cx : float
+        Principal point, pixels from the image's left edge; the centre of the first pixel is at 0.5.
+    cy : float
+        Principal point, pixels from the image's upper edge; the centre of the first pixel is at 0.5.
+    rotation : (3, 3) float64
+        x_cam = rotation @ x_world + translation, COLMAP's `cam_from_world`; no unit.
+    translation : (3,) float64
+        Translation of `cam_from_world`, world units.
+    near : float
+        Least depth of a drawn Gaussian's mean, world units. With the default, DEFAULT_NEAR_PLANE, the model's near
+        plane applies (`Gaussians.near`).
+    far : float
+        Largest depth of a drawn Gaussian's mean, world units.
+    projection : str
+        "perspective", "orthographic", "equirectangular" or "fisheye" (equidistant).
+    window : Window, optional
+        Place of the picture in its frame, pixels, if the picture is a part of a frame or extends beyond it. Then width
+        and height are the picture's, and cx and cy are measured from the frame's corner.
+    radial : (4,) float
+        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP), no unit. All 0:
+        equidistant.
+    by_rays : bool
+        True for a perspective camera that draws Gaussians along the rays of its pixels, like fisheye and panorama. Use
+        it for a model that was trained so (`Gaussians.by_rays`).
 
     Notes
     -----
+    Depth is z; for fisheye and equirectangular cameras it is the distance.
+
     The projected coordinates are, by projection (docs/cameras.md has the equations):
 
     - perspective: x/z and y/z.
@@ -156,12 +181,13 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """True if its picture is an undistorted photograph's, on the image plane or by rays."""
+        """True if the camera projects like an undistorted photograph, on the image plane or along rays."""
         return self.model.is_pinhole
 
     @property
     def fold(self) -> tuple[float, float]:
-        """The largest angle from the axis that a fisheye shows, in radians, and its radius there in focal lengths."""
+        """The largest angle from the axis that a fisheye shows, radians, and its distance from the principal point,
+        focal lengths."""
         return self.model.fold(self.radial)
 
     @property
@@ -200,8 +226,8 @@ class Camera:
         rotation = np.asarray(self.rotation, np.float64)
         if (off := float(np.abs(rotation.T @ rotation - np.eye(3)).max())) > ROTATION_TOLERANCE:
             raise InputError(
-                f"camera: rotation is none, its axes are {off:.2g} off right angles or length 1, expected that of "
-                "cam_from_world; a scale does not belong in it"
+                f"camera: rotation is no rotation matrix, its axes are {off:.2g} off right angles or length 1, "
+                "expected the rotation of cam_from_world, without a scale"
             )
         if not 0 < self.near < self.far:
             raise InputError(f"camera: near is {self.near}, far {self.far}, expected 0 < near < far")
@@ -220,12 +246,13 @@ class Camera:
             raise InputError(f"camera: radial is {self.radial}, expected four finite numbers")
 
     def through(self, model: CameraModel, radial: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Camera:
-        """The same intrinsics and pose, projected by the usual model of another projection, with its coefficients."""
+        """The same intrinsics and pose with another projection: the usual model of `model.projection`, and its
+        coefficients."""
         k1, k2, k3, k4 = radial
         return replace(self, projection=cast("Projection", model.projection), radial=(k1, k2, k3, k4), by_rays=False)
 
     def from_origin(self, origin: Float64) -> Camera:
-        """The same view, for world coordinates relative to origin (3,)."""
+        """The camera that shows the same view of a world whose coordinates are relative to origin (3,)."""
         if not origin.any():
             return self
         return replace(self, translation=self.translation + self.rotation @ origin)
@@ -249,7 +276,8 @@ class Camera:
         return replace(self, rotation=rotation, translation=translation)
 
     def refocused(self, log: float, x: float, y: float) -> Camera:
-        """The same view with focal lengths times e^log, and the principal point moved by x and y old focal lengths."""
+        """The same pose with focal lengths multiplied by e^log, and the principal point moved by x and y old focal
+        lengths."""
         factor, moved = math.exp(log), (self.cx + x * self.fx, self.cy + y * self.fy)
         return replace(self, fx=self.fx * factor, fy=self.fy * factor, cx=moved[0], cy=moved[1])
 
@@ -258,9 +286,7 @@ class Camera:
         return replace(self, near=near) if self.near == DEFAULT_NEAR_PLANE != near else self
 
     def along_rays(self, by_rays: bool) -> Camera:
-        """The same view of a model that is drawn along rays, or not. Cameras that are not perspective are returned
-        unchanged.
-        """
+        """The same view with `by_rays` set for a perspective camera. Other cameras are returned unchanged."""
         changes = self.is_pinhole and by_rays != self.by_rays
         return replace(self, by_rays=by_rays) if changes else self
 
@@ -284,8 +310,10 @@ class Camera:
         return (1 / np.sqrt(1 + a**2 + b[:, None] ** 2)).astype(np.float32)
 
     def depths_of(self, points: Float64) -> Float64:
-        """Depths (N,) of points (N, 3), world coordinates: along the optical axis of a camera with an image plane, else
-        distances. Files have these."""
+        """Depths (N,) of points (N, 3) in world coordinates, as files store them.
+
+        They are measured along the optical axis of a camera with an image plane. Other cameras have distances.
+        """
         local = points @ self.rotation.T + self.translation
         return np.asarray(local[:, 2] if self.model.flat else np.linalg.norm(local, axis=1))
 
@@ -340,7 +368,8 @@ class Camera:
 def focal_length(fov: float, size: float, projection: Projection = "perspective") -> float:
     """fx (or fy) of a camera that sees the angle `fov`, radians, across `size` pixels around its axis.
 
-    Raises ValueError for an angle that the projection cannot show, and for orthographic, which has none.
+    Raises ValueError for an angle that the projection cannot show, and for orthographic cameras, which have no angle of
+    view.
     """
     model = PROJECTIONS[projection]
     if model.parallel:
@@ -356,7 +385,7 @@ def model_with(column: str, value: object) -> CameraModel | None:
 
 
 def names_of(column: str) -> tuple[str, ...]:
-    """All names of a column, those of panoramas last."""
+    """All names of a column of CAMERA_MODELS; the names of panoramas come last."""
     return tuple(
         name for model in sorted(CAMERA_MODELS, key=lambda each: each.wraps) for name in getattr(model, column)
     )

@@ -17,7 +17,7 @@ class ClsplatError(Exception):
 
 
 def plain(text: str) -> str:
-    """`text` as one printable line for any terminal, since names in hostile files may contain anything."""
+    """`text` as one line that any terminal can print, since names in hostile files may contain any character."""
     return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
 
 
@@ -37,7 +37,7 @@ def examples(names: Iterable[object], most: int = 3) -> str:
 
 
 def amount(nbytes: int) -> str:
-    """A number of bytes as text, in a unit that leaves two digits or more."""
+    """A number of bytes as text, in the largest unit in which it has at least two digits."""
     for unit, name in ((2**30, "GiB"), (2**20, "MiB"), (2**10, "KiB")):
         if nbytes >= 10 * unit or (unit == 2**30 and nbytes >= unit):
             return f"{nbytes / unit:,.1f} {name}" if unit == 2**30 else f"{nbytes / unit:,.0f} {name}"
@@ -47,7 +47,7 @@ def amount(nbytes: int) -> str:
 class InputError(ClsplatError):
     """A file, folder or argument is wrong (exit status 2).
 
-    The message is one line: the wrong value, and the expected one.
+    The message is one line with the wrong value and the expected one.
     """
 
     exit_status = 2
@@ -57,9 +57,10 @@ class InputError(ClsplatError):
 
 
 class WriteError(ClsplatError, OSError):
-    """A file cannot be written. It has the system's error number, the reason in plain words, and the file's name.
+    """A file cannot be written. The error has the system's error number, the reason in plain words, and the file's
+    name.
 
-    Exit status 2 if the name is wrong, else 1.
+    The exit status is 2 if the name is wrong, else 1.
     """
 
     def __init__(self, number: int, reason: str, path: str) -> None:
@@ -93,7 +94,7 @@ def reason_of(error: OSError) -> str:
 
 
 def system_trouble(error: OSError) -> str:
-    """One line about a system error without a message of ours: the file and the reason."""
+    """One line about a system error that clsplat has no message for: the file and the reason."""
     names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
     return plain(": ".join([" to ".join(names), reason_of(error)] if names else [reason_of(error)]))
 
@@ -107,7 +108,7 @@ def switched_on(variable: str) -> bool:
 
 
 class DeviceError(InputError):
-    """There is no OpenCL device, or not the requested one."""
+    """There is no OpenCL device, or none matches the request."""
 
 
 @contextmanager
@@ -122,8 +123,8 @@ def of_argument() -> Iterator[None]:
 class KernelBuildError(ClsplatError):
     """A driver refused a kernel.
 
-    The message has the device, the options and the log's first error. `log` has the whole log, and `source` the source
-    with the line numbers of the log. CLSPLAT_DEBUG=1 shows both.
+    The message has the device, the build options and the log's first error. `log` has the whole log. `source` has the
+    source with the line numbers that the log uses. CLSPLAT_DEBUG=1 shows both.
     """
 
     def __init__(self, message: str, log: str, source: str) -> None:
@@ -140,4 +141,4 @@ class DriverError(ClsplatError):
 
 
 class CapacityError(ClsplatError):
-    """A buffer would exceed the device's limit, or all buffers together the limit --max-device-mem."""
+    """A buffer would exceed the device's limit, or all buffers together would exceed --max-device-mem."""

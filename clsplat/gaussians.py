@@ -34,8 +34,8 @@ class Gaussians:
     sh : (N, K, 3) float32
         K = (degree + 1)^2 real SH coefficients per channel. Colour = 0.5 + sum of basis times coefficient.
     origin : (3,) float64
-        Origin of the means in the world. It is 0 except for scenes far from the world's origin, which float32 would
-        blur (docs/decisions/0017).
+        World coordinates of the means' origin. It is 0 except for scenes far from the world's origin, where float32
+        would be too coarse (docs/decisions/0017).
     near : float
         Near plane for cameras without their own, world units (docs/decisions/0019).
     antialiased : bool
@@ -72,7 +72,8 @@ class Gaussians:
         return {group.field: getattr(self, group.field) for group in PARAMETER_GROUPS.values()}
 
     def local(self, camera: Camera) -> Camera:
-        """A world camera relative to the model's origin, with the model's near plane and way of drawing."""
+        """A camera in world coordinates, made relative to the model's origin, with the model's near plane and
+        `by_rays`."""
         return camera.from_origin(self.origin).before(self.near).along_rays(self.by_rays)
 
     def check(self) -> None:
@@ -162,7 +163,7 @@ class Group:
     field: the array of `Gaussians` that holds it.
     shape: shape of one Gaussian's row; -1 stands for the SH coefficients after the constant one.
     rate: name of its learning rate in `OptimiserConfig`.
-    limit: magnitudes stay below this bound.
+    limit: upper bound of the parameters' magnitudes.
     """
 
     field: str
@@ -179,8 +180,8 @@ PARAMETER_GROUPS: dict[str, Group] = {
     "sh_dc": Group("sh", (3,), "sh_dc_rate", MAX_SH_COEFFICIENT),
     "sh_rest": Group("sh", (-1, 3), "sh_rest_rate", MAX_SH_COEFFICIENT),
 }
-"""The parameter groups on the device, in the order of the kernels' arguments. SH is split into its constant and the
-rest.
+"""The parameter groups on the device, in the order of the kernels' arguments. SH coefficients are in two groups: the
+constant one, and the rest.
 """
 
 

@@ -15,7 +15,8 @@ from types import FrameType
 from typing import Any
 
 MAX_SIGNAL_WAIT_SECONDS = 0.5
-"""Longest wait of the main thread in seconds: on some systems a signal does not end a wait, and is handled after it."""
+"""Longest wait of the main thread, seconds. On some systems a signal does not end a wait, so it is handled only after
+it."""
 
 
 def apart() -> dict[str, Any]:
@@ -70,16 +71,17 @@ def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], o
 
 
 def terminable() -> AbstractContextManager[object]:
-    """Treat a signal that asks the process to end like Ctrl-C inside: temporary files are removed, and children end."""
+    """Inside, a signal that asks the process to end acts like Ctrl-C: temporary files are removed, and child processes
+    end."""
     return handled(endings(), interrupt)
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Delay signals that ask the process to end; afterwards the first one is raised.
+    """Inside, signals that ask the process to end are delayed. Afterwards the first of them is raised.
 
-    Handlers that a library installs inside are removed, in the main thread, like in `handled`. Threads that a library
-    starts inside have these signals blocked permanently, and so have the programs that they run.
+    As in `handled`, the main thread removes handlers that a library has installed inside. In threads that a library
+    starts inside these signals stay blocked, also for the programs that those threads run.
     """
     came: list[int] = []
 
@@ -105,7 +107,7 @@ def undisturbed() -> Iterator[None]:
 def fill_closed_streams() -> None:
     """Open a null device for standard input, output or error if the process was started without it (`>&-`).
 
-    Otherwise the next opened file gets its number, and a library's prints go into that file.
+    Otherwise the next opened file gets the number of the closed stream, and a library's prints go into that file.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
 
 Progress = Callable[[str, float | None], None]
-"""A progress callback: the text of a stage, and the fraction that is done, None if unknown."""
+"""A progress callback. It takes the text of a stage and the fraction that is done, or None if that is unknown."""
 PLAIN_LINE_SECONDS = 10.0
 """Seconds between plain lines."""
 METRIC_SMOOTHING_WEIGHT = 0.1
-"""Weight of the newest report in the shown PSNR and loss, which jump from view to view."""
+"""Weight of the newest report in the shown PSNR and loss, which are smoothed because they differ from view to view."""
 RATE_WINDOW_SECONDS = 20.0
 """Seconds of training over which the shown rate is averaged."""
 
@@ -33,11 +33,11 @@ class RemainingTime(Protocol):
         """Take a report."""
 
     def left(self) -> float | None:
-        """Seconds from the last report to the end, or None."""
+        """Seconds from the last report to the end, or None if they cannot be estimated yet."""
 
 
 class CountedFraction(float):
-    """A fraction that is reported as a count, such as "12 of 25 stand". total: at least 1."""
+    """A fraction that is reported as a count, such as "12 of 25 registered". total: at least 1."""
 
     def __new__(cls, done: int, total: int, verb: str) -> Self:
         """The fraction done / total, at most 1."""
@@ -62,7 +62,8 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # frames are counted and take similar times; the remaining time of steps is in their description
+            # Frames take similar times, so that rich can estimate the rest. Steps have their remaining time in the
+            # description.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(
@@ -84,7 +85,7 @@ class _Bar:
 class TrainProgress(_Bar):
     """Progress of a training of `total` steps. Call it with each `training.loop.StepReport`, every step or less often.
 
-    forecast: estimates the remaining time. Without it, steps are assumed to take as long as the last ones.
+    forecast: estimates the remaining time. Without it the remaining steps are assumed to take as long as the last ones.
     """
 
     def __init__(self, total: int, forecast: RemainingTime | None = None) -> None:
@@ -149,7 +150,7 @@ class TrainProgress(_Bar):
 class StageProgress:
     """Progress of work in named stages. Call it with the stage and the fraction done, or None if unknown.
 
-    A `CountedFraction` fraction is reported as a count, and the last one of a stage is always reported.
+    A `CountedFraction` is reported as a count. The last report of a stage is always shown.
     after: seconds without any output at the start, for work that is mostly quick.
     """
 
@@ -182,8 +183,8 @@ class FrameProgress(_Bar):
     """Progress of frames. Call it with each `sequence.task.Record` when its file is complete.
 
     total: number of frames, skipped ones included.
-    style: "auto", a bar on standard error if that is a terminal, and a line for each written frame on `lines`, with the
-      remaining time. No lines if `lines` is None, or if both are the same terminal.
+    style: "auto": a bar on standard error if that is a terminal, and on `lines` a line for each written frame, with the
+      remaining time. No lines are written if `lines` is None, or if both are the same terminal.
       "json": one object per line on `lines`. "openjd": progress lines of Open Job Description. "none": nothing.
     """
 
@@ -228,7 +229,7 @@ class FrameProgress(_Bar):
     def _left(self) -> str:
         """The remaining time, if frames take as long as before; empty if it is less than half a second.
 
-        The first frame counts only until there is a second one, since kernels may be built during it.
+        Once there is a second frame the first one no longer counts, since kernels may have been built during it.
         """
         now = time.monotonic()
         if self.written == 1:
@@ -239,7 +240,7 @@ class FrameProgress(_Bar):
 
 
 def duration(seconds: float) -> str:
-    """h:mm:ss or m:ss."""
+    """Seconds as h:mm:ss or m:ss."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -8,8 +8,8 @@ from functools import cache
 
 @cache
 def package_version() -> str:
-    """The version, such as "0.1.0", or "0+unknown" for a checkout that is on the path but not installed."""
-    from importlib import metadata  # slow to import, and most verbs never ask
+    """The version, such as "0.1.0". A checkout that is on the path but not installed has "0+unknown"."""
+    from importlib import metadata  # slow to import, and most verbs do not need the version
 
     try:
         return metadata.version("clsplat")

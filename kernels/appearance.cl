@@ -13,7 +13,7 @@
 #include "shared/lanes.h"
 
 #define MOST_LOG 16.0f
-#define MOST_MIX 0.2f // limit at which any six mixes can be undone
+#define MOST_MIX 0.2f // largest mix; up to it the map of any six mixes can be inverted
 
 // gains, target -> target: the photograph divided by its gains, so that it has the model's exposure.
 __kernel void remove_gains(const int photograph, const int stride, const int plane, __global const float *gains,
@@ -61,7 +61,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean offset of the pulled photographs is left free
+    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the pull leaves the mean offset of the pulled photographs free
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);
     for (int k = begin; k < end; ++k) {
@@ -70,7 +70,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
     }
     g = added(g, pull);
   }
-  if (!(g * g < INFINITY)) g = 0.0f; // a view with non-finite values teaches nothing
+  if (!(g * g < INFINITY)) g = 0.0f; // a gradient that is not finite counts as 0
   const float m = fma1(beta1, first[i], (1.0f - beta1) * g), v = fma1(beta2, second[i], (1.0f - beta2) * (g * g));
   first[i] = m, second[i] = v;
   moved[i] = logs[i] - (c < 3 ? rate : slow * rate) * m / fma1(sqrt(v), root, epsilon);

@@ -31,7 +31,8 @@
 #else
 #define RECORD(statements)
 #endif
-// With ellipse-tested cells few vectors are visited in vain, and the test would cost more than it saves.
+// If cells are tested against the ellipse, few vectors are visited in vain, and this test would cost more than it
+// saves.
 #if defined(RECORD_CELLS) && VECTORS > 1 // a cell of two vectors stays open while one of them is open
 #define CONTRIBUTES(mask) RECORDED((mask) & MASKL(pixels[cell].t > 0.0f))
 #elif defined(RECORD_CELLS)
@@ -75,7 +76,7 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, floa
   p->near = fmaL(weight, (floatL)(c_near), p->near);
 #endif
   p->t = AS_FLOATL(AS_INTL(after) & goes_on);
-  const intL ended = AS_INTL(before) & ~goes_on; // the bits of a positive number, or 0
+  const intL ended = AS_INTL(before) & ~goes_on; // the bits of `before` where the pixel is finished now, else 0
   if (!ANYL(ended)) return 0;
   p->kept = ended != 0 ? before : p->kept;
   p->stop = ended != 0 ? (intL)(i) : p->stop;
@@ -156,7 +157,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   int open = 0; /* the bits of a positive number, or 0 */                                                              \
   ALL_CELLS(cell) open |= AS_INTL(pixels[cell].t);
   __local Staged staged[BATCH];
-  __local int busy[2]; // items with an open pixel, for this batch and the next
+  __local int busy[2]; // number of items with an open pixel, for this batch and the next
   if (ITEM < 2) busy[ITEM] = 0;
   BARRIER_LOCAL();
   for (int batch = begin, turn = 0; batch < end; batch += BATCH, turn ^= 1) {

@@ -24,7 +24,7 @@
 #include "shared/alpha.h"
 #include "shared/prefetch.h"
 
-#ifdef CONTRIBUTIONS // they need every cell, also those without a gradient
+#ifdef CONTRIBUTIONS // contributions need every cell, also cells without a gradient
 #define LIVE(cells, live) (cells)
 #else
 #define LIVE(cells, live) ((cells) & (live))
@@ -61,7 +61,7 @@ typedef struct {
 #endif
 } Pixels;
 
-// A pair's share in a cell's pixels: g, and its blending weight.
+// g and the blending weight of a pair in a cell's pixels.
 typedef struct {
   floatL g, weight;
 } Share;
@@ -194,11 +194,11 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
 #elif ITEMS > 1
 #include "shared/item_sums.h"
 
-// Pairs whose sums over the group's items are made together: enough to give most items a row.
+// Number of pairs whose sums over the group's items are computed together: enough that most items have a row to add up.
 #define TOGETHER (SUBGROUP > 1 && ITEMS > SLOT_STRIDE ? ITEMS / SLOT_STRIDE : ITEMS < 256 ? 3 : 1)
 #endif
 
-// The gradient by a pixel's final transmittance; background: the part that comes through the background.
+// The gradient by a pixel's final transmittance; background: its part through the background's colour.
 #ifdef ALPHA_GRADIENT
 #define AT_END(background) ((background) + by_t)
 #define NEAR_PLANE 4
@@ -380,7 +380,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   __local Staged staged[BATCH];
   __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
   for (int batch = last; batch > begin; batch -= BATCH) {
-    const int count = min(BATCH, batch - begin); // of the pairs before `batch`, last one first
+    const int count = min(BATCH, batch - begin); // number of pairs before `batch`, from the last one on
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
       stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], splats, tile_x, tile_y);

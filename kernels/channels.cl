@@ -39,7 +39,7 @@ GROUP __kernel void channels(const int first_tile, const int tiles_x, const int 
   intL stop[OWNED], count[OWNED], heaviest[OWNED];
   int last = begin;
 #ifdef HOLDOUT
-  floatL cut[OWNED]; // light that the surfaces have absorbed
+  floatL cut[OWNED]; // fraction of the light that the surfaces have absorbed
   Held held[OWNED];
   ALL_CELLS(cell) {
     cut[cell] = (floatL)(0.0f);

@@ -51,7 +51,7 @@ __kernel void deep_merge(const int pixels, const int pictures, const int bins, c
     last = depth[p];
     __global const float *at = lists + picture * p + slice * next[p];
     t[p] = fma1(-t[p], at[plane * DEEP_ALPHA], t[p]);
-    after = 0.0f; // summed afresh: a running sum would lose small remainders
+    after = 0.0f; // summed anew each time: a running sum would lose small remainders
     for (int each = 0; each < pictures; ++each) after += t[each];
     sources[plane * events + pixel] = (uchar)p;
     const bool more = ++next[p] < bins && at[slice + plane * DEEP_ALPHA] > 0.0f;

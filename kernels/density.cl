@@ -23,7 +23,7 @@ static inline float ndc_norm(__global const float *screen, const size_t i, const
 // sigma. Here and below, a view with a value that is not finite does not count.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
 #ifdef RAYS
-                                 const float pixels, // per radian
+                                 const float pixels, // pixels per radian
 #endif
                                  __global const uint *tile_counts, __global const float *screen,
                                  __global const float *splats, __global float *gradient_sums, __global float *seen,
@@ -46,8 +46,8 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   radii[i] = radii[i] > radius ? radii[i] : radius;
 }
 
-// contributions (n): of the Gaussians with tiles, in pixels; area: full-size pixels per pixel -> totals, largest (n),
-// over the views.
+// contributions (n) of the Gaussians with tiles to this view, in pixels; area: full-size pixels per pixel -> totals,
+// largest (n): sum and maximum over the views.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
                                       __global float *largest) {
@@ -76,10 +76,10 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
 }
 
 // Marks `count` of the n rows, beginning at row `first`. scores, radii (n); log_scales (count, 3), logits (count): of
-// these rows; strongest, strongest_row: scores above `strongest` qualify, and equal ones up to row strongest_row ->
+// these rows; cut_off, cut_off_row: scores above `cut_off` qualify, and equal ones up to row cut_off_row ->
 // marks (3, n), 0 or 1: the row stays, is cloned, is split.
-__kernel void density_marks(const uint n, const uint first, const uint count, const float strongest,
-                            const uint strongest_row, const float large_edge, const float transparent_edge,
+__kernel void density_marks(const uint n, const uint first, const uint count, const float cut_off,
+                            const uint cut_off_row, const float large_edge, const float transparent_edge,
                             const float oversized_edge, const float oversized_half_edge, const float radius_edge,
                             __global const float *scores, __global const float *radii, __global const float *log_scales,
                             __global const float *logits, __global uint *marks) {
@@ -88,7 +88,7 @@ __kernel void density_marks(const uint n, const uint first, const uint count, co
   const float a = log_scales[3 * j], b = log_scales[3 * j + 1], c = log_scales[3 * j + 2], ab = a > b ? a : b;
   const float largest = a == a && b == b ? (ab > c ? ab : c) : -INFINITY;
   const float score = scores[i];
-  const bool wanted = score >= 0.0f && (score > strongest || (score == strongest && i <= strongest_row));
+  const bool wanted = score >= 0.0f && (score > cut_off || (score == cut_off && i <= cut_off_row));
   const bool large = largest > large_edge, gone = score == USELESS || logits[j] <= transparent_edge;
   const bool stays = !gone && !(largest > oversized_edge);
   marks[i] = stays && !(wanted && large) && !(radii[i] > radius_edge);

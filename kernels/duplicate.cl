@@ -45,8 +45,9 @@ GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const 
 // (visible). The first four entries of readback, zero before: visible Gaussians, pairs, the complement of the smallest
 // key, and the largest key. The bits of positive floats sort like the floats. A group owns a chunk.
 //
-// BY_CAPACITY: a pass stops if it has more than `capacity` pairs, or if Adam has refused an element before it. All
-// later passes stop too, until the host has reacted: they have no visible Gaussians, and no step changes the model.
+// BY_CAPACITY: a pass stops if it has more than `capacity` pairs, or if Adam has refused an element in an earlier step.
+// All later passes stop too, until the host has reacted. A stopped pass has no visible Gaussians, and its step does not
+// change the model.
 GROUP __kernel void compact_visible(const uint n, const uint chunk, __global const uint *shown,
                                     __global const uint *tile_counts, __global const float *splats,
                                     __global const uint *sums, __global uint *slots,

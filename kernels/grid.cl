@@ -150,7 +150,7 @@ __kernel void move_grid(const int photograph, const float rate, const float root
   if (item >= GRID_FLOATS || readback[READBACK_STOPPED]) return;
   const size_t at = (size_t)photograph * GRID_FLOATS + item;
   float g = by_grid[item];
-  if (!(g * g < INFINITY)) g = 0.0f; // a view with non-finite values teaches nothing
+  if (!(g * g < INFINITY)) g = 0.0f; // a gradient that is not finite counts as 0
   const float m = fma1(beta1, first[at], (1.0f - beta1) * g), v = fma1(beta2, second[at], (1.0f - beta2) * (g * g));
   first[at] = m, second[at] = v;
   grids[at] -= rate * m / fma1(sqrt(v), root, epsilon);

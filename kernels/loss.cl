@@ -31,11 +31,11 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
                                  2.13005538e-1f, 2.66011725e-1f, 2.13005538e-1f, 1.09360690e-1f,
                                  3.60007721e-2f, 7.59875814e-3f, 1.02838008e-3f};
 
-// Columns on either side of a block that a window reaches, rounded up to whole vectors.
+// Number of columns beyond either side of a block that a window reaches, rounded up to whole vectors.
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
 #if ITEMS == 1
 #define ROWS LOSS_ROWS
-#define COLUMNS LOSS_COLUMNS // at most
+#define COLUMNS LOSS_COLUMNS // most columns of a block
 #define NEAR_MARGIN (2 * MARGIN)
 #define RING_ROW(y) ((y) & (LOSS_RING - 1))
 #else

@@ -13,8 +13,8 @@
 #include "shared/elementary.h"
 #include "shared/random.h"
 
-#define HALVES 8              // uniform 16-bit numbers in a sum
-#define WORDS (HALVES / 2)    // two in each
+#define HALVES 8              // number of uniform 16-bit numbers in a sum
+#define WORDS (HALVES / 2)    // random words, with two numbers each
 #define SPREAD 1.86881232e-5f // 1 / the sum's standard deviation, sqrt(HALVES (2^32 - 1)/12)
 
 // The row's random number `index`: (93). Its sum is an integer under 2^23, so that it is rounded only once.

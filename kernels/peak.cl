@@ -6,7 +6,7 @@
 // Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep compilers from removing the work.
 //   limit_copy: from (n) -> to (n).
 // Equations: those of blend.cl and blend_grad.cl, without branches.
-#define SUMS_OF_LANES // their bits do not matter
+#define SUMS_OF_LANES // the bits of the sums do not matter
 #include "shared/widened.h"
 #include "shared/math.h"
 #include "shared/lanes.h"

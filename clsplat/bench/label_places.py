@@ -24,9 +24,9 @@ MARKER_RADIUS_PX = 6.0
 LEADER_LINE_DISTANCE_PX = 12.0
 """Distance in pixels beyond which a label has a leader line."""
 CROSSING_COST_PX = 60.0
-"""Cost of crossing a line, in pixels of distance between point and label."""
+"""Cost of crossing a line. It counts as much as this distance between point and label."""
 AMBIGUOUS_POINT_COST_PX = 40.0
-"""Cost of another point about as near to the label as its own, in the same unit."""
+"""Cost of another point that is about as near to the label as its own point, in the same unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
     """Place a label near each point, inside the box `frame`.
 
     points: (n, 2).
-    sizes: (n, 2), of the labels.
+    sizes: (n, 2), sizes of the labels.
     lines: segments that labels and leader lines should not cross.
     A point's marker covers a square around it.
     The search is greedy and starts with the points that have the most neighbours.

@@ -22,7 +22,7 @@ from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers.shapes import Shape, candidates, default_shape, save_shape
-from clsplat.device.drivers.worker_process import Child, end_with_parent, patience, python_module, tell
+from clsplat.device.drivers.worker_process import WorkerProcess, driver_timeout, end_with_parent, python_module, tell
 from clsplat.errors import DriverError
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
@@ -76,9 +76,9 @@ def choose(trials: list[Trial]) -> Shape:
 
 
 def _in_a_process(index: int, shape: Shape) -> float | None:
-    with closing(Child(python_module("clsplat.bench.shapes", str(index), shape.label))) as child:
+    with closing(WorkerProcess(python_module("clsplat.bench.shapes", str(index), shape.label))) as child:
         try:
-            answer = child.receive(patience())
+            answer = child.receive(driver_timeout())
         except TimeoutError:
             return None
     return float(answer["ms"]) if answer is not None else None

@@ -102,14 +102,14 @@ def bench(
 
 def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
     """Numbers of a frame's (tile, Gaussian) pairs and (pixel, Gaussian) pairs, by kind."""
-    listed = contributing = evaluated = 0
+    pairs = contributing = evaluated = 0
     for band in frame.bands:
-        part = rasterizer.part(frame, band)
-        listed += part.counted.pairs
-        drawn = (part.lists, frame.projected.splats, frame.background, frame.camera)
+        listed = rasterizer.listed(frame, band)
+        pairs += listed.counted.pairs
+        drawn = (listed.lists, frame.projected.splats, frame.background, frame.camera)
         added, looked_at = count_pairs(rasterizer.device, rasterizer.work, *drawn)
         contributing, evaluated = contributing + added, evaluated + looked_at
-    return {"listed": listed, "contributing": contributing, "evaluated": evaluated}
+    return {"listed": pairs, "contributing": contributing, "evaluated": evaluated}
 
 
 def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int) -> dict[str, dict[str, Any]]:

@@ -46,7 +46,7 @@ class Intrinsics(Protocol):
 class LensModel(NamedTuple):
     """A lens of photographs.
 
-    name: COLMAP's, if COLMAP has it.
+    name: COLMAP's name, or clsplat's own if COLMAP does not have the lens.
     coefficients: number of distortion coefficients that `Camera.radial` takes.
     with_two: the model with two focal lengths that replaces a model with one, "" for none.
     with_two_coefficients: number of its coefficients; the model's own are the first.
@@ -64,8 +64,8 @@ class LensModel(NamedTuple):
 class PlaneProjection(NamedTuple):
     """The linearised projection of points (N, 3) on an image plane.
 
-    ratios: (N, 2), as in the Jacobian.
-    unclamped: (N, 2), where the ratios follow the point.
+    ratios: (N, 2), x/z and y/z as in the Jacobian, clamped.
+    unclamped: (N, 2), True if the ratio is not clamped, so that it follows the point.
     jacobian: (N, 2, 3).
     """
 
@@ -185,11 +185,12 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:  # noqa: ARG002
-        """True for points (N, 3) in the camera's axes whose direction may be in a picture, (N,)."""
+        """For points (N, 3) in the camera's axes, True if a picture may show their direction, (N,)."""
         return np.ones(len(points), np.bool_)
 
     def pixel_widths(self, view: Intrinsics, points: Float64) -> Float64:
-        """A pixel's width (N,) at points (N, 3) in the camera's axes, world units; infinite where they are not seen.
+        """A pixel's width (N,) at points (N, 3) in the camera's axes, world units; infinite if the camera does not see
+        the point.
 
         Eq. (88) of docs/gradients.md.
         """
@@ -228,6 +229,6 @@ class CameraModel:
         The step is along the plane's axes.
 
         gradients: (N, 2, 2), by the covariance.
-        low_pass: in square pixels.
+        low_pass: variance added to the projected covariance, square pixels.
         """
         raise NotImplementedError(self.projection)

@@ -28,7 +28,7 @@ class BenchVerb(Verb):
     """
 
     source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL")] = None
-    """A scene as training starts it, a run, or a model file. If not given: a synthetic scene."""
+    """A scene, measured at the start of a training; a run, or a model file. If not given: a synthetic scene."""
     gaussians: int = 200_000
     """Gaussians of the synthetic scene."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
@@ -49,13 +49,13 @@ class BenchVerb(Verb):
     rasterizer: BenchSwitches = field(default_factory=BenchSwitches)
 
     def completed(self, given: Collection[str]) -> BenchVerb:
-        """Take the rasterizer's settings from the preset, apart from those given as flags."""
+        """Take the rasterizer's settings from the preset, except for settings given as flags."""
         switches = RASTERIZER_PRESETS[self.preset].switches()
         return replace(self, rasterizer=with_given(switches, self.rasterizer, given, "rasterizer."))
 
 
 def run(verb: BenchVerb, services: Services) -> int:
-    """Measure. Errors in the call are found before the measurements."""
+    """Measure. Errors in the command line are reported before the first measurement."""
     from clsplat.bench import settings as tradeoff
     from clsplat.bench import stages as bench_stages
     from clsplat.bench import workload as bench_subject

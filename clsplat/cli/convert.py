@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 SILENT_WRITE_SECONDS = 2.0
 """Seconds that writing a file may take before progress is shown."""
 NEAR_PLANE_RELATIVE_TOLERANCE = 0.05
-"""Relative tolerance of near planes. A file without one gets it from positions, which a format may have rounded."""
+"""Relative tolerance of near planes. A file that stores none gets one from its positions, which the format may have
+rounded."""
 MAX_MATRIX_FILE_BYTES = 1 << 16
 """Size limit in bytes of a matrix file."""
 
@@ -98,7 +99,8 @@ class ConvertVerb(Verb):
     """Replace an existing file, even the source."""
     activated: Annotated[Literal["opacities", "scales", "both"] | None, arg(metavar="opacities|scales|both")] = None
     """Read the source's opacities (0 to 1, to 100 or to 255), its scales, or both as plain values. This is for a file
-    that stores them in place of the usual logits and logarithms. A warning names files that seem to."""
+    that stores such values instead of the usual logits and logarithms. A warning names files that seem to store
+    them."""
     merge: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
     """Add the Gaussians of these model files."""
     crop: Annotated[str | None, arg(metavar="X0,Y0,Z0,X1,Y1,Z1")] = None
@@ -147,7 +149,7 @@ class ConvertVerb(Verb):
 
 
 def run(verb: ConvertVerb, services: Services) -> int:
-    """Read, edit, write and read back. Errors in the call are found before anything is written."""
+    """Read, edit, write and read back. Errors in the command line are reported before anything is written."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
@@ -169,7 +171,7 @@ def run(verb: ConvertVerb, services: Services) -> int:
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
         warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
-    read = load(verb.target, doubts=False)  # without warnings: those on the source were printed already
+    read = load(verb.target, doubts=False)  # without warnings: the same ones were printed for the source
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(
             f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
@@ -220,7 +222,7 @@ def _check(verb: ConvertVerb) -> None:
     )
     check_rules(verb, "--", rules)
     if (verb.prune_contribution is None) != (verb.cameras is None):
-        raise InputError("--prune-contribution and --cameras go together: contributions are to these cameras")
+        raise InputError("--prune-contribution and --cameras go together: contributions are to their pictures")
     defaults = {field.name: field.default for field in fields(verb)}
     names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
     if verb.scene is None and names:
@@ -258,7 +260,7 @@ def _edited(
 
 
 def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
-    """Options for the target's format. Raises InputError for a flag of another format."""
+    """Options that the flags give for the target's format. Raises InputError for a flag of another format."""
     flags = (
         ("up", verb.up and verb.up.upper(), "up_axis", "OpenUSD"),
         ("spz-version", verb.spz_version, "version", "SPZ"),
@@ -291,7 +293,7 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
     (path, other), (first_path, first) = merged, source
     space, expected = colour_space(path), colour_space(first_path)
     if space != expected:
-        warn(f"--merge {path}: its colours are {space}, but those of {first_path} are {expected}; all count as these")
+        warn(f"--merge {path}: its colours are {space}, and are taken for {expected}, the colours of {first_path}")
     distance = float(np.linalg.norm(other.origin - first.origin))
     if len(other) and distance > edit.MAX_WORLD_OFFSET_SIZES * float(other.means.std(axis=0).max()):
         step = float(np.spacing(np.float32(distance)))
@@ -378,9 +380,9 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
 def _measured(
     verb: ConvertVerb, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
 ) -> SceneComparison:
-    """PSNR in dB before and after conversion, against the photographs and against each other.
+    """PSNR in dB of the renders before and after conversion, against the photographs and against each other.
 
-    The cameras of the converted model move with it.
+    The result has each view's values and their means. The converted model is rendered from cameras transformed like it.
     """
     import numpy as np
 

@@ -29,7 +29,7 @@ class DemoVerb(Verb):
 
 
 def run(verb: DemoVerb, services: Services) -> int:
-    """Run the demo, after the device's self-test."""
+    """Run the device's self-test, then the demo."""
     TrainConfig(iterations=verb.iterations).check()
     verb.device.trusted(services)
     result = services.run_demo(verb.output, device=verb.device.selector, iterations=verb.iterations)

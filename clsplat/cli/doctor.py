@@ -49,12 +49,8 @@ def run(verb: DoctorVerb, _: Services) -> int:
         if line.advice:
             rows.append(("", "", f"-> {line.advice}"))
     print("\n".join(aligned(rows, left=range(3))))
-    verdict = f"{len(missing)} missing" if missing else "Nothing is missing without which training does not run"
-    print(
-        f"{verdict}. What is advised is behind the arrows."
-        if any(line.advice for line in everything)
-        else f"{verdict}."
-    )
+    verdict = f"{len(missing)} missing" if missing else "Everything that training needs is there"
+    print(f"{verdict}. Advice is behind the arrows." if any(line.advice for line in everything) else f"{verdict}.")
     return 1 if missing else 0
 
 
@@ -91,7 +87,7 @@ def _packages() -> list[Diagnostic]:
         match = _REQUIREMENT.match(text)
         assert match is not None, text
         name, extra = match[1], match[2]
-        if name == "clsplat" or (";" in text and not extra):  # needed on some systems only
+        if name == "clsplat" or (";" in text and not extra):  # itself, or a package that only some systems need
             continue
         version = _version(name)
         if extra:

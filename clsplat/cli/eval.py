@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class EvalVerb(Verb):
     """Measure a model on a scene's held-out views: PSNR, SSIM, and LPIPS if the extra is installed.
 
-    For a run, eval.json and test/ are replaced.
+    For a run, the files eval.json and test/ are replaced.
     """
 
     model: RunOrModel
@@ -57,7 +57,7 @@ class EvalVerb(Verb):
 
 
 def run(verb: EvalVerb, services: Services) -> int:
-    """Measure. A run's folder is locked."""
+    """Measure. A run's folder is locked meanwhile."""
     from clsplat.runs.locks import locked
     from clsplat.runs.run import is_run
 
@@ -124,7 +124,7 @@ def _evaluate(verb: EvalVerb, services: Services) -> int:
 
 
 def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | None) -> tuple[Scene, list[View]]:
-    """The scene, with the run's settings unless flags set others, and its held-out views. Raises InputError."""
+    """The scene and its held-out views. Flags override the run's settings. Raises InputError."""
     from clsplat.runs.refined_lenses import through_refined
 
     config = trained.config if trained else TrainConfig()
@@ -141,7 +141,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of scores that do not count as held-out scores, and of pictures that look wrong."""
+    """Warn of views whose scores are not held-out scores of the run's scene, and of pictures that look wrong."""
     from clsplat.runs import scene_record
     from clsplat.scenes.analysis import sanity_checks
 

@@ -18,10 +18,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from tyro.conf import FlagCreatePairsOff, Positional, Suppress
 
 Groups = tuple[tuple[str, tuple[str, ...]], ...]
-"""Titles with names of flags, which may end in `*`. A flag is listed in the first group that names it."""
+"""Title of each group, and its flags by name or by a pattern that ends in `*`. A flag is listed in the first group that
+has it."""
 OTHER_FLAGS_TITLE = "Others"
 HELP_TEXT_COLUMN = 24
-"""Column of the help text. A longer flag name has its text on the next line."""
+"""Column at which help texts begin. The text of a flag with a longer name begins on the next line."""
 MIN_FLAG_SIMILARITY = 0.75
 """Smallest similarity, 0 to 1, at which a known flag is suggested for an unknown one."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "STR"}
@@ -31,8 +32,8 @@ _METAVARS = {int: "INT", float: "FLOAT", str: "STR"}
 class Option:
     """A flag, or a positional argument.
 
-    names: on the command line; empty for a positional argument.
-    text: its docstring.
+    names: its names on the command line; empty for a positional argument.
+    text: the docstring of its field.
     off: name of the flag that switches it off, if there is one.
     """
 
@@ -86,7 +87,7 @@ def options(kind: type, prefix: str = "") -> Iterator[Option]:
 def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None) -> str:
     """Help of a verb, with its flags in groups.
 
-    width: of the lines; the terminal's if not given.
+    width: width of the lines; the terminal's if not given.
     """
     width = min(width or shutil.get_terminal_size().columns, 100)
     every = list(options(kind))
@@ -156,7 +157,7 @@ def _shown(value: object) -> str:
 
 
 def _marker(marked: Any) -> Any:
-    """The marker that a type of tyro's, such as Positional, adds to another type."""
+    """The marker that tyro's annotation, such as Positional, adds to a type."""
     return get_args(marked[int])[1]
 
 

@@ -28,9 +28,9 @@ def main(arguments: Sequence[str] | None = None, services: Services | None = Non
     """Run one command line, `sys.argv` if none is given. Returns the exit status."""
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())
-        sys.stdout.flush()  # now: at interpreter exit a closed pipe would print a traceback
+        sys.stdout.flush()  # here, because at interpreter exit a closed pipe would print a traceback
     except OSError as error:
-        if not reader_has_gone(error):  # standard output goes to a file that cannot be written
+        if not reader_has_gone(error):  # otherwise standard output is a file that cannot be written
             tell(f"clsplat: error: standard output: {system_trouble(error)}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

@@ -47,11 +47,11 @@ VERBS = {
 }
 """Verbs in the order of --help, with the first sentence of each one's help.
 
-Each is a module of `clsplat.cli`, with a class NAMEVerb and a function `run`.
-A module is imported when its verb is called.
+Each verb is a module of `clsplat.cli`, with a class NAMEVerb and a function `run`. A module is imported only when its
+verb is called.
 """
 _VERB_MODULES = {"render": "render.verb"}
-"""Modules of the verbs that have a folder."""
+"""Modules of verbs that have a folder of their own."""
 
 
 def verb_module(name: str) -> Any:
@@ -66,7 +66,7 @@ def verb_class(name: str) -> type[Verb]:
 
 
 def _listed(name: str) -> type:
-    """Placeholder without arguments for a verb that is only listed."""
+    """Placeholder class without arguments, for a verb that `clsplat --help` only lists."""
     return make_dataclass(name.capitalize(), (), namespace={"__doc__": VERBS[name]})
 
 
@@ -118,7 +118,7 @@ def _text_rules() -> tyro.constructors.ConstructorRegistry:
     """Parsing rules for flags of one word.
 
     Lists of steps are written 500,1000,2000, where tyro expects spaces.
-    An empty path, as from an unset shell variable, is refused: it does not mean the working directory.
+    An empty path is refused: it comes from an unset shell variable, and does not mean the working directory.
     """
     registry = tyro.constructors.ConstructorRegistry()
 
@@ -160,7 +160,7 @@ def _steps(text: str) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def _wide() -> Iterator[None]:
-    """Make the terminal look wide, so that a message that becomes one line is not wrapped first."""
+    """Inside, the terminal seems wide, so that tyro does not wrap messages that are to be one line."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "10000"
     try:
@@ -172,9 +172,9 @@ def _wide() -> Iterator[None]:
 
 
 def _unboxed(report: str) -> str:
-    """Message in one of tyro's boxes, on one line, without the frame and the advice below."""
+    """The message in one of tyro's boxes, on one line, without the frame and without the advice below it."""
     words: list[str] = []
-    # without box characters, where standard output is not UTF-8, the first rule is below the title
+    # if standard output is not UTF-8, the box is drawn without box characters, and its first rule is below the title
     titled = "╭" in report
     for line in report.splitlines():
         text = line.strip("│ ").strip()
@@ -191,7 +191,8 @@ def _unboxed(report: str) -> str:
 
 
 def report(message: str, status: int, arguments: Sequence[str]) -> None:
-    """Print an error, also as an object on standard output if the command line asks for JSON."""
+    """Print an error on standard error. If the command line asks for JSON, also print it as an object on standard
+    output."""
     tell(f"clsplat: error: {message}")
     if "--json" in arguments:
         print(as_json(message, status), flush=True)
@@ -203,8 +204,8 @@ def as_json(message: str, status: int) -> str:
 
 
 def tell(line: str) -> None:
-    """Print on standard error if possible. The exit status carries the same information."""
+    """Print a line on standard error, if that is possible. If not, the exit status still tells of the error."""
     try:
         print(line, file=sys.stderr, flush=True)
-    except OSError:  # text left in the stream would change the interpreter's exit status
+    except OSError:  # text that stays in the stream would change the interpreter's exit status
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())

@@ -49,10 +49,10 @@ def run(verb: ReportVerb, _: Services) -> int:
     path = verb.output or run.path / "report.html"
     check_page(path, overwrite=verb.overwrite or verb.output is None)
     with nullcontext() if verb.output else locked(run.path, "report"):
-        figures = write_report(run, path, views=verb.views)
+        numbers = write_report(run, path, views=verb.views)
     if verb.json:
-        print(json.dumps(figures.document(), indent=2, allow_nan=False))
-    for note in figures.notes:
+        print(json.dumps(numbers.document(), indent=2, allow_nan=False))
+    for note in numbers.notes:
         warn(note)
     print(f"report in {path}", file=sys.stderr)
     return 0

@@ -62,7 +62,7 @@ def run(verb: SelftestVerb, _: Services) -> int:
             print(table(report))
             print(f"This driver {report.verdict}.", flush=True)
             if report.remembered:
-                print(f"The shape is not used all the same: {report.remembered}.", flush=True)
+                print(f"The shape is still not used: {report.remembered}.", flush=True)
     records = [record(info, report) for info, report in zip(devices, reports, strict=True)]
     if verb.json:
         print(json.dumps(records, indent=2))
@@ -109,7 +109,7 @@ def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
 
 
 def table(report: DriverReport) -> str:
-    """Table of every stage with its worst error, or a note that it was not run."""
+    """Table of all stages: each with its worst error, or with a note that it was not run."""
     rows: list[tuple[str, ...]] = [SELFTEST_TABLE_HEADER]
     if report.build_seconds is not None:
         rows.append(("build", "", "", "", "", f"{1e3 * report.build_seconds:.0f}", ""))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environment of a verb: services, scene and devices."""
+"""Functions that verbs share: services of the package, the scene, and the devices."""
 
 from __future__ import annotations
 

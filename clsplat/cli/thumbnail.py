@@ -57,8 +57,8 @@ def run(verb: ThumbnailVerb, services: Services) -> int:
     output = verb.output or Path(f"{verb.model.resolve().name}.png")
     check_format(str(output), ("rgb",))
     if FRAME_FIELD_PATTERN.search(str(output)) or UNKNOWN_FIELD_PATTERN.search(output.name):
-        raise InputError(f"{output}: has a place for frames' numbers, expected the name of one picture, given with -o")
-    is_exr = output.suffix.lower() == ".exr"  # for other files, a model with linear colours is converted too
+        raise InputError(f"{output}: has a place for frame numbers, expected the name of one picture after -o")
+    is_exr = output.suffix.lower() == ".exr"  # an EXR file keeps a model's linear colours, other files do not
     frame = render.RenderVerb(
         verb.model,
         str(output),

@@ -73,7 +73,7 @@ class TrainVerb(Verb):
         """Take the settings from the resumed run, or from preset and schedule, and adapt them to the number of
         devices."""
         verb = self._with_settings(given)
-        if "points" in given and verb.config.points:  # absolute: a run can be resumed from any folder
+        if "points" in given and verb.config.points:  # an absolute path, so that the run can be resumed from any folder
             verb = replace(verb, config=replace(verb.config, points=str(Path(verb.config.points).absolute())))
         explicit = self.resume or "batch" in given
         config = verb.config.on_devices(self.device.count, explicit=explicit)
@@ -109,7 +109,7 @@ def _check_used(config: TrainConfig, given: Collection[str]) -> None:
 
 
 def run(verb: TrainVerb, services: Services) -> int:
-    """Train. Errors in the call are found before the run's folder is changed."""
+    """Train. Errors in the command line are reported before the run's folder is changed."""
     from clsplat.runs.locks import locked
     from clsplat.runs.run import check_output, is_run
 
@@ -155,8 +155,8 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     scene, config = _looked_at(verb, services, source)
     if earlier is not None:
         check_steps_left(earlier, config, "--iterations")
-    if len(scene.points) == 1:  # a Gaussian's size follows from its neighbours, and a single one has none
-        warn(f"{source}: has a single point, training starts from one Gaussian of next to no size")
+    if len(scene.points) == 1:  # a Gaussian's initial size comes from its neighbours, and a single point has none
+        warn(f"{source}: has a single point, training starts from one Gaussian of almost no size")
     changed = earlier is not None and scene_record.check(
         earlier, scene, source, config.resolution, accept=verb.accept_changes
     )
@@ -218,7 +218,8 @@ def _train_run(
     devices: Sequence[Device],
     page: Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]] | None,
 ) -> None:
-    """Train the run with a progress bar, and with a page if there is one. An interruption says how to go on."""
+    """Train the run with a progress bar, and with a page if there is one. The message on an interruption tells how to
+    resume."""
     from clsplat.training.forecast import Forecast
 
     def print_plan(plan: Plan) -> None:
@@ -272,7 +273,7 @@ def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
     """Load the scene to train on, with its start points. Raises InputError if training would fail on it."""
     from clsplat.training.preparation import prepared
 
-    if config.points:  # check now: structure from motion may run first and take long
+    if config.points:  # checked here, because structure from motion may come first and take long
         with open_input(Path(config.points), "a cloud of points"):
             pass
     scene = load_scene(
@@ -286,7 +287,7 @@ def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
 def _check_scene(scene: Scene) -> None:
     """Raise InputError for a scene on which training would fail later.
 
-    These have a view too small to measure, or a truncated picture.
+    That is a scene with a view too small to measure, or with a truncated picture.
     """
     from clsplat.evaluation.metrics import SSIM_WINDOW_PX
 

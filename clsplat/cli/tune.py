@@ -18,14 +18,14 @@ from clsplat.cli.session import Services
 class TuneVerb(Verb):
     """Find a device's quickest kernel shape by a short trial, and save it for later runs.
 
-    A shape sets how many pixels a kernel works on at once and how many work-items share a tile. It also sets whether
-    they share the tile's pixels or its Gaussians for the gradient. A run that is resumed, or repeated for the same
-    bytes, needs its original shape. CLSPLAT_SHAPE=LANESxITEMS overrides the saved one.
+    A shape sets how many pixels a work-item computes at once, and how many work-items share a tile. It also sets
+    whether they share the tile's pixels or its Gaussians for the gradient. A run that is resumed, or repeated for the
+    same bytes, needs its original shape. CLSPLAT_SHAPE=LANESxITEMS overrides the saved one.
     """
 
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
     forget: Flag = False
-    """Return to the default shape, without a trial."""
+    """Return to the default shape, without measuring."""
     json: Flag = False
     """Print the result as JSON."""
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat view` and the page of `clsplat train --view`: from the command line to a viewer (`clsplat.viewer`)."""
+"""`clsplat view`, and the page of `clsplat train --view`: both start a viewer (`clsplat.viewer`) from the command
+line."""
 
 from __future__ import annotations
 
@@ -86,14 +87,14 @@ def run(verb: ViewVerb, services: Services) -> int:
     box = (low + gaussians.origin, high + gaussians.origin)
     start = start_of([view.camera for view in views], gaussians.means + gaussians.origin)
     world = World(file.name, start, gaussians.origin, box, gaussians.sh_degree, views)
-    for exact in (False, True):  # kernels are built for the first pictures
+    for exact in (False, True):  # the first pictures build the kernels
         model.picture(looking(start, WARM_UP_PICTURE_SIZE_PX).camera(), Look(), exact=exact)
     viewing = Viewing(model)
     stopped = threading.Event()
     signals = handled((signal.SIGINT, *endings()), lambda *_: stopped.set())
     with signals, closing(Server(viewing, world, address)) as server:
         _print_address(server)
-        with suppress(TrialInterrupted):  # interrupted while a driver hung
+        with suppress(TrialInterrupted):  # raised if a driver hung when the interruption came
             while not stopped.is_set():
                 if not viewing.work():
                     viewing.wait(MAX_SIGNAL_WAIT_SECONDS)
@@ -130,7 +131,10 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
 
 
 def _scene(services: Services, path: Path | None, config: TrainConfig, *, given: bool) -> Scene | None:
-    """Load the scene, for its cameras and photos. If only the run names it and it is gone: None, with a warning."""
+    """Load the scene, for its cameras and photos. None, with a warning, if the scene that the run names is gone.
+
+    given: True if --scene names the scene; then an error is raised instead.
+    """
     if path is None:
         return None
     try:

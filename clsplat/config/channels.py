@@ -16,7 +16,8 @@ Source = Literal["image", "features", "depths", "whole", "shares"]
 class Channel:
     """A channel of a frame.
 
-    names: in a file, one for each float. EXR names follow the OpenEXR documentation ("Technical introduction", layers).
+    names: names in a file, one for each float. EXR names follow the OpenEXR documentation ("Technical introduction",
+    layers).
     kind: type of its values in a file. Colour is half or float as requested. Exact is always float, as a half has only
     11 bits for a depth. Whole is uint32 in a part of its own, else float.
     part: its name in a file of several parts.

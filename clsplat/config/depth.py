@@ -17,7 +17,7 @@ class DepthUse:
     """Source of the known depths.
 
     source: the scene's points, or depth maps next to the photographs.
-    maps: the values that the maps hold.
+    maps: kind of the values in the depth maps.
     unit: world units per step of an integer map.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of hold-outs (docs/pictures.md), and the layout of their surfaces."""
+"""Settings of holdouts (docs/pictures.md), and the layout of their surfaces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ last is 0 for a surface without length.
 
 @dataclass(frozen=True)
 class HoldoutConfig:
-    """Reading of hold-outs."""
+    """Settings for reading the files of --holdout."""
 
     channel: str = ""
     """Depth channel in --holdout's files, such as depth.Z; Z if not given. Their alpha is A of the same layer."""

@@ -12,7 +12,7 @@ AlphaMeaning = Literal["blend", "ignore", "transparent"]
 
 @dataclass(frozen=True)
 class MaskUse:
-    """Meanings of a scene's masks and alpha channels, and True if masks are inverted."""
+    """Meaning of a scene's masks, meaning of its alpha channels, and True if masks are inverted."""
 
     masks: MaskMeaning = "none"
     alpha: AlphaMeaning = "blend"

@@ -191,12 +191,12 @@ class SamplingConfig:
 
     @property
     def has_lens(self) -> bool:
-        """True if the camera is more than a pinhole."""
+        """True if the lens has a size, so that there is depth of field."""
         return bool(self.aperture) or self.f_stop is not None
 
     @property
     def on(self) -> bool:
-        """True if a frame is more than one sample."""
+        """True if a frame is the mean of several samples."""
         return self.moves or self.has_lens
 
     @property
@@ -283,8 +283,8 @@ class Encoding:
     """Encoding of pictures.
 
     bits: 8 or 16 for PNG and TIFF, 10 or 16 for DPX.
-    quality: of JPEG.
-    prores: of MOV.
+    quality: quality of JPEG files.
+    prores: ProRes profile of MOV files.
     """
 
     depth: ExrDepth = DEFAULT_EXR_DEPTH

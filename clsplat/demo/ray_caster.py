@@ -53,7 +53,7 @@ class Noise:
     def __call__(self, points: Float32, wavelength: float, octaves: int, gain: float = 0.65) -> Float32:
         """Sum of octaves at points (n, 3): (n,), about [-1, 1].
 
-        wavelength: of the first octave, in metres.
+        wavelength: wavelength of the first octave, in metres.
         A B-spline without prefilter removes frequencies that the lattice cannot represent: octaves are band limited.
         """
         total, weight = np.zeros(len(points), np.float32), 1.0
@@ -421,8 +421,8 @@ def write_photos(
     """Write `count` photos `photo_000.jpg` ... into the folder, which is made if missing.
 
     Equal seeds give equal photos.
-    width, height: in pixels.
-    progress: called with a text and a fraction as the work goes on.
+    width, height: size of the picture in pixels.
+    progress: function that is called with a text and the fraction that is done.
     Raises ClsplatError if a photo cannot be written.
     Poses are neither returned nor written: the demo shows that they can be recovered.
     """

@@ -38,8 +38,8 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
     """Make photos/, scene/, run/ and turntable/ below `output`, and return the evaluation, as in eval.json.
 
     Finished steps of an interrupted demo are reused.
-    device: as named by `clsplat devices`.
-    iterations: of training.
+    device: name of the device, as for `clsplat devices`.
+    iterations: number of training steps.
     Raises InputError if the folder holds other files, and the errors of the steps.
     """
     output.mkdir(parents=True, exist_ok=True)

@@ -3,8 +3,8 @@
 
 import os
 
-# Set before pyopencl is imported. Drivers cache their builds, keyed by the whole source text. A second cache in front
-# of theirs only adds binaries that some drivers fail to load again, and needs a writable home.
+# Set before pyopencl is imported: it switches pyopencl's own cache off. Drivers cache their builds by the whole source
+# text. A second cache only adds binaries that some drivers fail to load again, and needs a writable home.
 os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
 
 from clsplat.device.drivers import quirks

@@ -2,8 +2,8 @@
 """Arrays in device memory (a shape and a dtype over a buffer), and a workspace of named scratch arrays that grow.
 
 Debug mode: with CLSPLAT_POISON=1 every array is filled with NaN (2143289344 as an integer) when it is handed out.
-CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number. Reads of memory that was never written
-then show up in the results.
+CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number. A kernel that reads memory that was
+never written then shows it in its results.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class DeviceArray:
             pattern = np.asarray(value, self.dtype)
             fill = partial(cl.enqueue_fill_buffer, self.device.queue, self.buffer, pattern, 0, self.nbytes)
             self._note("fill", fill())
-            for tape in self.device.tapes:
-                tape.add_fill(fill, self.buffer.int_ptr, pattern.tobytes(), self.nbytes)
+            for commands in self.device.command_buffers:
+                commands.add_fill(fill, self.buffer.int_ptr, pattern.tobytes(), self.nbytes)
 
     def _note(self, name: str, event: cl.Event, nbytes: int | None = None) -> None:
         if self.device.recorder.on:
@@ -112,8 +112,8 @@ class DeviceArray:
             event.wait()
             return host
 
-        for tape in self.device.tapes:
-            tape.add_read(again, self.buffer.int_ptr, self.nbytes)
+        for commands in self.device.command_buffers:
+            commands.add_read(again, self.buffer.int_ptr, self.nbytes)
         return finish
 
     def get_rows(self, start: int, stop: int) -> NDArray[Any]:
@@ -144,7 +144,7 @@ class DeviceArray:
             self.device.under_way.clear()
 
     def _at(self, row: int) -> int:
-        """The byte at which a row begins; an array without a first axis has only row 0."""
+        """The byte at which a row begins. An array of no dimensions has only row 0."""
         return row * (self.nbytes // self.shape[0]) if row else 0
 
     def rows(self, start: int, stop: int) -> DeviceArray:
@@ -187,8 +187,8 @@ class _Buffer(cl.Buffer):  # type: ignore[misc]  # no types of its own
 def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity: int = 0) -> DeviceArray:
     """Allocate a new array with a buffer of at least `capacity` elements.
 
-    Raises CapacityError beyond the device's limit for one buffer, the limit for all (`Device.memory`), or its free
-    memory.
+    Raises CapacityError if the buffer would exceed the device's limit for one buffer, the limit for all buffers
+    together (`Device.memory`), or the device's free memory.
     """
     kind = np.dtype(dtype)
     elements = max(prod(shape), capacity, 1)
@@ -286,7 +286,7 @@ def hosted(device: Device, shape: tuple[int, ...], dtype: DTypeLike = np.float32
 def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """Allocate pinned host memory, to which a device copies by itself.
 
-    For copies to other memory a driver may make the host wait, even if asked not to.
+    A copy to other memory may make the host wait, even if the call asks not to wait.
     """
     nbytes = prod(shape) * np.dtype(dtype).itemsize
     buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR, nbytes)
@@ -295,16 +295,17 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[
     return host  # type: ignore[no-any-return]  # the array keeps the mapping alive, and the mapping keeps the buffer
 
 
-MAX_TAPES_PER_OBJECT = 256
-"""The most tapes of one object, enough for photographs of a few sizes. Beyond it all of its tapes are dropped."""
+MAX_COMMAND_BUFFERS_PER_OBJECT = 256
+"""The most command buffers of one object: enough for photographs of a few sizes. At this number all of them are
+dropped."""
 
 
 class Workspace:
     """Scratch arrays by name.
 
-    A name's buffer is kept from call to call. A buffer that is too small grows by half, or, if memory is `tight`, to
-    the required size only. The workspace also keeps tapes (recorded command buffers) of work on its arrays; they are
-    valid until one of these arrays gets another buffer.
+    A name's buffer is kept from call to call. A buffer that is too small is replaced by one half as large again; if
+    memory is `tight`, by one of the required size. The workspace also keeps command buffers of work on its arrays; they
+    are valid until one of these arrays gets another buffer.
     """
 
     def __init__(self, device: Device) -> None:
@@ -314,7 +315,7 @@ class Workspace:
         self._use = asked()
         self._arrays: dict[str, DeviceArray] = {}
         self._latest: dict[str, tuple[DeviceArray, DTypeLike]] = {}
-        self._tapes: WeakKeyDictionary[object, dict[tuple[object, ...], tuple[Any, CommandBuffer]]] = (
+        self._command_buffers: WeakKeyDictionary[object, dict[tuple[object, ...], tuple[Any, CommandBuffer]]] = (
             WeakKeyDictionary()
         )
         self._renewed = 0
@@ -322,35 +323,36 @@ class Workspace:
     def replayed(
         self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
     ) -> R:
-        """Return the result of `make`; its queue commands come from a tape from the second call with this key.
+        """Return the result of `make`. From the second call with this key on, a command buffer replays its queue
+        commands.
 
         For one key, `make` must always return the same result and put the same commands on the queue.
 
-        of: the object whose arrays are not the workspace's; its tapes are dropped with it.
+        of: the object whose arrays `make` uses in addition to the workspace's. Its command buffers are dropped with it.
         key: everything else that `make` depends on, except `numbers`.
-        numbers: the numbers that `make` launches as `Anew`, in order.
+        numbers: the numbers that `make` launches as `LaunchParameter`, in order.
         """
         if self._poison is not None or self._use == "0" or not self._device.replays:
             return make()
-        tapes = self._tapes.get(of)
-        known = None if tapes is None else tapes.get(key)
+        command_buffers = self._command_buffers.get(of)
+        known = None if command_buffers is None else command_buffers.get(key)
         if known is not None and self._use != CHECK_TAPES:
             known[1].set(numbers)
             self._device.replay(known[1])
             return known[0]  # type: ignore[no-any-return]  # the result of this key's `make`
         renewed = self._renewed
-        result, tape = self._device.record(make)
-        if tape is None or self._renewed != renewed:
+        result, commands = self._device.record(make)
+        if commands is None or self._renewed != renewed:
             return result
         if known is not None:
-            known[1].check(tape, numbers)
+            known[1].check(commands, numbers)
             for read in known[1].reads:  # copy into the memory of the known result
                 read()
             return known[0]  # type: ignore[no-any-return]  # as above
-        tapes = self._tapes.setdefault(of, {})
-        if len(tapes) >= MAX_TAPES_PER_OBJECT:
-            tapes.clear()
-        tapes[key] = result, tape
+        command_buffers = self._command_buffers.setdefault(of, {})
+        if len(command_buffers) >= MAX_COMMAND_BUFFERS_PER_OBJECT:
+            command_buffers.clear()
+        command_buffers[key] = result, commands
         return result
 
     def array(
@@ -358,7 +360,7 @@ class Workspace:
     ) -> DeviceArray:
         """An array whose contents are undefined until they are written.
 
-        kept: the array was handed out before in this shape, and its contents are kept.
+        kept: the array must have been handed out before in this shape. It keeps its contents.
         """
         latest = self._latest.get(name)
         if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:
@@ -370,7 +372,7 @@ class Workspace:
             roomy = held is not None and not self.tight
             spare = min(elements * 3 // 2, self._device.max_allocation // kind.itemsize) if roomy else 0
             if held is not None:
-                self._forget_tapes()
+                self._forget_command_buffers()
             held = self._arrays.pop(name, None)
             latest = self._latest.pop(name, None)
             del held, latest  # freed before the new buffer is allocated: there may not be room for both
@@ -385,9 +387,9 @@ class Workspace:
         """Release every buffer."""
         self._arrays.clear()
         self._latest.clear()
-        self._forget_tapes()
+        self._forget_command_buffers()
 
-    def _forget_tapes(self) -> None:
-        """Drop all tapes, and those being recorded."""
-        self._tapes.clear()
+    def _forget_command_buffers(self) -> None:
+        """Drop all command buffers, and those being recorded."""
+        self._command_buffers.clear()
         self._renewed += 1

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tapes: recorded command buffers, which put work on a device's queue again without the Python code that made it.
+"""Recorded command buffers, which put work on a device's queue again without the Python code that made it.
 
-CLSPLAT_TAPES=0 disables replay. CLSPLAT_TAPES=check launches everything as usual, and compares it with the tape if
-there is one: an argument that differs and was not declared as `LaunchParameter` is an error.
+CLSPLAT_TAPES=0 disables replay. CLSPLAT_TAPES=check launches everything as usual, and compares each launch with the
+recorded one: an argument that differs is an error unless it was declared as `LaunchParameter`.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class LaunchParameter(float):
     """A float argument of a launch that each replay sets again."""
 
 
-class AnewWord(int):
+class LaunchParameterWord(int):
     """An unsigned 32-bit argument of a launch that each replay sets again."""
 
 
 def asked() -> str:
-    """The use of tapes: 1, 0 or CHECK_TAPES. Raises InputError."""
+    """The use of command buffers: 1, 0 or CHECK_TAPES. Raises InputError."""
     value = os.environ.get(TAPES_VARIABLE) or "1"
     if value not in ("0", "1", CHECK_TAPES):
         raise InputError(f"{TAPES_VARIABLE}={value}: expected 1, 0 or {CHECK_TAPES}")
@@ -61,12 +61,12 @@ class CommandBuffer:
 
     entries: functions that put them on the queue, each with its kernel if it is a launch.
     calls: the number of calls of each kind.
-    anew: a setter and an argument index for each argument that a replay sets again.
+    anew: setter and argument index of each argument that a replay sets again.
     reads: the entries that copy to the host.
 
-    Each launch has its own kernel object, whose other arguments stay set. The object is left to other tapes afterwards,
-    because pyopencl takes at least 0.2 ms to make one. A tape keeps no buffer alive: its owner must drop it before a
-    buffer may be freed.
+    Each launch has its own kernel object, whose other arguments stay set. Other command buffers use the object later,
+    because pyopencl takes at least 0.2 ms to make one. A command buffer keeps no array alive: its owner must drop it
+    before one of its arrays is freed.
     """
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ class CommandBuffer:
         description = []
         for index, value in enumerate(values):
             own.set_arg(index, typed(value))
-            if given := isinstance(value, (LaunchParameter, AnewWord)):
+            if given := isinstance(value, (LaunchParameter, LaunchParameterWord)):
                 set_bytes = getattr(own, "_set_arg_buf", own.set_arg)  # takes a tenth of the time: no type check
                 self.anew.append((set_bytes, index))
                 self._numbers.append(value)
@@ -123,18 +123,20 @@ class CommandBuffer:
     def check(self, fresh: CommandBuffer, numbers: Sequence[float]) -> None:
         """Raise AssertionError if a replay with these numbers would put anything different from `fresh` on the
         queue."""
-        assert len(self._described) == len(fresh._described), "a tape is longer or shorter than what was made now"
+        assert len(self._described) == len(fresh._described), "a command buffer has another number of commands than now"
         for one, other in zip(self._described, fresh._described, strict=True):
-            assert len(one) == len(other), f"{one[0]} on a tape has another number of arguments than now"
+            assert len(one) == len(other), f"{one[0]} in a command buffer has another number of arguments than now"
             differing = [place for place, pair in enumerate(zip(one, other, strict=True)) if pair[0] != pair[1]]
-            assert not differing, f"{one[0]} on a tape has other arguments than now: {[p - 4 for p in differing]}"
+            assert not differing, (
+                f"{one[0]} in a command buffer has other arguments than now: {[p - 4 for p in differing]}"
+            )
         given, made = ([described(number) for number in each] for each in (numbers, fresh._numbers))
-        assert given == made, f"numbers given to a tape are {list(numbers)}, launched {fresh._numbers}"
+        assert given == made, f"numbers given to a command buffer are {list(numbers)}, launched {fresh._numbers}"
 
     def is_all_of(self, calls: Calls) -> bool:
         """Store the counts of calls since the recording began.
 
-        Returns False if some of them are not on the tape: a write, or a call for which the host waited.
+        Returns False if the command buffer lacks some of them: a write, or a call for which the host waited.
         """
         self.calls = calls
         return len(self.entries) == calls.launches + calls.fills + calls.reads == calls.total

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from clsplat.config.checks import device_names
 from clsplat.device import forks
 from clsplat.device.command_buffer import CommandBuffer
-from clsplat.device.drivers.capabilities import pretended, traits_of
+from clsplat.device.drivers.capabilities import capabilities_of, pretended
 from clsplat.device.drivers.cpu_name import name_processor
 from clsplat.device.drivers.driver_records import tell_once
 from clsplat.device.drivers.quirks import compiles_by_size, no_device, subgroup_ways, title
 from clsplat.device.drivers.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
-from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, patience
+from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, driver_timeout
 from clsplat.device.memory_account import Memory
 from clsplat.device.profile import Calls, Recorder
 from clsplat.device.program import Kernel, Kernels, build, text_of, variant_of
-from clsplat.device.sandbox import Rehearsal
+from clsplat.device.sandbox import KernelTrials
 from clsplat.device.source import kernel_source
 from clsplat.errors import DeviceError, DriverError, KernelBuildError, switched_on
 from clsplat.process import undisturbed
@@ -35,7 +35,8 @@ from clsplat.process import undisturbed
 T = TypeVar("T")
 
 SYNC_VARIABLE = "CLSPLAT_SYNC"
-"""Environment variable that makes each launch wait for its kernel, so that a kernel that hangs or fails is named."""
+"""Environment variable that makes each launch wait for its kernel, so that an error names the kernel that hangs or
+fails."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class DeviceInfo:
 def all_devices() -> list[cl.Device]:
     """Every visible OpenCL device, in the order of its index. Raises DeviceError in a forked process (`forks`)."""
     forks.claim()
-    with undisturbed():  # a driver's threads start compilers and linkers, which Ctrl-C in this terminal would end
+    with undisturbed():  # otherwise Ctrl-C would end compilers and linkers that a driver's threads start
         devices = _visible()
     for device in devices:
         name_processor(device)
@@ -88,7 +89,7 @@ def list_devices() -> list[DeviceInfo]:
             name=device.name.strip(),
             platform=device.platform.name.strip(),
             version=device.platform.version.strip(),
-            kind=traits_of(device).kind,
+            kind=capabilities_of(device).kind,
             compute_units=device.max_compute_units,
             memory_bytes=device.global_mem_size,
             shape=shape_text(device),
@@ -98,7 +99,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def limits(device: cl.Device) -> dict[str, object]:
-    """The device limits that decide how kernels are launched, for a bug report."""
+    """The device's limits that affect kernel launches, for a bug report."""
     names = (
         *("driver_version", "opencl_c_version", "extensions", "max_clock_frequency", "max_compute_units"),
         *("max_work_group_size", "local_mem_size", "max_constant_buffer_size", "max_mem_alloc_size", "global_mem_size"),
@@ -117,13 +118,13 @@ def limits(device: cl.Device) -> dict[str, object]:
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
-    why: the warning that this is not the wanted shape, given when the device is used.
-    only_tries: launches are rehearsed if necessary, and not made (`launch.only_tried`).
-    waits: wait for each kernel, as SYNC_VARIABLE requests.
-    shares_memory: the device uses the host's memory.
+    why: warning that the shape is not the wanted one, which is shown when the device is first used; empty otherwise.
+    only_tries: True if launches are only tried in the sandbox, and not made (`launch.only_tried`).
+    waits: True if each launch waits for its kernel, as SYNC_VARIABLE requests.
+    shares_memory: True if the device uses the host's memory.
     calls: the number of calls on its queue.
-    tapes: the tapes that are being recorded.
-    under_way: events and buffers that keep host arrays alive which the device may still have to read.
+    command_buffers: the command buffers that are being recorded.
+    under_way: events and buffers that keep host arrays alive while the device may still read them.
     part: for a part of a listed device, that device and the part's number.
     index: position in the list of devices; for a part, the position of the whole device.
     """
@@ -141,30 +142,30 @@ class Device:
         self.index = all_devices().index(device if part is None else part[0])
         self.name = device.name.strip() + ("" if part is None else f"/{part[1]}")
         self.driver = device.platform.version.strip()
-        traits = traits_of(device)
-        self.kind = traits.kind
+        capabilities = capabilities_of(device)
+        self.kind = capabilities.kind
         self.shape, self._why_another = (shape, why) if shape else shape_of(device)
         self.only_tries = False
         self.waits = switched_on(SYNC_VARIABLE)
         self.shares_memory = self.kind == "cpu"
         self.compiles_by_size = compiles_by_size(device)
-        self.max_allocation, self.max_group = traits.allocation, traits.group
+        self.max_allocation, self.max_group = capabilities.allocation, capabilities.group
         self.memory = Memory()
         self.context = cl.Context([device])
         self.profile = profile
         properties = cl.command_queue_properties.PROFILING_ENABLE if profile else 0
         self._queue = cl.CommandQueue(self.context, device, properties)
         self.calls = Calls()
-        self.tapes: list[CommandBuffer] = []
+        self.command_buffers: list[CommandBuffer] = []
         self.under_way: list[object] = []
         self._options = "-cl-std=CL1.2"
-        if traits.exact_division:
+        if capabilities.exact_division:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
         self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
         self._switches: Mapping[str, object] = {}
         self.recorder = Recorder(self._queue)
-        self.rehearsal = Rehearsal(device, self.index, self.shape.label)
-        self._fma: list[dict[str, object]] = [] if traits.contraction else [{}]
+        self.trials = KernelTrials(device, self.index, self.shape.label)
+        self._fma: list[dict[str, object]] = [] if capabilities.contraction else [{}]
         self._subgroups: list[dict[str, object]] = []
 
     @property
@@ -175,7 +176,7 @@ class Device:
 
     def kernels(self, stem: str, defines: Mapping[str, object] = {}) -> Kernels:
         """The kernels of `stem`.cl in this device's shape with these defines, built at the first call."""
-        if self._why_another:  # warned about when used, not before, as the self-test may still choose another shape
+        if self._why_another:  # only now: until it is used, the self-test may choose another shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -192,12 +193,12 @@ class Device:
 
     def _built(self, stem: str, defines: Mapping[str, object]) -> Kernels:
         given, text = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **defines}, text_of(stem)
-        # a driver's cache is keyed by the options: shapes share a file that names none of the options in which they
-        # differ
+        # A driver's cache is keyed by the options. Only options that the text names are given, so that shapes share the
+        # build of a file that does not depend on the shape.
         named = {name: value for name, value in given.items() if name.partition("(")[0] in text}
         variant = variant_of(stem, named, self._options)
-        program, salt = build(self.context, self.cl_device, self.rehearsal.build(variant))
-        self.rehearsal.built(variant, salt)
+        program, salt = build(self.context, self.cl_device, self.trials.build(variant))
+        self.trials.built(variant, salt)
         return Kernels(variant, program)
 
     def with_shape(
@@ -239,9 +240,10 @@ class Device:
 
     @property
     def row_alignment(self) -> int:
-        """Alignment, in rows of at least four bytes, of a part of an array that is used in place.
+        """Number of rows, of at least four bytes each, at whose multiples a part of an array must begin to be used in
+        place.
 
-        OpenCL requires sub-buffers to begin at multiples of it, and kernels read whole vectors of lanes.
+        OpenCL requires an alignment of sub-buffers, and kernels read whole vectors of lanes.
         """
         return max(int(self.cl_device.mem_base_addr_align) // 32, self.shape.lanes, 32)
 
@@ -260,48 +262,49 @@ class Device:
             self.calls.launches += 1
             if self.waits:
                 self._wait_for(event, kernel)
-            elif wait:  # so that a failing kernel is the last one named
+            elif wait:  # so that the last kernel in the log is the one that failed
                 self.finish()
         except cl.Error as error:
             raise self._not_launched(kernel, error) from None
-        for tape in self.tapes:
-            tape.add_launch(self.queue, kernel, size, local, values)
+        for commands in self.command_buffers:
+            commands.add_launch(self.queue, kernel, size, local, values)
         return event
 
     def _not_launched(self, kernel: Kernel, error: cl.Error) -> DriverError:
         return DriverError(self._trouble(kernel, f"cannot be launched: {' '.join(str(error).split())}"))
 
     def record(self, work: Callable[[], T]) -> tuple[T, CommandBuffer | None]:
-        """The result of `work`, and a tape of its queue commands; None if they cannot be replayed as they were."""
-        tape, before = CommandBuffer(), copy(self.calls)
-        self.tapes.append(tape)
+        """The result of `work`, and a command buffer of its queue commands, or None if they cannot be replayed
+        unchanged."""
+        commands, before = CommandBuffer(), copy(self.calls)
+        self.command_buffers.append(commands)
         try:
             result = work()
         finally:
-            self.tapes.remove(tape)
-        return result, tape if tape.is_all_of(self.calls.since(before)) else None
+            self.command_buffers.remove(commands)
+        return result, commands if commands.is_all_of(self.calls.since(before)) else None
 
-    def replay(self, tape: CommandBuffer) -> None:
-        """Put the commands of a tape on the queue. Raises DriverError, like `enqueue`."""
+    def replay(self, commands: CommandBuffer) -> None:
+        """Put the commands of a command buffer on the queue. Raises DriverError, like `enqueue`."""
         kernel = None
         try:
-            for kernel, call in tape.entries:  # noqa: B007  # the loop variable names the kernel in an error
+            for kernel, call in commands.entries:  # noqa: B007  # the loop variable names the kernel in an error
                 call()
         except cl.Error as error:
             if kernel is None:
                 raise
             raise self._not_launched(kernel, error) from None
-        self.calls.add(tape.calls)
+        self.calls.add(commands.calls)
 
     @property
     def replays(self) -> bool:
-        """True if tapes may be replayed: nothing needs to observe each launch."""
+        """True if command buffers may be replayed: nothing needs to observe each launch."""
         return not (self.waits or self.recorder.on or self.only_tries)
 
     def _wait_for(self, event: cl.Event, kernel: Kernel) -> None:
         """Wait for a kernel that is on the queue. Raises DriverError if it does not finish in time, or fails."""
         self.queue.flush()
-        start, seconds, pause = time.monotonic(), patience(), 1e-5
+        start, seconds, pause = time.monotonic(), driver_timeout(), 1e-5
         while (status := event.command_execution_status) > cl.command_execution_status.COMPLETE:
             if time.monotonic() - start > seconds:
                 raise DriverError(
@@ -330,10 +333,11 @@ class Device:
         return result, 1e3 * (time.perf_counter() - start)
 
     def _probe_fma(self) -> dict[str, object]:
-        """The define FMA_BY_CONTRACTION if the compiler fuses a lone a*b + c in vectors: then that is the fast way to
-        fma's bits.
+        """The define FMA_BY_CONTRACTION if the compiler fuses a lone a*b + c in vectors, which then is the fastest way
+        to the bits of fma.
 
-        Never without vectors: Intel's runtime vectorises loops by itself, and then fuses some of these operations only.
+        Without vectors it is never set: Intel's runtime vectorises loops by itself, and then fuses only some of these
+        operations.
         """
         if self.shape.lanes == 1:
             return {}
@@ -373,7 +377,7 @@ class Device:
         results = np.empty(shape, np.float32)
         buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, results.nbytes)
         values = (buffer, *numbers)
-        self.rehearsal.launch(kernel, (items,), (items,), values)
+        self.trials.launch(kernel, (items,), (items,), values)
         self.enqueue(kernel, (items,), (items,), values)
         cl.enqueue_copy(self.queue, results, buffer, is_blocking=True)
         return results
@@ -387,7 +391,7 @@ def select(selector: str | None) -> cl.Device:
 
     Without a selector: `CLSPLAT_DEVICE` if set, else the first GPU, else the first device. Raises DeviceError.
     """
-    patience()  # check the environment variable before it is needed
+    driver_timeout()  # raises InputError for an invalid environment variable before a kernel needs it
     devices = list(zip(all_devices(), list_devices(), strict=True))
     if not devices:
         raise no_device()
@@ -395,7 +399,7 @@ def select(selector: str | None) -> cl.Device:
     selector = selector or os.environ.get("CLSPLAT_DEVICE") or None
     if selector is None:
         return next((device for device, info in devices if info.kind == "gpu"), devices[0][0])
-    wanted = selector.lower() if selector.strip() else None  # a blank occurs in every name
+    wanted = selector.lower() if selector.strip() else None  # a blank would match any name
     for device, info in devices:
         words = f"{info.name} {info.platform} {info.version}".lower()
         by_name = wanted is not None and (wanted == info.kind or wanted in words)
@@ -459,10 +463,10 @@ def open_devices(
 ) -> list[Device]:
     """Open each device that `selector` names, separated by commas (see `select`).
 
-    Without a limit, the same device gives the same object. NAME/K is the K-th part, from 0, of a device that OpenCL
-    divides equally. The number of parts is the smallest, at least two, that has part K for every K given.
+    Without a limit, repeated calls return the same object for the same device. NAME/K is part K, counted from 0, of a
+    device that OpenCL divides equally. The device is divided into as few parts as the largest K needs, at least two.
 
-    memory_limit: bytes that the buffers of each object's users may take together.
+    memory_limit: most bytes that all buffers of one returned object may take together.
     profile: make queues that record timings.
     Raises DeviceError if a device is named twice.
     """

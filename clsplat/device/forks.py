@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forks of a process that has used OpenCL: the driver's threads are missing there, so a call would wait forever."""
+"""Check for forks of a process that has used OpenCL: a fork lacks the driver's threads, so a call would wait
+forever."""
 
 from __future__ import annotations
 

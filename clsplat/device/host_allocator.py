@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 HOST_ALIGNMENT_BYTES = 4096
-"""Alignment of the memory in bytes, at which no driver works on a copy of it."""
+"""Alignment of the memory in bytes. With it drivers use the memory in place instead of copying it."""
 MIN_RECYCLED_BYTES = 1 << 18
-"""Size in bytes below which reuse is not worth it."""
+"""Size in bytes from which memory is kept for reuse; for less, reuse saves no time."""
 MAX_IDLE_BYTES = 1 << 28
 """The most bytes kept for reuse."""
 
@@ -33,7 +33,7 @@ def host_bytes(count: int) -> NDArray[np.uint8]:
 
 
 def _found(size: int) -> NDArray[np.uint8] | None:
-    # a finalizer that runs within these statements may call this too: it gets new memory, and never waits
+    # A finalizer may run within these statements and call this function: it then gets new memory instead of waiting.
     if not _lock.acquire(blocking=False):
         return None
     try:
@@ -46,14 +46,14 @@ def _found(size: int) -> NDArray[np.uint8] | None:
 
 
 class _Block:
-    """Memory under arrays: NumPy keeps it while such an array exists."""
+    """Memory that arrays use. NumPy keeps this object while such an array exists."""
 
     def __init__(self, raw: NDArray[np.uint8]) -> None:
         self._raw = raw
         self.__array_interface__: dict[str, Any] = raw.__array_interface__
 
     def __del__(self) -> None:
-        # an array may end within any statement, also under the lock: then the memory is not kept
+        # An array may be deleted within any statement, also while the lock is held: then the memory is not kept.
         if not _lock.acquire(blocking=False):
             return
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel launches: argument conversion, group sizes, and the rehearsal of first launches."""
+"""Kernel launches: argument conversion, group sizes, and the sandbox trial before a kernel's first launch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from clsplat.device.profile import UPDATED_ARRAYS_BY_KERNEL
 from clsplat.device.program import Kernel
 
 DEFAULT_GROUP_ITEMS = 64
-"""Work-items per group in kernels that do not co-operate: enough for a GPU's wave, short enough for a CPU's chunk."""
+"""Work-items per group in kernels whose items do not co-operate: enough for a GPU's wave, few enough for a CPU's
+chunk."""
 _LOW_32_BITS = 0xFFFFFFFF
 _RECOMPILED_SIZE_ITEMS = 1 << 16
 """Items along an axis from which PoCL compiles a kernel again."""
@@ -25,9 +26,9 @@ _RECOMPILED_SIZE_ITEMS = 1 << 16
 
 @contextmanager
 def only_tried(device: Device) -> Iterator[None]:
-    """In the block, rehearse this device's launches if necessary, and do not make them.
+    """In the block, kernels are tried in the sandbox if necessary, but not launched on this device.
 
-    A driver's failure then leaves nothing half done.
+    So if a driver fails, nothing has been changed yet.
     """
     device.only_tries = True
     try:
@@ -58,7 +59,7 @@ def _type(value: Any) -> Any:
 def form_of(device: Device, size: tuple[int, ...], local: tuple[int, ...] | None) -> str:
     """The form of a launch, for a driver that compiles a kernel again for each form; empty for the usual form.
 
-    Group sizes are not part of it: an image's width is one, and each would need a trial.
+    The group size is not part of the form: it may be an image's width, and each width would need a trial.
     """
     if not device.compiles_by_size:
         return ""
@@ -80,13 +81,13 @@ def _first(
     if tells_group_sizes(device.cl_device):
         most = min(most, kernel.most_items(device.cl_device))
     if local is not None and prod(local) > most:
-        raise device.rehearsal.fail(
+        raise device.trials.fail(
             kernel.variant,
             kernel.name,
             f"has {prod(local)} items in a group, where the driver allows it {most}",
         )
     typed = [value if kind is None else np.dtype(kind).type(value) for kind, value in zip(types, values, strict=True)]
-    device.rehearsal.launch(kernel, size, local, typed, form)
+    device.trials.launch(kernel, size, local, typed, form)
     kernel.cl_kernel.set_scalar_arg_dtypes(types)
     kernel.tried.add(form)
 
@@ -101,7 +102,7 @@ def _enqueue(
         _first(device, kernel, size, local, values, form)
     if device.only_tries:
         return
-    event = device.enqueue(kernel, size, local, values, wait=first and device.rehearsal.say is not None)
+    event = device.enqueue(kernel, size, local, values, wait=first and device.trials.say is not None)
     if device.recorder.on:
         name = kernel.name
         arrays = [argument for argument in arguments if isinstance(argument, DeviceArray)]
@@ -111,7 +112,7 @@ def _enqueue(
 
 
 def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) -> None:
-    """Launch one work-item for each of `items`; the kernel guards the rounding up. Nothing for 0 items."""
+    """Launch `items` work-items, rounded up to whole groups; the kernel ignores the surplus. 0 items launch nothing."""
     if items > 0:
         size = -(-items // DEFAULT_GROUP_ITEMS) * DEFAULT_GROUP_ITEMS
         local = (DEFAULT_GROUP_ITEMS,) if device.max_group >= DEFAULT_GROUP_ITEMS else None
@@ -119,16 +120,15 @@ def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) ->
 
 
 def launch_groups(device: Device, kernel: Kernel, groups: int, items: int, *arguments: Any) -> None:
-    """Launch `groups` work-groups of `items`. Nothing for 0 groups."""
+    """Launch `groups` work-groups of `items` work-items. 0 groups launch nothing."""
     if groups > 0:
         _enqueue(device, kernel, (groups * items,), (items,), arguments)
 
 
 def launch_grid(device: Device, kernel: Kernel, size: tuple[int, ...], *arguments: Any) -> None:
-    """Launch a grid of work-items. On a CPU a row is one group's loop; the driver would otherwise make one group of
-    all.
+    """Launch a grid of work-items. A side of 0 launches nothing.
 
-    Nothing if a side is 0.
+    On a CPU each row is a group, as the driver might otherwise make one group of the whole grid.
     """
     if all(size):
         fits = size[0] <= min(device.max_group, 1024)

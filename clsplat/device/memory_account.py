@@ -11,7 +11,7 @@ from clsplat.errors import CapacityError, amount
 
 
 class Memory:
-    """The account of one device's buffers: `used` and `peak` bytes, and their `limit`, or None."""
+    """The account of one device's buffers: the bytes `used` now, their `peak`, and their `limit` or None."""
 
     def __init__(self, limit: int | None = None) -> None:
         self.limit = limit
@@ -19,10 +19,10 @@ class Memory:
         self.peak = 0
 
     def check(self, nbytes: int) -> None:
-        """Raise CapacityError if `nbytes` more would pass the limit."""
+        """Raise CapacityError if `nbytes` more bytes would exceed the limit."""
         if self.limit is None or self.used + nbytes <= self.limit:
             return
-        gc.collect()  # buffers that only an exception's traceback or a cycle holds are not in use
+        gc.collect()  # frees buffers that only an exception's traceback or a reference cycle holds
         if self.used + nbytes > self.limit:
             raise CapacityError(
                 f"--max-device-mem {amount(self.limit)} is too little: {amount(self.used)} of the device's memory are "
@@ -31,7 +31,7 @@ class Memory:
             )
 
     def add(self, buffer: Any, nbytes: int) -> None:
-        """Count a buffer while the object lives."""
+        """Count a buffer's bytes for as long as the buffer exists."""
         self.used += nbytes
         self.peak = max(self.peak, self.used)
         weakref.finalize(buffer, self._remove, nbytes).atexit = False

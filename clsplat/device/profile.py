@@ -16,17 +16,17 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 TRANSFERS_STAGE = "transfers"
-"""The stage of work put on the queue outside every stage: camera, background."""
+"""Name under which work outside all stages is recorded: copies of the camera and the background."""
 
 
 @dataclass
 class StageRecord:
     """The costs of one stage.
 
-    kernels: device milliseconds by kernel, including copies and fills.
-    ms: their sum.
-    wall_ms: from idle device to idle device, including launches and the host's work.
-    bytes: of the arrays passed to the launches.
+    kernels: milliseconds on the device by kernel, including copies and fills.
+    ms: sum of `kernels`.
+    wall_ms: milliseconds from idle device to idle device, including launches and the host's work.
+    bytes: bytes of the arrays passed to the launches.
     """
 
     kernels: dict[str, float] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class Calls:
         return sum(astuple(self))
 
     def add(self, more: Calls) -> None:
-        """Add the counts of a tape, which never waits."""
+        """Add the counts of a command buffer, which never waits."""
         self.launches += more.launches
         self.fills += more.fills
         self.reads += more.reads
@@ -128,7 +128,7 @@ class Recorder:
 
 
 class Recorded(Protocol):
-    """A device, which has a recorder."""
+    """An object with a recorder, such as a `Device`."""
 
     recorder: Recorder
 

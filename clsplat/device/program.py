@@ -36,9 +36,9 @@ class Variant:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def anew(self, salt: str) -> Variant:
-        """The same kernels, in a text that is in no driver's cache, as the cached entry may come from an aborted build.
+        """The same kernels in another text, which no driver has cached: a cached entry may come from an aborted build.
 
-        A comment would not do, as PoCL's cache is keyed by the preprocessor's output.
+        The texts must differ in more than a comment, as PoCL's cache is keyed by the preprocessor's output.
         """
         return replace(self, source=f"{self.source}typedef int anew_{salt};\n") if salt else self
 
@@ -91,7 +91,7 @@ def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.
         salt = secrets.token_hex(8)
         program = _compiled(context, device, variant.anew(salt))
     if program.num_kernels == 0:
-        raise DriverError(f"{device.name.strip()}: {variant.stem}.cl has no kernels when the driver has built it")
+        raise DriverError(f"{device.name.strip()}: {variant.stem}.cl has no kernels after the driver has built it")
     binary_cache.save(device, variant.digest, program)
     return program, salt
 
@@ -117,9 +117,9 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
 class Kernel:
     """A built kernel.
 
-    tried: the forms of launch (`launch.form_of`) that the driver is known to manage. With the first of them the types
-    of the kernel's scalars are set in pyopencl, as each would otherwise cost 10 microseconds a launch.
-    spare: kernel objects of dropped tapes, for other tapes (`command_buffer.Tape`).
+    tried: the forms of launch (`launch.form_of`) that the driver has passed. At the first one pyopencl is told the
+    types of the kernel's scalars, as each scalar would otherwise cost 10 microseconds a launch.
+    spare: kernel objects of dropped command buffers, which new command buffers may use.
     """
 
     def __init__(self, variant: Variant, program: cl.Program, kernel: Any) -> None:

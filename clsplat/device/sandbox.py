@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rehearsal of every kernel's first build and first launch in a sandbox process that a driver may crash.
+"""Trials: the first build and the first launch of every kernel run in a sandbox process that a driver may crash.
 
-A driver's compiler may abort or hang at the build, or, like PoCL's code generator, only at the launch. So when a driver
-first gets a kernel's text and options, another process builds it, and launches it on zero-filled arrays of the same
-sizes. The outcome is recorded (`driver_records`), and not tried again with that driver.
+A driver's compiler may abort or hang at the build, or, like PoCL's code generator, only at the launch. So before a
+driver first gets a kernel's text and options here, another process builds the kernel, and launches it on zero-filled
+arrays of the same sizes. The outcome is recorded (`driver_records`), and the trial is not repeated with that driver.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.quirks import title
 from clsplat.device.drivers.worker_process import (
     TRUST_DRIVER_VARIABLE,
-    Child,
+    WorkerProcess,
+    driver_timeout,
     ending_at_once,
-    patience,
     python_module,
     regardless,
 )
@@ -32,12 +32,12 @@ from clsplat.device.program import Kernel, Variant, text_of
 from clsplat.errors import DriverError
 
 SANDBOX_IDLE_SECONDS = 20.0
-"""Seconds after which the idle process is ended: its device memory is worth more than its start-up time of 0.5 s."""
+"""Seconds after which the idle process is ended, as it occupies device memory, and needs only 0.5 s to start again."""
 MAX_TRIAL_BYTES = 2 << 30
-"""Bytes of a launch's arrays beyond which the kernel is only built, as there might not be room for them twice."""
+"""Bytes of a launch's arrays beyond which the kernel is only built: the memory may not hold them twice."""
 MAX_TRIAL_ITEMS = 1 << 17
-"""The most items of a trial launch along each axis. It is enough for PoCL to compile it as for any larger number (it
-has other code below 65,536), and small enough to take no time."""
+"""The most work-items of a trial's launch along each axis. PoCL compiles the same code for any larger number, and other
+code for less than 65,536. This many take almost no time."""
 
 
 class _Process:
@@ -46,14 +46,14 @@ class _Process:
     def __init__(self, index: int) -> None:
         self._index = index
         self._lock = threading.Lock()
-        self._child: Child | None = None
+        self._child: WorkerProcess | None = None
         self._timer: threading.Timer | None = None
 
     def ask(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
-        """The answer, how the process ended (or an empty string), and whether the driver crashed it.
+        """The answer, a text on how the process ended (empty if it has not), and True if the driver crashed it.
 
-        A crash counts only if it happens twice, as the driver's linker may have been killed the first time. Raises
-        TrialInterrupted, and DriverError if the process cannot be started.
+        A crash counts only if a second try crashes too, as the driver's linker may have been killed the first time.
+        Raises TrialInterrupted, and DriverError if the process cannot be started.
         """
         answer, ending, crashed = self._once(message)
         return (answer, ending, crashed) if not crashed or answer.get("hung") else self._once(message)
@@ -78,8 +78,8 @@ class _Process:
 
     def _asked(self, message: dict[str, Any]) -> tuple[dict[str, Any], str, bool]:
         if self._child is None:
-            self._child = Child(python_module("clsplat.device.sandbox_worker", str(self._index)))
-        seconds = patience()
+            self._child = WorkerProcess(python_module("clsplat.device.sandbox_worker", str(self._index)))
+        seconds = driver_timeout()
         self._child.send({**message, "seconds": seconds})
         try:
             answer = self._child.receive(seconds)
@@ -118,12 +118,12 @@ def _process(index: int) -> _Process:
     return _processes[index]
 
 
-class Rehearsal:
-    """The kernels that a driver is known to build and launch, in one kernel shape, LANESxITEMS.
+class KernelTrials:
+    """The kernels that a driver has been seen to build and launch, in one kernel shape, LANESxITEMS.
 
-    In a process that is itself a trial, like `clsplat.selftest.worker`, `done` holds the names of the kernels that were
-    built and launched. Each has the salt of `Variant.anew` that its text needed. `say`, if given, is called with the
-    name of each kernel before it is tried.
+    In a worker process that tests a driver, like `clsplat.selftest.worker`, no sandbox is used. There `done` holds the
+    names of the kernels that were built and launched, each with the salt of `Variant.anew` that its text needed. `say`,
+    if set, is called with the name of each kernel before its first use.
     """
 
     def __init__(self, device: cl.Device, index: int, shape: str) -> None:
@@ -179,7 +179,7 @@ class Rehearsal:
         lasting: bool = True,
         trial: Mapping[str, Any] | None = None,
     ) -> DriverError:
-        """The error to raise.
+        """The error to raise for a failure.
 
         lasting: also record that the driver cannot be used in this shape.
         trial: the failed trial (`driver_records.Entry`), if there was one.
@@ -201,7 +201,9 @@ class Rehearsal:
         if name in self._failed:
             raise DriverError(self._failed[name])
         answer, ending, crashed = _process(self._index).ask(message)
-        if answer.get("memory"):  # does not mean a bad driver, and is no reason to try it at every launch
+        if answer.get(
+            "memory"
+        ):  # lack of memory is no fault of the driver, and the trial need not be repeated at every launch
             self._known[name] = ""
             driver_records.tell_once(
                 f"{self._device.name.strip()}: not enough memory to try every kernel in a process of its own before it "
@@ -211,7 +213,7 @@ class Rehearsal:
         if trouble := _trouble(answer, ending):
             trial = {**message, "name": name, "build": {"stem": variant.stem, "options": variant.options}}
             error = self.fail(variant, kernel, trouble, lasting=crashed or not ending, trial=trial)
-            self._failed[name] = str(error)  # so that it is not tried again
+            self._failed[name] = str(error)  # so that this process does not try it again
             raise error
         self._known[name] = str(answer.get("salt", ""))
         if not answer.get("refused"):  # a launch refused with a reason is refused here as well
@@ -221,7 +223,7 @@ class Rehearsal:
 def again(index: int, trial: Mapping[str, Any]) -> str:
     """Repeat a failed trial (`driver_records.Entry.trial`) on the `index`-th device.
 
-    Returns the failure in words, or an empty string. Raises any error of a trial that clsplat did not write.
+    Returns the failure in words, or an empty string. A record that clsplat did not write may raise any exception.
     """
     given = trial["build"]
     variant = Variant(given["stem"], text_of(given["stem"]), tuple(given["options"]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sandbox process of a rehearsal: it tries kernels, so that a driver that aborts does so here."""
+"""The sandbox process: it tries kernels, so that a driver that aborts ends this process and not the caller's."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class _Stage:
                 program, salt = build(self._context, self._device, variant)
                 self._kernels[variant.digest] = {kernel.function_name: kernel for kernel in program.all_kernels()}
                 if caches_programs(self._device) and build(self._context, self._device, variant.anew(salt))[1]:
-                    return {"trouble": "has no kernels when it comes from the driver's cache"}
+                    return {"trouble": "has no kernels after it was loaded from the driver's cache"}
             if "launch" in message:
                 self._launch(self._kernels[variant.digest], message["launch"])
         except (MemoryError, cl.MemoryError):
@@ -55,7 +55,7 @@ class _Stage:
         except KernelBuildError as error:
             return {"refused": str(error)[:300]}
         except DriverError:
-            return {"trouble": "has no kernels when the driver has built it"}
+            return {"trouble": "has no kernels after the driver has built it"}
         except cl.Error as error:
             return {"trouble": "cannot be launched: " + " ".join(str(error).split())[:300]}
         return {"salt": salt}
@@ -68,7 +68,7 @@ class _Stage:
 
 
 def _serve(index: int) -> None:
-    """Answer until the parent has gone; end this process if a driver hangs and no parent is left to notice."""
+    """Answer messages until the parent ends. If a driver hangs by then, end this process all the same."""
     stage = None
     for line in sys.stdin:
         message = json.loads(line)

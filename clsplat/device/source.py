@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernel sources: their folder, and one text of a file with its includes."""
+"""The kernel sources: their folder, and the text of a file with its includes inserted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def kernel_root() -> Path:
 def kernel_source(stem: str) -> str:
     """The text of `stem`.cl, with each `#include "..."` (relative to the kernel root) inserted once.
 
-    The text is complete, instead of relying on `-I`, so that drivers' caches notice a changed header.
+    The headers are inserted here rather than found by the compiler with `-I`, so that drivers' caches notice a change.
     """
     seen: set[str] = set()
     lines: list[str] = []

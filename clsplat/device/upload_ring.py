@@ -15,17 +15,17 @@ from clsplat.device.context import Device
 from clsplat.errors import CapacityError
 
 UPLOAD_RING_SLOTS = 3
-"""Arrays in flight: one for the current work, one for the work queued behind it, which may be replaced, and one that is
-being uploaded."""
+"""Number of slots: one for the current work, one for the work queued behind it, and one for the array being
+uploaded."""
 
 
 @dataclass(eq=False)
 class _Slot:
-    """Room on the device, and as much pinned memory on the host.
+    """Memory for one array on the device, and as much pinned memory on the host.
 
-    key: of the array that it holds.
-    arrived: its copy to the device.
-    used: the end of all work that was launched with it.
+    key: key of the array that the slot holds.
+    arrived: event of the copy to the device.
+    used: event of the last work that was launched with the array.
     """
 
     array: DeviceArray
@@ -37,7 +37,8 @@ class _Slot:
 
 
 class UploadRing:
-    """Room for UPLOAD_RING_SLOTS arrays of at most `nbytes` each. Raises CapacityError if the device has no room."""
+    """Memory for UPLOAD_RING_SLOTS arrays of at most `nbytes` each. Raises CapacityError if the device lacks the
+    memory."""
 
     def __init__(self, device: Device, nbytes: int) -> None:
         self._device, self.nbytes = device, nbytes
@@ -51,7 +52,7 @@ class UploadRing:
         """The slots, the least recently sent or taken first."""
 
     def begin(self, key: object, values: NDArray[Any]) -> None:
-        """Start to upload an array, for `take`; nothing if it is too large or already on its way."""
+        """Start to upload an array for `take`, unless it is too large or its upload has already begun."""
         if values.nbytes > self.nbytes or any(slot.key == key for slot in self._slots):
             return
         done = cl.enqueue_marker(self._device.queue)
@@ -62,7 +63,7 @@ class UploadRing:
         slot = self._slots[0]
         self._touch(slot)
         if slot.arrived is not None:
-            slot.arrived.wait()  # sent a while ago: the pinned memory is free
+            slot.arrived.wait()  # waits until the slot's last upload has left the pinned memory
         host = slot.host[: values.nbytes].view(values.dtype).reshape(values.shape)
         host[...] = values
         slot.held, slot.key = DeviceArray(self._device, slot.array.buffer, values.shape, values.dtype), key
@@ -73,9 +74,9 @@ class UploadRing:
         self._device.calls.writes += 1
 
     def take(self, key: object) -> DeviceArray | None:
-        """An uploaded array, for work launched from now; None if it was not sent.
+        """The uploaded array with this key, for work launched from now on; None if it was not sent.
 
-        It is valid until UPLOAD_RING_SLOTS - 1 other arrays have been sent or taken after it.
+        It is valid until UPLOAD_RING_SLOTS - 1 other arrays have been sent or taken.
         """
         for slot in self._slots:
             if slot.key == key and slot.arrived is not None:

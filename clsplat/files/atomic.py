@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are written whole or not at all, temporary names, and disks without room."""
+"""Files that are written completely or not at all, temporary names, and full disks."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from clsplat.files.names import ON_WINDOWS
 
 TEMPORARY_SUFFIX = ".clsplat-tmp"
 ABANDONED_FILE_SECONDS = 600.0
-"""Seconds without a write after which a temporary file of another machine counts as abandoned."""
+"""Seconds without a write after which a temporary file from another machine counts as abandoned."""
 DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 DISK_PROBE_BYTES = 1 << 16
-"""Bytes that are written to find out whether a disk has room."""
+"""Number of bytes that are written to find out whether a disk has room."""
 WINDOWS_RETRY_SECONDS = 2.0
-"""Seconds in which a file on Windows that another program has open is tried again: a virus scanner or an indexer lets
-go of a new file within one."""
+"""Seconds during which an operation is tried again if another program has the file open, on Windows. A virus scanner or
+an indexer closes a new file within one second."""
 TEMPORARY_NAME = re.compile(rf"\.(.+)\.([0-9a-f]{{20}}){re.escape(TEMPORARY_SUFFIX)}", re.DOTALL)
 
 
@@ -41,14 +41,16 @@ def machine_mark() -> str:
 
 
 def temporary_name(target: Path) -> Path:
-    """A new name beside a file, which says what machine and process writes there."""
+    """A new name for a file beside `target`. The name has marks of this machine and process."""
     token = f"{machine_mark()}{os.getpid():08x}{secrets.token_hex(4)}"
     return target.with_name(f".{target.name}.{token}{TEMPORARY_SUFFIX}")
 
 
 def is_abandoned(path: Path, token: str) -> bool:
-    """True if the writer that a temporary name's token names has ended, or has not written for ABANDONED_FILE_SECONDS
-    seconds."""
+    """True if the process in the token of a temporary name has ended, or has not written for ABANDONED_FILE_SECONDS.
+
+    token: marks of the machine and the process, from the file's name.
+    """
     if token[:4] == machine_mark() and os.name == "posix":
         try:
             os.kill(int(token[4:12], 16), 0)
@@ -61,8 +63,13 @@ def is_abandoned(path: Path, token: str) -> bool:
 
 
 def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
-    """Raise InputError where a file that is named to be written is there already, or is one of those that are read,
-    unless it may be replaced; where it is a folder, or has none to be in, in any case."""
+    """Raise InputError if a file must not be written at `path`.
+
+    That is so if the file exists or is one of `sources`, unless `overwrite` is set. It is always so if the path is a
+    folder, or its folder does not exist.
+
+    sources: files from which the new file is made.
+    """
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected the name of a file to write")
     if not path.parent.is_dir():
@@ -71,20 +78,21 @@ def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> N
         return
     if any(source.exists() and path.exists() and source.samefile(path) for source in sources):
         raise InputError(
-            f"{path}: is what is read, and would be replaced by what is made of it; name another file, or give "
-            "--overwrite to change it in place"
+            f"{path}: is read, and would be replaced by the result; name another file, or give --overwrite to change "
+            "it in place"
         )
     raise InputError(f"{path}: is there already; name another file, or give --overwrite to replace it")
 
 
 @contextmanager
 def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[Path]:
-    """A name for a file that takes the place of `path` when the block ends well, and never exists otherwise.
+    """Context with a temporary name, whose file is renamed to `path` at the end of the block.
 
-    It is a temporary one in the same folder (a rename is atomic only within a file system). A link at `path` is
-    followed. The folder must exist. needs: bytes that the file will have, for the message of a full disk, where they
-    are known. Raises WriteError where the system refuses, with the name `path`; the temporary file is removed on any
-    exception, KeyboardInterrupt included.
+    The temporary file is in the same folder, since a rename is atomic only within a file system. The folder must exist.
+    A link at `path` is followed. On any exception, also KeyboardInterrupt, the temporary file is removed, and `path`
+    stays as it was. Raises WriteError with the name `path` if the system refuses to write.
+
+    needs: size of the file in bytes if it is known, for the message on a full disk.
     """
     target = Path(os.path.realpath(path))
     temporary = temporary_name(target)
@@ -97,18 +105,18 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # first, so that the message has what is free without it
+            temporary.unlink()  # before the message is made, so that its free space is without this file
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
-            # A full disk is found by `write`, which does not know the name; and the temporary one is unknown to users.
+            # The error names the temporary file, which users do not know, or for a full disk no file.
             raise write_error(path, error, written, needs) from None
         raise
 
 
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
-    """Open a binary file of an `atomic_name`, which is flushed to the disk before it takes its place."""
-    # "x" and no mkstemp: the file gets the permissions that the user's umask gives any new file.
+    """Context with an open binary file, which is flushed to the disk and then takes its place like in `atomic_name`."""
+    # mode "x" instead of mkstemp, so that the file gets the permissions of the user's umask
     with atomic_name(path, needs) as temporary, open(temporary, "xb") as file:
         yield file
         file.flush()
@@ -117,8 +125,13 @@ def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Ite
 
 
 def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, needs: int | None = None) -> WriteError:
-    """The system's error as a plain sentence about the file that was being written; of a full disk with how much the
-    file needs, or at least what had been `written` of it, and how much is free."""
+    """The system's error as a plain sentence about the file that was being written.
+
+    For a full disk the sentence has the free space, and the size that the file needs.
+
+    written: bytes written so far, which stand for the size if it is unknown.
+    needs: size of the file in bytes, if it is known.
+    """
     number, reason = error.errno or 0, reason_of(error)
     folder = Path(os.path.realpath(path)).parent
     if number in DISK_FULL_ERRNOS:
@@ -134,7 +147,7 @@ def write_error(path: str | os.PathLike[str], error: OSError, written: int = 0, 
 
 
 def room_error(folder: Path) -> OSError | None:
-    """The reason that nothing more can be written to a folder, found by trying; for libraries that do not tell."""
+    """The error of an attempt to write to a folder; None if it succeeds. It is for libraries that report no reason."""
     probe = temporary_name(folder / "probe")
     try:
         with open(probe, "xb") as file:
@@ -155,8 +168,11 @@ _reserving = threading.Lock()
 
 @contextmanager
 def require_room(path: str | os.PathLike[str], needs: int) -> Iterator[None]:
-    """Inside, a library may write a file of `needs` bytes at most beside others that do; for those that end the
-    process, or say nothing, when the disk is full. Raises WriteError where there is no room."""
+    """Context in which a library may write a file of at most `needs` bytes. Raises WriteError if the disk lacks room.
+
+    It is for libraries that end the process, or report nothing, when the disk is full. Space that other threads have
+    reserved in this way counts as used.
+    """
     folder = Path(os.path.realpath(path)).parent
     try:
         disk, free = folder.stat().st_dev, shutil.disk_usage(folder).free
@@ -175,9 +191,12 @@ def require_room(path: str | os.PathLike[str], needs: int) -> Iterator[None]:
 
 @contextmanager
 def scratch_folder(needs: int) -> Iterator[Path]:
-    """A folder for files that a library makes by name, gone afterwards. Raises WriteError where its disk has no room
-    for `needs` bytes, and where that runs full, which the library reports as anything but an OSError."""
-    # a library may hold its file open for longer, which Windows does not remove
+    """Context with a temporary folder, for a library that writes files by name.
+
+    Raises WriteError if its disk lacks room for `needs` bytes, or becomes full while the library writes. Any exception
+    of the library except OSError may mean a full disk.
+    """
+    # errors are ignored: a library may still have its file open, which Windows does not remove
     with tempfile.TemporaryDirectory(prefix="clsplat-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
         try:
@@ -196,23 +215,23 @@ def scratch_folder(needs: int) -> Iterator[Path]:
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write `data` as the whole content of `path`; see `atomic_writer`."""
+    """Write `data` as the whole content of `path`, like with `atomic_writer`."""
     with atomic_writer(path, len(data)) as file:
         file.write(data)
 
 
 def replace(source: Path, target: Path) -> None:
-    """Rename a file or a folder, in the place of a file that is there. Raises OSError."""
+    """Rename a file or a folder. An existing file at the target is replaced. Raises OSError."""
     _patiently(lambda: source.replace(target))
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if it is there. Raises OSError."""
+    """Remove a file if it exists. Raises OSError."""
     _patiently(lambda: path.unlink(missing_ok=True))
 
 
 def _patiently(act: Callable[[], object], *, windows: bool = ON_WINDOWS) -> None:
-    """Do it; again and again for a while where Windows says that another program has the file open."""
+    """Call `act`. On Windows, repeat it for a while if another program has the file open."""
     until = time.monotonic() + WINDOWS_RETRY_SECONDS
     while True:
         try:
@@ -226,7 +245,7 @@ def _patiently(act: Callable[[], object], *, windows: bool = ON_WINDOWS) -> None
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a rename last through a power cut, where the file system can (not on Windows, nor on some shares)."""
+    """Make a rename survive a power cut, if the file system supports that (not on Windows, nor on some shares)."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are read: existence, digests, JSON."""
+"""Reading of files: existence, digests, JSON."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from typing import Any, BinaryIO
 from clsplat.errors import InputError, WriteError, reason_of
 
 MAX_DOCUMENT_BYTES = 32 << 20
-"""Bytes of a JSON or TOML file: as Python's objects they take up to 24 times as much."""
+"""Largest size of a JSON or TOML file, bytes. As Python objects its content takes up to 24 times as much memory."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 MAX_LFS_POINTER_BYTES = 1024
-"""First bytes, and most bytes, of the note that Git LFS leaves in place of a file
-(https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md)."""
+"""The pointer file that Git LFS leaves in place of a file: its first bytes, and its largest size in bytes.
+
+Specification: https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md.
+"""
 
 
 def digest(path: str | os.PathLike[str]) -> str:
@@ -28,7 +30,8 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def short_digest(path: Path) -> str | None:
-    """BLAKE2b of 16 bytes of the file's content, in hexadecimal, which is quicker; None where there is no file."""
+    """BLAKE2b digest of the file's content, 16 bytes in hexadecimal, which is quicker than `digest`; None without a
+    file."""
     return _digest(path, hashlib.blake2b(digest_size=16)) if is_file(path) else None
 
 
@@ -41,7 +44,7 @@ def _digest(path: str | os.PathLike[str], state: Any) -> str:
 
 
 def is_file(path: str | os.PathLike[str]) -> bool:
-    """True if there is a regular file; False, and no exception, for a name that no file can have."""
+    """True if there is a regular file. A name that no file can have gives False and no exception."""
     try:
         return stat.S_ISREG(Path(path).stat().st_mode)
     except (OSError, ValueError):
@@ -52,9 +55,10 @@ def is_file(path: str | os.PathLike[str]) -> bool:
 def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
     """Open a file to read it.
 
-    `expected` ends the message of the InputError for one that is missing, a folder, or anything else that is no regular
-    file, such as a pipe, which may never be written to; for one that cannot be read; and for Git LFS's note in place of
-    one that was not fetched.
+    Raises InputError if the file is missing, cannot be read, or is not a regular file: a folder, or a pipe, from which
+    nothing may ever come. Also raises it for the pointer of Git LFS in place of a file that was not fetched.
+
+    expected: end of the message of an error.
     """
     try:
         status = path.stat()
@@ -84,8 +88,10 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
 
 
 def read_document(path: Path, expected: str, limit: int = MAX_DOCUMENT_BYTES) -> str:
-    """The text of a file in UTF-8 of at most `limit` bytes, without the mark of the byte order that editors on Windows
-    put before it. Raises InputError as `open_input`."""
+    """The text of a file of at most `limit` bytes in UTF-8, without the byte order mark that editors on Windows write.
+
+    Raises InputError like `open_input`.
+    """
     with open_input(path, expected) as file:
         data = file.read(limit + 1)
     if len(data) > limit:
@@ -106,8 +112,10 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, *, once: bool = False) -> Any:
-    """The value. Raises ValueError for whatever does not parse, nested too deeply too. once: also for a key that an
-    object has twice, of which the last would count."""
+    """The value of a JSON text. Raises ValueError if it does not parse, or is nested too deeply.
+
+    once: also raise it if an object has a key twice, of which otherwise the last would count.
+    """
     try:
         return json.loads(text, object_pairs_hook=_once if once else None)
     except RecursionError:

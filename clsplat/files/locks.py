@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Locks and claims: files that say which process is at work on another file."""
+"""Locks and claims by marker files: the process that creates the marker may work on the file beside it.
+
+Locks of the operating system, for a run's folder, are in `clsplat.runs.locks`
+(docs/decisions/0040-three-libraries-not-taken.md compares the two).
+"""
 
 from __future__ import annotations
 
@@ -14,20 +18,20 @@ from clsplat.files.atomic import ABANDONED_FILE_SECONDS, TEMPORARY_NAME, is_aban
 from clsplat.files.names import ON_WINDOWS
 
 EMPTY_CLAIM_SECONDS = 20
-"""Seconds after which a claim in which nothing stands is taken over."""
+"""Seconds after which an empty claim is taken over."""
 CLAIM_SUFFIX = ".clsplat-claim"
 _PROCESS_TOKEN = secrets.token_hex(4)
-"""Mark that tells this process from one of the same number, before it or on another machine."""
+"""Mark that distinguishes this process from others with the same number, earlier or on another machine."""
 
 
 @contextmanager
-def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
-    """Inside, no other process is inside with this file, which need not be there: FILE.lock beside it says so.
+def briefly_locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
+    """Context that only one thread of one process is in at a time, for a file that need not exist.
 
-    It is no lock of the system's, unlike `locks.locked`: those do not keep a process's own threads apart, and homes on
-    a network, where this is used, may have none. A lock older than `seconds` is of a process that was killed, and is
-    taken away. After waiting for twice as long a process goes on without. Raises OSError where the folder cannot be
-    written.
+    The marker is FILE.lock beside the file. A lock of the operating system, as in `clsplat.runs.locks`, would not keep
+    the threads of one process apart, and homes on a network may not support it. A marker older than `seconds` is taken
+    to be from a process that was killed, and is removed. After waiting for twice `seconds` the caller goes on without
+    the lock. Raises OSError if the folder cannot be written.
     """
     lock, token = path.with_name(f"{path.name}.lock"), secrets.token_bytes(8)
     until = time.monotonic() + 2 * seconds
@@ -40,15 +44,18 @@ def locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
         yield
     finally:
         if ours:
-            with suppress(OSError):  # it may have been taken away, and another's be there
+            with suppress(OSError):  # another process may have removed the marker, and made its own
                 if lock.read_bytes() == token:
                     remove(lock)
 
 
 def claim(target: Path) -> Path | None:
-    """A file beside `target` that tells other processes that this one makes it, for `give_back`; None where another has
-    claimed it. It has to be touched now and then: one that has not been for ABANDONED_FILE_SECONDS seconds is taken
-    over, as is that of a process that has ended. Raises OSError where the folder cannot be written."""
+    """Claim `target` for this process, which is going to write it. Returns the marker file, for `give_back`; None if
+    another process has claimed the target.
+
+    The marker's modification time has to be updated regularly: others take over a claim that was not updated for
+    ABANDONED_FILE_SECONDS seconds, or whose process has ended. Raises OSError if the folder cannot be written.
+    """
     path = _claim_of(target)
     for _ in range(2):
         if _take(path, f"{machine_mark()}{os.getpid():08x}{_PROCESS_TOKEN}".encode()):
@@ -57,7 +64,7 @@ def claim(target: Path) -> Path | None:
             if not _is_given_up(path):
                 return None
             path.unlink()
-        except (FileNotFoundError, PermissionError):  # given back, or taken over
+        except (FileNotFoundError, PermissionError):  # meanwhile given back, or taken over by another process
             continue
     return None
 
@@ -71,7 +78,7 @@ def _is_given_up(claimed: Path) -> bool:
     if age > ABANDONED_FILE_SECONDS:
         return True
     token = claimed.read_text(encoding="ascii", errors="replace")
-    if not token:  # it is just being written, or its process was killed as it did
+    if not token:  # the marker is being written now, or its process was killed while it wrote
         return age > EMPTY_CLAIM_SECONDS
     if (
         token[:12] == f"{machine_mark()}{os.getpid():08x}"
@@ -81,7 +88,7 @@ def _is_given_up(claimed: Path) -> bool:
 
 
 def give_back(claimed: Path) -> None:
-    """Let others make what was claimed."""
+    """Remove the marker of a claim, so that other processes may claim the target."""
     with suppress(FileNotFoundError):
         remove(claimed)
 
@@ -91,7 +98,7 @@ def _take(lock: Path, token: bytes) -> bool:
         file = lock.open("xb", buffering=0)
     except FileExistsError:
         return False
-    except PermissionError:  # Windows says so of a file that is being removed
+    except PermissionError:  # Windows reports this for a file that is being removed
         if not ON_WINDOWS:
             raise
         return False
@@ -105,8 +112,10 @@ def _take(lock: Path, token: bytes) -> bool:
 
 
 def abandoned(targets: Iterable[Path]) -> list[Path]:
-    """The temporary files and claims that writers of these files have left: their process has ended, or they are of
-    another machine and have not been written to for ABANDONED_FILE_SECONDS seconds."""
+    """Temporary files and claims that are left over from writers of these files.
+
+    Their process has ended, or they are from another machine and have not changed for ABANDONED_FILE_SECONDS seconds.
+    """
     names: dict[Path, set[str]] = {}
     for target in targets:
         real = Path(os.path.realpath(target))

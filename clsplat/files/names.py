@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of files: those that some system refuses, and the two spellings of one file."""
+"""File names: which names an operating system refuses, and which spellings it takes for one file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from clsplat.errors import InputError
 
 ON_WINDOWS = os.name == "nt"
 CASE_INSENSITIVE_FILES = sys.platform in ("win32", "darwin")
-"""True if the system's usual file systems take A.png and a.png for one file, and an accented letter for its parts."""
+"""True if the system's usual file systems take A.png and a.png for one file, and so for two Unicode forms of an
+accent."""
 _FORBIDDEN_NAME_CHARACTERS = re.compile(r'[<>:"|?*\x00-\x1f]')
 _WINDOWS_DEVICE_NAME = re.compile(
     r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE | re.DOTALL
@@ -21,8 +22,10 @@ _WINDOWS_DEVICE_NAME = re.compile(
 
 
 def name_trouble(name: str, *, windows: bool = ON_WINDOWS) -> str | None:
-    """The reason that no file below a folder can be called `name`, with its sub-folders before slashes; None where one
-    can."""
+    """The reason why no file below a folder can have this name, as the end of a sentence; None if one can.
+
+    name: path relative to the folder, with forward slashes.
+    """
     pure: PurePath = PureWindowsPath(name) if windows else PurePosixPath(name)
     if pure.anchor or ".." in pure.parts:
         return "leads out of the output folder"
@@ -31,7 +34,7 @@ def name_trouble(name: str, *, windows: bool = ON_WINDOWS) -> str | None:
     if windows:
         for part in pure.parts:
             if character := _FORBIDDEN_NAME_CHARACTERS.search(part):
-                return f"has {character[0]!r} in it, which no name of a file on Windows may have"
+                return f"has {character[0]!r} in it, which no file name on Windows may have"
             if _WINDOWS_DEVICE_NAME.fullmatch(part):
                 return f"is a name that Windows keeps for a device ({part})"
             if part[-1] in ". ":
@@ -40,7 +43,7 @@ def name_trouble(name: str, *, windows: bool = ON_WINDOWS) -> str | None:
 
 
 def native_name(path: str | os.PathLike[str]) -> str:
-    """The name of a file for a library that takes names in UTF-8, whatever the locale says. Raises InputError."""
+    """A file's name as text for a library that expects UTF-8 in any locale. Raises InputError."""
     try:
         return os.fsencode(path).decode("utf-8")
     except UnicodeError:
@@ -48,6 +51,6 @@ def native_name(path: str | os.PathLike[str]) -> str:
 
 
 def identity(path: PurePath, *, ignores_case: bool = CASE_INSENSITIVE_FILES) -> str:
-    """Equal for two paths that the system takes for one file, whatever links there are."""
+    """A text that is equal for two paths if the system takes them for one file. Links are not followed."""
     text = str(path)
     return unicodedata.normalize("NFC", text).casefold() if ignores_case else text

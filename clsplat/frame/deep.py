@@ -36,9 +36,9 @@ Convert = Callable[[Float32, Float32], Float32]
 Weighted = tuple[Float32, Float32]
 """Planes of a picture, and the weight of each of its pixels (H, W)."""
 _MERGE_MEMORY_DIVISOR = 16
-"""Divisor of the device's memory limit that gives a merge's share. Rendering uses the rest."""
+"""A merge may use the device's memory limit divided by this. Rendering uses the rest."""
 _WARP_BATCH_PIXELS = 1 << 14
-"""Pixels that are warped at once, to bound the host's memory."""
+"""Number of pixels that are warped at once, which bounds the host's memory."""
 
 
 def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
@@ -48,9 +48,9 @@ def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: 
 
 
 def drawn_in_slices(renderer: Renderer, gaussians: Callable[[], Gaussians], bins: int) -> DrawDeep:
-    """A DrawDeep by the kernels.
+    """A DrawDeep that renders with the kernels.
 
-    gaussians: called when they are drawn, not before.
+    gaussians: function that returns the model; it is called only when the picture is drawn.
     """
     return lambda camera: render_deep(renderer, gaussians(), camera, bins).transpose(0, 3, 1, 2)
 
@@ -67,9 +67,9 @@ def deep_rows(device: Device, camera: Camera, bins: int, pictures: int = 1) -> i
 
 
 def deep_in_strips(draw: DrawDeep, rows: Callable[[Camera], int]) -> DrawDeep:
-    """A DrawDeep of the same planes, in strips.
+    """A DrawDeep that renders the same planes in strips.
 
-    rows: rows of a strip, for a camera.
+    rows: function from a camera to the number of rows of a strip.
     """
     return lambda camera: np.concatenate([draw(strip) for strip in strips(camera, rows(camera))], axis=2)
 
@@ -127,7 +127,7 @@ class Merge:
 
 
 def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Merge) -> DrawDeep:
-    """A DrawDeep of the mean over samples. The camera that is drawn gives only size and window.
+    """A DrawDeep of the mean over samples. The camera that is passed to it gives only size and window.
 
     draws, cameras: for each sample, its DrawDeep and its camera of the whole frame.
     """
@@ -141,7 +141,7 @@ def deep_sampled(draws: Sequence[DrawDeep], cameras: Sequence[Camera], merge: Me
 
 
 def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
-    """A DrawDeep of warped pictures. The camera that is drawn gives only size and window.
+    """A DrawDeep of warped pictures. The camera that is passed to it gives only size and window.
 
     A pixel is the mean over `Warp.samples` by `Warp.samples` places, each a bilinear mix of the four pixels around. A
     filter with negative weights cannot make slices. Where nothing is seen, there are no slices.

@@ -27,7 +27,8 @@ from clsplat.images.frame_files import MAX_HALF_FLOAT, FrameFileHeader, deep_spe
 from clsplat.images.writing import write_rows
 
 _ENCODE_BATCH_PIXELS = 1 << 16
-"""Pixels that are encoded at once: bounds the host's memory, and leaves the encoder enough rows for its threads."""
+"""Number of pixels that are encoded at once: few enough for the host's memory, enough rows for the encoder's
+threads."""
 
 
 def write_deep(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A `Draw` renders the named channels of a camera's picture. Contains the one by the kernels."""
+"""The type `Draw`, a function that renders channels of a camera's picture, and the Draw that uses the kernels."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def drawn_by(
     earlier: Gaussians | None = None,
     mattes: Mapping[str, Matte] | None = None,
 ) -> Draw:
-    """A Draw by the kernels.
+    """A Draw that renders with the kernels.
 
     after, before: cameras of a whole frame that motion and backward motion lead to.
-    cut: of the frame's holdout.
+    cut: cuts the surfaces of the frame's holdout; None without one.
     moved, earlier: Gaussians that motion and backward motion lead to, None if they stand still.
-    mattes: by the names of their channels.
+    mattes: mattes by the names of their channels.
     Planes need not be contiguous: the encoder, which may run in another thread, makes them so.
     """
 

@@ -20,19 +20,19 @@ from clsplat.images.stmap import StMap
 from clsplat.scenes.dataset import Lens
 
 MAX_BEYOND_EDGE_FRAMES = 1.0
-"""Limit of places beyond each edge of the straight frame, in frames. Farther out nothing is seen, as a map may have any
-value there."""
+"""Limit of places beyond each edge of the straight frame, in frames. Places farther out count as seeing nothing, as a
+map may have any value there."""
 PLACE_STEP_PX = 2.0**-20
 """Places are rounded to multiples of this, in pixels, so that subtracting a window's corner causes no rounding
 error."""
 INTERPOLATION_MARGIN_PX = 2
-"""Pixels around a place that its interpolation reads."""
+"""Number of pixels on each side of a place that its interpolation reads."""
 PROBE_GRID_SIDE = 33
-"""Places across and down at which a lens is sampled for properties of the whole frame."""
+"""Number of places across and down at which a lens is sampled to find properties of the whole frame."""
 MAX_SINGLE_SAMPLE_PX = 1.25
-"""Size of a warped pixel, in straight pixels, up to which one sample is enough."""
+"""Size of a warped pixel, in straight pixels, up to which a single sample is taken."""
 MAX_WARP_SAMPLES = 16
-"""Limit of a pixel's samples across and down."""
+"""Largest number of a pixel's samples across, and down."""
 _HALF_PIXEL_STEPS = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
 
 
@@ -107,7 +107,7 @@ class Warp:
 
     @property
     def shown(self) -> Camera:
-        """A camera of the warped frame's size. Only its pixels are valid, not its rays."""
+        """A camera of the warped frame's size. Its pixels are those of the frame, but its rays have no meaning."""
         width, height = self.source.size(self.frame)
         return replace(self.frame, width=width, height=height)
 

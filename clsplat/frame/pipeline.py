@@ -42,7 +42,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.stages.holdout import held_bytes
 
 BLANK_COLOUR_TOLERANCE = 1e-6
-"""Largest difference from the background's colour where nothing is seen, since averages of equal samples are
+"""Largest difference from the background's colour at which a pixel counts as empty, since averages of equal samples are
 rounded."""
 
 
@@ -102,8 +102,8 @@ class FramePipeline:
         """Prepare colours, and check the settings of a job.
 
         recorded: the model's colour space (`colour.recorded_space`).
-        background: in that space, black if alpha is written.
-        mattes: by the names of their channels.
+        background: colour of the background in that space; black if alpha is written.
+        mattes: mattes by the names of their channels.
         Raises InputError for settings and colour spaces that do not fit together.
         """
         self.config = config or PictureConfig()
@@ -115,7 +115,7 @@ class FramePipeline:
     def draw(self, frame: FrameRequest) -> tuple[Draw, Callable[[Planes], Planes]]:
         """The Draw of a frame, and the conversion of its planes to the file's colours, which needs no device.
 
-        The camera that is drawn gives only size and window, of the picture or of a strip.
+        The camera that is passed to the Draw gives only size and window, of the picture or of a strip.
         """
         draw = self._by_kernels(frame)
         for apply in self._passes(frame):

@@ -94,7 +94,7 @@ def lens_points(count: int) -> Float64:
 def lens_radius(camera: Camera, config: SamplingConfig) -> float:
     """Radius of the lens in scene units.
 
-    camera: of a whole frame.
+    camera: camera of a whole frame.
     """
     if config.f_stop is None:
         return config.aperture or 0.0
@@ -141,7 +141,7 @@ def sampled(draw: Draw, middle: Camera, cameras: Sequence[Camera], light: Callab
     """A Draw of rgb and alpha as the mean over the cameras. Other channels have no mean and come from the middle
     camera.
 
-    middle, cameras: of whole frames. The camera that is drawn gives only size and window.
+    middle, cameras: cameras of whole frames. The camera that is passed to the Draw gives only size and window.
     light: the Draw of each sample, if it differs from `draw`.
     `draw` must give rgb in linear light. Sums are float64, in the cameras' order.
     """

@@ -30,7 +30,7 @@ def strip_rows(
 ) -> int:
     """Rows of a strip that leaves memory for the rest, in whole tiles; the picture's height if it needs no strips.
 
-    names: of the wanted channels.
+    names: names of the wanted channels.
     config: its supersampling makes rendered strips larger than written ones.
     planes: bytes per pixel in further planes.
     """
@@ -69,7 +69,7 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
     """Raise InputError for a file in several parts or views, which it stores one after the other.
 
-    views: of a stereo pair in the file.
+    views: number of views of a stereo pair in the file.
     """
     if views > 1:
         raise InputError(

@@ -20,11 +20,11 @@ from clsplat.frame.draw import Draw, Planes
 from clsplat.frame.lens import Warp
 
 _SAMPLE_ROWS_PER_BATCH = 128
-"""Rows of samples that are taken at once, to bound the host's memory."""
+"""Number of rows of samples that are taken at once, which bounds the host's memory."""
 
 
 def warped(draw: Draw, warp: Warp) -> Draw:
-    """A Draw of warped pictures. The camera that is drawn gives only size and window.
+    """A Draw of warped pictures. The camera that is passed to it gives only size and window.
 
     `draw` renders straight windows, with rgb in linear light. rgb and alpha are means over `Warp.samples` by
     `Warp.samples` samples of a pixel, interpolated by Catmull and Rom's cubic. Other channels come from the nearest

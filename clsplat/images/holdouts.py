@@ -62,7 +62,7 @@ class Surfaces:
 class Holdout:
     """Holdout of a frame.
 
-    surfaces: of the file's data window.
+    surfaces: surfaces in the file's data window.
     x, y: pixel of the frame where that window begins.
     size: width and height of the frame.
     """
@@ -139,7 +139,8 @@ def _surfaces(
 
 
 def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float32:
-    """HELD of each surface. An opaque surface hides everything behind its front, so it gets no length."""
+    """HOLDOUT_SURFACE_FIELDS of each surface. An opaque surface hides everything behind its front, so it gets no
+    length."""
     rows = np.zeros((len(begin), len(HOLDOUT_SURFACE_FIELDS)), np.float32)
     rows[:, 0], rows[:, 2] = begin, 1 - alpha
     rows[:, 1] = np.where((alpha < 1) & (end > begin), end, begin)
@@ -153,11 +154,11 @@ def _rows(begin: NDArray[Any], end: NDArray[Any], alpha: NDArray[Any]) -> Float3
 def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any, int, list[int | None]]]:
     """The file's input, the part with the depths, and channel indices of depths, alpha and back depths in it."""
     if not is_file(path):
-        raise InputError(f"{path}: no such hold-out, expected a depth or deep EXR for each frame that is rendered")
+        raise InputError(f"{path}: no such holdout, expected a depth or deep EXR for each frame that is rendered")
     source = open_image(path)
     try:
         if source.format_name() != "openexr":
-            raise InputError(f"{path}: is no EXR, expected a depth or deep EXR as a hold-out")
+            raise InputError(f"{path}: is no EXR, expected a depth or deep EXR as a holdout")
         name, part, seen = channel or "Z", 0, []
         while source.seek_subimage(part, 0) and name not in (names := list(source.spec().channelnames)):
             seen += names
@@ -186,7 +187,7 @@ def _plane(path: Path, source: Any, part: int, place: int | None) -> NDArray[Any
         return None
     plane = source.read_image(part, 0, place, place + 1, oiio.FLOAT)
     if plane is None:
-        raise InputError(f"{path}: does not decode: {one_line(error_of(source))}; write the hold-out again")
+        raise InputError(f"{path}: does not decode: {one_line(error_of(source))}; write the holdout again")
     return np.asarray(plane).ravel()
 
 
@@ -195,7 +196,7 @@ def _deep(
 ) -> tuple[NDArray[np.int64], list[NDArray[Any] | None]]:
     data = source.read_native_deep_image(part, 0)
     if data is None:
-        raise InputError(f"{path}: does not decode: {one_line(error_of(source))}; write the hold-out again")
+        raise InputError(f"{path}: does not decode: {one_line(error_of(source))}; write the holdout again")
     counts = np.fromiter(map(data.samples, range(data.pixels)), np.int64, data.pixels)
     total = int(counts.sum())
     pixels = np.repeat(np.arange(data.pixels), counts).tolist()

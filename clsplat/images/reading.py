@@ -37,7 +37,7 @@ MAX_IMAGE_PIXELS = 1 << 28
 MAX_UNCHECKED_CHANNEL_VALUES, MAX_CHANNEL_VALUES_PER_BYTE = 48 << 20, 4096
 """Channel values allowed for a file of any length, or for each byte of it, whichever is more.
 
-Both exceed any real image; deflate expands a byte to at most 1032 bytes.
+No real image reaches them: deflate expands a byte to at most 1032 bytes.
 """
 _DECODE_CHECK_ROWS = 64
 MAX_IMAGE_FILE_BYTES, MAX_UNSIGNED_IMAGE_BYTES = 1 << 30, 1 << 26

@@ -21,11 +21,11 @@ from clsplat.images.reading import error_of, one_line, open_image
 from clsplat.images.writing import write_spec
 
 HALF_FLOAT_SIDE_LIMIT_PX = 2048
-"""Image side in pixels from which a half float is more than half a pixel off."""
+"""Image side in pixels from which a half float may be wrong by more than half a pixel."""
 
 
 _ORIENTATION_CELLS_PER_SIDE = 32
-"""Cells along each side of a map; each cell's orientation is tested."""
+"""Number of cells along each side of a map whose orientation is tested."""
 _MIN_CELL_SINE = 0.05
 """Smallest sine of the angle between a cell's mapped sides; for a grey image the two sides coincide."""
 _MIN_ORIENTED_SHARE = 0.7

@@ -153,7 +153,7 @@ class PassSettings:
 class ViewGradients:
     """Gradients of one view's blended values, on the host. None counts as 0.
 
-    on_image: by their names in `Ewa`, without the compensations.
+    on_image: gradients by the arrays of `Ewa`, by name, without the compensations.
     opacities: (N,), of the compensated ones.
     colors: (N, D).
     """

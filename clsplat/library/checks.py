@@ -26,7 +26,9 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
     with np.errstate(over="ignore", invalid="ignore"):
         result = np.ascontiguousarray(array, np.float32)
         flat = result.reshape(-1)
-        finite = np.isfinite(flat @ flat) or bool(np.isfinite(flat).all())  # faster than isfinite, but may overflow
+        finite = np.isfinite(flat @ flat) or bool(
+            np.isfinite(flat).all()
+        )  # the dot product is faster than isfinite, but may overflow
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)

@@ -59,9 +59,9 @@ class HarmonicColors:
             device = session.device
             by_directions, by_sh = hosted(device, given.directions.shape), hosted(device, given.sh.shape)
             d_colours = from_host(device, values.reshape(-1, 3))
-            unused = given.directions  # only used for a camera
+            colours = given.directions  # any array: the kernel reads colours only for a camera's directions
             gradients = HarmonicsGradients(by_sh.array, by_directions.array)
-            harmonics_grad(device, session.scratch, given, unused, d_colours, gradients)
+            harmonics_grad(device, session.scratch, given, colours, d_colours, gradients)
             batch = self.colors.shape[:-1]
             return {
                 "directions": np.asarray(by_directions.get(), np.float32).reshape(*batch, 3),

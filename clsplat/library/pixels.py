@@ -185,7 +185,7 @@ class ListedPixels:
 class PixelPass(ListedPixels):
     """One camera's pixels from projected Gaussians. It keeps the device memory for its gradient until it is dropped.
 
-    gaussians: on the session's device. Their values must not change before the last `gradient`.
+    gaussians: Gaussians on the session's device. Their values must not change before the last `gradient`.
     size: width and height, pixels.
     background: (D,) float32, or None for black.
     alpha_max: the cap of alpha, below 1.

@@ -222,11 +222,11 @@ def fully_fused_projection(
     width, height : int
         Image size, pixels.
     eps2d : float
-        Added to the diagonal of each projected covariance, px^2.
+        Low-pass filter: variance that is added to the diagonal of each projected covariance, px^2.
     near_plane, far_plane : float
-        World units.
+        Gaussians whose depth is not strictly between these are culled, world units.
     radius_clip : float
-        Gaussians whose radii are not larger are culled, pixels.
+        Gaussians whose radii are at most this are culled, pixels.
     calc_compensations : bool
         Also compute sqrt(det(covariance without eps2d) / det(covariance with eps2d)).
     camera_model : str
@@ -340,7 +340,7 @@ def check_given(covars: object, quaternions: object, scales: object) -> None:
 class GivenShapes:
     """The checked shapes of n Gaussians: quaternions (n, 4) and scales (n, 3), or covariances (n, 6).
 
-    covariance_layout: of the caller's covariances, "upper" for (n, 6) or "full" for (n, 3, 3); empty for none.
+    covariance_layout: layout of the caller's covariances, "upper" for (n, 6) or "full" for (n, 3, 3); empty for none.
     """
 
     quaternions: Float32 | None = None

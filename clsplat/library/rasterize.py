@@ -208,7 +208,7 @@ class Rasterization:
         Returns
         -------
         dict
-            The result of `vjp_projection`, with "backgrounds" and "absolute" of `vjp_pixels` where it has them.
+            The result of `vjp_projection`, with "backgrounds" and "absolute" if `vjp_pixels` returns them.
 
         Raises
         ------
@@ -285,9 +285,9 @@ def rasterize(
     width, height : int or sequence of int
         Pixels, of all cameras or one number per camera.
     near_plane, far_plane : float
-        World units.
+        Gaussians whose depth is not strictly between these are not drawn, world units.
     radius_clip : float
-        Gaussians whose radii are not larger are not drawn, pixels.
+        Gaussians whose radii are at most this are not drawn, pixels.
     eps2d : float
         Low-pass filter: added to both variances on the image, px^2.
     sh_degree : int, optional

@@ -21,7 +21,7 @@ _PAIR_ARRAY_NAMES = ("ranges", "gaussian_from_sorted", "slot_from_sorted", "cell
 BACKWARD_ARRAY_NAMES = frozenset(("splats", "tile_counts", "first_slots", "transmittance", "stops", *_PAIR_ARRAY_NAMES))
 """Arrays of a forward pass that its gradient reads; each pass has its own. All other arrays are the session's."""
 MAX_IDLE_WORKSPACES = 4
-"""Workspaces of finished passes that are kept for later passes."""
+"""Largest number of workspaces of finished passes that are kept for later passes."""
 
 
 class PassWorkspace(Workspace):

@@ -28,7 +28,7 @@ TRANSFORM_SCALE_LIMITS = (1e-12, 1e12)
 _INVISIBLE_LOGIT = -80.0
 """Logit of an invisible opacity; exp(80) still fits float32."""
 _SIMILARITY_TOLERANCE = 1e-6
-"""Tolerance of Q^T Q against the identity, for matrices typed with six digits or stored as float32."""
+"""Largest difference of Q^T Q from the identity, for matrices typed with six digits or stored as float32."""
 
 
 def take(gaussians: Gaussians, rows: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Gaussians:

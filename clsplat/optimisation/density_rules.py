@@ -22,7 +22,7 @@ UNWANTED, USELESS = -1.0, -2.0
 class MarkRules:
     """Thresholds (`edge`) that divide the Gaussians; the defaults change nothing.
 
-    A Gaussian is densified if its mean gradient is over `gradient` and it passes `strongest`. It is split if the log of
+    A Gaussian is densified if its mean gradient is over `gradient` and it passes `cut_off`. It is split if the log of
     its largest scale is over `large`, else cloned.
 
     A Gaussian is pruned in any of these cases:
@@ -32,11 +32,11 @@ class MarkRules:
     - It is not new and its radius is over `radius`.
     - It contributes at most `contribution` to every view.
 
-    strongest: (value, row); scores over the value pass, and equal scores up to that row.
+    cut_off: (value, row). A Gaussian passes if its score is over the value, or equal to it and its row is at most this.
     """
 
     gradient: float = inf
-    strongest: tuple[float, int] = (-inf, 0)
+    cut_off: tuple[float, int] = (-inf, 0)
     large: float = inf
     transparent: float = -inf
     oversized: float = inf

@@ -47,8 +47,8 @@ def step(
 ) -> tuple[Float64, Float64, Float64]:
     """Logs and moments (photographs, entries) after Adam's step along by_logs.
 
-    rate: of all entries, or of each.
-    centred: then subtract each entry's mean.
+    rate: learning rate of all entries, or of each.
+    centred: True to subtract each entry's mean over the photographs afterwards.
     """
     first, second = 0.9 * first + 0.1 * by_logs, 0.999 * second + 0.001 * by_logs**2
     change = rate * (first / (1 - 0.9**number)) / (np.sqrt(second / (1 - 0.999**number)) + 1e-15)

@@ -25,10 +25,10 @@ class BlendedTwin:
     """A blended picture.
 
     image: (H, W, 3).
-    transmittance: (H, W), of the background.
+    transmittance: (H, W), the fraction of the background's light that reaches the camera.
     last: (H, W), position in `order` of the last Gaussian added, -1 for none.
     count: (H, W), number of Gaussians added.
-    nearness: (H, W), the sum of weight over depth.
+    nearness: (H, W), the sum of weight / depth.
     margin: (H, W), the smallest relative distance of a decision to its threshold (alpha to 1/255 and 0.99, T to 1e-4),
     clamped to 0.05.
     """
@@ -51,7 +51,7 @@ class BlendGradients:
     opacities: (N,).
     colors: (N, 3).
     contributions: (N,), each Gaussian's contribution to the image: eq. (55).
-    nearness: (N,), by one over the depth, (122).
+    nearness: (N,), by 1 / depth, (122).
     """
 
     means2d: Float64
@@ -67,10 +67,10 @@ class BlendGradients:
 class Layer:
     """One Gaussian on the pixels of its box.
 
-    position: in the order.
+    position: position in the order of depth.
     before, after: transmittance in front of it and behind it.
     added: the pixels to which it is added.
-    margin: as in `BlendedTwin`, infinite where nothing is decided.
+    margin: as in `BlendedTwin`; infinite in pixels in which nothing is decided.
     """
 
     position: int

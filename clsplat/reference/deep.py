@@ -23,7 +23,7 @@ class Deep:
     """A frame in slices by depth.
 
     slices: (bins, H, W, 5) by (70) to (72): red, green, blue, alpha, depth.
-    slack: (H, W), of each pixel, (74).
+    slack: (H, W), the slack s of each pixel, (74).
     margin: (H, W), the smallest distance of a decision to its threshold, as differences of transmittance.
     """
 
@@ -41,7 +41,7 @@ class _Cut:
         self.margin = np.full(slack.shape, np.inf)
 
     def begins(self, layer: Layer, may: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
-        """True where the layer begins a slice. may: where it is allowed to."""
+        """True in pixels in which the layer begins a slice. may: True in pixels in which it is allowed to."""
         box = layer.box
         opened, placed, slack, added = self.open[box], self.placed[box], self.slack[box], layer.added
         in_front = opened - layer.before - slack

@@ -15,7 +15,7 @@ from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS, MarkRul
 def scores(rules: MarkRules, statistics: Mapping[str, Float32]) -> Float32:
     """Mean gradients (n,) of the Gaussians that may be densified; UNWANTED or USELESS for others.
 
-    statistics: by their names in a checkpoint.
+    statistics: arrays by their names in a checkpoint.
     """
     with np.errstate(all="ignore"):
         means = statistics["gradient_sums"] / np.maximum(statistics["seen"], np.float32(1))
@@ -39,7 +39,7 @@ def rows(
     The order is: remaining rows, clones, first halves, second halves.
     """
     found, largest = scores(rules, statistics), log_scales.max(axis=1)
-    value, row = rules.strongest
+    value, row = rules.cut_off
     wanted = (found > np.float32(value)) | ((found == np.float32(value)) & (np.arange(len(found)) <= row))
     wanted &= found >= 0
     large = largest > np.float32(rules.large)

@@ -11,7 +11,7 @@ from clsplat.reference.noise import mixed
 
 
 def factors(thinning: Thinning, count: int, first_row: int = 0) -> Float64:
-    """Eq. (101): the opacity factor of each row (n,), 0 where it is dropped."""
+    """Eq. (101): the opacity factor of each row (n,), 0 if the row is dropped."""
     rows = (first_row + np.arange(count)).astype(np.uint32)
     key0, key1 = (np.uint32(word) for word in thinning.key)
     words = mixed(mixed(rows ^ key0) + key1)

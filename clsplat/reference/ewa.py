@@ -19,11 +19,11 @@ from clsplat.reference.project import ALPHA_MIN
 BOX_STANDARD_DEVIATIONS = 3.33
 """Half size of a Gaussian's box in standard deviations, if its opacity does not make it smaller."""
 TWIN_EWA_CLAMP_FRACTION = 0.15
-"""Fraction of the image's side: how far beyond an edge the Jacobian is evaluated.
+"""Distance beyond an edge up to which the Jacobian is evaluated, as a fraction of the image's side.
 
 `stages.ewa` has its own: a twin takes no number of a formula from the code that it checks."""
 SERIES_TANGENT_SQUARED = 1e-3
-"""For a fisheye: (r / z)^2 up to which differences are computed by their series."""
+"""Largest (r / z)^2 of a fisheye at which differences are computed by their series."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +33,9 @@ class EwaViewTwin:
     viewmat: (4, 4), camera from world.
     intrinsics: (3, 3); the skew is ignored.
     model: pinhole, ortho or fisheye.
-    near, far: world units.
-    eps2d: px^2.
-    radius_clip: pixels.
+    near, far: Gaussians whose depth is not strictly between these are culled, world units.
+    eps2d: px^2, added to the diagonal of the projected covariance.
+    radius_clip: pixels; Gaussians with no larger radius are culled.
     """
 
     viewmat: Float64
@@ -220,8 +220,8 @@ def project(
 
 
 def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
-    """Of a fisheye: the gradient (N, 3) by the points in the camera, and that by the focal lengths (2,) through the
-    means on the image.
+    """For a fisheye, the gradient (N, 3) by the points in the camera, and the gradient (2,) by the focal lengths
+    through the means on the image.
 
     d_j: (N, 2, 3), by the Jacobians.
     """
@@ -250,8 +250,8 @@ def _pinhole_grad(
     d_means2d: Float64,
     d_j: Float64,
 ) -> tuple[Float64, Float64, Float64]:
-    """Of a pinhole camera: the gradients by the points and the focal lengths, as `_fisheye_grad`, and the part (2,) by
-    the principal point that the clamp takes away.
+    """For a pinhole camera, the gradients by the points and the focal lengths, like `_fisheye_grad`, and the part (2,)
+    by the principal point that the clamp takes away.
     """
     z = points[:, 2]
     jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]
@@ -276,7 +276,7 @@ def project_grad(
 ) -> dict[str, Float64]:
     """Gradients by means (N, 3), covariances (N, 3, 3), viewmat (4, 4) and intrinsics (3, 3): equations (159) to (166).
 
-    gradients: by means2d, depths, conics and compensations; each is optional.
+    gradients: gradients by means2d, depths, conics and compensations; each is optional.
 
     The gradient by the covariances is symmetric. Culled Gaussians have none.
     """

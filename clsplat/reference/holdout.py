@@ -12,7 +12,7 @@ from clsplat.reference.blend import layers
 from clsplat.reference.project import ProjectedTwin
 
 Surface = tuple[Float64, Float64, Float64]
-"""Depths (H, W) at which a surface begins and ends, infinite where there is none, and its alpha (H, W)."""
+"""Depths (H, W) at which a surface begins and ends, infinite in pixels without it, and its alpha (H, W)."""
 
 
 def let_through(surfaces: Sequence[Surface], depth: float) -> Float64:

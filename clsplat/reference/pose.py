@@ -19,7 +19,7 @@ def pose_gradient(
 ) -> Float64:
     """Gradient (6,) by a motion of the camera as in `Camera.moved`: three of the rotation, three of the translation.
 
-    gradients: by means (N, 3), quaternions (N, 4) and sh (N, K, 3), zero where a Gaussian is not seen.
+    gradients: gradients by means (N, 3), quaternions (N, 4) and sh (N, K, 3), zero where a Gaussian is not seen.
     """
     directions, _ = view_directions(means, camera)
     of_direction = sh_basis_grad(directions, sh_degree)

@@ -38,7 +38,7 @@ class Forward:
 class GradientsTwin(BlendGradients):
     """Gradients on the image and by the parameters.
 
-    parameters: by the name of the array in `Gaussians`, same shapes.
+    parameters: arrays by their names in `Gaussians`, with the same shapes.
     visible: (N,).
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build defines of the kernels for a RasterizerConfig. The default needs none: its kernels are the unchanged source."""
+"""Build defines of the kernels for a RasterizerConfig. The default config needs no defines."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def kernel_defines(
     config, default = config.switches(), RasterizerConfig()
     defines: dict[str, object] = {}
     if config.extent == "3sigma":
-        # Within a tile whole cells are skipped, so that the cut would depend on the kernels' shape.
+        # Whole cells of a tile are skipped, so that the result would depend on the kernel shape.
         defines.update(EXTENT_BUDGET=_literal(9 * _HALF_LOG2E), NO_ROW_SKIP=True, NO_COLUMN_SKIP=True)
     elif config.extent == "constant":
         defines["EXTENT_BUDGET"] = _literal(-math.log2(config.alpha_min))

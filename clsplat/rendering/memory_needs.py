@@ -80,7 +80,7 @@ def plan_step(
 ) -> Plan:
     """Memory plan of a training step with any of the cameras. Raises CapacityError.
 
-    models: arrays per parameter, if not as in a step of one view.
+    models: arrays per parameter; by default those of a step of one view.
     """
     planes, extra = 0, step.masks * (target.MASK_PIXEL_BYTES + loss_terms.ALPHA_PIXEL_BYTES + step.turns)
     for camera in cameras:
@@ -107,11 +107,12 @@ def plan_step(
 
 
 def frame_pixels(device: Device, features: int = 0, planes: int = 0) -> int:
-    """Largest number of pixels of a frame, by memory.
+    """Largest number of pixels of a frame that the device's memory allows.
 
-    Its planes must leave three quarters of the device's memory to the model and its pairs, and fit one allocation each.
+    All planes together may take at most a quarter of the memory, so that the rest is left for the model and its pairs.
+    A plane must fit in one allocation.
     """
-    per_pixel = _pixel_bytes(features, planes) + 1  # with a share of the tile's bytes
+    per_pixel = _pixel_bytes(features, planes) + 1  # plus the pixel's part of its tile's bytes
     largest = max(12, 4 * (features + 2) if features else 0, planes)
     return min(device.budget // (4 * per_pixel), device.max_allocation // largest)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limit of device memory, and the division of the work that follows from it. Policy only: no OpenCL."""
+"""The plan of the device memory: how the work is divided so that it fits the limit. Policy only: no OpenCL."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ class Need:
     """Device memory that a frame or a training step needs, in bytes unless noted.
 
     gaussians: number of Gaussians.
-    model: parameters of a Gaussian, in a step with moments.
-    widest: a Gaussian's row in the largest parameter array.
-    row: all other arrays of a Gaussian.
-    banded: further bytes of a Gaussian if tiles are divided into bands.
-    pair: arrays of a (tile, Gaussian) pair.
-    most_pairs: number of pairs at which the largest pair array reaches its limit.
-    planes: all arrays that are as large as the image.
-    scratch: all other arrays.
-    photographs: photographs that the device may keep between steps, if there is room.
+    model: bytes per Gaussian of its parameters, and in a training step of its moments.
+    widest: bytes per Gaussian of the largest parameter array.
+    row: bytes per Gaussian of all other arrays.
+    banded: further bytes per Gaussian if the tiles are divided into bands.
+    pair: bytes per (tile, Gaussian) pair.
+    most_pairs: number of pairs at which the largest pair array reaches the limit of one allocation.
+    planes: bytes of all arrays that are as large as the image.
+    scratch: bytes of all other arrays.
+    photographs: bytes of the photographs, which the device keeps between steps if it has room.
     """
 
     gaussians: int
@@ -42,12 +42,12 @@ class Need:
 
     @property
     def pairs(self) -> int:
-        """Estimated number of pairs, before the first frame."""
+        """Number of pairs, estimated before the first frame."""
         return ESTIMATED_PAIRS_PER_GAUSSIAN * self.gaussians
 
     @property
     def total(self) -> int:
-        """Bytes with everything on the device at once, without photographs."""
+        """Bytes if everything except photographs is on the device at once."""
         return self.planes + self.scratch + self.gaussians * (self.row + self.model) + self.pairs * self.pair
 
     @property
@@ -64,12 +64,12 @@ ESTIMATED_PAIRS_PER_GAUSSIAN = 8
 class Plan:
     """Division of the work, so that it fits the memory.
 
-    rows: Gaussians whose parameters and moments are on the device at once.
-    streamed: True if that is not all of them.
+    rows: number of Gaussians whose parameters and moments are on the device at once.
+    streamed: True if these are not all Gaussians.
     pairs: largest number of (tile, Gaussian) pairs at once.
-    gathers: True if rows are moved on the device.
+    gathers: True if the device moves rows, False if the host does.
     allowed: memory limit, bytes.
-    groups: estimated number of groups of tiles.
+    bands: estimated number of bands of tiles, which are listed and blended one after the other.
     photographs: bytes of photographs that stay on the device.
     """
 
@@ -79,13 +79,13 @@ class Plan:
     pairs: int
     gathers: bool
     allowed: int
-    groups: int
+    bands: int
     photographs: int = 0
 
     @property
     def pieces(self) -> tuple[bool, bool]:
         """True for each part that is divided: parameters, image."""
-        return self.streamed, self.groups > 1
+        return self.streamed, self.bands > 1
 
     @property
     def tight(self) -> bool:
@@ -97,19 +97,19 @@ class Plan:
         how = []
         if self.streamed:
             how.append(f"parameters are streamed, {self.rows:,} Gaussians at a time")
-        if self.groups > 1:
-            how.append(f"the image is done in about {self.groups} groups of tiles")
+        if self.bands > 1:
+            how.append(f"the image is done in about {self.bands} bands of tiles")
         needed, allowed = mebibytes(self.need.total), mebibytes(self.allowed)
         return f"about {needed} of device memory needed, {allowed} allowed: " + (", ".join(how) or "all at once")
 
 
 def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
-    """Divide the work by the estimated number of pairs.
+    """Divide the work, going by the estimated number of pairs.
 
-    If everything does not fit at once, the tiles are divided into bands. If that makes many bands, the parameters are
-    streamed in parts. Bands repeat little work, but parts cross the bus in every step.
+    If not everything fits at once, the tiles are divided into bands. If that would make many bands, the parameters are
+    also streamed in parts. Bands come first because they repeat little work, while parts cross the bus in every step.
 
-    alignment: the number of rows is a multiple of it.
+    alignment: number of which the number of rows is a multiple.
     Raises CapacityError if not even the smallest pieces fit.
     """
     photographs = min(max(budget - need.total - need.moving, 0) // 2, need.photographs)
@@ -118,8 +118,8 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     def made(rows: int, *, streamed: bool) -> Plan:
         pairs = min((room - rows * need.model) // need.pair, need.most_pairs)
         gathers = not streamed and need.total + need.moving + photographs <= budget
-        groups = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
-        return Plan(need, rows, streamed, pairs, gathers, budget, groups, photographs)
+        bands = -(-need.pairs // max(pairs, 1)) if need.total > budget or need.pairs > need.most_pairs else 1
+        return Plan(need, rows, streamed, pairs, gathers, budget, bands, photographs)
 
     whole = made(need.gaussians, streamed=False)
     enough = min(need.pairs // 8, need.gaussians) + 1
@@ -133,6 +133,6 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
         least = budget - room + alignment * need.model + max(need.gaussians // 8, 1) * need.pair
         raise CapacityError(
             f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device "
-            f"memory, {mebibytes(need.total)} to be done at once, and {mebibytes(budget)} are allowed"
+            f"memory, or {mebibytes(need.total)} to be done at once, and {mebibytes(budget)} are allowed"
         )
     return streamed

@@ -44,8 +44,8 @@ R = TypeVar("R")
 
 
 @dataclass(frozen=True, eq=False)
-class TileBand:
-    """The unit of listing and blending: the pairs of a band of tiles."""
+class ListedBand:
+    """A band of tiles with the pairs and lists of its Gaussians."""
 
     counted: Counted
     pairs: Pairs
@@ -53,15 +53,15 @@ class TileBand:
 
 
 MAX_COUNTED_PASSES = 3
-"""Passes by capacity whose counts are kept: the current one, the one before, and one that is repeated."""
+"""Number of passes by capacity whose counts are kept: the current one, the one before, and one that is repeated."""
 
 
 @dataclass(frozen=True)
 class PairCapacity:
-    """Arrays of a pass by capacity.
+    """Capacity of a pass that is launched before its number of pairs is known.
 
-    pairs: number of pairs that fit.
-    turn: index below MAX_COUNTED_PASSES of the pass's counts.
+    pairs: number of pairs that fit in its arrays.
+    turn: place of its counts, below MAX_COUNTED_PASSES.
     """
 
     pairs: int
@@ -72,8 +72,9 @@ class PairCapacity:
 class ForwardPass:
     """One forward pass: every stage's arrays, valid until the rasterizer's next forward pass.
 
-    bands: one band of all tiles, unless memory is short. With several, `part` is the last one's.
-    refused: the counts that `adam` had written to `Rasterizer.readback` by then.
+    bands: one band of all tiles, unless memory is short.
+    listed: the lists of the last band.
+    refused: the counts that `adam` had written to `Rasterizer.readback` when this pass read it back.
     """
 
     camera: Camera
@@ -81,13 +82,13 @@ class ForwardPass:
     background: DeviceArray
     projected: Projected
     bands: tuple[Band, ...]
-    part: TileBand
+    listed: ListedBand
     blended: Blended
     refused: tuple[int, ...] = ()
 
     @property
     def inputs(self) -> ImageInputs:
-        """Input of the stages that make more of the image."""
+        """Input of the stages that compute more from this pass, such as channels and the gradient."""
         camera = self.camera
         return ImageInputs(self.projected.splats, self.background, camera.width, camera.height, self.camera_array)
 
@@ -126,7 +127,8 @@ class Rasterizer:
         }
 
     def follow(self, plan: Plan) -> None:
-        """Use as much memory as the plan allows. If that is tight, free the arrays of an earlier plan."""
+        """Use at most as much memory as the plan allows. If memory is tight, the arrays of an earlier plan are
+        freed."""
         self.work.tight = self.device.memory.limit is not None or plan.tight
         if self.work.tight:
             self.work.clear()
@@ -165,15 +167,15 @@ class Rasterizer:
 
         background: (3,) float32, on the host or the device.
         backward: True if a gradient will follow. If False, the work that only a gradient needs is left out.
-        room: run by capacity, without waiting for the number of pairs. If there are more pairs than `room` holds, the
-        pass has no effect (docs/decisions/0025-launch-by-capacity.md).
+        room: capacity with which to run without waiting for the number of pairs. If there are more pairs, the pass has
+        no effect (docs/decisions/0025-launch-by-capacity.md). None counts the pairs first.
         thinning: random dropout of the model's Gaussians in this pass.
         nearness: like `nearness` of `blend`.
         """
         device, work = self.device_of(camera), self.work
         camera_array, background = self._send(camera, background)
 
-        def make() -> tuple[Projected, tuple[Band, ...], TileBand, Blended, tuple[int, ...]]:
+        def make() -> tuple[Projected, tuple[Band, ...], ListedBand, Blended, tuple[int, ...]]:
             projected = project(device, work, gaussians, camera, camera_array, thinning)
             if room is None:
                 counted = count(device, work, projected, all_bits=self._all_bits, readback=self.readback)
@@ -182,13 +184,13 @@ class Rasterizer:
             bands = plan_bands(device, work, projected, counted, tiles_of(camera), self.capacity)
             record = backward and len(bands) == 1 and self._switches.record_cells
             inputs = ImageInputs(projected.splats, background, camera.width, camera.height, camera_array)
-            part = None
+            listed = None
             for band in bands:
-                del part  # its arrays may have to be freed for larger ones
-                part = self._part(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
-                blended = blend(device, work, part.lists, inputs, record=record, nearness=nearness)
-            assert part is not None, "an image has a tile"
-            return projected, bands, part, blended, counted.refused
+                del listed  # this band may need the memory for larger arrays
+                listed = self._list(device, projected, band, tiles_of(camera), counted if len(bands) == 1 else None)
+                blended = blend(device, work, listed.lists, inputs, record=record, nearness=nearness)
+            assert listed is not None, "an image has a tile"
+            return projected, bands, listed, blended, counted.refused
 
         if room is None:
             return ForwardPass(camera, camera_array, background, *make())
@@ -205,23 +207,23 @@ class Rasterizer:
         row: NDArray[np.uint32] = self._arriving[turn]
         return row
 
-    def part(self, frame: ForwardPass, band: Band) -> TileBand:
+    def listed(self, frame: ForwardPass, band: Band) -> ListedBand:
         """The band with its pairs and lists. With several bands it reuses the memory of the previous one."""
         if len(frame.bands) == 1:
-            return frame.part
-        return self._part(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
+            return frame.listed
+        return self._list(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
 
-    def by_band(self, frame: ForwardPass, work_on: Callable[[TileBand], R]) -> list[R]:
+    def by_band(self, frame: ForwardPass, work_on: Callable[[ListedBand], R]) -> list[R]:
         """Results of `work_on` for each of the frame's bands in turn.
 
-        No part is kept, since its arrays may have to be freed for larger ones of the next band.
+        The lists of a band are not kept: the next band may need the memory for larger ones.
         """
-        return [work_on(self.part(frame, band)) for band in frame.bands]
+        return [work_on(self.listed(frame, band)) for band in frame.bands]
 
     def hold_out(self, frame: ForwardPass, held: Held) -> None:
         """Remove from the frame's image and transmittance everything behind the holdout's surfaces."""
         device = self.device_of(frame.camera)
-        self.by_band(frame, lambda part: holdout(device, held, part.lists, frame.inputs, frame.blended))
+        self.by_band(frame, lambda listed: holdout(device, held, listed.lists, frame.inputs, frame.blended))
 
     def channels(
         self,
@@ -238,7 +240,7 @@ class Rasterizer:
         device, work = self.device_of(frame.camera), self.work
         rows = features(device, work, wanted, gaussians, frame.camera_array, frame.projected, motion)
         pixels = (frame.inputs, frame.blended, held)
-        return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1]
+        return self.by_band(frame, lambda listed: channels(device, work, wanted, rows, listed.lists, *pixels))[-1]
 
     def shares(self, frame: ForwardPass, rows: DeviceArray, held: Held | None = None) -> DeviceArray:
         """Planes (floats + 2, height, stride); the first `floats` are weighted means of `rows`.
@@ -249,31 +251,31 @@ class Rasterizer:
         device, work = self.device_of(frame.camera), self.work
         wanted = Floats(rows.shape[1])
         pixels = (frame.inputs, frame.blended, held)
-        return self.by_band(frame, lambda part: channels(device, work, wanted, rows, part.lists, *pixels))[-1].means
+        return self.by_band(frame, lambda listed: channels(device, work, wanted, rows, listed.lists, *pixels))[-1].means
 
     def deep(self, frame: ForwardPass, bins: int) -> DeviceArray:
         """The frame in slices by depth: the array of `stages.deep`."""
         device = self.device_of(frame.camera)
         pixels = (frame.inputs, frame.blended)
-        return self.by_band(frame, lambda part: deep(device, self.work, bins, part.lists, *pixels))[-1]
+        return self.by_band(frame, lambda listed: deep(device, self.work, bins, listed.lists, *pixels))[-1]
 
     def device_of(self, camera: Camera) -> Device:
         """The device with the kernel switches of the camera's projection."""
         return self._by_model[camera.model]
 
-    def _part(
+    def _list(
         self,
         device: Device,
         projected: Projected,
         band: Band,
         tiles: tuple[int, int],
         counted: Counted | None = None,
-    ) -> TileBand:
+    ) -> ListedBand:
         work = self.work
         counted = counted or count_band(device, work, projected, tiles, band, all_bits=self._all_bits)
         listing = duplicate_and_sort if self._switches.depth_sort == "pairs" else duplicate
         pairs = listing(device, work, projected.splats, counted, tiles, band)
-        return TileBand(counted, pairs, tile_lists(device, work, pairs, band, all_bits=self._all_bits))
+        return ListedBand(counted, pairs, tile_lists(device, work, pairs, band, all_bits=self._all_bits))
 
     def backward(
         self,
@@ -311,17 +313,17 @@ class Rasterizer:
         device, work = self.device_of(frame.camera), self.work
         pixels = (frame.inputs, frame.blended, image_gradient)
 
-        def slots(part: TileBand) -> Slots:
-            values = blend_grad(device, work, part.lists, *pixels, fields=fields)
-            return Slots(values, part.counted.first_slots, fields)
+        def slots(listed: ListedBand) -> Slots:
+            values = blend_grad(device, work, listed.lists, *pixels, fields=fields)
+            return Slots(values, listed.counted.first_slots, fields)
 
         if len(frame.bands) == 1:
-            return slots(frame.part)
+            return slots(frame.listed)
         sums: DeviceArray | None = None
 
-        def add(part: TileBand) -> None:
+        def add(listed: ListedBand) -> None:
             nonlocal sums
-            sums = add_slots(device, work, part.counted.tile_counts, slots(part), sums)
+            sums = add_slots(device, work, listed.counted.tile_counts, slots(listed), sums)
 
         self.by_band(frame, add)
         assert sums is not None, "an image has a tile"

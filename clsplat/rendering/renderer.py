@@ -55,7 +55,7 @@ class RenderResult:
 
 
 OBJECTS_PER_COVERAGE_PASS = 8
-"""Objects that are blended in one pass of `render_shares`."""
+"""Number of objects that `render_shares` blends in one pass."""
 ChannelResult = dict[str, NDArray[Any]]
 """Extra channels by their names in the kernels.
 
@@ -66,7 +66,7 @@ Others, if they were asked for: (H, W) or (H, W, floats) float32, as docs/channe
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """The SH coefficients that the settings keep of a model for rendering.
+    """The SH coefficients of a model that the settings keep for rendering, and their storage.
 
     Raises InputError if a coefficient is too large for float16.
     """
@@ -119,17 +119,18 @@ class Renderer:
         Parameters
         ----------
         gaussians : Gaussians
-            The model. The same object is assumed to be unchanged. A model on the device is accepted too; the camera
-            then has the same origin as its means.
+            The model. If it is the object of the last call, it is assumed to be unchanged. It may also be on the
+            device; the camera must then be relative to the origin of its means.
         camera : Camera
             In world coordinates.
         background : sequence of 3 float
             Red, green, blue.
         contiguous : bool
-            Return contiguous arrays. False returns views of planes, for which the device waits less.
+            Return contiguous arrays. False returns views of planes, which is faster.
         holdout : Surfaces, optional
-            Surfaces of other elements of the picture, which hide the model behind them. Their depths are measured as in
-            the kernels.
+            Surfaces of CG elements, which hide the part of the model behind them. Their depths are measured as the
+            kernels
+            measure depths: z, or distances for cameras that draw along rays.
 
         Returns
         -------
@@ -174,9 +175,10 @@ class Renderer:
         wanted : collection of str
             Features by their names in the kernels (`clsplat.config.channels`).
         after, before : Camera, optional
-            Cameras for motion and backward motion. None means the view's own.
+            Cameras for motion and backward motion. None means the view's own camera.
         moved, earlier : Gaussians, optional
-            The same Gaussians with the means for motion and backward motion. None means that they do not move.
+            The same Gaussians with their means at the time of `after` and of `before`. None means that they do not
+            move.
         background, contiguous, holdout
             As for `render`.
 
@@ -191,7 +193,7 @@ class Renderer:
         Raises
         ------
         InputError
-            If motion is between two projections, or the camera is a fisheye with coefficients.
+            If the cameras of motion have different projections, or the camera is a fisheye with coefficients.
         ValueError
             If the number of moved Gaussians differs.
         """

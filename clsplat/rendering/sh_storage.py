@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The SH coefficients of a model that matter, and the part of them to store. Policy only: no OpenCL."""
+"""The SH coefficients of a model that change its colours visibly, and how to store them. Policy only: no OpenCL."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError
 
 MIN_DROPPED_SH_FRACTION = 0.5
-"""Fraction of the coefficients above band 0 that must be droppable before each Gaussian stores its own degree.
+"""Fraction of the coefficients above band 0 that can be left out, from which each Gaussian stores its own degree.
 
-At this fraction a frame takes no longer with the degrees than without them (docs/performance.md).
+From this fraction on, a frame takes no longer with the degrees than without them (docs/performance.md).
 """
 
 _HALF_MAX = float(np.finfo(np.float16).max)
@@ -44,7 +44,7 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
         if tolerance > 0:
             left_out = left_out + change_bounds(band, degree)
             falls_away = left_out.max(axis=1) <= tolerance
-        else:  # no norm: squares of small numbers may underflow to zero
+        else:  # the coefficients themselves: squares in a norm may underflow to zero
             falls_away = ~band.any(axis=(1, 2))
         degrees[undecided[~falls_away]] = degree
         undecided, left_out = undecided[falls_away], left_out[falls_away]
@@ -52,9 +52,7 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
 
 
 def coefficients_in_use(degrees: NDArray[np.uint8]) -> tuple[int, bool]:
-    """Coefficients of each channel for the Gaussian with the most, and True if degrees per Gaussian save enough of the
-    rest.
-    """
+    """Coefficients per channel of the Gaussian with the most, and True if a degree for each Gaussian saves enough."""
     coefficients = (int(degrees.max(initial=0)) + 1) ** 2
     if coefficients == 1:
         return 1, False

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML pages: report.html, the results of a run in one file, and the comparison of runs (docs/report.md).
 
-`figures` reads a run, `svg` draws charts, `thumbnails` embeds pictures, `page` and `compare` build the pages.
-`training.telemetry` records their input during training.
+`run_numbers` reads the numbers of a run, `charts` draws charts as SVG, `thumbnails` embeds pictures, `page` and
+`compare` build the pages. `training.telemetry` records their input during training.
 """
 
 from __future__ import annotations

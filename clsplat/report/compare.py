@@ -12,9 +12,9 @@ from markupsafe import Markup
 
 from clsplat.errors import InputError, examples, plain
 from clsplat.progress import aligned
-from clsplat.report.figures import SCORE_NAMES, Figures, read_figures, settings_of, smooth
+from clsplat.report.charts import SERIES_COLOUR_COUNT, ChartSeries, chart
 from clsplat.report.page import SCORE_TITLES, duration, render_page, score, setting_text
-from clsplat.report.svg import SERIES_COLOUR_COUNT, ChartSeries, chart
+from clsplat.report.run_numbers import SCORE_NAMES, RunNumbers, read_run_numbers, settings_of, smooth
 from clsplat.runs.run import Run
 
 MAX_COMPARED_RUNS = 24
@@ -26,21 +26,21 @@ MAX_COMPARED_VIEWS = 100
 class Comparison:
     """Runs by unique labels.
 
-    notes: reasons why the figures are hard to compare.
+    notes: reasons why the numbers are hard to compare.
     """
 
-    runs: dict[str, Figures]
+    runs: dict[str, RunNumbers]
     notes: list[str] = field(default_factory=list)
 
     @property
     def scores(self) -> list[str]:
         """Names of the scores for which at least one run has a mean."""
-        return [name for name in SCORE_NAMES if any(_mean(figures, name) is not None for figures in self.runs.values())]
+        return [name for name in SCORE_NAMES if any(_mean(numbers, name) is not None for numbers in self.runs.values())]
 
     @property
     def differing(self) -> dict[str, list[Any]]:
         """Settings that differ between the runs: values of each run, by flag."""
-        settings = [dict(settings_of(figures.run.config)) for figures in self.runs.values()]
+        settings = [dict(settings_of(numbers.run.config)) for numbers in self.runs.values()]
         values = {name: [setting[name] for setting in settings] for name in settings[0]}
         return {name: listed for name, listed in values.items() if any(value != listed[0] for value in listed)}
 
@@ -49,43 +49,43 @@ class Comparison:
         runs = [
             {
                 "run": label,
-                "step": figures.step,
-                "iterations": figures.run.config.iterations,
-                "gaussians": figures.gaussians,
-                "seconds": figures.seconds,
-                "elapsed": figures.elapsed,
-                "mean": figures.evaluation["mean"] if figures.evaluation else None,
-                "views": figures.evaluation["views"] if figures.evaluation else [],
-                "evaluations": figures.evaluations,
-                "device": figures.sessions[-1].get("device") if figures.sessions else None,
-                "notes": figures.notes,
+                "step": numbers.step,
+                "iterations": numbers.run.config.iterations,
+                "gaussians": numbers.gaussians,
+                "seconds": numbers.seconds,
+                "elapsed": numbers.elapsed,
+                "mean": numbers.evaluation["mean"] if numbers.evaluation else None,
+                "views": numbers.evaluation["views"] if numbers.evaluation else [],
+                "evaluations": numbers.evaluations,
+                "device": numbers.sessions[-1].get("device") if numbers.sessions else None,
+                "notes": numbers.notes,
             }
-            for label, figures in self.runs.items()
+            for label, numbers in self.runs.items()
         ]
         return {"runs": runs, "settings": self.differing, "notes": self.notes}
 
 
 def compare_runs(runs: Sequence[Run]) -> Comparison:
-    """Read the runs. Raises InputError like `read_figures`, and for too many runs."""
+    """Read the runs. Raises InputError like `read_run_numbers`, and for too many runs."""
     if len(runs) > MAX_COMPARED_RUNS:
         raise InputError(f"{len(runs)} runs: expected at most {MAX_COMPARED_RUNS} to compare")
-    all_figures = [read_figures(run, describe=False) for run in runs]
-    comparison = Comparison(dict(zip(_labels([run.path for run in runs]), all_figures, strict=True)))
+    all_numbers = [read_run_numbers(run, describe=False) for run in runs]
+    comparison = Comparison(dict(zip(_labels([run.path for run in runs]), all_numbers, strict=True)))
     notes = comparison.notes
-    for label, figures in comparison.runs.items():
-        notes += [f"{label}: {note}" for note in figures.notes if note.startswith(("Not finished", "eval.json"))]
-    scenes = {figures.run.scene.name for figures in all_figures if figures.run.scene is not None}
+    for label, numbers in comparison.runs.items():
+        notes += [f"{label}: {note}" for note in numbers.notes if note.startswith(("Not finished", "eval.json"))]
+    scenes = {numbers.run.scene.name for numbers in all_numbers if numbers.run.scene is not None}
     if len(scenes) > 1:
         notes.append(f"The runs are of different scenes: {examples(sorted(scenes))}.")
     held_out = {
-        frozenset(view["name"] for view in figures.evaluation["views"]) for figures in all_figures if figures.evaluation
+        frozenset(view["name"] for view in numbers.evaluation["views"]) for numbers in all_numbers if numbers.evaluation
     }
     if len(held_out) > 1:
         notes.append("The runs do not hold out the same views: their scores are not of the same pictures.")
     for name in ("resolution", "background"):
-        if len({getattr(figures.run.config, name) for figures in all_figures}) > 1:
+        if len({getattr(numbers.run.config, name) for numbers in all_numbers}) > 1:
             notes.append(f"--{name} differs: scores are not of the same pictures.")
-    if len({figures.sessions[-1].get("device") for figures in all_figures if figures.sessions}) > 1:
+    if len({numbers.sessions[-1].get("device") for numbers in all_numbers if numbers.sessions}) > 1:
         notes.append("The runs are of different devices: their times are not of one machine.")
     return comparison
 
@@ -100,10 +100,10 @@ def comparison_page(comparison: Comparison) -> str:
         notes=comparison.notes,
         columns=[(name, SCORE_TITLES[name]) for name in columns],
         rows=[
-            (index % SERIES_COLOUR_COUNT, label, figures, [_mean(figures, name) for name in columns])
-            for index, (label, figures) in enumerate(runs.items())
+            (index % SERIES_COLOUR_COUNT, label, numbers, [_mean(numbers, name) for name in columns])
+            for index, (label, numbers) in enumerate(runs.items())
         ],
-        best=[_best([_mean(figures, name) for figures in runs.values()], name) for name in columns],
+        best=[_best([_mean(numbers, name) for numbers in runs.values()], name) for name in columns],
         charts=[figure for figure in charts(comparison) if figure],
         settings=[(name, list(map(setting_text, values))) for name, values in comparison.differing.items()],
         views=views[:MAX_COMPARED_VIEWS],
@@ -121,8 +121,8 @@ def charts(comparison: Comparison) -> list[Markup]:
         ("step", "Held-out PSNR", "step"),
     ):
         series = [
-            ChartSeries(label, figures.held_out(x), "dots", index)
-            for index, (label, figures) in enumerate(comparison.runs.items())
+            ChartSeries(label, numbers.held_out(x), "dots", index)
+            for index, (label, numbers) in enumerate(comparison.runs.items())
         ]
         drawn.append(chart(title, series, x_label, "PSNR of the held-out views, dB"))
     curves = (
@@ -134,8 +134,8 @@ def charts(comparison: Comparison) -> list[Markup]:
     for title, name, y_label, log_y in curves:
         is_noisy = name in ("loss", "psnr")
         series = []
-        for index, (label, figures) in enumerate(comparison.runs.items()):
-            steps, values = figures.curves["step"], figures.curves[name]
+        for index, (label, numbers) in enumerate(comparison.runs.items()):
+            steps, values = numbers.curves["step"], numbers.curves[name]
             if is_noisy and len(steps) > 20:
                 values = smooth(values, max(len(steps) // 50, 5))
             series.append(ChartSeries(label, list(zip(steps, values, strict=True)), "line", index))
@@ -146,7 +146,7 @@ def charts(comparison: Comparison) -> list[Markup]:
 
 def view_rows(comparison: Comparison) -> list[tuple[str, list[float | None], float | None]]:
     """Rows of the views that at least two runs share: name, PSNR in each run, best PSNR."""
-    views = [figures.evaluation["views"] if figures.evaluation else [] for figures in comparison.runs.values()]
+    views = [numbers.evaluation["views"] if numbers.evaluation else [] for numbers in comparison.runs.values()]
     scores = [{view["name"]: view.get("psnr") for view in listed} for listed in views]
     rows = []
     for name in dict.fromkeys(name for by_name in scores for name in by_name):
@@ -160,11 +160,11 @@ def comparison_table(comparison: Comparison) -> str:
     """Text table for the terminal."""
     columns = comparison.scores
     rows = [["run", "steps", *(name.upper() for name in columns), "Gaussians", "training"]]
-    for label, figures in comparison.runs.items():
-        means = {name: _mean(figures, name) for name in columns}
+    for label, numbers in comparison.runs.items():
+        means = {name: _mean(numbers, name) for name in columns}
         scores = ["-" if value is None else score(value, name) for name, value in means.items()]
-        gaussians = "-" if figures.gaussians is None else f"{figures.gaussians:,}"
-        rows.append([plain(label), f"{figures.step:,}", *scores, gaussians, duration(figures.seconds)])
+        gaussians = "-" if numbers.gaussians is None else f"{numbers.gaussians:,}"
+        rows.append([plain(label), f"{numbers.step:,}", *scores, gaussians, duration(numbers.seconds)])
     lines = aligned(rows)
     if comparison.differing:
         settings = [[name, *map(setting_text, values)] for name, values in comparison.differing.items()]
@@ -182,8 +182,8 @@ def _labels(paths: Sequence[Path]) -> list[str]:
     return [f"{number} {path.resolve().name}" for number, path in enumerate(paths, 1)]
 
 
-def _mean(figures: Figures, name: str) -> float | None:
-    return figures.evaluation["mean"].get(name) if figures.evaluation else None
+def _mean(numbers: RunNumbers, name: str) -> float | None:
+    return numbers.evaluation["mean"].get(name) if numbers.evaluation else None
 
 
 def _best(values: Sequence[float | None], name: str) -> float | None:

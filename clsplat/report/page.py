@@ -21,17 +21,17 @@ from clsplat.files.atomic import atomic_write
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.report import REPORT_FILE_NAME, thumbnails
-from clsplat.report.figures import (
+from clsplat.report.charts import ChartSeries, chart, short, templates
+from clsplat.report.photographs import SMALL_PICTURE_SIDE_PX, MaskedPhotograph, exposure_chart, masked_photographs
+from clsplat.report.run_numbers import (
     CURVE_KEYS,
     MAX_STAGES,
     SCORE_NAMES,
-    Figures,
-    read_figures,
+    RunNumbers,
+    read_run_numbers,
     settings_of,
     smooth,
 )
-from clsplat.report.photographs import SMALL_PICTURE_SIDE_PX, MaskedPhotograph, exposure_chart, masked_photographs
-from clsplat.report.svg import ChartSeries, chart, short, templates
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.version import package_version
@@ -39,11 +39,11 @@ from clsplat.version import package_version
 MAX_PICTURED_VIEWS = 8
 """Default number of held-out views with pictures."""
 MAX_EMBEDDED_RECORDS = 2000
-"""Number of metrics.jsonl records whose figures are embedded in the page."""
+"""Largest number of metrics.jsonl records whose numbers are embedded in the page."""
 MAX_TABLE_VIEWS = 200
-"""Number of views in the table."""
+"""Largest number of views in the table."""
 MAX_COLOURED_STAGES = 7
-"""Number of stages with their own colour. The smaller ones are drawn together."""
+"""Largest number of stages with a colour of their own. The smaller stages are drawn together."""
 SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
 
 
@@ -54,18 +54,18 @@ def write_report(
     scene: Scene | str | None = None,
     model: Gaussians | None = None,
     views: int = MAX_PICTURED_VIEWS,
-) -> Figures:
-    """Write the page atomically to `path`, or into the run's folder. Returns its figures.
+) -> RunNumbers:
+    """Write the page atomically to `path`, or into the run's folder. Returns its numbers.
 
     scene: the run's scene, or the reason why there is none; looked up if not given.
     model: content of model.ply, if already loaded.
     views: largest number of held-out views with pictures.
     Raises InputError if metrics cannot be read, and OSError if the page cannot be written.
     """
-    figures = read_figures(run, model)
-    page = report_page(figures, scene, views)
+    numbers = read_run_numbers(run, model)
+    page = report_page(numbers, scene, views)
     atomic_write(path or run.path / REPORT_FILE_NAME, page.encode("utf-8", "replace"))
-    return figures
+    return numbers
 
 
 def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
@@ -77,16 +77,16 @@ def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
         warnings.warn(f"no {REPORT_FILE_NAME} ({why}); try again with: clsplat report {run.path}", stacklevel=2)
 
 
-def report_page(figures: Figures, scene: Scene | str | None = None, views: int = MAX_PICTURED_VIEWS) -> str:
+def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: int = MAX_PICTURED_VIEWS) -> str:
     """HTML of the report page."""
-    evaluation = figures.evaluation
+    evaluation = numbers.evaluation
     listed = evaluation["views"] if evaluation else []
     shown: list[thumbnails.Shown] = []
     low: list[thumbnails.Shown] = []
-    notes = list(figures.notes)
-    use = figures.run.config.mask_use
+    notes = list(numbers.notes)
+    use = numbers.run.config.mask_use
     if views > 0 and (listed or use != NO_MASKS):
-        scene = scene if scene is not None else thumbnails.scene_of(figures.run)
+        scene = scene if scene is not None else thumbnails.scene_of(numbers.run)
     masks: list[MaskedPhotograph] = []
     masked_count = 0
     if views > 0 and use != NO_MASKS and isinstance(scene, Scene):
@@ -96,13 +96,13 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
             notes.append(f"There are renders without photographs: {scene}.")
         names = [view["name"] for view in listed]
         wanted = thumbnails.chosen([view.get("psnr") for view in listed], views)
-        background = background_colour(figures.run.config.background)
+        background = background_colour(numbers.run.config.background)
         known = None if isinstance(scene, str) else scene
-        shown = thumbnails.show(figures.run, names, wanted, known, background)
+        shown = thumbnails.show(numbers.run, names, wanted, known, background)
         worst = depths.worst(listed) if isinstance(scene, Scene) else []
         low = [
             view
-            for view in thumbnails.show(figures.run, names, worst, known, background, SMALL_PICTURE_SIDE_PX)
+            for view in thumbnails.show(numbers.run, names, worst, known, background, SMALL_PICTURE_SIDE_PX)
             if view.depth
         ]
         if len(shown) < len(wanted):
@@ -112,15 +112,15 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
     places = {view.name: place for place, view in enumerate(shown, 1)}
     return render_page(
         "report.html",
-        figures=figures,
+        numbers=numbers,
         notes=notes,
         titles=SCORE_TITLES,
-        charts=list(filter(None, [*charts(figures), exposure_chart(figures.run)])),
+        charts=list(filter(None, [*charts(numbers), exposure_chart(numbers.run)])),
         masks=masks,
         masked_count=masked_count,
         mask_words=_mask_words(use),
-        histograms=list(filter(None, histograms(figures))),
-        stages=stage_rows(figures),
+        histograms=list(filter(None, histograms(numbers))),
+        stages=stage_rows(numbers),
         shown=[(place, view, scores[view.name]) for place, view in enumerate(shown, 1)],
         places=places,
         low=[(view, scores[view.name]) for view in low],
@@ -131,9 +131,9 @@ def report_page(figures: Figures, scene: Scene | str | None = None, views: int =
         views_left_out=max(len(listed) - MAX_TABLE_VIEWS, 0),
         settings=[
             (name, setting_text(value), setting_text(defaults[name]), value != defaults[name])
-            for name, value in settings_of(figures.run.config)
+            for name, value in settings_of(numbers.run.config)
         ],
-        data=_data(figures),
+        data=_data(numbers),
     )
 
 
@@ -152,9 +152,9 @@ def render_page(name: str, **values: Any) -> str:
     )
 
 
-def charts(figures: Figures) -> list[Markup]:
+def charts(numbers: RunNumbers) -> list[Markup]:
     """Charts of loss, PSNR, Gaussians, stage times and training time, by step, and of PSNR by training time."""
-    curves, steps = figures.curves, figures.curves["step"]
+    curves, steps = numbers.curves, numbers.curves["step"]
     around = max(len(steps) // 50, 5)
     note = f"each tenth step, of one view; the line is the mean of {around} records" if len(steps) > 20 else ""
     made = []
@@ -164,54 +164,54 @@ def charts(figures: Figures) -> list[Markup]:
             means = list(zip(steps, smooth(curves[name], around), strict=True))
             series = [replace(series[0], kind="faint"), ChartSeries("training views, mean", means)]
         if name == "psnr":
-            series.append(ChartSeries("held-out views", figures.held_out("step"), "dots", 1))
+            series.append(ChartSeries("held-out views", numbers.held_out("step"), "dots", 1))
         made.append(chart(title, series, "step", label, log_y=name == "loss", note=note))
     grown = ChartSeries("Gaussians", list(zip(steps, curves["gaussians"], strict=True)), color=2)
     made.append(chart("Number of Gaussians", [grown], "step", "Gaussians", from_zero=True))
-    made.append(stage_chart(figures))
+    made.append(stage_chart(numbers))
     trained = ChartSeries("training", [(0.0, 0.0), *zip(steps, curves["seconds"], strict=True)], color=4)
     if steps:
         made.append(chart("Time", [trained], "step", "seconds of training", from_zero=True))
-    series = [ChartSeries("held-out views", figures.held_out("seconds"), "dots", 1)]
+    series = [ChartSeries("held-out views", numbers.held_out("seconds"), "dots", 1)]
     made.append(chart("Time against PSNR", series, "seconds of training", "PSNR, dB"))
     return made
 
 
-def stage_chart(figures: Figures) -> Markup:
+def stage_chart(numbers: RunNumbers) -> Markup:
     """Stacked chart of milliseconds per stage, with the small stages together. Empty with fewer than two
     measurements."""
-    if len(figures.stages) < 2:
+    if len(numbers.stages) < 2:
         return Markup("")
-    names = [name for name, *_ in stage_rows(figures)]
+    names = [name for name, *_ in stage_rows(numbers)]
     named = names if len(names) <= MAX_COLOURED_STAGES + 1 else names[:MAX_COLOURED_STAGES]
     groups = [(name, [name]) for name in named]
     if rest := names[len(named) :]:
         groups.append((f"{len(rest)} smaller ones", rest))
     series = []
     for color, (label, members) in enumerate(groups):
-        times = [(float(record["step"]), sum(record["ms"].get(n, 0.0) for n in members)) for record in figures.stages]
+        times = [(float(record["step"]), sum(record["ms"].get(n, 0.0) for n in members)) for record in numbers.stages]
         series.append(ChartSeries(label, times, "area", color))
     return chart("Time per stage", series, "step", "ms of a step", note="waiting for the device after each stage")
 
 
-def stage_rows(figures: Figures) -> list[tuple[str, float, float, float]]:
+def stage_rows(numbers: RunNumbers) -> list[tuple[str, float, float, float]]:
     """Rows of the stages, largest first: name, median and last milliseconds, fraction of the last step."""
-    if not figures.stages:
+    if not numbers.stages:
         return []
-    last = figures.stages[-1]["ms"]
-    names = sorted({name for record in figures.stages for name in record["ms"]} - {"all"})[:MAX_STAGES]
+    last = numbers.stages[-1]["ms"]
+    names = sorted({name for record in numbers.stages for name in record["ms"]} - {"all"})[:MAX_STAGES]
     rows = []
     for name in names:
-        values = sorted(record["ms"].get(name, 0.0) for record in figures.stages)
+        values = sorted(record["ms"].get(name, 0.0) for record in numbers.stages)
         now = last.get(name, 0.0)
         rows.append((name, values[len(values) // 2], now, now / last["all"]))
     return sorted(rows, key=lambda row: -row[2])
 
 
-def histograms(figures: Figures) -> list[Markup]:
+def histograms(numbers: RunNumbers) -> list[Markup]:
     """Histograms of scales, opacities and contributions."""
     bars = {
-        name: list(zip(data["edges"], [*data["counts"], 0], strict=True)) for name, data in figures.histograms.items()
+        name: list(zip(data["edges"], [*data["counts"], 0], strict=True)) for name, data in numbers.histograms.items()
     }
     scales = (("largest scale", 0), ("smallest scale", 1))
     series = [ChartSeries(name, bars[name], "bars", color) for name, color in scales if name in bars]
@@ -219,7 +219,7 @@ def histograms(figures: Figures) -> list[Markup]:
     if "opacity" in bars:
         made.append(chart("Opacity", [ChartSeries("opacity", bars["opacity"], "bars", 2)], "opacity", "Gaussians"))
     if "contribution" in bars:
-        record = figures.histograms["contribution"]
+        record = numbers.histograms["contribution"]
         views = f"{record['views']} of {record['of']} training views"
         note = f"largest to one of {views}; {record['none']:,} contribute to none"
         series = [ChartSeries("contribution", bars["contribution"], "bars", 3)]
@@ -255,18 +255,18 @@ def _mask_words(use: MaskUse) -> list[str]:
     return [text for meaning, text in words.items() if meaning in (use.masks, use.alpha)]
 
 
-def _data(figures: Figures) -> dict[str, Any]:
-    """Data of the page for programs: the figures, unrounded."""
-    length = len(figures.curves["step"])
+def _data(numbers: RunNumbers) -> dict[str, Any]:
+    """Data of the page for programs: the numbers, unrounded."""
+    length = len(numbers.curves["step"])
     every = -(-length // MAX_EMBEDDED_RECORDS) or 1
     kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})
-    curves = {name: [figures.curves[name][index] for index in kept] for name in CURVE_KEYS}
+    curves = {name: [numbers.curves[name][index] for index in kept] for name in CURVE_KEYS}
     return {
-        "run": figures.name,
+        "run": numbers.name,
         "records": length,
         "curves": curves,
-        **{name: getattr(figures, name) for name in ("stages", "evaluation", "evaluations", "model", "histograms")},
-        "settings": dict(settings_of(figures.run.config)),
+        **{name: getattr(numbers, name) for name in ("stages", "evaluation", "evaluations", "model", "histograms")},
+        "settings": dict(settings_of(numbers.run.config)),
     }
 
 

@@ -12,8 +12,8 @@ from markupsafe import Markup
 from clsplat.errors import InputError, examples
 from clsplat.files.documents import parse_json, read_document
 from clsplat.images.colour import displayed, photos_space
-from clsplat.report.figures import number
-from clsplat.report.svg import ChartSeries, chart
+from clsplat.report.charts import ChartSeries, chart
+from clsplat.report.run_numbers import number
 from clsplat.report.thumbnails import data_uri
 from clsplat.runs.run import Run
 from clsplat.scenes.analysis.mask_overlay import masked
@@ -21,7 +21,7 @@ from clsplat.scenes.analysis.sanity_checks import spread
 from clsplat.scenes.scene import Scene, View
 
 MAX_MASKED_PHOTOGRAPHS = 6
-"""Number of masked photographs shown."""
+"""Largest number of masked photographs that are shown."""
 SMALL_PICTURE_SIDE_PX = 320
 """Pixels of the longer side of small pictures."""
 

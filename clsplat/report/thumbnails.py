@@ -31,7 +31,7 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.supervision.masks import after_sfm
 
 MAX_PICTURE_SIDE_PX = 640
-"""Pixels of the longer side of a picture in a page."""
+"""Most pixels of the longer side of a picture in a page."""
 MAX_PNG_SIDE_PX = 160
 """Largest side of a picture that is stored as PNG and shown with its pixels as squares."""
 REPORT_JPEG_QUALITY = 85
@@ -111,7 +111,7 @@ def show(
 ) -> list[Shown]:
     """Pictures of the views `names[index]` for the wanted indices, if their render is in the run's test/.
 
-    side: pixels of the longer side, at most.
+    side: most pixels of the longer side.
     """
     try:
         paths = picture_names(names)

@@ -20,7 +20,7 @@ from clsplat.runs.run import Run, run_of
 MAX_APPEARANCE_BYTES = 1 << 28
 MAX_LOG2_GAIN = 16.0
 MAX_CHANNEL_MIX = 0.25
-"""Below this limit the matrix of any six mixes can be inverted."""
+"""Exclusive limit of a mix's magnitude. Below it the matrix of any six mixes can be inverted."""
 KINDS_WITH_GAINS = ("exposure", "ppisp")
 """Settings of --appearance whose files have gains, which a render can take."""
 EXPECTED_APPEARANCE_FILE = "what clsplat train --appearance writes"

@@ -38,7 +38,7 @@ class Checkpoint:
     """One checkpoint.
 
     step: optimisation steps done.
-    arrays: by name.
+    arrays: arrays by name.
     state: JSON values.
     """
 
@@ -86,7 +86,7 @@ def read_arrays(path: Path, expected: str) -> Arrays:
 def write_checkpoint(path: Path, step: int, arrays: Mapping[str, NDArray[Any]], state: Mapping[str, Any]) -> None:
     """Write a checkpoint atomically, with a digest of each array.
 
-    arrays: of any dtype but object.
+    arrays: arrays of any dtype except object.
     state: values that JSON can hold.
     """
     if STATE_KEY in arrays:

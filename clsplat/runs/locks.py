@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exclusive write lock on a folder. The operating system holds it, so a killed process leaves no stale lock."""
+"""Exclusive write lock on a run's folder. The operating system holds it, so a killed process leaves no stale lock.
+
+Locks by marker files are in `clsplat.files.locks`.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,14 @@ from clsplat.errors import InputError, warn
 from clsplat.files.documents import parse_json
 
 LOCK_FILE_NAME = ".clsplat-lock"
-"""File in the folder that is locked while a process writes there. It names the process."""
+"""Name of the file in the folder that is locked while a process writes there. The file names the process."""
 _LOCKED_BYTE_OFFSET = 1 << 30
 """Offset of the locked byte. Windows forbids other processes to read a locked byte, so it lies beyond the file's
 content."""
 _LOCK_HELD_ERRNOS = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 _NO_LOCKING_ERRNOS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL, errno.EIO)
 _held: dict[str, int] = {}
-"""Number of times that this process has locked each folder."""
+"""Number of times that this process has entered the lock of each folder."""
 
 
 @contextmanager
@@ -76,7 +79,7 @@ def _take(path: Path, folder: Path) -> IO[bytes]:
         with suppress(OSError):
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
-        file.close()  # the previous holder has just removed this file: try again
+        file.close()  # the previous holder has just removed this file, so another one has to be locked
 
 
 def try_lock(file: IO[bytes]) -> None:
@@ -91,7 +94,7 @@ def try_lock(file: IO[bytes]) -> None:
 
 
 def _sign(file: IO[bytes], verb: str) -> None:
-    """Write this process's identity. A failure, such as a full disk, is ignored."""
+    """Write the identity of this process into the locked file. A failure, such as a full disk, is ignored."""
     text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "verb": verb, "since": time.time()})
     with suppress(OSError):
         file.seek(0)

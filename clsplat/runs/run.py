@@ -72,7 +72,7 @@ class Run:
         check_output(path, resume=resume, overwrite=overwrite)
         path.mkdir(parents=True, exist_ok=True)
         with locked(path, "train"):
-            check_output(path, resume=resume, overwrite=overwrite)  # again: another process may have been faster
+            check_output(path, resume=resume, overwrite=overwrite)  # again, as another process may have made a run
             if resume:
                 earlier = cls.open(path)
                 check_resumed(earlier, config)
@@ -150,7 +150,7 @@ class Run:
         try:
             with open(self.metrics_path, "a", encoding="utf-8", newline="\n") as file:
                 file.write(line + "\n")
-        except OSError as error:  # the error of a full disk names no file
+        except OSError as error:  # the system's error for a full disk does not name the file
             raise write_error(self.metrics_path, error, needs=len(line) + 1) from None
 
     def read_metrics(self) -> list[dict[str, Any]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of images, and one-line warnings about implausible ones, judged by intrinsics, poses and visible points."""
+"""Cameras of images, and one-line warnings about implausible ones, from their intrinsics, poses and visible points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clsplat.scenes.dataset import (
 
 Named = tuple[str, Camera, Lens]
 MIN_CHECKED_POSES = 4
-"""Minimum number of cameras to judge their poses."""
+"""Minimum number of cameras whose poses are checked."""
 MAX_CHECKED_POSES = 40
 """Maximum number of cameras whose poses are checked, evenly spaced."""
 MAX_POSE_CHECK_POINTS = 1000
@@ -31,9 +31,10 @@ MAX_POSE_CHECK_POINTS = 1000
 used."""
 MIN_POSE_CHECK_POINTS = 30
 MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
-"""Minimum mean fraction of the points in view if poses are read another way, and minimum ratio to the poses as given.
+"""Another reading of the poses is reported if at least this mean fraction of the points is in view, and this many times
+the fraction with the poses as given.
 
-Each picture of an aerial survey shows about 1 % of the points, either way.
+Each picture of an aerial survey shows about 1 % of the points in either reading.
 """
 BLIND_VIEW_POINT_FRACTION, MIN_BLIND_VIEW_FRACTION = 0.01, 0.2
 """Fraction of the points below which a view is blind, and fraction of blind views that makes the poses doubtful.
@@ -42,7 +43,8 @@ Another reading of the poses is then reported if it has no blind views. In the c
 a quarter of the points.
 """
 MAX_CONVERGING_FRACTION_AS_GIVEN, MIN_CONVERGING_FRACTION_INVERTED = 0.2, 0.9
-"""Maximum fraction of the cameras that face a common point as given, and minimum fraction with inverted poses."""
+"""Inverted poses are reported if at most the first fraction of the cameras face a common point as given, and at least
+the second fraction does with inverted poses."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
 """Length of the mean optical axis above which the cameras look the same way, as along a facade or from a drone.
 
@@ -53,7 +55,7 @@ CENTRE_RATIO_TOLERANCE = 0.02
 FACING_COSINE = np.cos(np.deg2rad(20.0))
 """Cosine of the maximum angle between the optical axis and a point that a camera faces."""
 MAX_EDGE_DISTORTION = 0.5
-"""Maximum shift by a lens at the picture's edge, as a fraction of half the width or height."""
+"""Maximum plausible shift by a lens at the picture's edge, as a fraction of half the width or height."""
 OPENGL_AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
 """Signs that convert between COLMAP's and OpenGL's camera axes."""
 

@@ -19,7 +19,7 @@ EXPORT_AGAIN_ADVICE = "export the data set anew or add it"
 
 
 class Keys:
-    """Values of one frame or camera; the file's values are the defaults.
+    """Values of one frame or camera. A value that it lacks comes from the file's top level.
 
     where: beginning of every error message.
     Each method raises InputError for an invalid value.

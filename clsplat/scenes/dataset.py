@@ -31,13 +31,13 @@ with undisturbed():  # its import reports Ctrl-C as "not installed", and sets a 
 
 
 MAX_IMAGE_SIDE_PX = 1 << 20
-"""Maximum width or height in pixels; a larger one means a damaged file. Keeps width times height far from overflow."""
+"""Maximum width or height in pixels. A larger one means a damaged file; width times height stays far from overflow."""
 MAX_COORDINATE = 1e30
-"""Coordinates of this magnitude or more mean a damaged file. Their squares are still finite."""
+"""Exclusive limit of coordinates. Larger ones mean a damaged file; squares of smaller ones are finite."""
 MIN_FOCAL_PER_SIDE = 1 / 20
 """Minimum plausible focal length, as a fraction of the longer side. A fisheye of 220 degrees has 1/4."""
 MIN_CENTRE_CHECK_SIDE_PX = 16
-"""Minimum shorter side in pixels of a picture in whose first pixel a principal point is implausible."""
+"""Minimum shorter side, pixels, of pictures whose principal point cannot plausibly lie in the first pixel."""
 
 
 @cache
@@ -74,13 +74,14 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """The camera model that shows its pictures without undistortion, if it is no pinhole; else None."""
+        """The camera model that renders like the lens, without undistortion; None for a pinhole, and if there is
+        none."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 
     @property
     def is_colmap(self) -> bool:
-        """True if COLMAP has the model; the formulas of others are those of their camera model."""
+        """True if COLMAP has the model. Other models have the formulas of their camera model in `clsplat.cameras`."""
         return self.model not in lens_models() or lens_models()[self.model][0].is_colmap
 
     @property
@@ -116,8 +117,8 @@ class Lens:
         """Pinhole camera of the undistorted picture, with the pose of the original.
 
         Size and focal length follow COLMAP's image undistorter. It keeps the focal length and crops so that no pixel
-        lies outside the source picture, if this leaves at least a fifth of its size. A fisheye of 180 degrees or more
-        keeps about its picture's size. It loses everything beyond, which no pinhole camera can show.
+        lies outside the source picture, if this leaves at least a fifth of its size. The result for a fisheye of 180
+        degrees or more has about the size of its picture, and lacks directions that no pinhole camera can show.
         """
         camera = self._camera()
         if not self.is_pinhole:
@@ -195,7 +196,7 @@ class Lens:
         return np.asarray(self._camera().cam_from_img(np.ascontiguousarray(pixels, np.float64)))
 
     def _camera(self) -> pycolmap.Camera:
-        model = self.model if self.is_colmap else "PINHOLE"  # for focal lengths and principal point alone
+        model = self.model if self.is_colmap else "PINHOLE"  # enough for the focal lengths and the principal point
         camera = pycolmap.Camera(model=model, width=self.width, height=self.height, params=list(self.params))
         camera.camera_id = 1
         return camera

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 DEPTH_FOLDERS = ("depths", "depth")
 """Names of the depth map folder, next to the photographs' folder or inside it."""
 MIN_DEPTH_FIT_POINTS = 10
-"""Minimum number of points in a photograph to fit its relative depth map to."""
+"""Minimum number of points in a photograph whose relative depth map is fitted to them."""
 MIN_TRACKED_POINTS_IN_VIEW = 0.1
 """Minimum fraction of tracked points that lie in their photographs.
 
@@ -54,7 +54,7 @@ def with_depths(scene: Scene, use: DepthUse) -> Scene:
         known = _mapped(scene, use)
     without = [view.name for view in scene.train_views if view.name not in known]
     if use and without:
-        warn(f"{scene.name}: of {len(without):,} photograph(s) no depths are known ({examples(without)})")
+        warn(f"{scene.name}: no depths are known for {len(without):,} photograph(s) ({examples(without)})")
     views = [replace(view, depth=known.get(view.name) if view.split == "train" else None) for view in scene.views]
     return replace(scene, views=views, depth_use=use)
 
@@ -63,12 +63,12 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
     """Points that COLMAP observed in each photograph, weighted by their error e in pixels: 1/(1 + e^2)."""
     model = None if scene.source is None else colmap.find_model(scene.source)
     if model is None:
-        raise InputError(f"{scene.name}: {asked} wants to know which photographs show a point, expected a COLMAP model")
+        raise InputError(f"{scene.name}: {asked} needs to know which photographs show a point, expected a COLMAP model")
     tracks = colmap.read_tracks(model)
     weights = 1 / (1 + np.square(np.maximum(tracks.errors, 0.0)))
     tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
     if not tracked:
-        raise InputError(f"{model}: no point has a track, and {asked} goes by them; export the model with tracks")
+        raise InputError(f"{model}: no point has a track, and {asked} needs tracks; export the model with them")
     names = match([view.name for view in scene.train_views], tracked).names
     rows = {name: tracked[theirs] for name, theirs in names.items()}
     known = {name: KnownDepth(tracks.points[which], weights[which]) for name, which in rows.items()}
@@ -82,7 +82,8 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
 
 
 def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
-    """Raise InputError if hardly any tracked point lies in its photographs: the cameras may be in another frame."""
+    """Raise InputError if hardly any tracked point lies in its photographs, as the cameras then have another world
+    frame."""
     seen = whole = 0
     for view in scene.train_views:
         if view.name in known:

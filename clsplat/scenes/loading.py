@@ -37,7 +37,7 @@ MAX_ASPECT_RATIO_CHANGE = 1.5
 Beyond it, or if rotated, the file is another picture.
 """
 SIDE_ROUNDING_PX = 2.5
-"""Maximum difference in pixels, at the camera's size, that rounding of the sides explains."""
+"""Maximum difference in pixels, at the camera's size, that is taken for rounding of the sides."""
 BLENDER_CUBE_HALF_SIDE = 1.3
 """Half the side of the cube for random points in the synthetic scenes: the authors' value."""
 
@@ -64,7 +64,7 @@ def load_scene(
         there are no other pictures.
     lenses: "undistort" turns fisheyes into pinhole cameras, "native" keeps them.
     work_dir: output of structure from motion, by default NAME_colmap next to `path`.
-    progress: called with a text and a fraction or None.
+    progress: function that is called with a text and a fraction or None.
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
         are not used, and structure from motion finds no features in left-out pixels.
     missing: how many listed pictures may be missing, "few" (a tenth), "skip" (any number but not all) or "error"
@@ -215,7 +215,7 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
 
 
 def _warn_of_copies(views: list[View]) -> None:
-    """Warn of held-out pictures that are also trained on, as their scores say nothing about the model's quality."""
+    """Warn of held-out pictures that are also trained on: their scores do not show how good the model is elsewhere."""
     by_size: dict[int, list[View]] = {}
     for view in views:
         by_size.setdefault(view.path.stat().st_size, []).append(view)
@@ -254,7 +254,7 @@ def _view(image: PosedImage, split: Split, resolution: int, smaller: Sequence[Pa
 def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None:
     """Warn of pictures that were resized by different factors across and down.
 
-    They are used as resized, as in gsplat. Pictures of another camera may look the same.
+    They are used with both factors, as in gsplat. But such a picture may also belong to another camera.
     """
     uneven = []
     for image, view in zip(images, views, strict=True):

@@ -14,7 +14,7 @@ from clsplat.camera import Camera
 OUTLIER_GAP_RATIO = 2.0
 """Minimum ratio between successive distances from the middle at which outliers may begin.
 
-In the captures at hand this ratio is at most 1.7 at their edge.
+In captures without outliers the ratio is at most 1.7, at their edge.
 """
 OUTLIER_DISTANCE_RATIO = 5.0
 """Minimum distance of an outlier from the middle, relative to the farthest place that is not one.
@@ -22,9 +22,9 @@ OUTLIER_DISTANCE_RATIO = 5.0
 A training of 24 photographs whose scene size includes an outlier loses 1.2 dB at 5, 2.7 at 8, 4 at 12 and 7 at 30.
 """
 MAX_OUTLIER_CAMERA_FRACTION = 0.25
-"""Maximum fraction of the cameras that can be outliers. More of them are part of the capture."""
+"""Maximum fraction of the cameras that can be outliers. If more are far away, they belong to the capture."""
 MAX_OUTLIER_POINT_FRACTION = 0.01
-"""Maximum fraction of the points that can be outliers; thousands of points remain."""
+"""Maximum fraction of the points that can be outliers."""
 
 
 def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | None = None) -> NDArray[np.bool_]:
@@ -37,7 +37,7 @@ def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | N
         it, places that coincide except for a few have no size to compare with, and no outliers.
     """
     found = np.zeros(len(places), np.bool_)
-    first = len(places) - int(most * len(places))  # this many are never outliers, whatever their distances are
+    first = len(places) - int(most * len(places))  # the nearest ones, which cannot be outliers
     if not 0 < first < len(places):
         return found
     distances = np.linalg.norm(places - (np.median(places, axis=0) if middle is None else middle), axis=1)

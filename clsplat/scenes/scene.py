@@ -38,21 +38,22 @@ At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pi
 MIN_POINTS_IN_FAR_VIEW, MIN_POINT_SPREAD_IN_FAR_VIEW = 10, 0.08
 """Minimum number of points in the picture of a distant camera, and their standard deviation as a fraction of a side.
 
-With more, the picture shows the same as the others from further off, or another reconstructed part. Points spread over
-the picture have 0.29. An outlier shows no points, or all in one pixel.
+With at least so many points, spread at least so far, the picture shows the same as the others from further away, or
+another reconstructed part. Points all over the picture have a standard deviation of 0.29. The picture of an outlier
+shows no points, or has every point in one pixel.
 """
 MIN_FAR_GROUP_NEIGHBOURS = 2
 """Minimum number of other cameras near a distant one that form a group with it. Wrong poses are scattered."""
 SAME_PLACE_TOLERANCE = 1e-12
-"""Distance between cameras, relative to their largest coordinate, up to which they are in the same place."""
+"""Distance between cameras, relative to their largest coordinate, up to which they count as in the same place."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """A photograph and its camera.
 
-    name: as in the data set, with extension, unique in the scene.
-    camera: at the working size.
+    name: name in the data set, with extension, unique in the scene.
+    camera: its camera at the working size.
     path: the file.
     split: "train" or "test".
     lens: the lens that took the file, at the file's size.
@@ -85,8 +86,7 @@ class View:
     def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read like `load`. If pixels are left out, a fifth channel is 1 for pixels that count, else 0.
 
-        A pixel counts if at least half of its area does. Its colour is the mean of that part alone, so that no left-out
-        colour leaks in.
+        A pixel counts if at least half of its area counts. Its colour is the mean over that part of its area only.
         """
         width, height = width or self.camera.width, height or self.camera.height
         image = self._read()
@@ -113,7 +113,7 @@ class View:
         return undistort(image, self.lens, self.camera.resized(width, height))
 
     def check(self) -> Thumbnail:
-        """Thumbnail of the picture. Raises InputError where `load` would."""
+        """Thumbnail of the picture. Raises InputError if `load` would."""
         image = self._read()
         if self.mask is not None:
             self.mask.applied(image, orient=self.upright)

@@ -26,7 +26,7 @@ class Thumbnail:
 
     pixels: (h, w, 3), colours as stored.
     transparent: fraction of the photograph's pixels that are transparent.
-    sharpness: see `sharpness_of`.
+    sharpness: result of `sharpness_of`.
     """
 
     pixels: Float32

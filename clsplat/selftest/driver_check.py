@@ -18,7 +18,13 @@ from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.quirks import title
 from clsplat.device.drivers.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
-from clsplat.device.drivers.worker_process import TRUST_DRIVER_VARIABLE, Child, patience, python_module, regardless
+from clsplat.device.drivers.worker_process import (
+    TRUST_DRIVER_VARIABLE,
+    WorkerProcess,
+    driver_timeout,
+    python_module,
+    regardless,
+)
 from clsplat.errors import DeviceError, DriverError
 from clsplat.selftest.result import FORWARD_STAGES, SELFTEST_STAGES, TRAINING_STAGES, Result
 
@@ -27,9 +33,9 @@ from clsplat.selftest.result import FORWARD_STAGES, SELFTEST_STAGES, TRAINING_ST
 class DriverReport:
     """The self-test result of a device.
 
-    digests: of each stage's output, by "scene/stage".
+    digests: digest of each stage's output, by "scene/stage".
     build_seconds: None if the kernels were not built first.
-    end: how the process ended before its work was done, or empty.
+    end: description of the process's end if it came before the work was done, or empty.
     crashed: True if the driver caused that.
     hung: True if the process did not come back.
     kernels: the kernels that were built and launched, named as in `device.sandbox`.
@@ -82,9 +88,9 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *
     """Test the `index`-th device in a worker process. stages: in the order of SELFTEST_STAGES, including
     FORWARD_STAGES."""
     report = DriverReport(wanted=tuple(stages))
-    begun, seconds = "starting", patience()
+    begun, seconds = "starting", driver_timeout()
     words = [str(index), shape.label, ",".join(stages), *(["quick"] if quick else [])]
-    with closing(Child(python_module("clsplat.selftest.worker", *words))) as child:
+    with closing(WorkerProcess(python_module("clsplat.selftest.worker", *words))) as child:
         try:
             while (message := child.receive(seconds)) is not None:
                 begun = message.get("begins", begun)

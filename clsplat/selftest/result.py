@@ -81,7 +81,7 @@ class Result:
     absolute, ulp: the worst error.
     bound: the error bound in ulp.
     same_bits: True if the bits match the stored digest; None if none is stored for this shape.
-    ms: of all scenes.
+    ms: milliseconds of all scenes.
     trouble: a fault other than the error, in words, or empty.
     where: the place of the worst error in ulp.
     otherwise: operations that do not round like IEEE 754.

@@ -70,8 +70,8 @@ def run(
 
     It stops early if the next stage would read or write outside its arrays.
 
-    say: is called with the name of each stage before it runs.
-    digests: receives the digests of this run by "scene/stage".
+    say: function that is called with the name of each stage before it runs.
+    digests: dictionary that receives the digests of this run, by "scene/stage".
     """
     benches = [CaseBench(device, frozen) for frozen in scenes(quick=quick)]
     for name in stages:
@@ -121,7 +121,7 @@ def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> Non
     end_with_parent()
     tell(begins="opening the device")
     device = Device(all_devices()[index]).with_shape(shape)
-    device.rehearsal.say = lambda kernel: tell(begins=kernel)
+    device.trials.say = lambda kernel: tell(begins=kernel)
     try:
         if not quick:
             start = time.perf_counter()
@@ -134,7 +134,7 @@ def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> Non
     except DriverError as error:
         tell(failed=str(error))
     else:
-        tell(done=device.rehearsal.done)
+        tell(done=device.trials.done)
 
 
 if __name__ == "__main__":

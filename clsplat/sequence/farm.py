@@ -30,9 +30,9 @@ from clsplat.sequence.workers import WRITE_QUEUE_BYTES, Result, encode_frame, en
 from clsplat.version import package_version
 
 LOCAL_WORKER_THREADS = 2
-"""Threads of a local worker: one frame is encoded while the next is rendered."""
+"""Number of threads of a local worker: one frame is encoded while the next is rendered."""
 MAX_FRAMES_PER_WORKER = 3
-"""Frames that a worker holds at once, regardless of its number of threads."""
+"""Largest number of frames that a worker holds at once, whatever its number of threads."""
 SCHEDULER_TIMEOUT_SECONDS = 20
 """Seconds within which a scheduler has to answer."""
 NO_WORKERS_WARNING_SECONDS = 10.0
@@ -44,9 +44,9 @@ class WorkerJob:
     """Everything that a worker has to load.
 
     model: absolute path of the model, or of the shot file.
-    digest: SHA-256 of its content (`Cast.digest`).
+    digest: SHA-256 of its content (`JobModels.digest`).
     placed: the tasks contain placements of the models.
-    version: of clsplat.
+    version: version of clsplat.
     """
 
     model: str

@@ -19,7 +19,7 @@ from clsplat.images.provenance import MODEL_DIGEST_ATTRIBUTE, SETTINGS_DIGEST_AT
 from clsplat.sequence.task import RenderOptions, Task, digest_of, picture_camera, settings_digest
 
 MAX_FILE_THREADS = 8
-"""Limit of threads that read or write files at once."""
+"""Largest number of threads that read or write files at once."""
 IDENTITY_ATTRIBUTES = (MODEL_DIGEST_ATTRIBUTE, "clsplat:colorspace")
 """Attributes that identify a file's model and colour space."""
 

@@ -95,7 +95,7 @@ class FrameQueue:
     def take(self, skip: Callable[[Task], None]) -> Task | None:
         """The next frame to render, None if there is none. Waits for frames of other jobs.
 
-        skip: called with each frame that is done already.
+        skip: function that is called with each frame that is done already.
         """
         began = time.monotonic()
         while not self.stop.is_set():

@@ -81,7 +81,7 @@ class FrameRenderer:
 
         renderer: a `Renderer`.
         models: a single one used as it is, or several that the tasks place.
-        mattes: by the names of their channels.
+        mattes: mattes by the names of their channels.
         Raises InputError for settings and colour spaces that do not fit together.
         """
         self.options = options

@@ -28,13 +28,13 @@ from clsplat.shots.usd_models import read_stage
 class JobModels:
     """The models of a job.
 
-    path: of the file that defines them.
+    path: path of the file that defines them.
     models: each in its own world.
     names: one per model.
     digest: SHA-256 of their sources; for a single model file, of that file.
-    space: the colour space of all.
-    tracks: their placements, None for a single model used as it is.
-    files: of the models, empty for a stage.
+    space: the colour space that all models have.
+    tracks: placements of the models over time; None for a single model that is not placed.
+    files: files of the models; empty for a stage.
     volumes: regions with mattes, for each model.
     numbered: files by frame number for each model, empty for a model that does not change.
     """
@@ -174,7 +174,7 @@ def load_cast(path: Path, transform: KeyedTrack | None = None) -> JobModels:
 class _Opened:
     """A loaded model of a shot.
 
-    file: of the model, or the pattern of its files.
+    file: file of the model, or the pattern of its files.
     """
 
     model: Gaussians | ModelSeries

@@ -26,7 +26,7 @@ def make_views(
 ) -> tuple[list[Task], Shot]:
     """Tasks from `task.make_tasks` for each eye, and the chosen frames of the first shot.
 
-    shots: by eye, or under "" for a shot without a pair.
+    shots: shots by eye; a shot without a pair is under "".
     The two eyes' frames alternate. If the pattern has no field for the eye, they become views of one file. Raises
     InputError in the cases of `make_tasks` and `Shot.only`.
     """

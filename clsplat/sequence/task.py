@@ -77,8 +77,8 @@ class Record:
     """Record of a finished frame.
 
     seconds: time for rendering and writing, without waiting.
-    skipped: the file was there already.
-    eye: of a stereo pair in two files.
+    skipped: True if the file was there already.
+    eye: eye of a stereo pair in two files.
     blank, kernel_ms, transfer_ms: as in `Measured`.
     """
 
@@ -109,12 +109,12 @@ class Task:
     """A frame to be rendered.
 
     number, name: as in `shots.Frame`.
-    camera: of the whole frame, in its final size.
-    path: of the file.
+    camera: camera of the whole frame, in its final size.
+    path: path of the file.
     after, earlier: cameras that motion and backward motion lead to, of the same size; None unless requested.
     stretch: cameras while the shutter is open, None for a static camera.
     before: state of the file when the job began (`finished_frames.stamp`).
-    sampling: shutter and lens of this frame, None for the job's.
+    sampling: shutter and lens of this frame; None means the job's.
     optics: shutter and lens that a stage sets.
     eye: left or right of a stereo pair.
     right: task of the right eye, if one file holds both.
@@ -267,14 +267,14 @@ class RenderOptions:
     """Options that all frames of a job share.
 
     channels: names from the table in `config.channels`.
-    attributes: of the file's header.
+    attributes: attributes for the file's header.
     pictures: windows, samples and colours of a frame.
     recorded: the model's colour space.
     deep: settings of deep pictures, None for flat ones.
     drawn: digest of the rasterizer's settings.
     gains: three factors of the model's colours, or nine entries of a matrix; empty for unchanged colours.
-    holdout: how holdouts are read, None if there are none.
-    mattes: those among the channels.
+    holdout: settings for reading holdouts; None without holdouts.
+    mattes: the mattes among the channels.
     ids_from: property of the model files that holds semantic ids.
     """
 

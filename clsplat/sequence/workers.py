@@ -44,7 +44,7 @@ Result = tuple[Record, VideoPlanes | None]
 WRITE_QUEUE_BYTES = 1 << 30
 """Target for the main memory of frames that wait to be written. Three frames are held in any case."""
 ENCODING_COPIES = 3
-"""Copies of a frame in memory while it is encoded: rendered, assembled, converted."""
+"""Number of copies of a frame in memory while it is encoded: rendered, assembled, converted."""
 
 
 def encode_frame(task: Task, frame: RenderedFrame, options: RenderOptions) -> Result:
@@ -131,10 +131,10 @@ def run_tasks(
     """Render the frames and write them meanwhile, or add them to the video.
 
     Each renderer has a thread, which takes the next free frame.
-    sharing: other jobs may render some of these frames meanwhile; their frames are awaited at the end.
-    on_done: called in this thread for each frame when its file is complete, not always in order; for a video in order,
-      when the frame has been encoded.
-    The first error of any thread is raised here, after all threads have ended.
+    sharing: claims of frames, if other jobs may render some of these frames meanwhile; their frames are awaited at the
+    end.
+    on_done: called in this thread for each frame when its file is complete, not always in order. For a video it is
+    called in order, when the frame has been encoded. The first error of any thread is raised at the end of all threads.
     """
     if not tasks:
         return

@@ -25,9 +25,9 @@ DEFAULT_ORBIT_SIZE_PX = (1280, 720)
 ORBIT_FOV_RADIANS = math.radians(40.0)
 """Field of view of the shorter side, in radians."""
 SUBJECT_SAMPLE_SIZE = 100_000
-"""Gaussians sampled to locate a model. More of them move its centre by less than a pixel."""
+"""Number of Gaussians that are sampled to locate a model. A larger sample moves its centre by less than a pixel."""
 MIN_GAUSSIANS_FOR_STRAYS = 100
-"""Fewest Gaussians of a model in which some are treated as strays."""
+"""Smallest number of Gaussians in a model of which some may be treated as strays."""
 BALL_SHRINK_FACTOR = 0.9
 """Ratio of successive ball radii in the search for the most detailed region."""
 REGION_DETAIL_FRACTION = 0.35
@@ -39,14 +39,14 @@ MIN_DETAIL_SIZE_QUANTILE, MIN_DETAIL_SIZE_RATIO = 0.02, 1e-4
 """Sizes below which a Gaussian shows no more detail: this quantile of all sizes, and this fraction of the model's
 radius. Some files have Gaussians of size 0."""
 SCENE_RADIUS_MARGIN = 1.3
-"""Radius shown of a scene, relative to the radius of its most detailed region."""
+"""Radius of the part of a scene that is shown, relative to the radius of its most detailed region."""
 ORBIT_FRAMING_MARGIN = 1.1
-"""Radius that fits into a picture, relative to the subject's radius, since strays extend beyond the subject."""
+"""Radius that a picture shows, relative to the subject's radius, since strays lie beyond the subject."""
 RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))
 """Elevations of the camera rings, in radians. A turntable follows the first ring; a spiral rises and sinks between the
 others."""
 CAMERAS_PER_RING = 24
-"""Cameras per ring."""
+"""Number of cameras in a ring."""
 
 
 def parse_up(text: str) -> tuple[float, float, float]:
@@ -75,7 +75,7 @@ def cameras_around(
     """Level pinhole cameras in three rings around a model, or around the most detailed region of a scene, facing its
     centre.
 
-    up: of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
+    up: up direction (3,), of any length but 0. With up along y, the first camera looks along z, as at a COLMAP scene.
     size: width and height in pixels; a side that is None follows from the other at the default aspect ratio.
     Raises InputError for a model without Gaussians.
     """

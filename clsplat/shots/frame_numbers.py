@@ -12,7 +12,7 @@ from clsplat.errors import InputError
 from clsplat.files.names import identity, name_trouble
 
 MAX_LISTED_FRAMES = 10_000_000
-"""Limit of the frames that one list may name."""
+"""Largest number of frames that one list may name."""
 FRAME_RANGE_PATTERN = re.compile(r"(-?\d+)(?:-(-?\d+)(?:[:x](\d+))?)?")
 FRAME_FIELD_PATTERN = re.compile(
     r"(?P<digits>#+|@{2,})|%(?P<printed>0\d+)?d|\{(?P<word>\w*)(?::(?P<padded>0\d+)d?)?\}"

@@ -93,11 +93,11 @@ def turntable(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 SPIRAL_TURNS = 2
 """Full turns of a spiral around the focus point."""
 MAX_SPIRAL_ELEVATION_RADIANS = np.deg2rad(85.0)
-"""Limit of a spiral's elevation, in radians. A level camera that looks straight up or down has no defined right
+"""Largest elevation of a spiral, in radians. A level camera that looks straight up or down has no defined right
 axis."""
 SMOOTHING_NEIGHBOURS = 3
-"""Neighbours on each side that are used to smooth a camera, to remove the hand's jitter from photograph to
-photograph."""
+"""Number of neighbours on each side that are used to smooth a camera, which removes the hand's jitter from photograph
+to photograph."""
 
 
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:

@@ -16,7 +16,7 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 
 MAX_TANGENT_SLOPE_RATIO = 3.0
-"""Limit of a tangent, relative to the slope of an adjacent segment. At 3, a cubic's inner Bezier points are a chord's
+"""Largest tangent, relative to the slope of an adjacent segment. At 3, a cubic's inner Bezier points are a chord's
 length from its ends. For a scalar it is the largest limit at which a cubic is always monotone."""
 
 
@@ -24,7 +24,7 @@ length from its ends. For a scalar it is the largest limit at which a cubic is a
 class Key:
     """A camera at a frame, which need not be whole.
 
-    roll: radians about the camera's own z axis, on top of its rotation.
+    roll: rotation about the camera's own z axis in radians, after its other rotation.
     """
 
     frame: float
@@ -35,7 +35,7 @@ class Key:
 def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | None = None) -> list[Camera]:
     """Interpolate cameras at `frames`. Before the first key and after the last, the camera is that key's.
 
-    keys: at rising frames, with cameras of one size and projection.
+    keys: key frames at rising frames, with cameras of one size and projection.
     loop: number of frames after which the first key repeats; must exceed the span of the keys.
     Rotations take the shorter arc from key to key; rolls turn through their full difference. Raises ValueError for no
     keys, or frames that do not rise.

@@ -17,8 +17,8 @@ from clsplat.errors import InputError
 from clsplat.shots.shot import Frame, Shot
 
 NEIGHBOUR_FRAMES = 2
-"""Frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets its
-tangent."""
+"""Number of frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets
+its tangent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,8 @@ def _values(camera: Camera) -> Float64:
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: Iterable[float]) -> Moments:
     """Cameras of a shot that has `moment`, evaluated around the frame `number`.
 
-    times: in frames from that frame. Times between the first and the last at which the source has values are added.
+    times: times in frames from that frame. Times between the first and the last at which the source has values are
+    added.
     """
     assert shot.moment is not None
     moment, wanted = shot.moment, list(times)

@@ -23,7 +23,7 @@ class Optics:
     shutter: opening and closing time, in frames from the frame.
     f_stop: f-number, 0 for a pinhole.
     focus: focus distance in world units, 0 if it is not set.
-    focal_length: in world units.
+    focal_length: focal length in world units.
     metres: length of a world unit in metres.
     fps: frames per second, 0 if unknown.
     """

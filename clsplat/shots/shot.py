@@ -43,7 +43,7 @@ class Frame:
 class Shot:
     """The frames to render, and settings of their source.
 
-    frames: in rising order of their numbers.
+    frames: frames in rising order of their numbers.
     warnings: one line each, for the user.
     fps: frames per second, if the source gives it.
     unapplied: settings of the source that no frame shows.

@@ -68,7 +68,7 @@ class StageTrack:
 class StageModels:
     """The Gaussians of a stage in their own coordinates, one model per prim, and one per instance of an instanced prim.
 
-    names: of the models' places in the stage.
+    names: names of the models' places in the stage.
     digest: SHA-256 of the data that they are read from.
     space: their colour space.
     """
@@ -134,7 +134,7 @@ def read_here(path: Path) -> StageModels | None:
 def _model_of(path: Path, stage: Any, prim: Any, space: str) -> Gaussians | ModelSeries:
     """The Gaussians of a prim, as a `ModelSeries` if it has time samples.
 
-    stage: is referenced by the result, since USD closes it with its last reference.
+    stage: the opened stage. The result keeps it open, since USD closes a stage with its last reference.
     """
     from pxr import Usd
 

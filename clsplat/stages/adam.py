@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches adam.cl for every parameter group. A step of one view has Adam in `stages.project.project_step`."""
+"""Launches adam.cl for every parameter group. In a step of one view, `stages.project.project_step` does Adam
+instead."""
 
 from __future__ import annotations
 
@@ -52,10 +53,11 @@ def adam(
     """Take a step along the gradients, and leave them zero.
 
     tile_counts: (n,) uint32, 0 where the view does not show a Gaussian, for `OptimiserConfig.sparse`.
-    readback: (READBACK_SIZE,) uint32; its last four count the elements that got no step, by reason (`columns.REFUSED`).
+    readback: (READBACK_SIZE,) uint32. Its last four count the elements whose step was refused, by reason
+    (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
-    counts = readback.buffer  # a raw buffer, not an array that each step processes: it is touched only on a fault
+    counts = readback.buffer  # not the array: its bytes are no traffic, as it is written only on a fault
     config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes

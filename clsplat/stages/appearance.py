@@ -41,13 +41,13 @@ PLAIN_GAINS = GainEntries()
 class Gains:
     """Gains of all photographs, (photographs, entries) float32 each.
 
-    logs: logs to base 2; mixes after the first three entries, if there are more.
-    start: their initial values.
+    logs: logarithms of the gains to base 2 in the first three entries; further entries are mixes.
+    start: initial values of `logs`.
     first, second: Adam's moments.
     gains: 2^logs.
     moved: scratch.
-    begins (photographs + 1,), others, weights (n,): rows of a matrix, stored like a `csr_array`. The matrix times the
-    distances of the gains from their start is added to the gradient.
+    begins (photographs + 1,), others, weights (n,): a matrix, stored like a `csr_array`. The matrix times `logs -
+    start` is added to the gradient, which pulls the gains to their start.
     """
 
     logs: DeviceArray
@@ -73,7 +73,7 @@ class Gains:
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
     """The begins, others and weights of a matrix; None gives a zero matrix."""
     matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
-    spare = np.zeros(1)  # an array has at least one element
+    spare = np.zeros(1)  # device arrays need at least one element
     parts = {
         "begins": matrix.indptr.astype(np.int32),
         "others": np.append(matrix.indices, spare).astype(np.int32),
@@ -84,7 +84,7 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
 
 @stage("appearance", remove_gains=1)
 def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
-    """Divide the photograph's gains out of planes (3 or more, rows, stride), the first three of them colours."""
+    """Divide the first three planes, the colours, of (3 or more, rows, stride) by the photograph's gains."""
     _, rows, stride = target.shape
     kernel = device.kernels("appearance", {"LANES": 1}).remove_gains
     launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
@@ -129,7 +129,7 @@ def step_gains(
 ) -> None:
     """Adam's step number `step` (from 1) along the column sums of the entries.
 
-    A step by capacity that has stopped changes nothing.
+    If the step's pass by capacity has stopped, nothing changes.
     """
     kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
     count = photographs * width

@@ -29,12 +29,12 @@ def gradient_pair_bytes(fields: SlotFields) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ImageInputs:
-    """Input of an image's stages in addition to the tile lists.
+    """Input of the stages that work on pixels, in addition to the tile lists.
 
     splats: (n, SPLAT), of `Projected`.
     background: (3,).
     width, height: pixels.
-    camera_array: the packed camera, for pixels that are rays.
+    camera_array: the packed camera, for cameras that draw along the rays of pixels.
     """
 
     splats: DeviceArray
@@ -49,7 +49,7 @@ class Blended:
     """Planes padded to whole tiles: image (3, rows, stride), transmittance (rows, stride), stops (rows, stride).
 
     cells_from_sorted: (pairs) uint32, the cells in which each pair's Gaussian contributes, as bits; or None.
-    nearness: (rows, stride), the sum of weight over depth, if requested.
+    nearness: (rows, stride), the sum of weight / depth, if requested.
     """
 
     image: DeviceArray
@@ -70,11 +70,11 @@ def _planes(work: Workspace, width: int, height: int, *, kept: bool) -> tuple[De
 
 
 _MIN_TILE_ITEMS = 8
-"""The fewest work-items that share a tile, if more than one: a row of a block (kernels/shared/blocks.h)."""
+"""The fewest work-items that share a tile, if more than one does: a row of a block (kernels/shared/blocks.h)."""
 
 
 def tile_items(device: Device) -> int:
-    """Work-items that share a tile, at most its number of pixels; one if vectors have several pixels."""
+    """Number of work-items that share a tile: at most its number of pixels, and one if vectors have several pixels."""
     if device.shape.lanes > 1 or device.shape.items == 1:
         return 1
     return min(max(device.shape.items, _MIN_TILE_ITEMS), TILE * TILE)
@@ -115,7 +115,7 @@ def blend(
     Pixels of other tiles are left unchanged.
 
     record: keep the cells that the gradient has to visit, if the kernel shape supports it.
-    nearness: also sum one over the depth.
+    nearness: also blend 1 / depth.
     """
     width, height = inputs.width, inputs.height
     planes, near = _planes(work, width, height, kept=lists.band.first > 0), None
@@ -141,10 +141,11 @@ def count_pairs(
 ) -> tuple[int, int]:
     """Count pairs of a Gaussian and a pixel, by a build of blend.cl that counts them: (contributing, evaluated).
 
-    Contributing: added to the pixel's colour. Evaluated: alpha was computed, in a lane of a visited vector.
+    A pair contributes if its colour is added to the pixel. It is evaluated if its alpha is computed, which a vector
+    does for all its lanes.
     """
     width, height = camera.width, camera.height
-    planes = _planes(work, width, height, kept=True)  # the planes of `blend`: this writes the same values again
+    planes = _planes(work, width, height, kept=True)  # the planes that `blend` wrote, which get the same values again
     counts = work.array("counts", (lists.band.tiles * tile_items(device), 2), np.uint32)
     arrays = (lists.ranges, lists.gaussian_from_sorted, splats, background, *planes, counts)
     launch_tiles(device, "blend", {"COUNT_PAIRS": True}, lists, -(-width // TILE), width, height, *arrays)

@@ -93,12 +93,12 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The moments that motion and backward motion lead to.
+    """Cameras and means at the times to which motion and backward motion lead.
 
     after: the packed camera of motion.
-    before: the packed camera of backward motion; None for `after`.
-    moved, earlier: the Gaussians with their means at the times of these cameras, stored on the same side as the
-    model; None if they do not move.
+    before: the packed camera of backward motion; None means `after`.
+    moved, earlier: the Gaussians with their means at the times of `after` and `before`, on the device or the host like
+    the model; None if they do not move.
     """
 
     after: DeviceArray
@@ -158,7 +158,7 @@ def channels(
 ) -> Channels:
     """Blend the features with the weights of `blended`, which must be of the same lists.
 
-    held: surfaces that hold the frame out.
+    held: surfaces of the holdout, if there is one.
     """
     plane_rows, stride = blended.stops.shape
     means = work.array("channel_means", (wanted.floats + len(DEPTH_PLANES), plane_rows, stride))

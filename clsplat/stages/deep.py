@@ -27,7 +27,7 @@ def deep(
 ) -> DeviceArray:
     """Slices (bins, DEEP_FLOATS, rows, stride) of the lists' tiles; `blended` must be of the same tiles.
 
-    bins: the most slices of a pixel.
+    bins: largest number of slices of a pixel.
     """
     plane_rows, stride = blended.stops.shape
     planes = work.array("deep", (bins, DEEP_FLOATS, plane_rows, stride), kept=lists.band.first > 0)

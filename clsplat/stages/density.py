@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches density.cl: the statistics for density control, and the row moves that it orders."""
+"""Launches density.cl: the statistics for density control, and the moves of rows that density control plans."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class DensityStatistics:
     seen: number of views that show the Gaussian.
     radii: largest radius in pixels.
 
-    CONTRIBUTION_STATISTICS to the images of the training views, in pixels, are counted per epoch, independent of
-    densification. They are the total over the views and the largest in one view, of the current epoch and of the last
-    whole one. They are infinite for Gaussians that were absent or not measured at any time since the epoch's first
-    view. They are None if no rule uses them.
+    CONTRIBUTION_STATISTICS are contributions to the images of the training views, in pixels. They are counted per
+    epoch, whether or not Gaussians are densified. There is the total over the views and the largest in one view, each
+    for the current epoch and for the last whole one. They are infinite for Gaussians that did not exist, or were not
+    measured, in some view of the epoch. They are None if no rule uses them.
     """
 
     gradient_sums: DeviceArray
@@ -110,7 +110,7 @@ def add_statistics(
     projected: Projected,
     screen: Screen,
 ) -> None:
-    """Add one view: the norm of each visible mean's gradient, in NDC like the paper's threshold."""
+    """Add one view: the norm of the gradient by each visible mean, in NDC, the unit of the paper's threshold."""
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
     kernels = device.kernels("density", {"RAYS": True} if rays else {})
@@ -126,7 +126,7 @@ def add_contributions(
 ) -> None:
     """Add the contributions of one view's Gaussians, (n,), to the current epoch.
 
-    area: full-resolution pixels per pixel, as a reduced image has fewer.
+    area: number of full-resolution pixels per pixel, by which contributions in a reduced image are multiplied.
     """
     n = projected.tile_counts.shape[0]
     kernel, view = device.kernels("density").contribution_statistics, (projected.tile_counts, contributions)
@@ -153,8 +153,8 @@ class DeviceRowList:
 class DeviceMarker:
     """Marks the Gaussians of a model by their statistics.
 
-    Its output lies in the memory of `work` that holds a frame's splats. There is no frame meanwhile, and the lists are
-    valid until the next one.
+    Its output takes the memory of `work` that holds a frame's splats. So no frame may be in use meanwhile, and the
+    lists are valid until the next frame.
     """
 
     device: Device
@@ -204,7 +204,7 @@ def _listed(device: Device, marker: DeviceMarker, rules: MarkRules) -> DeviceRow
     edges = (rules.large, rules.transparent, rules.oversized, rules.oversized_half, rules.radius)
     for start, stop, (part,) in parts(marker.work, columns):
         some, arrays = stop - start, (scratch.scores, marker.statistics.radii, *part.arrays.values(), scratch.marks)
-        launch_items(device, kernels.density_marks, some, n, start, some, *rules.strongest, *edges, *arrays)
+        launch_items(device, kernels.density_marks, some, n, start, some, *rules.cut_off, *edges, *arrays)
     scan(device, marker.work, scratch.marks, scratch.places, counts)
     launch_items(device, kernels.density_rows, n, n, scratch.marks, scratch.places, scratch.rows, counts)
     total, splits = (int(number) for number in counts.get())
@@ -218,7 +218,8 @@ def list_rows(device: Device, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]
 
 
 def try_gather(device: Device, count: int, source: AnyGaussians) -> None:
-    """Launch the kernels of `gather` on existing arrays, which it overwrites; for `launch.only_tried`."""
+    """Launch the kernels of `gather` on existing arrays, which would overwrite them; only inside
+    `launch.only_tried`."""
     if isinstance(source, DeviceGaussians):
         array = source["opacity_logits"]
         _gather_array(device, array.reshaped(min(count, source.count)), array, array, None)
@@ -230,7 +231,7 @@ def gather(
 ) -> AnyGaussians:
     """Gather rows into new arrays, on the device or host of the source: row j is row rows[j] of the source.
 
-    renews: FRESH rows become zero. The same function serves parameters and moments.
+    renews: True if FRESH rows become zero, as for moments; False copies them too, as for parameters.
     """
     count = rows.shape[0]
     if isinstance(rows, DeviceArray):
@@ -253,7 +254,7 @@ def carry(
 ) -> None:
     """Carry statistics over to arrays of new sizes: row j is row rows[j] of the source, infinite if FRESH.
 
-    It always carries the contributions, and everything else if nothing was densified.
+    Contributions are always carried over, the other statistics only if nothing was densified.
     """
     for name, array in to.named().items():
         if name in CONTRIBUTION_STATISTICS or not densified:

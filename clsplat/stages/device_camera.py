@@ -15,13 +15,15 @@ assert CAMERA[len(_CAMERA_FIELDS) :] == tuple(
     f"{name}_LOW" for name in _CAMERA_FIELDS[: len(CAMERA) - len(_CAMERA_FIELDS)]
 )
 FARTHEST_PLANE = float(np.finfo(np.float32).max)
-"""World units: the far plane of a camera without one. Infinity would give NaN when split into two floats."""
+"""Far plane of a camera without one, world units. It is finite because infinity, split into two floats, would give
+NaN."""
 _TRANSLATION_FIELDS, _POSITION_FIELDS = ("T0", "T1", "T2"), ("PX", "PY", "PZ")
 _ROTATION_FIELDS = tuple(tuple(f"R{row}{column}" for column in range(3)) for row in range(3))
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
-    """Pack a camera in the order of `columns.CAMERA`: its values as float32, and the rounding errors as _LOW.
+    """Pack a camera in the order of `columns.CAMERA`: its values as float32, and their rounding errors in the fields
+    _LOW.
 
     Raises InputError for a panorama of more than a full turn.
     """

@@ -20,7 +20,7 @@ from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, floats_of, group_shap
 class ShStorage:
     """Storage of the SH coefficients in a model that is only rendered.
 
-    coefficients: per channel.
+    coefficients: number of coefficients per channel.
     degrees: (n,) uint8, the highest degree evaluated for each Gaussian; None evaluates all.
     half: store the bands above 0 as float16.
     """
@@ -108,11 +108,11 @@ AnyGaussians = DeviceGaussians | HostGaussians
 def parts(
     work: Workspace, *models: AnyGaussians, keep: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
-    """Yield (start, stop, the models' rows [start, stop) on the device), all at once if they are on the device.
+    """Yield (start, stop, the models' rows [start, stop) on the device) for one part of the rows after the other.
 
-    A part of a host model is valid until the next one is requested.
+    Models on the device have a single part. A part of a host model is valid until the next part is requested.
 
-    keep: copy the part's changes back to the host.
+    keep: copy changes of the part back to the host.
     """
     on_device = tuple(model for model in models if isinstance(model, DeviceGaussians))
     if len(on_device) == len(models):
@@ -174,8 +174,8 @@ def host_gaussians(gaussians: Gaussians, rows: int, sh: ShStorage | None = None)
 
 
 def host_model(arrays: Mapping[str, NDArray[Any]], kind: str) -> HostGaussians:
-    """Gaussians from the arrays named `kind`/means and so on. Raises ValueError if names, shapes or dtypes are
-    wrong."""
+    """Gaussians on the host from a checkpoint's arrays `kind`/means and so on. Raises ValueError if names, shapes or
+    dtypes are wrong."""
     if missing := [group for group in PARAMETER_GROUPS if f"{kind}/{group}" not in arrays]:
         raise ValueError(f"has no {kind}/{missing[0]}")
     host = {group: HostArray(arrays[f"{kind}/{group}"]) for group in PARAMETER_GROUPS}

@@ -21,7 +21,7 @@ from clsplat.stages.scan import Elements, chunking, scan
 from clsplat.stages.sort import SORT_KEY_BYTES, sort
 
 MAX_PAIRS_PER_BAND = 2**31 - 1024
-"""The most pairs in one band: `stops` count in signed integers, and kernels read slightly ahead of them."""
+"""The most pairs in one band: stops are signed 32-bit integers, and kernels read slightly beyond the last pair."""
 
 
 DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
@@ -34,7 +34,8 @@ BAND_TILE_BYTES = 4
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Bytes per pair: tile, slot, Gaussian; if pairs are sorted, also these and the depth by slot, and the sort."""
+    """Bytes per pair: tile, slot and Gaussian. If pairs are sorted by depth, tile, Gaussian and depth by slot, and the
+    sort, are added."""
     return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 
 
@@ -59,13 +60,13 @@ class Counted:
     gaussian_from_visible, depth_keys: (visible), in order of the Gaussians.
     visible, pairs: the totals; pairs are capped at 2^32 - 1.
     least_key: a lower bound of the depth keys.
-    key_bits: the number of low bits that can be set in a key less least_key.
+    key_bits: the number of low bits that can be set in a key minus least_key.
     refused: the counts of `adam`.
 
-    In a pass by capacity, visible and pairs are upper bounds:
+    In a pass by capacity, `visible` and `pairs` are upper bounds, and these fields are set:
 
-    on_device: the READBACK in which its kernels find the totals.
-    arriving: a function that waits for a copy of that, and returns it.
+    on_device: the READBACK array in which its kernels find the totals.
+    arriving: function that waits for the host's copy of that array, and returns it.
     """
 
     tile_counts: DeviceArray
@@ -81,13 +82,16 @@ class Counted:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The count called `name` in READBACK, as kernels take it. most: the count itself, or an upper bound."""
+        """The number of elements for kernels, by its name in READBACK.
+
+        most: the number itself, or in a pass by capacity its upper bound.
+        """
         return Elements(most, self.on_device, READBACK.index(name))
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs in order of depth, ties by index of the Gaussian.
+    """Pairs in order of depth; pairs of equal depth are in order of the Gaussian's index.
 
     tile_keys: (pairs).
     pair_ids: (pairs, 2), slot and Gaussian.
@@ -112,8 +116,8 @@ def count(
 
     Waits for the device.
 
-    all_bits: assume 32 bits.
-    readback: (READBACK_SIZE,) uint32, the array that is read; give it to read the counts of `adam` in the same copy.
+    all_bits: assume that depths differ in all 32 bits.
+    readback: (READBACK_SIZE,) uint32, the array that is read back. The array that `adam` uses also gives its counts.
     """
     readback = readback or work.array("readback", (len(COUNTED),), np.uint32)
     first_slots, gaussian_from_visible, depth_keys = _compact(device, work, projected, readback)
@@ -141,12 +145,12 @@ def count_by_capacity(
     capacity: int,
     host: NDArray[np.uint32],
 ) -> Counted:
-    """Like `count` without waiting, for at most `capacity` pairs; a pass with more pairs stops (kernels/duplicate.cl).
+    """Like `count`, without waiting, for at most `capacity` pairs: with more the pass stops (kernels/duplicate.cl).
 
-    readback: (READBACK_SIZE,) uint32, the array that `project_step` gets.
-    host: memory for its copy.
+    readback: (READBACK_SIZE,) uint32, the array that `project_step` gets too.
+    host: host memory for its copy.
 
-    Depths are sorted by 32 bits. On a GPU that takes as many passes as the bits in which a scene's depths differ.
+    Depths are sorted by all 32 bits. On a GPU that takes as many passes as the bits in which depths differ.
     """
     (n,) = projected.tile_counts.shape
     arrays = (projected.tile_counts, *_compact(device, work, projected, readback, capacity))
@@ -208,8 +212,8 @@ def plan_bands(
     by_tile = counts.get()
     if (most := int(by_tile.max(initial=0))) > capacity:
         raise CapacityError(
-            f"one tile of {TILE}x{TILE} pixels has {most:,} Gaussians, and the memory that is left on {device.name} "
-            f"is enough for {capacity:,} of {amount(device.budget)}: allow more (--max-device-mem)"
+            f"one tile of {TILE}x{TILE} pixels has {most:,} Gaussians, and of the {amount(device.budget)} on "
+            f"{device.name} enough is left for {capacity:,}: allow more (--max-device-mem)"
         )
     ends = np.cumsum(by_tile, dtype=np.uint64)
     bands, first, done = [], 0, 0
@@ -247,9 +251,9 @@ def duplicate(
 def duplicate_and_sort(
     device: Device, work: Workspace, splats: DeviceArray, counted: Counted, tiles: tuple[int, int], band: Band
 ) -> Pairs:
-    """The pairs of `duplicate`, by sorting all pairs by depth, as in the code of Kerbl et al.
+    """The same pairs as from `duplicate`, made by sorting all pairs by depth, as in the code of Kerbl et al.
 
-    With the sort by tile that follows, it is the lower half of one sort by 64-bit keys.
+    It is the lower half of a sort by 64-bit keys, whose upper half is the sort by tile that follows.
     """
     visible, pairs = counted.visible, counted.pairs
     kernels = device.kernels("duplicate")

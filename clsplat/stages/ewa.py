@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launches ewa.cl and ewa_grad.cl: Gaussians to means, conics, depths and radii on the image, and the gradient back.
 
-They follow gsplat's conventions. The gradient is also by the camera.
+The kernels follow gsplat's conventions. They can also compute the gradient by the camera.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _TWO_FLOAT_FIELDS = tuple(name.removesuffix("_LOW") for name in EWA_CAMERA if na
 class EwaCamera:
     """A camera of the EWA projection.
 
-    viewmat: (4, 4), camera from world, any numbers in its first three rows.
+    viewmat: (4, 4), camera from world. Its first three rows need not be a rotation and a translation.
     intrinsics: (3, 3), fx, fy, cx and cy in pixels; a skew is ignored.
     width, height: pixels.
-    near, far: world units.
+    near, far: Gaussians whose depth is not strictly between these are culled, world units.
     eps2d: px^2, added to the diagonal of the projected covariance.
     radius_clip: pixels; Gaussians with no larger radius are culled.
     model: one of EWA_CAMERA_MODELS.
@@ -72,8 +72,8 @@ class EwaCamera:
         return np.asarray(inverse[:3, 3], np.float64)
 
     def position_gradient(self, by_position: Float64) -> Float64:
-        """The gradient (4, 4) by the view matrix from the gradient (3,) by the centre, with all sixteen numbers
-        free."""
+        """The gradient (4, 4) by the view matrix from the gradient (3,) by the centre. All sixteen numbers count as
+        variables."""
         inverse = np.linalg.inv(self.viewmat)
         by_inverse = np.zeros((4, 4))
         by_inverse[:3, 3] = by_position
@@ -173,7 +173,10 @@ class Ewa:
 
 @dataclass(frozen=True, eq=False)
 class EwaImageGradients:
-    """Gradients by the arrays of `Ewa`, with their shapes. None counts as 0; the b of a conic counts as one number."""
+    """Gradients by the arrays of `Ewa`, with their shapes. None counts as 0.
+
+    The b of a conic stands for two entries of a symmetric matrix, but counts as one variable.
+    """
 
     means2d: DeviceArray | None = None
     depths: DeviceArray | None = None
@@ -185,7 +188,7 @@ class EwaImageGradients:
 class EwaGradients:
     """Gradients by the arrays of EwaInputs, with their shapes.
 
-    The gradient by an off-diagonal entry of a covariance counts both of its places.
+    The gradient by an off-diagonal entry of a covariance is the sum over both of its places in the matrix.
     """
 
     means: DeviceArray

@@ -41,9 +41,9 @@ def _spans(width: int, height: int) -> tuple[float, float]:
 
 
 def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
-    """Bytes per pixel with padding: the planes of the transformed image, and a share of fixed arrays.
+    """Bytes per pixel with padding: the planes of the transformed image, and the fixed arrays divided over the pixels.
 
-    Those are the grids with their moments, and the line sums in the largest of these sizes, (width, height).
+    The fixed arrays are the grids with their moments, and the line sums in the largest of the `sizes` (width, height).
     """
     lines = max((height for _, height in sizes), default=0) * GRID_SHAPE[2] * 12 * GRID_SHAPE[0]
     held = 4 * (3 * GRID_FLOATS * photographs + GRID_FLOATS + lines)
@@ -108,7 +108,7 @@ def step_grid(
 ) -> None:
     """Adam's step for the photograph's grid, at its visit number `visit` (from 1).
 
-    A step by capacity that has stopped changes nothing.
+    If the step's pass by capacity has stopped, nothing changes.
     """
     kernel = device.kernels("grid", {"LANES": 1}).move_grid
     constants = (
@@ -124,6 +124,6 @@ def step_grid(
 
 @stage("appearance")
 def centre_grids(device: Device, grids: Grids, readback: DeviceArray) -> None:
-    """Make the mean of all grids the identity. A step by capacity that has stopped changes nothing."""
+    """Make the mean of all grids the identity. If the step's pass by capacity has stopped, nothing changes."""
     kernel = device.kernels("grid", {"LANES": 1}).centre_grids
     launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.grids)

@@ -29,8 +29,8 @@ class Harmonics:
     directions: (n, 3), of any length.
     sh: (n, K, 3), K at least (degree + 1)^2; the rest is ignored.
     mask: (n,) or (n, 2), int32; rows that are not positive are skipped.
-    centre: (6,), a camera's `centre_array`. With it the directions are means, and colours are offset by 0.5 and clamped
-    at 0.
+    centre: (6,), a camera's `centre_array`. If it is given, `directions` has means instead, and colours are offset by
+    0.5 and clamped at 0.
     """
 
     directions: DeviceArray
@@ -66,7 +66,7 @@ class Harmonics:
 
     @property
     def arguments(self) -> tuple[object, ...]:
-        """Arguments of both kernels that follow the count."""
+        """Arguments of both kernels that come after the number of colours."""
         centre = () if self.centre is None else (self.centre,)
         mask = () if self.mask is None else (self.mask.size // max(self.count, 1), self.mask)
         return (self.sh.shape[1], self.used, *centre, self.directions, self.sh, *mask)
@@ -109,7 +109,7 @@ def harmonics_grad(
 ) -> DeviceArray | None:
     """Fill `gradients` from d_colours (n, 3) and the colours of `harmonics`.
 
-    add, add_directions: add to existing gradients, of earlier cameras, or of the means.
+    add, add_directions: add to existing gradients, of earlier cameras or by the means, instead of replacing them.
     by_centre: return the gradient (3,) by the camera's centre.
 
     Equations (38) to (40) and (168).

@@ -25,7 +25,7 @@ HELD_PIXEL_BYTES = 4 + 4 * len(HOLDOUT_SURFACE_FIELDS)
 class Held:
     """Holdout surfaces on the device.
 
-    starts: (rows * stride + 1) uint32, the first surface of each pixel of a padded plane, and the end.
+    starts: (rows * stride + 1) uint32, the index of the first surface of each pixel of a padded plane, then the end.
     surfaces: (S, 4) float32.
     """
 
@@ -34,7 +34,7 @@ class Held:
 
     @property
     def arguments(self) -> tuple[DeviceArray, DeviceArray]:
-        """The arguments of a kernel that holds out."""
+        """The arguments for a kernel that leaves out everything behind the surfaces."""
         return self.starts, self.surfaces
 
 
@@ -54,7 +54,7 @@ def upload_held(device: Device, surfaces: Surfaces) -> Held:
 
 @stage("holdout")
 def holdout(device: Device, held: Held, lists: TileLists, inputs: ImageInputs, blended: Blended) -> None:
-    """Rewrite the image and transmittance of `blended`, held out; `blended` must be of the lists' tiles."""
+    """Replace the image and transmittance of `blended` by the held-out ones. `blended` must be of the lists' tiles."""
     tiles_x, listed = blended.stops.shape[1] // TILE, (lists.ranges, lists.gaussian_from_sorted)
     planes = (blended.stops, blended.image, blended.transmittance)
     arrays = (*listed, inputs.splats, inputs.background, *planes, *held.arguments)

@@ -22,15 +22,16 @@ LOSS_PIXEL_BYTES = 12
 """Bytes of the image's gradient, per pixel with padding."""
 
 _MIN_BLOCK_ROWS = 32
-"""The fewest rows of a block: each block recomputes ten more."""
+"""The fewest rows of a block. Blocks should not be smaller, as each computes ten further rows of its neighbours
+again."""
 
 
 @dataclass(frozen=True)
 class _Blocks:
     """Blocks of pixels that the groups work on.
 
-    rows, columns: of a block.
-    groups: their number.
+    rows, columns: size of a block, pixels.
+    groups: number of blocks.
     field: floats from one derivative of a row to the next, in groups that keep derivatives.
     partials, sums: floats of these arrays.
 
@@ -61,7 +62,7 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
 
 
 def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> int:
-    """Bytes of the partial derivatives and the partial sums, which each turn has."""
+    """Bytes of the partial derivatives, and of the partial sums, of which each turn has its own."""
     blocks = _blocks(device, height, stride)
     return 4 * (blocks.partials + turns * blocks.sums)
 
@@ -75,7 +76,7 @@ class Loss:
     by the sums of these.
     samples: the number of samples that count.
     masked: the number of masked samples, whose windows still count in SSIM.
-    copy: returns the sums if a copy to the host is under way.
+    copy: function that returns the sums, if a copy to the host has been started.
     further: weight, divisor and number of sums of each further term.
     """
 
@@ -123,13 +124,12 @@ def loss(
     blended: Blended | None = None,
     terms: Sequence[LossTerm] = (),
 ) -> Loss:
-    """Compute (1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), zero to the right of and below the
-    image.
+    """Compute (1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), whose padding must be zero.
 
-    turn: each turn has its own array of sums.
+    turn: number of the array of sums to use, so that earlier sums can still be read.
     kept: number of pixels that count; the means are over these, and other pixels are zero in both images.
-    blended: the render, if there are terms.
-    terms: loss terms to add. Each has a plane of the gradient behind the colours, and its own partial sums.
+    blended: the render, which is needed only if there are terms.
+    terms: loss terms to add. Each has a plane of the gradient after the colours, and its own partial sums.
     """
     _, rows, stride = image.shape
     every, blocks, items = 3 * width * height, _blocks(device, height, stride), device.shape.items

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loss terms beside L1 and D-SSIM. Launches alpha_loss.cl and depth_loss.cl; a new term is a class here."""
+"""Loss terms in addition to L1 and D-SSIM. Launches alpha_loss.cl and depth_loss.cl; a new term is a class here."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class AlphaTerm(LossTerm):
         return self.weight
 
     def scale(self, pixels: float) -> tuple[float, float]:
-        """The weight over the pixels."""
+        """The weight, and the number of pixels."""
         return self.weight, pixels
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
@@ -97,7 +97,7 @@ class DepthTerm(LossTerm):
     factor: float
 
     def scale(self, pixels: float) -> tuple[float, float]:  # noqa: ARG002
-        """The factor; the weights of pixels contain their number."""
+        """The factor, and 1: the weights of the pixels already contain their number."""
         return self.factor, 1.0
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:

@@ -16,7 +16,7 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 NOISE_OPACITY_RANGE = 0.16
-"""Opacity above `dead` from which no noise is added: there it is less than 1.2e-7 of the noise of dead Gaussians."""
+"""No noise is added to opacities over `dead` by more than this: it would be less than 1.2e-7 of a dead Gaussian's."""
 
 
 def highest_logit(dead: float) -> float:
@@ -28,9 +28,9 @@ def highest_logit(dead: float) -> float:
 def noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
-    """Add a step's noise to the means of these Gaussians; none after a pass that has stopped, by `readback`.
+    """Add a step's noise to the means of these Gaussians, unless the step's pass by capacity has stopped (`readback`).
 
-    first_row: row of their first in the model.
+    first_row: row in the model of the first of these Gaussians.
     """
     if explore.amount != 0:
         _add_noise(device, explore, gaussians, first_row, readback)

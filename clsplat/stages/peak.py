@@ -27,8 +27,8 @@ class Limits:
 
     pairs_per_second, gradient_pairs_per_second: the arithmetic of blending and of its gradient alone, with every lane
     in use.
-    copy_bytes_per_second: bytes read plus bytes written by a copy that no cache holds.
-    lanes, items: the kernel shape of all.
+    copy_bytes_per_second: bytes read plus bytes written by a copy too large for the caches.
+    lanes, items: the kernel shape of all measurements.
     """
 
     pairs_per_second: float
@@ -93,7 +93,7 @@ def _copy_rate(device: Device, nbytes: int, repeat: int) -> float:
     n = min(nbytes, device.max_allocation // 4, device.budget // 4) // 4 // copied * copied
     source, copy = allocate(device, (n,), np.float32), allocate(device, (n,), np.float32)
     source.fill(1.0)
-    copy.fill(0.0)  # so that its pages exist
+    copy.fill(0.0)  # so that the host maps its pages before the measurement
     kernel = device.kernels("peak", {"ITEMS": tile_items(device), "NARROW": True}).limit_copy
     runs = [device.timed(lambda: launch_items(device, kernel, n // copied, n, source, copy)) for _ in range(repeat + 1)]
     return 8e3 * n / min(ms for _, ms in runs)

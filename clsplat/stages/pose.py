@@ -35,7 +35,7 @@ def pose_rows(
 ) -> None:
     """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
 
-    device: with the switches of the camera's projection.
+    device: the device with the switches of the camera's projection.
     first_row: row of the first of them in the model, a multiple of POSE_ROWS.
     """
     launch_items(

@@ -22,9 +22,9 @@ PPISP_PIXEL_BYTES = 8
 
 @dataclass(frozen=True)
 class PhotoLens:
-    """How a photograph was taken.
+    """Photograph and lens of a view, as the kernels need them.
 
-    photograph, lens: their rows.
+    photograph, lens: rows of their entries.
     centre: the principal point, as fractions of the image's width and height.
     flat: False for a panorama, which has no vignette.
     """

@@ -10,7 +10,7 @@ import numpy as np
 
 from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace
-from clsplat.device.command_buffer import AnewWord, LaunchParameter
+from clsplat.device.command_buffer import LaunchParameter, LaunchParameterWord
 from clsplat.device.context import Device
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS, launch_groups, launch_items
 from clsplat.device.profile import stage
@@ -23,8 +23,8 @@ from clsplat.stages.device_camera import tiles_of
 from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, parts
 
 CPU_STEP_ROWS = 128
-"""Gaussians of a `project_step` group on a CPU. Their gradients, 30 KiB, stay in its cache, and each array's part is
-long enough for the processor to prefetch. In groups of one vector of lanes a step takes 1.5 times as long."""
+"""Number of Gaussians in a group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and the part
+of each array is long enough for the processor to prefetch. With groups of one vector a step takes 1.5 times as long."""
 
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
@@ -41,7 +41,7 @@ class Projected:
 
     splats: (n, SPLAT).
     tile_counts: (n), 0 where culled.
-    shown: (n), 0 where there is no splat; given only if culling is switched off, as it then differs from tile_counts.
+    shown: (n), 0 where there is no splat. None unless culling is switched off, as otherwise tile_counts says the same.
     """
 
     splats: DeviceArray
@@ -57,10 +57,10 @@ class Projected:
 
 
 def thinning_numbers(thinning: Thinning | None) -> tuple[float, ...]:
-    """Arguments of `project` that change with the step."""
+    """Arguments of `project` that change from step to step."""
     if thinning is None:
         return ()
-    return (*map(AnewWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
+    return (*map(LaunchParameterWord, (*thinning.key, thinning.threshold)), LaunchParameter(thinning.factor))
 
 
 @stage("project")
@@ -266,7 +266,8 @@ class _Build(NamedTuple):
 
 
 def _build(device: Device) -> _Build:
-    """The build of the gradient: one Gaussian per work-item for rays, as in their projection."""
+    """The build of the gradient. For cameras that draw along rays a work-item has one Gaussian, as in the
+    projection."""
     return _Build(1, {"LANES": 1}) if device.switched("RAYS") else _Build(device.shape.lanes, {})
 
 
@@ -279,6 +280,8 @@ def _inputs(
     gaussians: DeviceGaussians, camera_array: DeviceArray, projected: Projected, slots: Slots
 ) -> tuple[object, ...]:
     """The first arguments of both kernels."""
-    first_slots = slots.first_slots or projected.tile_counts  # unused if the slots are already summed
+    first_slots = (
+        slots.first_slots or projected.tile_counts
+    )  # the kernel does not read it if the slots are already summed
     counts = (projected.tile_counts, first_slots, slots.values, projected.splats)
     return (gaussians.count, gaussians.coefficients, camera_array, *counts)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches sampling.cl: scales not below the sampling limit of the photographs."""
+"""Launches sampling.cl: lower limits of the scales, from the sampling rate of the photographs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SAMPLING_GAUSSIAN_BYTES = 4
 
 @dataclass(frozen=True, eq=False)
 class UploadedCameras:
-    """Cameras of one model, (views, CAMERA), with the same origin as the means."""
+    """Cameras of one camera model on the device, (views, CAMERA), relative to the origin of the means."""
 
     model: CameraModel
     values: DeviceArray

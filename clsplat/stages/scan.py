@@ -13,19 +13,21 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 
 CHUNK_ELEMENTS_PER_ITEM = 16
-"""Elements of a chunk per item of a group, or a multiple of it."""
+"""A chunk has this many elements per work-item of a group, or a multiple of that."""
 MIN_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS = 1024, 1 << 14
-"""For groups of one item: the fewest elements of a chunk, and the number up to which one chunk takes all. One chunk of
-that size is done sooner than another launch begins."""
+"""For groups of one item: the fewest elements of a chunk, and the number of elements up to which a single chunk takes
+all. A chunk of that size is done before a second launch would begin."""
 MAX_SCAN_GROUPS = 2048
-"""The most groups of more than one item that share a scan or sort: each reads the counts of all earlier groups."""
+"""The most groups, of more than one item, that share a scan or sort. There is a limit as each reads the counts of all
+earlier groups."""
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
     """The number of elements that a kernel processes (kernels/shared/count.h).
 
-    It is `most`, or with `counts` the number at `place` there, which must not be larger. Launches are sized for `most`.
+    The number is `most`. If `counts` is given, the number is counts[place] instead, which must be at most `most`.
+    Launches are sized for `most`.
     """
 
     most: int
@@ -67,7 +69,7 @@ def scan(
 ) -> None:
     """Compute out[i] = sum of values[:i] and total[0] = sum of all, in one launch if one group is enough, else two.
 
-    elements: the number of values that count, if not all do.
+    elements: the number of values that count, if it is not all of them.
     """
     elements = elements or Elements(values.shape[0])
     groups, chunk = chunking(device, elements.most)

@@ -23,9 +23,11 @@ SORT_KEY_BYTES = 16
 """Bytes per sorted key: keys and positions, each in two alternating arrays."""
 
 WIDE_DIGIT_BITS, MIN_WIDE_DIGIT_KEYS = 13, 1 << 17
-"""Bits of a wide digit, and the number of keys from which it is used, for groups of one item. Its counters fill the 32
-KiB of local memory, and fewer passes save more than the larger histograms cost. An item that sorts alone has one
-histogram, and always uses it."""
+"""Bits of a wide digit, and the number of keys from which it is used, for groups of one item.
+
+Its counters fill the 32 KiB of local memory. From that number of keys, fewer passes save more time than the larger
+histograms cost. An item that sorts alone has a single histogram, and always uses wide digits.
+"""
 
 
 def _widest_digit(device: Device, n: int) -> int:
@@ -47,12 +49,12 @@ def radix_sort(
     base: int = 0,
     elements: Elements | None = None,
 ) -> tuple[DeviceArray, DeviceArray]:
-    """Sort by the lowest `bits` of the keys less `base`; return (sorted keys, positions) in workspace arrays under
+    """Sort by the lowest `bits` of the keys minus `base`. Returns (sorted keys, positions), in workspace arrays under
     `name`.
 
-    elements: the number of keys that count, if not all do.
+    elements: the number of keys that count, if it is not all of them.
 
-    It uses as few passes as the widest digit allows, with digits of equal width.
+    It makes as few passes as the widest digit allows, with digits of equal width.
     """
     n, items = keys.shape[0], device.shape.sort_items
     elements = elements or Elements(n)

@@ -70,7 +70,7 @@ def splats(
 ) -> Projected:
     """Compute splats and tile counts for an image of width x height pixels.
 
-    listed: make a splat for every Gaussian, as the caller's tile lists may name any.
+    listed: make a splat for every Gaussian, also for culled ones, as the caller's tile lists may contain any.
     """
     n = gaussians.count
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))

@@ -40,11 +40,13 @@ def target(
     alpha: add a fourth plane, the alpha.
 
     A fifth channel is a mask, 0 where a pixel does not count. Such pixels become zero in the planes and also in the
-    blended image, and the gradient of blending skips them: this changes the render. An image on the host is uploaded
+    render `blended`, which this changes, and the gradient of blending skips them. An image on the host is uploaded
     without waiting: it must not change until the host has waited for the device.
     """
     if isinstance(image, DeviceArray):
-        device.under_way.append(image.buffer)  # it may be the host's memory
+        device.under_way.append(
+            image.buffer
+        )  # the buffer may be the host's memory, which must live until the kernel has run
         source = image
     else:
         source = work.array("target_source", image.shape, image.dtype)
@@ -55,7 +57,7 @@ def target(
     defines = {"BYTES": True} if source.dtype == np.uint8 else {}
     render: tuple[DeviceArray, ...] = ()
     if channels == 5:
-        assert blended is not None, "a mask is of a render too"
+        assert blended is not None, "a mask also changes the render"
         defines["MASKED"], render = True, (blended.image, blended.stops)
     if alpha:
         defines["ALPHA"] = True

@@ -16,11 +16,11 @@ from clsplat.stages.ranges import TileLists
 from clsplat.stages.splats import SLOT_MOMENT_FIELDS, SPLAT_VALUES, ScreenGradients, add_values, splats_grad
 
 MAX_VALUES_PER_PASS = 32
-"""Values per pass if a work-item is a lane. Otherwise they are in registers, and there are fewer."""
+"""The most values per pass if one work-item has a whole tile. If several share it, fewer sums fit in registers."""
 _MAX_REGISTER_SUMS = 64
-"""The most sums of a work-item in a group's forward pass: the values of its pixels."""
+"""The most sums of a work-item in the forward pass of a group: values times pixels."""
 _MAX_LOCAL_SUMS = 2048
-"""Values per pass times items per group in the gradient, limited by the local memory of their sums."""
+"""The most values per pass times items per group in the gradient: their sums must fit in local memory."""
 
 
 def passes(first: int, depth: int, most: int) -> Iterator[tuple[int, int]]:

@@ -64,11 +64,11 @@ def fully_fused_projection(
     width, height : int
         Pixels.
     eps2d : float
-        Added to each variance on the image, px^2.
+        Low-pass filter: added to each variance on the image, px^2.
     near_plane, far_plane : float
-        Depths between which a Gaussian is in view, world units.
+        Gaussians whose depth is not strictly between these are not in view, world units.
     radius_clip : float
-        Splats whose radii are not larger are not in view, pixels.
+        Splats whose radii are at most this are not in view, pixels.
     packed : bool
         Return only the splats in view.
     sparse_grad : bool

@@ -113,11 +113,11 @@ def rasterization(
     width, height : int
         Pixels. Sizes and numbers may be tensors of one element, and sizes may be floats such as 40.0.
     near_plane, far_plane : float
-        Depths between which a Gaussian is drawn, in units of the scene.
+        Gaussians whose depth is not strictly between these are not drawn, in units of the scene.
     radius_clip : float
-        Splats whose radii are not larger are not drawn, pixels.
+        Splats whose radii are at most this are not drawn, pixels.
     eps2d : float
-        Added to the variance of each splat, px^2.
+        Low-pass filter: added to the variances of each splat, px^2.
     sh_degree : int, optional
         Degree to use, 0 to 4. None if colors are colours.
     packed : bool

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A step of several views, on one device or several: gradients are summed in the order of the views, then Adam.
 
-The first device has the model. The others have copies of its parameters, each with a thread, and return their views'
-results. So neither their speed nor their number changes a bit.
+The first device has the model. Each further device has a thread and a copy of the parameters, and returns the results
+of its views. Neither the speed nor the number of devices changes a bit of the result.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ def scaled(config: OptimiserConfig, batch: int) -> OptimiserConfig:
 def scaled_rates(rates: Mapping[str, float], batch: int) -> dict[str, float]:
     """Learning rates for steps of `batch` views.
 
-    Gradients of different views are nearly independent, so their sum grows with the root of their number, by which Adam
-    divides (the same paper).
+    Gradients of different views are nearly independent, so their sum grows with the root of their number. Adam divides
+    by that growth, and the rates restore it (the same paper).
     """
     return {group: rate * sqrt(batch) for group, rate in rates.items()}
 
 
 def shares(count: int, devices: int) -> list[range]:
-    """Views of a step for each device; each device's views are consecutive."""
+    """The views of a step that each device takes: consecutive ones."""
     size = -(-count // devices)
     return [range(min(k * size, count), min((k + 1) * size, count)) for k in range(devices)]
 
@@ -87,21 +87,22 @@ class Losses:
 
 @dataclass(frozen=True, eq=False)
 class _AddedView(GradientStep):
-    """A view whose gradients are added to the sums, which are the second member of its model.
+    """A view whose gradients are added to the sums over the views. The sums are the second member of its model.
 
-    shown: (n,), Gaussians that any view shows, if Adam needs them.
-    own: gradients of the views' shares, by the views' places.
+    shown: (n,), nonzero for Gaussians that any view shows; None if Adam does not need it.
+    own: gradients by the parameters of the views' parts, by the views' places.
     """
 
     shown: DeviceArray | None
     own: dict[int, Sequence[DeviceArray | None]]
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Keep the gradients, as all views of the batch use the components' state from before it."""
+        """Keep the gradients instead of taking a step: all views of the batch use the components' state from before
+        it."""
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
-        """Add the rows' gradients. If kernels are only tried, try Adam's too."""
+        """Add the rows' gradients to the sums. If kernels are only tried in the sandbox, try Adam's too."""
         assert rows.gradients is not None, "the batch asks for them"
         parameters, sums = rows.model
         shown = None if self.shown is None else self.shown.rows(rows.start, rows.stop)
@@ -118,8 +119,8 @@ class ViewOutcome:
     """Results of a view on another device, on the host until the next step.
 
     arrays: arrays of its rows, by name.
-    gradients: by group.
-    own: gradients of its shares.
+    gradients: gradients of its rows, by parameter group.
+    own: gradients by the parameters of its parts.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -130,7 +131,7 @@ class ViewOutcome:
 
 @dataclass(frozen=True, eq=False)
 class _RemoteView(GradientStep):
-    """A view on another device than the model, whose results go to the host."""
+    """A view on another device than the model's. Its results go to the host."""
 
     arrays: dict[str, NDArray[Any]]
     outcome: dict[str, NDArray[np.float32]]
@@ -159,7 +160,7 @@ class _RemoteView(GradientStep):
 
 
 class Replica:
-    """A further device of a training, with a copy of the parameters, and a thread."""
+    """A further device of a training, with a copy of the parameters and a thread of its own."""
 
     def __init__(self, device: Device, config: TrainConfig, photographs: ImageCache) -> None:
         self.device, self.config, self.photographs = device, config, photographs.for_device(device)
@@ -204,7 +205,7 @@ class Replica:
 
         place: its number among this device's views.
         factor: divisor of the photographs' resolution.
-        values: values of its shares, for this device.
+        values: values of its parts, for this device.
         splats: True if density control uses its gradients.
         """
         parameters, photograph = self.parameters, self.photographs.bring(inputs.view, factor)
@@ -227,7 +228,7 @@ class Replica:
         return ViewOutcome(arrays, gradients, view.run((parameters,), here, StepProbe(), room, reads_loss=True), own)
 
     def _host(self, place: int, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> NDArray[Any]:
-        """Room on the host, the same from step to step: fresh pages would cost as much as the copy."""
+        """Memory on the host, the same from step to step, as fresh pages would cost as much time as the copy."""
         held = self._room.get((place, name))
         if held is None or held.shape != shape:
             held = self._room[place, name] = np.empty(shape, dtype)
@@ -237,7 +238,7 @@ class Replica:
 class Batch:
     """The gradients of several views, and Adam along their sum.
 
-    rasterizer, photographs: of the device that has the model.
+    rasterizer, photographs: rasterizer and image cache of the device that has the model.
     further: the other devices.
     Raises InputError if a device occurs twice.
     """
@@ -248,8 +249,8 @@ class Batch:
         devices = (rasterizer.device, *further)
         if len({device.queue.int_ptr for device in devices}) < len(devices):
             raise InputError(
-                f"several devices to train on: got {', '.join(device.name for device in devices)}, of which two have "
-                "one queue and one set of kernels; expected each opened on its own, as a thread works with it"
+                f"several devices to train on: got {', '.join(device.name for device in devices)}, of which two "
+                "share a queue and kernels; expected each opened on its own, as each gets a thread"
             )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
         self.replicas = [Replica(device, config, photographs) for device in further]
@@ -258,7 +259,7 @@ class Batch:
         self._room: dict[str, NDArray[np.float32]] = {}
 
     def follow(self, plans: Sequence[Plan]) -> None:
-        """Use as much of the further devices' memory as the plans allow. Arrays of earlier plans are freed."""
+        """Use at most as much of the further devices' memory as the plans allow. Arrays of earlier plans are freed."""
         self._sums = self._sent = None
         self._room.clear()
         for replica, plan in zip(self.replicas, plans, strict=True):
@@ -329,7 +330,10 @@ class Batch:
         return Losses(tuple(losses))
 
     def _room_for(self, device: Device, parameters: AnyGaussians) -> tuple[AnyGaussians, DeviceArray | None]:
-        """Sums, all zero, as `adam` leaves them, and room for the Gaussians shown, cleared, if Adam needs them."""
+        """Arrays for the sums and for the mark of shown Gaussians, or None if Adam does not need the mark.
+
+        The sums are zero, as `adam` leaves them; the marks are cleared.
+        """
         count, coefficients, sums = parameters.count, parameters.coefficients, self._sums
         if sums is None or (sums.count, sums.coefficients) != (count, coefficients):
             del sums
@@ -380,7 +384,7 @@ class Batch:
         return step.run(model, inputs, probes(inputs, step), gradients, reads_loss=True)
 
     def _take(self, sums: AnyGaussians, outcome: ViewOutcome, step: _AddedView, probe: StepProbe) -> Loss:
-        """Add a view's results from another device, in the memory of a view on this one."""
+        """Add a view's results from another device. They take the memory that a view on this device would use."""
         device, work = step.device, self.rasterizer.work
         probe.loss(outcome.loss)
         for start, stop, (part,) in parts(work, sums, keep=True):
@@ -398,7 +402,7 @@ class Batch:
 
 
 def _brought(work: Workspace, device: Device, name: str, values: NDArray[Any]) -> DeviceArray:
-    """Bring an array of another device to this one. It stays on the host until the next step."""
+    """Copy an array of another device to this one. The host's copy must stay until the next step."""
     if device.shares_memory and values.size:
         return shared(device, values)
     array = work.array(name, values.shape, values.dtype.type)

@@ -17,8 +17,8 @@ from clsplat.training.supervision.resolution import by_doubling
 PRIOR_GROWTH_FACTOR, PRIOR_GROWTH_EXPONENT = 26.0, 0.6
 """Prior of the peak growth, in Gaussians that a densification by the paper's rule adds.
 
-It is a factor times a power of the initial number of Gaussians. Five scenes of 2,754 to 78,868 points add between 0.7
-and 1.5 of it.
+The prior is a factor times a power of the initial number of Gaussians. Five scenes of 2,754 to 78,868 points add 0.7 to
+1.5 times as many.
 """
 GROWTH_RAMP = (0.35, 0.55, 0.75, 0.9)
 """Growth of the first densifications, as fractions of the peak: split Gaussians have to accumulate gradients first."""
@@ -30,16 +30,16 @@ enough fall below the threshold."""
 RECENT_DENSIFICATIONS = 4
 """Number of latest densifications that predict the next ones."""
 PRIOR_GROWTH_WEIGHT = 0.5
-"""Weight of the prior, in densifications at the peak."""
+"""Weight of the prior: it counts as much as this many measured densifications at the peak."""
 PRIOR_COST_SHARES = np.array([0.75, 0.1, 0.15])
 """Prior shares of a step's cost at the start, as on CPUs.
 
-They are the costs by pixels, by Gaussians, and by both, as more Gaussians overlap each pixel.
+The three costs are proportional to the pixels, to the Gaussians, and to both, as more Gaussians overlap each pixel.
 """
 PRIOR_COST_WEIGHT_SECONDS = 0.003
-"""Weight of the prior shares against one measured second, in seconds."""
+"""Weight of the prior shares: they count as much as this many measured seconds."""
 PACE_WINDOW_SECONDS = 60.0
-"""Time window in seconds for the machine's current speed."""
+"""Seconds of recent steps that give the machine's current speed."""
 
 
 class TimedStep(Protocol):
@@ -120,7 +120,7 @@ class Forecast:
         return added / (PRIOR_GROWTH_WEIGHT + sum(_course(self.config.density, step, peak) for step, _ in taken)), peak
 
     def _shares(self, factor: float, number: float) -> Float64:
-        """Amounts (3,) that the parts of a step's cost are proportional to, relative to a full-size step with the
+        """Amounts (3,) to which the three costs of a step are proportional, relative to a full-size step with the
         initial Gaussians."""
         assert self.begun is not None
         pixels, gaussians = 1 / factor**2, number / max(self.begun[1], 1)
@@ -133,7 +133,7 @@ class Forecast:
         steps, seconds = (np.array(column, np.float64) for column in list(zip(*spans, strict=True))[2:])
         rate = float(seconds.sum() / max((steps * (parts @ PRIOR_COST_SHARES)).sum(), 1e-12))
         usual = rate * PRIOR_COST_SHARES
-        # least squares of relative errors, regularised towards the prior; no part may be less than a tenth of its prior
+        # least squares of relative errors, regularised towards the prior; each cost is at least a tenth of its prior
         weights = np.sqrt(seconds) / np.maximum(parts @ usual, 1e-12)
         strength = math.sqrt(PRIOR_COST_WEIGHT_SECONDS * max(float(seconds.sum()), 1e-9)) / np.maximum(usual, 1e-12)
         rows = np.concatenate([weights[:, None] * parts, np.diag(strength)])

@@ -32,9 +32,9 @@ class _FixedModel(GradientStep):
 
 
 def aligned(trainer: Trainer, view: View, look: Look) -> Camera:
-    """Camera of a held-out view, moved to the best fit of the model to its photograph.
+    """Camera of a held-out view, moved so that the model fits the view's photograph best. The model does not change.
 
-    look: the view's appearance, which is removed from the photograph. The model does not change.
+    look: function that gives the view's appearance, which is removed from the photograph.
     """
     config, rasterizer, model = replace(trainer.config, thinning=0.0), trainer.rasterizer, trainer.parameters
     photograph = np.ascontiguousarray(view.load_masked())

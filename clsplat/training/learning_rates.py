@@ -11,7 +11,7 @@ def rates_at(config: TrainConfig, step: int, extent: float, factor: float) -> di
     """Learning rate of each group at a step.
 
     The means' rate falls exponentially, and is relative to the scene's extent. All rates fall in the cooldown.
-    factor: multiplies all rates; it falls with each return to a checkpoint.
+    factor: factor on all rates, which falls with each return to a checkpoint.
     """
     optimiser = config.optimiser
     into = optimiser.cooldown - max(config.iterations - step, 0)

@@ -44,14 +44,15 @@ from clsplat.training.stability.health import MAX_CHECKPOINT_RETURNS, TROUBLE_WI
 from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
-"""Steps between readings of the loss. The host waits for the loss while the device continues with the step."""
+"""Steps between readings of the loss. While the host waits for a loss, the device continues with the rest of the
+step."""
 GROWTH_LIMIT_FRACTION = 0.97
-"""Fraction of --density.max-gaussians from which growth counts as limited: some Gaussians are pruned after reaching
-it."""
+"""Fraction of --density.max-gaussians from which growth counts as limited. It is below 1 because some Gaussians are
+pruned after the limit was reached."""
 OVERFITTING_DB = 0.2
-"""Fall of the held-out views' mean PSNR in dB from which it is told.
+"""Fall of the held-out views' mean PSNR, dB, from which a warning tells of overfitting.
 
-Seeds of one setting differ by as much (docs/quality.md).
+Trainings that differ only in the seed differ by as much (docs/quality.md).
 """
 
 
@@ -65,8 +66,8 @@ class StepReport:
     """Report of a step.
 
     step: number of steps done.
-    loss, psnr: of that step's view, or of all views of its batch.
-    seconds: training time so far, without anything else.
+    loss, psnr: loss and PSNR of that step's view, or of all views of its batch.
+    seconds: training time so far; evaluations, checkpoints and other work do not count.
     """
 
     step: int
@@ -78,10 +79,10 @@ class StepReport:
 
 @contextmanager
 def _interruption() -> Iterator[Callable[[], int]]:
-    """Context in which the first Ctrl-C or other termination signal only stops the loop between two steps.
+    """Context in which the first Ctrl-C or other termination signal stops the loop only between two steps.
 
-    Its function returns the signal's number, or 0 without one. After the signal, a Ctrl-C is Python's own again, and
-    the other signals are restored.
+    It yields a function that returns the signal's number, or 0 before a signal. After the first signal, Python handles
+    Ctrl-C again, and the other signals have their previous handlers.
     """
     first = 0
 
@@ -92,7 +93,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
     def asked() -> int:
         if not first:
-            for number in before:  # again, as kernel compilers install handlers of their own
+            for number in before:  # installed again, as kernel compilers have installed handlers of their own
                 signal.signal(number, ask)
         return first
 
@@ -135,14 +136,14 @@ class TrainingSession:
         """Write a checkpoint, unless this step has one or the model is too broken to return to."""
         if self.run is not None and self.trainer.step > self.saved:
             arrays, state = self.trainer.checkpoint()
-            if not self.trainer.watch.patience.lost:
+            if not self.trainer.monitor.retries.lost:
                 state |= {"seconds": self.seconds, **({"scene": self.scene} if self.scene else {})}
                 self.run.save_checkpoint(self.trainer.step, arrays, state)
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """Write a checkpoint of the state at the start of the step, if it is intact, after a failed or interrupted
-        trial.
+        """After a failed or interrupted trial of a kernel, write a checkpoint of the state at the start of the step, if
+        that is intact.
 
         Returns the end of a sentence that reports it, or "".
         """
@@ -158,15 +159,16 @@ class TrainingSession:
         return f"; the checkpoint of step {self.trainer.step} is written: {resume} goes on from it"
 
     def go_back(self) -> bool:
-        """Report trouble. After too much of it go back to the last checkpoint, with smaller learning rates.
+        """Report non-finite values. After too many troubled steps, go back to the last checkpoint with smaller learning
+        rates.
 
-        After too many returns raise ClsplatError. Returns True if it went back.
+        After too many returns it raises ClsplatError. Returns True if training went back.
         """
-        trainer, patience = self.trainer, self.trainer.watch.patience
+        trainer, retries = self.trainer, self.trainer.monitor.retries
         self.tell_trouble()
-        if not patience.over:
+        if not retries.over:
             return False
-        if patience.spent:
+        if retries.spent:
             self.give_up()
         checkpoint = self.run.load_latest_checkpoint() if self.run is not None else None
         stopped = trainer.step
@@ -174,57 +176,57 @@ class TrainingSession:
             trainer.restore(checkpoint)
         else:
             trainer.restart()
-        trainer.watch.patience = patience.after_return()
+        trainer.monitor.retries = retries.after_return()
         if self.run is not None:
             self.run.truncate_metrics(trainer.step)
             self.saved = -1
             self.save()  # the smaller learning rates must survive a crash
         warnings.warn(
-            f"step {stopped}: {len(patience.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had trouble: back to "
+            f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had trouble: back to "
             "step "
-            f"{trainer.step}, with learning rates of {trainer.watch.patience.rate_factor:g} of what they would be"
+            f"{trainer.step}, with learning rates multiplied by {trainer.monitor.retries.rate_factor:g}"
         )
         return True
 
     def tell_trouble(self) -> None:
-        """Warn of the first trouble of each stage, and count the rest."""
-        for incident in self.trainer.watch.incidents:
+        """Warn of the first incident of each stage, and count the others."""
+        for incident in self.trainer.monitor.incidents:
             self.troubles[incident.stage] += 1
             if self.troubles[incident.stage] == 1:
-                warnings.warn(f"{incident} (more of this kind will be counted only)")
-        self.trainer.watch.incidents.clear()
+                warnings.warn(f"{incident} (further ones of this kind are only counted)")
+        self.trainer.monitor.incidents.clear()
 
     def tell_the_rest(self) -> None:
         """Warn of the number of troubled steps that were only counted."""
         self.trainer.mend()
         self.tell_trouble()
         if untold := self.troubles.total() - len(self.troubles):
-            warnings.warn(f"{untold} more steps had something that was not finite")
+            warnings.warn(f"{untold} more steps had values that were not finite")
 
     def give_up(self) -> None:
         """Write a bundle that reproduces the trouble into the run's folder, and raise ClsplatError."""
-        incident = self.trainer.watch.latest
-        assert incident is not None, "patience is over only after trouble"
+        incident = self.trainer.monitor.latest
+        assert incident is not None, "retries are used up only after trouble"
         trouble = f"{incident}, and {MAX_CHECKPOINT_RETURNS} returns with smaller steps did not help"
         if self.run is None:
-            raise ClsplatError(f"{trouble}: give a run, and what reproduces it is written there")
+            raise ClsplatError(f"{trouble}: with run=..., a file that reproduces it would be written there")
         path = write_bundle(self.run.path, self.trainer, incident)
         raise ClsplatError(f"{trouble}: {path} reproduces it (python -m clsplat.training.repro_bundle)")
 
     def tell_plan(self) -> None:
-        """Report the use of the device's memory, first and whenever more or less work is split into pieces."""
+        """Report the memory plan at the start, and whenever work has to be split into pieces or no longer has to be."""
         plan, announced = self.trainer.plan, self.announced
         if self.on_plan is not None and (announced is None or plan.pieces != announced.pieces):
             self.on_plan(plan)
         self.announced = plan
 
     def report(self, result: Loss | Losses) -> StepReport | None:
-        """Read the loss of the latest step; None if it is not finite."""
+        """Read the loss of the latest step, and make its report; None if the loss is not finite."""
         start = time.perf_counter()
         value, squared = result.read()
         self.seconds += time.perf_counter() - start
         if not np.isfinite(value):
-            self.trainer.watch.loss_failed()
+            self.trainer.monitor.loss_failed()
             return None
         psnr = float(-10 * np.log10(max(squared, 1e-12)))
         return StepReport(self.trainer.step, value, psnr, self.trainer.parameters.count, self.seconds)
@@ -261,7 +263,7 @@ class TrainingSession:
         )
 
     def record(
-        self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, judged: bool = False
+        self, report: StepReport, *, evaluating: bool, stages: dict[str, float] | None, validated: bool = False
     ) -> None:
         """Pass the report on, and record it with the data that clsplat.report needs."""
         if self.on_step is not None:
@@ -274,7 +276,7 @@ class TrainingSession:
         trainer = self.trainer
         if stages is not None:
             record["stages"] = stages
-        if judged:
+        if validated:
             record["gate"] = trainer.cameras.gate.record()
         if not self.recorded:
             record["session"] = telemetry.session(trainer.device, self.first_step)
@@ -285,13 +287,13 @@ class TrainingSession:
         self.run.append_metrics({**record, "elapsed": time.perf_counter() - self.began})
 
     def doubt(self) -> None:
-        """Warn if the renders show nothing. It renders nothing if memory is too small."""
+        """Warn if the renders show nothing. If the memory is too small to render, nothing is checked."""
         with suppress(CapacityError):
             if text := sanity_checks.of_pictures(self.draw, self.trainer.views):
                 warnings.warn(f"step {self.trainer.step}: {text}")
 
     def times_stages(self, steps: range) -> bool:
-        """True if each stage of these steps, which run together, has to be timed; only if the times are recorded."""
+        """True if each stage of these steps, which run together, has to be timed. Without a run no step is timed."""
         config = self.trainer.config
         if config.stages_every == 0:
             return False
@@ -322,14 +324,14 @@ class TrainingSession:
             trainer.mend(look=True)
         if self.go_back():
             return
-        judged = trainer.judge()
+        validated = trainer.validate()
         if sanity_checks.FIRST_RENDER_CHECK_STEP in steps and trainer.step < config.iterations:
             self.doubt()
         if reports:
             evaluating = self.evaluates(steps)
             report = self.report(result)
             if report is not None:
-                self.record(report, evaluating=evaluating, stages=stages, judged=judged)
+                self.record(report, evaluating=evaluating, stages=stages, validated=validated)
         if config.checkpoint_every > 0 and _reached(config.checkpoint_every, steps):
             self.save()
 
@@ -341,7 +343,7 @@ class TrainingSession:
         self.tell_plan()
         try:
             self.make_steps(between)
-        except (DriverError, TrialInterrupted) as error:  # with a checkpoint nothing is lost
+        except (DriverError, TrialInterrupted) as error:  # a checkpoint saves the work so far
             written = self.rescue()
             if written and isinstance(error, DriverError):
                 raise DriverError(f"{error}{written}") from error
@@ -359,7 +361,9 @@ class TrainingSession:
                 doubt_length(run.read_metrics(), result["mean"]["psnr"])
                 ample = trainer.device.memory.limit is None and not any(trainer.plan.pieces)
                 if trainer.config.report and ample:
-                    with suppress(CapacityError, DriverError):  # a missing picture does not fail the training
+                    with suppress(
+                        CapacityError, DriverError
+                    ):  # the training counts as successful even if a picture cannot be rendered
                         views = trainer.cameras.lenses.of_views(trainer.scene.test_views)
                         keep_depths(self.render, model, views, result["views"], run.depth_path)
         return model
@@ -384,13 +388,14 @@ class TrainingSession:
 
 
 def _tell_of_limit(trainer: Trainer) -> None:
-    """Warn if the limit has stopped the paper's growth, which started below it."""
+    """Warn if --density.max-gaussians has limited the growth by the paper's rule, unless training began above the
+    limit."""
     density, scene = trainer.config.density, trainer.scene
     most, began = GROWTH_LIMIT_FRACTION * density.max_gaussians, len(scene.points) or trainer.config.random_points
     if not density.fills and began < most <= trainer.parameters.count:
         warnings.warn(
-            f"--density.max-gaussians {density.max_gaussians:,} has held the growth: --density.growth mcmc, or budget "
-            "with --density.long-axis, shows more with as many Gaussians"
+            f"--density.max-gaussians {density.max_gaussians:,} has limited the growth: --density.growth mcmc, or "
+            "budget with --density.long-axis, shows more with as many Gaussians"
         )
 
 

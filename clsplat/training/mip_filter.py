@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mip-Splatting's 3D smoothing filter: no Gaussian becomes smaller than the training pictures can show."""
+"""Mip-Splatting's 3D smoothing filter: no Gaussian becomes smaller than the training photographs can resolve."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class MipFilter(Component):
         self.after_adam(gaussians)
 
     def after_adam(self, gaussians: AnyGaussians) -> None:
-        """Raise scales below their limit to it."""
+        """Raise scales that are below their limit to the limit."""
         if self._least is not None:
             limit_scales(self._device, self._work, gaussians, self._least)
 

@@ -40,7 +40,7 @@ def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
-    """Scene to train on, with colours, recorded in the run. Warns of each doubt about it.
+    """Scene to train on, with coloured points. It is recorded in the run. Warns of each finding of the sanity checks.
 
     Raises InputError if the run has already been trained, or trained on another scene.
     """
@@ -60,7 +60,7 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
     for text in sanity_checks.of_scene(scene, config.background):
         warnings.warn(text)
     if is_colourless(scene):
-        warnings.warn(f"{scene.name}: the points have no colours, those of the photographs are taken for them")
+        warnings.warn(f"{scene.name}: the points have no colours, and get those of the photographs")
         scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
     return scene
 
@@ -100,7 +100,7 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
     if optimiser.cooldown > last:
         part = optimiser.cooldown_to ** (1 - last / optimiser.cooldown)
         yield (
-            f"--optimiser.cooldown {optimiser.cooldown}: the learning rates begin at {part:.2g} of what they are, "
+            f"--optimiser.cooldown {optimiser.cooldown}: the learning rates begin at {part:.2g} of their values, "
             f"training has {last} steps; {expected}"
         )
     late = [step for step in config.warmup if step >= max(last, 2)]

@@ -4,8 +4,8 @@
     python -m clsplat.training.repro_bundle RUN/trouble-step-0001234.npz [--device DEVICE] [--json]
 
 prints the number of non-finite values after each stage of that step. The exit status is 0 if there are any, else 1.
-A bundle is a checkpoint's file, with the inputs of one view: a photograph, a camera and a background. Its Gaussians are
-only those concerned if they reproduce the trouble on their own, else all.
+A bundle has the format of a checkpoint, and the inputs of one view: a photograph, a camera and a background. It has
+only the Gaussians concerned if these reproduce the trouble on their own, otherwise all Gaussians.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def write_bundle(folder: Path, trainer: Trainer, incident: Incident) -> Path:
 
 
 def _unmarked(models: dict[str, HostGaussians]) -> dict[str, HostGaussians]:
-    """Models with the moments before `adam` refused a step, as far as they are known."""
+    """Models in which moments that mark a refused step are as before that step, as far as they are known."""
     for kind in ("first", "second"):
         arrays = {g: HostArray(finite_or_zero(array.values)) for g, array in models[kind].arrays.items()}
         models[kind] = replace(models[kind], arrays=arrays)
@@ -195,7 +195,10 @@ def read_bundle(path: Path) -> Bundle:
 
 
 def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
-    """Raises nearly any exception for arrays and values that make no step. Sizes follow from the photograph's."""
+    """The bundle in a checkpoint. It may raise any exception if the arrays and values do not make a step.
+
+    All sizes follow from the photograph's.
+    """
     record, arrays = cast("StepRecord", {**saved.state, "step": saved.step}), saved.arrays
     record["rates"] = {group: float(record["rates"][group]) for group in PARAMETER_GROUPS}
     config, _ = parse_config(record["settings"], path)
@@ -266,7 +269,7 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
 
 
 def first_trouble(counts: dict[str, int]) -> str | None:
-    """First stage followed by a non-finite value."""
+    """First stage after which a value is not finite."""
     return next((stage for stage, count in counts.items() if count), None)
 
 

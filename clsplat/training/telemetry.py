@@ -29,9 +29,9 @@ T = TypeVar("T")
 
 REPORTED_PACKAGES = ("numpy", "pyopencl", "OpenImageIO", "scipy", "scikit-image")
 CONTRIBUTION_SECONDS = 1.0
-"""Time limit for sampling training views for contributions, after the first view."""
+"""Seconds for sampling training views for contributions, counted from the end of the first view."""
 CONTRIBUTION_BIN_EDGES = tuple(float(edge) for edge in np.round(np.arange(-3.0, 5.01, 0.2), 1))
-"""Powers of ten of pixels, between the bins of contributions."""
+"""Edges of the bins of contributions, as powers of ten of pixels."""
 
 
 def session(device: Device, step: int) -> dict[str, Any]:
@@ -56,8 +56,8 @@ def session(device: Device, step: int) -> dict[str, Any]:
 def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
     """Result of `work`, and milliseconds of each stage; "other" for time outside the stages, "all" for the total.
 
-    It measures wall time from an idle device to an idle device. So launches are included and no queue needs profiling.
-    Use it rarely: waiting after every stage prevents host and device from overlapping.
+    It measures wall time from an idle device to an idle device. So the times include launches, and the queue needs no
+    profiling. Use it rarely: as it waits after every stage, host and device do not work at the same time.
     """
     with device.recorder.recording(wait=True) as stages:
         result, total = device.timed(work)
@@ -68,8 +68,8 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
 def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> dict[str, Any] | None:
     """Histogram of `largest_contributions`.
 
-    `none` counts Gaussians that no view shows, `counts` those between `edges`, which are powers of ten of pixels. The
-    first and last bin include everything beyond.
+    `none` is the number of Gaussians that no view shows. `counts` are the numbers of the others between `edges`, which
+    are powers of ten of pixels. The first and last bin include all values beyond their outer edge.
     Returns None if memory is limited, as the plan covers training alone.
     """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):
@@ -91,7 +91,8 @@ def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> di
 
 
 def largest_contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> tuple[NDArray[np.float32], int]:
-    """Largest contribution of each Gaussian (n,) to a sampled view (`sums_of_weights`), and the number of views.
+    """Largest contribution of each Gaussian (n,) to a sampled view (`sums_of_weights`), and the number of sampled
+    views.
 
     It samples as many training views, evenly spaced, as `seconds` allow. The training state does not change. Raises
     CapacityError.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Gaussians in training: parameters, Adam's moments and density statistics, and the plans that move their rows."""
+"""The Gaussians in training: parameters, Adam's moments, density statistics, and the moves of their rows."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from clsplat.training.density import RowPlan
 class TrainedModel:
     """Parameters, first and second moments and statistics, on the device or streamed from the host.
 
-    make_plan: plans the device's memory for a number of Gaussians.
+    make_plan: function that plans the device's memory for a number of Gaussians.
     counts_contributions: True if the statistics have contributions.
     """
 
@@ -69,7 +69,7 @@ class TrainedModel:
             self.set(upload_gaussians(self._device, initial))
 
     def load(self, models: Sequence[HostGaussians]) -> None:
-        """Continue with parameters, first and second moments of a checkpoint, and new statistics."""
+        """Continue with the parameters, first and second moments of a checkpoint. The statistics start anew."""
         self.plan = self._make_plan(models[0].count)
         self.set(*(self._placed(model) for model in models))
 
@@ -80,7 +80,7 @@ class TrainedModel:
     def set(
         self, parameters: AnyGaussians, first: AnyGaussians | None = None, second: AnyGaussians | None = None
     ) -> None:
-        """Set the arrays, with new statistics. Without moments they start from zero."""
+        """Set the arrays, with new statistics. Moments that are not given start from zero."""
         count, coefficients = parameters.count, parameters.coefficients
         self.parameters = parameters
         self.first = first or self._zeros(count, coefficients)
@@ -111,7 +111,7 @@ class TrainedModel:
     def rearrange(self, plan: RowPlan, changes: Callable[[], None]) -> DeviceArray | None:
         """Carry out a plan of density control, or of a repair. Returns the list of rows if rows have moved.
 
-        changes: called before anything changes, once the kernels have been tried.
+        changes: function that is called after the kernels have been tried in the sandbox, just before the first change.
         """
         listed = plan.listed
         if plan.rows is not None:
@@ -147,7 +147,7 @@ class TrainedModel:
         return models
 
     def _placed(self, model: AnyGaussians) -> AnyGaussians:
-        """Move the model to the place that the plan assigns, if it is elsewhere."""
+        """The model on the device or on the host, as the plan assigns; it is moved there if necessary."""
         if isinstance(model, HostGaussians):
             return replace(model, rows=self.plan.rows) if self.plan.streamed else to_device(self._device, model)
         return model

@@ -38,7 +38,7 @@ from clsplat.stages.loss import Loss
 from clsplat.training.appearance.choice import appearance_of
 from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER, REPLICA_ARRAYS_PER_PARAMETER, Batch, Losses
 from clsplat.training.cameras.refinement import Cameras
-from clsplat.training.cameras.validation import ValidationViews, judge
+from clsplat.training.cameras.validation import ValidationViews, validate
 from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
 from clsplat.training.learning_rates import rates_at
@@ -63,10 +63,10 @@ if TYPE_CHECKING:
 class _Mark:
     """A point of the work at which a checkpoint is possible.
 
-    step: steps done.
+    step: number of steps done.
     rng: state of the random generator.
-    queue: remaining views.
-    controlled: True if the next step's density control is done.
+    queue: views that the epoch has left.
+    controlled: True if the density control before the next step has been done.
     """
 
     step: int
@@ -79,9 +79,9 @@ class Trainer:
     """A model in training: parameters, moments, statistics and the random state, which a checkpoint holds.
 
     step: number of views done.
-    watch: notices non-finite values in the model, and counts them.
-    pending: steps that are launched but not known to be complete.
-    mark: state that `step_back` restores; None after that state has changed.
+    monitor: monitor of non-finite values in the model.
+    pending: steps that have been launched but may have to be repeated.
+    mark: state that `step_back` restores; None once the arrays no longer have that state.
     further: devices in addition to the model's.
     """
 
@@ -100,14 +100,14 @@ class Trainer:
         self.rasterizer.antialias(on=config.antialiased)
         self.photographs = ImageCache(self.views, device)
         self.renderer = Renderer(device, self.rasterizer)
-        self.judges = ValidationViews(scene, device, config)
+        self.validation_views = ValidationViews(scene, device, config)
         self.depths = DepthTargets(config, self.views, scene.extent, scene.near, self._pixels)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = by_doubling(config.warmup)
         self.background: NDArray[np.float32] = np.zeros(3, np.float32)
         self.given = initial
-        self.watch = NonFiniteMonitor(self.rasterizer.readback, [view.name for view in self.views])
-        self.pending = SpeculativeSteps(device, self.watch, self._begin_again)
+        self.monitor = NonFiniteMonitor(self.rasterizer.readback, [view.name for view in self.views])
+        self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
         self.pending.on &= self.batch is None and not config.refines  # a batch reads its losses; cameras, gradients
         self._start()
 
@@ -118,14 +118,14 @@ class Trainer:
         self.queue: list[int] = []
         self.controlled, self.last_views = False, 1
         self.mark: _Mark | None = None
-        self.rehearsed: set[tuple[object, ...]] = set()
+        self.tried: set[tuple[object, ...]] = set()
         self.strategy = self._new_strategy(self.config)
         self._looks_at_steps = type(self.strategy).after_gradient is not Strategy.after_gradient
         initial = self.given
         if initial is None:
             initial = from_scene(self.scene, self.config.random_points, self.rng)
         self.appearance = appearance_of(self.config, self.device, self.scene)
-        self.cameras = Cameras(self.config, self.scene, self.rasterizer.work, len(self.judges.views))
+        self.cameras = Cameras(self.config, self.scene, self.rasterizer.work, len(self.validation_views.views))
         self.origin, self.near = initial.origin, self.scene.near
         asked = self.config.perspective
         self.by_rays = asked == "rays" or (asked == "auto" and any(view.camera.model.along_rays for view in self.views))
@@ -203,15 +203,15 @@ class Trainer:
     def train_step(self, *, reads_loss: bool = False) -> Loss | Losses:
         """Run the pending density control, then one view, or a batch of them: forward, loss, backward, Adam.
 
-        reads_loss: the loss will be read. Reading then waits only for the loss.
+        reads_loss: True if the loss will be read. Reading then waits only for the loss, not for the whole step.
 
-        Kerbl et al. 2023, algorithm 1, but the loop starts elsewhere. A model is rendered, saved or finished before its
-        Gaussians are split or made transparent, not just after.
+        Kerbl et al. 2023, algorithm 1, but density control comes first instead of last. So a model is rendered, saved
+        or finished before its Gaussians are split or made transparent, and not right after.
         """
         if self.mark is None or self._looks_at_steps:
             self._note()
         self.mend()
-        self.judge()
+        self.validate()
         if not self.controlled:
             self._control_density()
             self.controlled = True
@@ -226,7 +226,7 @@ class Trainer:
         if self.batch is None:
             run = partial(self._run, step, inputs[0], reads_loss)
             result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
-            if self.queue:  # the next one, unless the resolution rises
+            if self.queue:  # the next step's photograph, unless the resolution rises
                 self.photographs.ahead(self.queue[-1], factor)
         else:
             gathers, model = self.strategy.needs(self.step).gradients, (self.parameters, self.first, self.second)
@@ -239,14 +239,14 @@ class Trainer:
         return result
 
     def _prepare_components(self, views: int) -> None:
-        """Let the components do what is due before a step of `views` views."""
+        """Let the components do the work that is due before a step of `views` views."""
         if due := [component for component in self.components if component.is_due(self.step, views)]:
             self.settle()
             for component in due:
                 component.before_step(self.parameters)
 
     def _inputs(self, views: int) -> Sequence[ViewInputs]:
-        """Inputs of the step's views, with the components' shares."""
+        """Inputs of the step's views, with the components' parts in them."""
         inputs: Sequence[ViewInputs] = [self._view_inputs(place) for place in range(views)]
         for component in self.components:
             inputs = component.join(inputs, self.step, self.parameters.count)
@@ -276,16 +276,16 @@ class Trainer:
         return result
 
     def _room(self, factor: float) -> int:
-        """Number of pairs to launch the next step for.
+        """Number of pairs that the next step is launched for.
 
-        0 for the exact number, for example if the strategy inspects the model after each step.
+        0 if the pairs have to be counted first, for example if the strategy inspects the model after each step.
         """
         if not self.pending.on or self._looks_at_steps or not self.rasterizer.takes_room:
             return 0
         return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
 
     def _begin_again(self) -> None:
-        """Prepare for repeating a step. The mark is lost."""
+        """Prepare for repeating a step. `mark` is lost."""
         self.mark = None
         self.mend()
 
@@ -317,7 +317,7 @@ class Trainer:
         )
 
     def _view_gradients(self, inputs: ViewInputs) -> DeviceGaussians | None:
-        """Room for the rows' gradients, if a component reads them."""
+        """Arrays for the rows' gradients; None if no component reads them."""
         if not any(part.wants_gradients for part in inputs.parts):
             return None
         return view_gradients(self.rasterizer.work, self.parameters, zero=True)
@@ -330,14 +330,14 @@ class Trainer:
         """Probe of a view."""
         needs = self.strategy.needs(number)
         return StepMonitor(
-            step, number, inputs, needs, self.statistics, self.watch, self.pending, self.rehearsed, self._unmark
+            step, number, inputs, needs, self.statistics, self.monitor, self.pending, self.tried, self._unmark
         )
 
     def _unmark(self) -> None:
         self.mark = None
 
     def _watched_in_batch(self, inputs: ViewInputs, step: GradientStep) -> StepProbe:
-        """Probe of a view, when the statistics of earlier views are complete."""
+        """Probe of a view in a batch. It may begin an epoch, so the statistics of earlier views must be complete."""
         if inputs.begins:
             self._turn_epoch()
         return self._watched(inputs, step, self.step)
@@ -348,26 +348,26 @@ class Trainer:
         background = background_colour(self.config.background)
         return self.renderer.render(self.parameters, self.local(camera), background)
 
-    def judge(self) -> bool:
+    def validate(self) -> bool:
         """Validate the refined cameras, if that is due. True if they were measured."""
         if not self.cameras.gate.is_due(self.step):
             return False
         self.settle()
         look = held_out_looks(self.appearance.record())
-        judge(self.cameras, self.judges, self.step, lambda camera: self.draw(camera).image, look)
+        validate(self.cameras, self.validation_views, self.step, lambda camera: self.draw(camera).image, look)
         return True
 
     def _note(self, *, begun: bool = False) -> None:
         """Mark the current state. Until it changes, `step_back` returns to it.
 
-        begun: the step number has already risen, by its one view.
+        begun: True if the step number has already been increased for the current step, of one view.
         """
         self.mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
 
     def step_back(self) -> bool:
-        """Restore the state before the current step, or after its density control, following an error.
+        """After an error, restore the state before the current step, or after its density control.
 
-        False if that is impossible.
+        Returns False if that is impossible.
         """
         mark = self.mark
         if mark is None:
@@ -379,33 +379,33 @@ class Trainer:
     def mend(self, *, look: bool = False) -> None:
         """Repair Gaussians with non-finite values, if any were noticed.
 
-        look: read the counts first.
+        look: True to read `adam`'s counts first.
         """
         if look:
             self.settle()
-            self.watch.look()
-        self._apply(self.watch.examine(self.models()))
+            self.monitor.look()
+        self._apply(self.monitor.examine(self.models()))
 
     def models(self) -> dict[str, AnyGaussians]:
         """Parameters, first and second moments, by their names in a checkpoint."""
         return self.model.kinds()
 
-    def _apply(self, remedy: Repair | None) -> None:
-        if remedy is None:
+    def _apply(self, repair: Repair | None) -> None:
+        if repair is None:
             return
-        for kind, groups in remedy.moments.items():
+        for kind, groups in repair.moments.items():
             for group, values in groups.items():
                 self.models()[kind][group].set(values)
-        self._rearrange(RowPlan(remedy.rows))
+        self._rearrange(RowPlan(repair.rows))
 
     def rates(self) -> dict[str, float]:
         """Learning rate of each group at this step."""
-        return rates_at(self.config, self.step, self.scene.extent, self.watch.patience.rate_factor)
+        return rates_at(self.config, self.step, self.scene.extent, self.monitor.retries.rate_factor)
 
     def _next_view(self) -> int:
         if not self.queue:
             self.queue = [int(index) for index in self.rng.permutation(len(self.views))]
-            if self.batch is None:  # a batch may have views of the epoch before to count
+            if self.batch is None:  # a batch may still have to count views of the last epoch
                 self._turn_epoch()
                 self._note(begun=True)
         return self.queue.pop()
@@ -423,7 +423,7 @@ class Trainer:
         return np.array(background_colour(self.config.background), np.float32)
 
     def _raise_sh_degree(self) -> None:
-        """Raise the SH degree in use. Unused bands have no memory, as their gradients, and so their steps, would be
+        """Raise the SH degree in use. Bands above it have no memory: their gradients, and so their steps, would be
         zero."""
         every = self.config.sh_degree_every
         degree = min(self.step // every, self.config.sh_degree) if every > 0 else self.config.sh_degree
@@ -433,7 +433,7 @@ class Trainer:
             self.model.widen(coefficients)
 
     def _control_density(self) -> None:
-        """Run the density control that is due after any of the last step's views."""
+        """Run the density control that is due after one of the last step's views."""
         steps = [step for step in range(self.step - self.last_views + 1, self.step + 1) if self.strategy.is_due(step)]
         for step in steps if self.step > 0 else ():
             self.mend(look=True)
@@ -441,7 +441,7 @@ class Trainer:
                 self._note()
             self._rearrange(self.strategy.before_step(self._state(step)))
         if steps:
-            self.mark = None  # of what a strategy has drawn, too
+            self.mark = None  # the strategy may also have drawn random numbers
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
@@ -500,14 +500,16 @@ class Trainer:
     def checkpoint(self) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """All state that the remaining steps depend on: arrays and JSON state.
 
-        The whole model is finite, unless `watch.patience.lost`.
+        The whole model is finite, unless `monitor.retries.lost`.
         """
         self.mend(look=True)
         arrays = self._arrays()
-        if (remedy := self.watch.examine_all(arrays)) is not None:  # hidden Gaussians, which no step has come by
-            self._apply(remedy)
+        if (
+            repair := self.monitor.examine_all(arrays)
+        ) is not None:  # finds non-finite values in Gaussians that no step has visited
+            self._apply(repair)
             arrays = self._arrays()
-        state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.watch.patience)}
+        state = {"rng": self.rng.bit_generator.state, "queue": self.queue, "patience": asdict(self.monitor.retries)}
         views = {"views": self.last_views} if self.last_views > 1 else {}
         return arrays, {**state, **views, **({"controlled": True} if self.controlled else {})}
 
@@ -520,10 +522,10 @@ class Trainer:
         return arrays
 
     def restart(self) -> None:
-        """Start again, at the rates that `watch.patience` allows."""
+        """Start again from step 0, with the rate factor of `monitor.retries`."""
         self.pending.forget()
         self.model.free()
-        self.watch.forget()
+        self.monitor.forget()
         self._start()
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -535,18 +537,18 @@ class Trainer:
             queue = list(checkpoint.state["queue"])
             if not all(type(index) is int and index >= 0 for index in queue):
                 raise ValueError(f"a queue of {queue[:3]}")
-            patience = RetryBudget(**checkpoint.state.get("patience", {}))
+            retries = RetryBudget(**checkpoint.state.get("patience", {}))
             last_views = checkpoint.state.get("views", 1)
             if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
                 raise ValueError(f"a step of {last_views!r:.20} views")
         except (KeyError, TypeError, ValueError, IndexError) as error:
             why = f"{type(error).__name__}: {error}"
             raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
-        self.queue = queue if max(queue, default=0) < len(self.views) else []  # of a scene that had more of them
+        self.queue = queue if max(queue, default=0) < len(self.views) else []  # a scene that had more views
         self.controlled, self.mark = bool(checkpoint.state.get("controlled", False)), None
         self.last_views = last_views
-        self.watch.patience = patience
-        self.watch.forget()
+        self.monitor.retries = retries
+        self.monitor.forget()
         self.pending.forget()
         self.model.free()
         self.model.load(loaded)
@@ -554,7 +556,7 @@ class Trainer:
         for name, array in self.statistics.named().items():
             if name in statistics and (statistics[name].shape, statistics[name].dtype) != (array.shape, array.dtype):
                 raise unusable(checkpoint, f"statistics/{name} has shape {statistics[name].shape}")
-        self.statistics.load(statistics)  # what the settings did not ask for before the checkpoint is not known
+        self.statistics.load(statistics)  # statistics that the settings did not need before the checkpoint stay unknown
         self.strategy.load(checkpoint.named("strategy/"))
         try:
             for component in self.components:

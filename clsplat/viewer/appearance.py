@@ -42,8 +42,8 @@ class Look:
 
     mode: the displayed channel.
     degree: highest SH degree used.
-    size, opacity: factors.
-    crop: Gaussians outside are hidden.
+    size, opacity: factors on scales and opacities.
+    crop: box outside of which Gaussians are hidden; None without one.
     """
 
     mode: Mode = "colour"

@@ -25,7 +25,7 @@ from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture
 from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 
 MAX_MODELS_ON_DEVICE = 2
-"""Models kept on the device: the file's, and one edited by a look."""
+"""Number of models kept on the device: the file's, and one edited by a look."""
 CHANNEL_FLOATS_PER_GAUSSIAN = 3
 """Floats per Gaussian that the channels need at least, in addition to colour."""
 

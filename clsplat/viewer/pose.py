@@ -33,8 +33,8 @@ class Pose:
 
     rotation: (3, 3), world from camera (x right, y down, z forward).
     position: (3,), in the world.
-    fov: vertical, radians.
-    width, height: of the page, in pixels.
+    fov: vertical field of view, radians.
+    width, height: size of the page in pixels.
     """
 
     rotation: Float64
@@ -80,7 +80,7 @@ def read_pose(
 
     wxyz: quaternion of the rotation from the camera's axes (COLMAP's) to the world's.
     position: relative to `origin` (3,).
-    fov: vertical, radians.
+    fov: vertical field of view, radians.
     size: width and height.
     """
     try:

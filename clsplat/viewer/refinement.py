@@ -18,13 +18,13 @@ REST_INTERVAL_RATIO = 3.0
 MOTION_PICTURE_SECONDS = 0.04
 """Time budget in seconds of a picture in motion, encoding included. The browser's own time is not included."""
 MAX_UNPREPARED_EXACT_SECONDS = 0.6
-"""Longest time in seconds of an exact picture that is shown without intermediate pictures of growing size."""
+"""Seconds of an exact picture beyond which intermediate pictures of growing size are shown first."""
 MIN_MOTION_SCALE = 1 / 8
 """Smallest scale relative to the page. A coarser picture would be unrecognisable."""
 PAGE_JPEG_QUALITIES = (60, 95)
 """JPEG quality in motion and at rest."""
 VIEWER_TIME_FRACTIONS = (0.2, 0.05)
-"""Fractions of a training's time for pictures: while a viewer moves, and while all are at rest."""
+"""Fractions of a training's time that pictures may take: while a viewer moves, and while all viewers are at rest."""
 
 
 @dataclass(frozen=True)

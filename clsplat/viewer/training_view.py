@@ -24,7 +24,7 @@ STATUS_INTERVAL_SECONDS = 0.5
 class TrainingView:
     """Viewer hook of `clsplat.api.train`, called between two steps.
 
-    It renders for all viewers, within their fraction of the time.
+    It renders for all viewers, within the fraction of the training's time that pictures may take.
     """
 
     def __init__(self, viewing: Viewing, server: Server, background: tuple[float, float, float], last: int) -> None:

@@ -1,5 +1,5 @@
-// A Gaussian's alpha in a tile's pixels. blend and blend_grad must agree to the last bit, or the gradient recovers a
-// different transmittance by division.
+// A Gaussian's alpha in a tile's pixels. blend and blend_grad must agree to the last bit: otherwise the gradient, which
+// recovers the transmittance by division, would use another one than the image.
 
 // A Gaussian's nearness, 1 / depth, which is blended like a colour (docs/gradients.md, (120)).
 #ifdef NEARNESS

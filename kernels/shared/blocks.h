@@ -37,7 +37,7 @@
 #endif
 #define ALL_CELLS(cell) UNROLLED for (int cell = 0; cell < OWNED; ++cell)
 
-typedef int Open; // how many of the item's cells
+typedef int Open; // number of the item's cells with an open pixel
 #define OPEN_CELL(open, cell) (++(open))
 #define CLOSE_CELL(open, cell) (--(open))
 
@@ -47,7 +47,7 @@ typedef uint Reach;
 #define FROM_OWN(blocks) ((blocks) >> (ITEM / BLOCK_ITEMS))
 #define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * (ITEMS / BLOCK_ITEMS)) & 1)
 
-// Every block: for kernels that take one splat at a time, where the test would cost more than the pixels.
+// All blocks, without a test: for kernels that take one splat at a time, where testing would cost more than the pixels.
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 
 #if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
@@ -107,7 +107,7 @@ typedef struct {
   float blue;
   uint blocks, gaussian, slot;
 #ifdef NEARNESS
-  float near;     // 1 / depth
+  float near;     // nearness, 1 / depth
   uint unused[3]; // padding to 16 bytes, set so that copies read no unwritten memory
 #endif
 } __attribute__((aligned(16))) Staged;

@@ -12,7 +12,7 @@
 #include "shared/elementary.h"
 #include "shared/angles.h"
 
-#ifndef CAMERA_SPACE // address space of the camera
+#ifndef CAMERA_SPACE // address space of the camera's array
 #define CAMERA_SPACE __constant
 #endif
 
@@ -25,7 +25,7 @@ typedef struct {
 #ifdef NEEDS_BOXES
 typedef struct {
   float low_x, high_x, low_y, high_y; // in pixels, not clamped
-  int whole_rows;                     // it wraps all the way round
+  int whole_rows;                     // the box goes all the way round the panorama
 } Box;
 #endif
 #ifdef RAYS
@@ -49,7 +49,8 @@ typedef struct {
 #endif
 
 // A component of the view direction at a Gaussian, in world axes, and of the gradient through that direction.
-// `offset`: from the camera's centre, `length`: of all of it, `axis`: of the camera's axis.
+// `offset`: this component of the vector from the camera's centre; `length`: length of that vector; `axis`: this
+// component of the camera's axis.
 #ifdef PARALLEL_RAYS // one direction for all Gaussians
 #define SEEN_ALONG(offset, length, axis) (axis)
 #define BY_DIRECTION(gradient, length) (0.0f)

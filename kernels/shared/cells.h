@@ -9,7 +9,7 @@
 #define COLUMNS (TILE / CELL_W)
 #define ROWS (TILE / CELL_H)
 #define CELLS (COLUMNS * ROWS)
-#define OWNED CELLS // by a work-item
+#define OWNED CELLS // number of cells of a work-item
 #define ALL_CELLS(cell) for (int cell = 0; cell < OWNED; ++cell)
 #define CELL_X(cell) ((cell) % COLUMNS * CELL_W)
 #define CELL_Y(cell) ((cell) / COLUMNS * CELL_H)
@@ -104,7 +104,7 @@ static inline int8 reached_columns(float my, float mx, float l12, float l22, flo
   end = end > 0.0f ? end : (float8)(0.0f);
   end = end < (float)TILE ? end : (float8)(TILE);
   const int8 whole = convert_int8(low);
-  const int8 first = whole - (convert_float8(whole) < low), last = convert_int8(end) - 1; // a comparison is -1
+  const int8 first = whole - (convert_float8(whole) < low), last = convert_int8(end) - 1; // a true comparison is -1
   const int8 bits = ((int8)(2) << (last >> 2)) - ((int8)(1) << (first >> 2));
   const int8 none = (int8)(0);
   const int8 some = last >= first ? bits : none;
@@ -215,7 +215,7 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #define AT_X(cell) PIXELS_X(cell)
 #define AT_Y(cell) PIXELS_Y(cell)
 
-typedef int Open; // how many
+typedef int Open; // number of open cells
 #define OPEN_CELL(open, cell) (++(open))
 #define CLOSE_CELL(open, cell) (--(open))
 #define IN_OPEN(reach, open) (reach)

@@ -6,7 +6,7 @@
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
 
-// The smallest determinant without the low-pass at which a compensation has a gradient.
+// A compensation has a gradient only if the determinant without the low-pass is at least this.
 #define LEAST_DETERMINANT 1e-30f
 
 typedef struct {
@@ -30,7 +30,7 @@ typedef struct {
   floatL adj[6]; // V's adjugate, in the same order
 #else
   floatL q[4];         // unit quaternion w x y z
-  floatL length;       // of the raw quaternion
+  floatL length;       // length of the raw quaternion
   floatL r[9];         // rotation matrix
   floatL s[3];         // scales
   floatL b1[3], b2[3]; // t1 and t2 along the Gaussian's axes

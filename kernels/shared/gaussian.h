@@ -19,7 +19,7 @@ typedef struct {
   floatL rx, ry;        // x/z and y/z as in the Jacobian, clamped; orthographic: 0
   floatL jx, jy;        // the Jacobian's rows are jx (1, 0, -rx) and jy (0, 1, -ry)
   floatL q[4];          // unit quaternion w x y z
-  floatL length;        // of the raw quaternion
+  floatL length;        // length of the raw quaternion
   floatL a2[3];         // last row of A, camera from Gaussian: the axes' depths
   floatL b1[3], b2[3];  // the two rows of J A
   floatL c[3];          // minors: b1[k] b2[l] - b1[l] b2[k] is c[m], for cyclic k, l, m
@@ -27,7 +27,7 @@ typedef struct {
   floatL sxx, sxy, syy; // projected covariance with the low-pass
   floatL det;
 #ifdef ANTIALIASED
-  floatL det0; // without the low-pass
+  floatL det0; // determinant without the low-pass
 #endif
 } Projection;
 

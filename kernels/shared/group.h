@@ -1,4 +1,4 @@
-// Operations of a whole work-group. With ITEMS == 1 a group is one sequential work-item, and they vanish.
+// Operations of a whole work-group. With ITEMS == 1 a group is one sequential work-item, and they compile to nothing.
 #ifndef ITEMS
 #error "ITEMS must be defined: work-items per group, 1 on CPUs"
 #endif
@@ -25,7 +25,7 @@
   value = group_max;
 #endif
 
-// A 64-bit sum in 32 bits, 0xffffffff where it does not fit. A saturated sum of many values is the same in every order
+// A 64-bit sum in 32 bits; 0xffffffff if it does not fit. A saturated sum of many values is the same in every order
 // of addition.
 #define CAPPED(sum) ((sum) > 0xffffffff ? 0xffffffff : (uint)(sum))
 

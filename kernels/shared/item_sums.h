@@ -1,6 +1,6 @@
 // Sums over a group's items: first neighbours, then pairs, fours and so on. The order and the bits are the same whether
 // items leave their addends in local memory or exchange them in sub-groups of SUBGROUP items.
-#define PARTS (ITEMS / SUBGROUP) // addends of a row in local memory
+#define PARTS (ITEMS / SUBGROUP) // number of addends of a row in local memory
 
 // A row is padded so that rows begin in different banks.
 #define ROW (PARTS < 4 ? PARTS : PARTS + 4)

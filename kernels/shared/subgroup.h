@@ -23,7 +23,7 @@ static inline float exchanged(float x, int step) {
   __asm__ volatile("shfl.sync.bfly.b32 %0, %1, %2, 31, -1;" : "=r"(got) : "r"(as_int(x)), "r"(step));
   return as_float(got);
 }
-#elif defined(SHUFFLE_AMD) // waves may have twice as many items
+#elif defined(SHUFFLE_AMD) // a wave may have twice as many items as SUBGROUP
 #define EXCHANGED(x, step) exchanged(x, step)
 static inline float exchanged(float x, int step) {
   const int lane = __builtin_amdgcn_mbcnt_hi(-1, __builtin_amdgcn_mbcnt_lo(-1, 0));

@@ -12,7 +12,7 @@ typedef struct {
   float m1[5], m2[5];       // M, and the low-pass as two more columns
   float sxx, sxy, syy, det; // covariance with the low-pass
 #ifdef ANTIALIASED
-  float det0; // without the low-pass
+  float det0; // determinant without the low-pass
 #endif
 } RayProjection;
 

@@ -2,7 +2,8 @@
 // disagreed by one tile, the emitted pairs would overrun, or leave gaps in, the arrays sized by the count.
 #include "shared/splat.h"
 
-// Slack in pixels, more than float32's rounding here. An extra tile only costs time; a missing one would be visible.
+// Slack in pixels. It exceeds float32's rounding here: an extra tile only costs time, but a missing one would be
+// visible.
 #define TILE_SLACK 0.01f
 
 // u^2 + v^2 at the edge of a Gaussian's ellipse, where alpha is ALPHA_MIN unless RasterizerConfig.extent says
@@ -40,7 +41,7 @@ static inline int end_cell(float high, float size, int count) {
 
 #ifdef RAYS // pixels are directions; project_rays.cl has computed the box
 typedef struct {
-  int tile_x0, tile_x1, tile_y0, tile_y1; // of the box; it wraps if x0 > x1: [x0, tiles_x) and [0, x1)
+  int tile_x0, tile_x1, tile_y0, tile_y1; // tiles of the box; if x0 > x1 it wraps: [x0, tiles_x) and [0, x1)
   int box;                                // number of tiles
 } Ellipse;
 
@@ -63,7 +64,7 @@ static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, in
 #else
 typedef struct {
   float mx, my, l11, l12, l22, half_w, half_h;
-  float budget;                           // u^2 + v^2 at its edge
+  float budget;                           // u^2 + v^2 at the ellipse's edge
   float tangent;                          // dy from the mean to the rightmost point
   int tile_x0, tile_x1, tile_y0, tile_y1; // tiles that its box reaches
   int box;                                // number of tiles

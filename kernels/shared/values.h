@@ -16,7 +16,7 @@
 #define FOR_VALUES(k) UNROLL for (int k = 0; k < VALUES; ++k)
 
 // Cells of the i-th pair with a pixel that takes it, or may take it.
-#ifdef RECORD_CELLS // by blend
+#ifdef RECORD_CELLS // blend has recorded them
 #define CELLS_OF_PAIR(i, splat) cells_from_sorted[i]
 #else
 #define CELLS_OF_PAIR(i, splat) reach_of(splat, tile_x, tile_y)

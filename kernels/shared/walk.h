@@ -7,7 +7,7 @@
 #if ITEMS < 16 || ITEMS > 128
 #error "a chunk is a row of a tile, or a part of one of two pixels or more"
 #endif
-#define CHUNK (TILE * TILE / ITEMS) // in pixels
+#define CHUNK (TILE * TILE / ITEMS) // pixels of a chunk
 #define ROW_CHUNKS (TILE / CHUNK)
 #define CHUNK_BLOCK(chunk) ((chunk) / ROW_CHUNKS / BLOCK_H * BLOCK_COLUMNS + (chunk) % ROW_CHUNKS * CHUNK / BLOCK_W)
 

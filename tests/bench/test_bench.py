@@ -59,7 +59,12 @@ def profiled(default_device: Device) -> Device:
 def counted(pipeline: Pipeline) -> tuple[int, int]:
     frame, rasterizer = pipeline.frame, pipeline.rasterizer
     return count_pairs(
-        rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, frame.background, pipeline.camera
+        rasterizer.device,
+        rasterizer.work,
+        frame.listed.lists,
+        frame.projected.splats,
+        frame.background,
+        pipeline.camera,
     )
 
 
@@ -106,7 +111,7 @@ def brute_force_evaluated(pipeline: Pipeline, lanes: int, items: int, reached: C
     """Lanes of the cells that each Gaussian reaches, up to where the last of the cell's pixels has ended, or, where a
     work-item has no bits for its cells, of the item's pixels. A group's cells are reached by blocks of 8x4."""
     frame = pipeline.frame
-    ranges, listed = frame.part.lists.ranges.get().astype(int), frame.part.lists.gaussian_from_sorted.get()
+    ranges, listed = frame.listed.lists.ranges.get().astype(int), frame.listed.lists.gaussian_from_sorted.get()
     splats, stops = frame.projected.splats.get(), frame.blended.stops.get()
     tiles_x = -(-pipeline.camera.width // TILE)
     cells = TILE * TILE // lanes

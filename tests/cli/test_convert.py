@@ -286,11 +286,11 @@ def test_a_model_is_changed_in_place_only_if_asked(model: Path, capsys: Capture)
     for target in (model, model.parent / "." / "x" / ".." / model.name):
         (model.parent / "x").mkdir(exist_ok=True)
         assert convert(model, target, "--prune-opacity", "0.5") == 2
-        assert "is what is read, and would be replaced by what is made of it" in capsys.readouterr().err
+        assert "is read, and would be replaced by the result" in capsys.readouterr().err
     other = model.with_name("b.ply")
     random_gaussians(3).save(other)
     assert convert(model, other, "--merge", other) == 2
-    assert "b.ply: is what is read" in capsys.readouterr().err
+    assert "b.ply: is read" in capsys.readouterr().err
     assert model.read_bytes() == before
     assert convert(model, model, "--prune-opacity", "0.5", "--overwrite") == 0
     assert 0 < len(Gaussians.load(model)) < 300
@@ -493,7 +493,7 @@ def test_models_that_do_not_go_together(model: Path, tmp_path: Path, capsys: Cap
     placed.save(near)
     assert convert(model, tmp_path / "a.ply", "--merge", light) == 0
     assert (
-        f"warning: --merge {light}: its colours are {colour.LINEAR}, but those of {model} are sRGB"
+        f"warning: --merge {light}: its colours are {colour.LINEAR}, and are taken for sRGB, the colours of {model}"
         in capsys.readouterr().err
     )
     assert convert(model, tmp_path / "b.ply", "--merge", far) == 0

@@ -176,7 +176,7 @@ def test_a_scene_of_one_point(tmp_path: Path, capfd: Capture) -> None:
     assert train(scene, tmp_path / "run", short(iterations=2, warmup=())) == 0
     warned = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
     assert warned == [
-        f"clsplat: warning: {scene}: has a single point, training starts from one Gaussian of next to no size"
+        f"clsplat: warning: {scene}: has a single point, training starts from one Gaussian of almost no size"
     ]
 
 

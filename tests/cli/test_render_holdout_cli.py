@@ -178,7 +178,7 @@ def test_cg_that_ends_with_the_frame_is_told_with_overscan(folder: Path, tmp_pat
 
 
 def test_a_bent_picture_is_held_out_straight(folder: Path, tmp_path: Path, capsys: Capture) -> None:
-    """A map that shifts by whole pixels shows the pixels of the straight picture that is held out; the hold-out is of
+    """A map that shifts by whole pixels shows the pixels of the straight picture that is held out; the holdout is of
     the straight frame."""
     places = np.stack(np.meshgrid(np.arange(WIDTH) + 5.5, np.arange(HEIGHT) - 2.5), axis=2)
     write_stmap(tmp_path / "shift.exr", places, WIDTH, HEIGHT)
@@ -238,13 +238,13 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
     write_flat(tmp_path / "nan.exr", {"Z": np.full((HEIGHT, WIDTH), np.nan)})
     held = f"--holdout {folder}/z.####.exr"
     cases = [
-        (f"--holdout {folder}/none.####.exr", "none.0001.exr: no such hold-out, expected a depth or deep EXR"),
+        (f"--holdout {folder}/none.####.exr", "none.0001.exr: no such holdout, expected a depth or deep EXR"),
         (f"{held} --width 20", f"z.0001.exr: is of a frame of {WIDTH}x{HEIGHT}, expected 20x"),
         (f"{held} --holdout.channel depth.Z", "has no channel depth.Z, but Z; name its depths with --holdout.channel"),
         ("--holdout.channel Z", "--holdout.channel Z: is for holdouts, expected --holdout with it"),
         (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
         ("--holdout.depths ray", "--holdout.depths ray: is for holdouts, expected --holdout with it"),
-        (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such hold-out"),
+        (f"--holdout {folder}/z.$X.exr --frames 1", "z.$X.exr: no such holdout"),
         (f"--holdout {folder}/z.{{shot}}.exr", "{shot} is not known, expected {name}"),
         (f"--holdout {tmp_path}/nan.exr", "values of Z are not a number, expected depths and alpha of surfaces"),
     ]

@@ -86,7 +86,7 @@ def coverage(pixels: Float32, name: str) -> Float64:
 def by_hand(
     model: Gaussians, owners: np.ndarray, count: int, camera: Camera, surfaces: Sequence[Surface] = ()
 ) -> Float64:
-    """(H, W, count): the sums of the weights, in float64; surfaces: of a hold-out."""
+    """(H, W, count): the sums of the weights, in float64; surfaces: of a holdout."""
     shares, projected = np.zeros((HEIGHT, WIDTH, count)), forward(model, camera).projected
     for layer in layers(projected, WIDTH, HEIGHT):
         weight = np.where(layer.added, layer.before * layer.alpha, 0.0)

@@ -202,7 +202,7 @@ OPEN = "--shutter-open 0 --shutter-close 0.5 --samples 2"
 
 @pytest.mark.parametrize(("shutter", "wall"), [("", np.inf), (OPEN, np.inf), (OPEN, 4.0)])
 def test_motion_is_the_models_too(shutter: str, wall: float, folder: Path, tmp_path: Path) -> None:
-    """wall: depth of a hold-out, behind which nothing is seen."""
+    """wall: depth of a holdout, behind which nothing is seen."""
     shot = layout(folder, "moving", **MOVING)
     held = write_flat(tmp_path / "wall.exr", {"Z": np.full((HEIGHT, WIDTH), wall)})
     assert render(folder, shot, tmp_path, f"--frames 2 --channels motion,alpha {shutter} --holdout {held}") == 0

@@ -10,7 +10,7 @@ from tiny import CONFIG, write_scene
 from clsplat.api import train
 from clsplat.device.context import Device, open_device
 from clsplat.device.drivers import driver_records
-from clsplat.device.drivers.capabilities import PRETEND_VARIABLE, traits_of
+from clsplat.device.drivers.capabilities import PRETEND_VARIABLE, capabilities_of
 from clsplat.errors import DeviceError
 from clsplat.gaussians import Gaussians
 from clsplat.scenes.loading import load_scene
@@ -20,7 +20,7 @@ from clsplat.training.trainer import Trainer
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("traits") / "scene"))
+    return load_scene(write_scene(tmp_path_factory.mktemp("capabilities") / "scene"))
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +64,11 @@ def test_the_same_model(
 ) -> None:
     """A multiply-add by the built-in function, division as the driver likes it, where these drivers divide exactly
     anyway; buffers that do not hold a frame's pairs; launches in groups that the driver chooses."""
-    usual, traits = opened(monkeypatch, device, ""), traits_of(device.cl_device)
+    usual, capabilities = opened(monkeypatch, device, ""), capabilities_of(device.cl_device)
     other = opened(monkeypatch, device, pretended)
-    assert traits_of(device.cl_device) != traits or (pretended == "no-exact-division" and not traits.exact_division)
+    assert capabilities_of(device.cl_device) != capabilities or (
+        pretended == "no-exact-division" and not capabilities.exact_division
+    )
     if "division" in pretended:
         assert "correctly-rounded" not in other._options
     if device.index not in usual_models:
@@ -95,7 +97,7 @@ def test_what_is_learnt_of_a_pretended_device_is_kept_apart(
 def test_a_variable_that_makes_no_sense(default_device: Device, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PRETEND_VARIABLE, text)
     with pytest.raises(DeviceError, match=rf"{PRETEND_VARIABLE}=.* is none of gpu, .*, group=NUMBER, "):
-        traits_of(default_device.cl_device)
+        capabilities_of(default_device.cl_device)
 
 
 def test_trainers_take_it(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches that are put on the queue a second time from a tape, and when they are not."""
+"""Launches that are put on the queue a second time from a command buffer, and when they are not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from clsplat.device import command_buffer as tapes
+from clsplat.device import command_buffer
 from clsplat.device.buffers import Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups, only_tried
@@ -84,7 +84,7 @@ def test_arguments_are_those_of_the_tape(made: Work, words: Kernel) -> None:
 
 
 def test_numbers_that_are_given_anew(made: Work) -> None:
-    """In order, and the tape's others are those that were recorded."""
+    """In order, and the command buffer's others are those that were recorded."""
     for number in (0.1, -0.1, 1e-45):
         values = [number, 2 * number]
 
@@ -94,7 +94,15 @@ def test_numbers_that_are_given_anew(made: Work) -> None:
             for out, value in zip((first, second), values, strict=True):
                 out.fill(1)
                 launch_groups(
-                    made.device, made.kernel, 1, 1, 1, -7, tapes.LaunchParameter(value), out, cl.LocalMemory(4)
+                    made.device,
+                    made.kernel,
+                    1,
+                    1,
+                    1,
+                    -7,
+                    command_buffer.LaunchParameter(value),
+                    out,
+                    cl.LocalMemory(4),
                 )
             one, other = first.begin_get(), second.begin_get()
             return lambda: np.stack([one(), other()])
@@ -109,7 +117,7 @@ def test_a_tape_goes_with_a_buffer(made: Work) -> None:
     made.replayed()
     used = made.device.memory.used
     made.work.array("out", (300,), np.uint32)
-    assert made.device.memory.used >= used + 4 * 297  # and no more than that: the tape keeps none alive
+    assert made.device.memory.used >= used + 4 * 297  # and no more than that: the command buffer keeps none alive
     assert made.device.memory.used <= used + 4 * 600
     assert [made.replayed(), made.replayed(), made.made] == [EXPECTED, EXPECTED, 2]
     made.work.clear()
@@ -180,8 +188,8 @@ def test_a_launch_that_fails_is_named(made: Work, monkeypatch: pytest.MonkeyPatc
     def fails(*_: object) -> None:
         raise cl.RuntimeError("OUT_OF_RESOURCES")
 
-    monkeypatch.setattr(tapes.cl, "enqueue_nd_range_kernel", fails)
+    monkeypatch.setattr(command_buffer.cl, "enqueue_nd_range_kernel", fails)
     assert made.replayed("another key") == EXPECTED  # kernels are called there
     with pytest.raises(DriverError, match=r"words\.cl, words, cannot be launched: .*OUT_OF_RESOURCES"):
         made.replayed("another key")
-    assert not made.device.tapes
+    assert not made.device.command_buffers

@@ -25,7 +25,7 @@ from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records, shapes, worker_process
 from clsplat.device.program import Kernels, Variant, build
 from clsplat.errors import DeviceError, DriverError
-from clsplat.files.locks import locked
+from clsplat.files.locks import briefly_locked
 from clsplat.selftest import driver_check
 from clsplat.selftest.driver_check import DriverReport
 from clsplat.selftest.result import SELFTEST_STAGES
@@ -63,11 +63,11 @@ def test_a_lock_is_waited_for_and_not_for_ever(tmp_path: Path) -> None:
     order = []
 
     def later() -> None:
-        with locked(path):
+        with briefly_locked(path):
             order.append("second")
 
     other = threading.Thread(target=later)
-    with locked(path):
+    with briefly_locked(path):
         other.start()
         time.sleep(0.1)
         order.append("first")
@@ -76,11 +76,11 @@ def test_a_lock_is_waited_for_and_not_for_ever(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     (tmp_path / "words.json.lock").write_bytes(b"of one that was killed")
     os.utime(tmp_path / "words.json.lock", (0, 0))
-    with locked(path):
+    with briefly_locked(path):
         assert (tmp_path / "words.json.lock").read_bytes() != b"of one that was killed"
-    with locked(path):  # held for longer than anybody waits
+    with briefly_locked(path):  # held for longer than anybody waits
         begun = time.monotonic()
-        with locked(path, seconds=0.2):
+        with briefly_locked(path, seconds=0.2):
             assert time.monotonic() - begun < 10
 
 
@@ -148,7 +148,7 @@ def test_a_failure_is_forgotten_when_what_failed_works(
     assert "probe.cl" in failed
     monkeypatch.setattr(driver_check, "examine", lambda *_: DriverReport())
     assert main(["selftest", "--device", str(index)]) == 0
-    assert f"The shape is not used all the same: {failed}; tried once more: " in capsys.readouterr().out
+    assert f"The shape is still not used: {failed}; tried once more: " in capsys.readouterr().out
     assert driver_records.entries(device)[label].failed == failed
     standing("abort", ALWAYS)
     assert main(["selftest", "--device", str(index), "--json"]) == 0
@@ -272,7 +272,7 @@ def test_what_a_driver_compiles_anew_is_tried_anew(default_device: Device, monke
     variant = Variant("fill", TEXT, ("-cl-std=CL1.2",))
     kernel = Kernels(variant, build(device.context, device.cl_device, variant)[0]).fill
     tried: list[str] = []
-    monkeypatch.setattr(device.rehearsal, "launch", lambda *given: tried.append(given[-1]))
+    monkeypatch.setattr(device.trials, "launch", lambda *given: tried.append(given[-1]))
     monkeypatch.setattr(device, "compiles_by_size", True)
     out = allocate(device, (1 << 17,), np.uint32)
     for groups, items in ((1, 64), (2, 64), (2, 32), (1 << 10, 64), (1 << 11, 32), (3, 16)):

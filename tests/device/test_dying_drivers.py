@@ -24,7 +24,7 @@ from clsplat.device import context, sandbox
 from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.shapes import shapes_in_turn
-from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, Child
+from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, WorkerProcess
 from clsplat.device.program import build, variant_of
 from clsplat.errors import DriverError
 from clsplat.selftest import driver_check
@@ -135,7 +135,7 @@ def test_modules_of_the_folder_that_we_are_in_are_not_taken(
 def test_a_child_ends_with_its_parent_and_is_heard_whatever_else_is_said(tmp_path: Path) -> None:
     code = "import sys, time; from clsplat.device.drivers.worker_process import *; end_with_parent(); "
     code += "sys.stdout.write('half a line'); tell(said=1); time.sleep(600)"
-    child = Child([sys.executable, "-c", code])
+    child = WorkerProcess([sys.executable, "-c", code])
     assert child.receive(60) == {"said": 1}
     assert child._process.stdin is not None
     child._process.stdin.close()  # as the system does for a parent that is killed

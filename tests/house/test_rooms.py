@@ -58,7 +58,7 @@ def test_every_contract_is_kept() -> None:
             "from clsplat.models import edit",
             "clsplat.images is not allowed to import clsplat.models",
         ),
-        ("report/svg.py", "import clsplat.viewer.pose", "clsplat.report is not allowed to import clsplat.viewer"),
+        ("report/charts.py", "import clsplat.viewer.pose", "clsplat.report is not allowed to import clsplat.viewer"),
         (
             "stages/scan.py",
             "from clsplat.reference import sort",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hold-outs read from depth EXR and deep EXR, and what is wrong with files that are none."""
+"""Holdouts read from depth EXR and deep EXR, and what is wrong with files that are none."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_taken_and_scaled() -> None:
 def test_what_is_wrong(tmp_path: Path) -> None:
     nan, negative = (np.where(DEPTH == 3, value, DEPTH) for value in (np.nan, -3.0))
     cases = [
-        (tmp_path / "none.exr", "none.exr: no such hold-out, expected a depth or deep EXR for each frame"),
+        (tmp_path / "none.exr", "none.exr: no such holdout, expected a depth or deep EXR for each frame"),
         (write_flat(tmp_path / "s.exr", {"Z": np.ones((4, 4))}), "s.exr: is of a frame of 4x4, expected 3x2"),
         (
             write_flat(tmp_path / "c.exr", {"Y": DEPTH}),

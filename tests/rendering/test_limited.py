@@ -180,7 +180,7 @@ def test_absolute_gradients_in_less_memory(scene: Scene, default_device: Device)
 def test_a_small_training_that_fits_is_not_cut(scene: Scene, default_device: Device) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
     assert not trainer.plan.streamed
-    assert (trainer.plan.groups, trainer.plan.gathers) == (1, True)
+    assert (trainer.plan.bands, trainer.plan.gathers) == (1, True)
 
 
 def test_no_buffer_is_over_the_devices_limit_of_one(
@@ -217,7 +217,7 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
     rates = dict.fromkeys(PARAMETER_GROUPS, 1e-3)
     project_step(device, AdamStep(OptimiserConfig(), 1, rates), (model, first, second), *view)
     assert len(frame.bands) == 1 if capacity is None else len(frame.bands) > 2
-    pairs = frame.part.pairs.tile_keys.shape[0] if capacity is None else capacity
+    pairs = frame.listed.pairs.tile_keys.shape[0] if capacity is None else capacity
     rows = need.row + need.model + (need.banded if capacity else 0)
     estimate = need.planes + need.scratch + need.gaussians * rows + pairs * need.pair
     assert 0.8 * estimate < device.memory.peak <= estimate
@@ -249,7 +249,7 @@ def test_the_needs_of_a_frame_are_those_of_its_arrays(default_device: Device) ->
     rasterizer = Rasterizer(device)
     background = upload(device, np.zeros(3, np.float32))
     frame = rasterizer.forward(upload_gaussians(device, gaussians), camera, background, backward=False)
-    estimate = need.total + (frame.part.pairs.tile_keys.shape[0] - need.pairs) * need.pair
+    estimate = need.total + (frame.listed.pairs.tile_keys.shape[0] - need.pairs) * need.pair
     assert 0.8 * estimate < device.memory.peak <= estimate
 
 
@@ -265,9 +265,9 @@ def planned(mebibytes: float, need: Need = STEP, largest: int = 2**31) -> str:
 
 def test_the_plan_in_words() -> None:
     assert planned(1000) == "about 211.6 MiB of device memory needed, 1,000.0 MiB allowed: all at once"
-    assert planned(190).endswith("190.0 MiB allowed: the image is done in about 2 groups of tiles")
+    assert planned(190).endswith("190.0 MiB allowed: the image is done in about 2 bands of tiles")
     assert "allowed: parameters are streamed, 20,128 Gaussians at a time, the image" in planned(140)
-    with pytest.raises(CapacityError, match=r"need at least about 68.3 MiB of device memory, 211.6 MiB to be done"):
+    with pytest.raises(CapacityError, match=r"need at least about 68.3 MiB of device memory, or 211.6 MiB to be done"):
         planned(65)
     small = Need(gaussians=40, **ROW, planes=50_000, scratch=1024)
     with pytest.raises(CapacityError, match=r"about [0-9]+ KiB .* [0-9]+ KiB to be done at once, and 4,000 bytes are"):

@@ -160,7 +160,7 @@ def test_culling_that_is_off_on_every_device(device: Device) -> None:
 def check_culling(device: Device, name: str, config: RasterizerConfig) -> None:
     default, got = (run(device, name, replace(config.switches(), frustum_cull=on)) for on in (True, False))
     assert_same_bits(got.frame.blended.image.get(), default.frame.blended.image.get())
-    projected, counted = got.frame.projected, got.frame.part.counted
+    projected, counted = got.frame.projected, got.frame.listed.counted
     np.testing.assert_array_equal(projected.tile_counts.get(), default.frame.projected.tile_counts.get())
     assert projected.shown is not None
     shown = projected.shown.get() > 0
@@ -171,7 +171,7 @@ def check_culling(device: Device, name: str, config: RasterizerConfig) -> None:
     faint = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64))) <= config.alpha_min
     np.testing.assert_array_equal(shown, default.visible | ((depths > camera.near) & ~faint))
     assert np.isfinite(got.splat("RED", "GREEN", "BLUE")[shown]).all()
-    assert counted.visible > default.frame.part.counted.visible
+    assert counted.visible > default.frame.listed.counted.visible
 
 
 def test_culling_that_is_off_in_bands(default_device: Device) -> None:
@@ -198,7 +198,7 @@ def test_exact_switches_in_every_shape(default_device: Device, shape: tuple[int,
 def test_switches_that_are_off_do_more_work(default_device: Device) -> None:
     device = shaped(default_device, 8, 1)
     pairs = {
-        name: run(device, "cloud", config).frame.part.lists.gaussian_from_sorted.shape[0]
+        name: run(device, "cloud", config).frame.listed.lists.gaussian_from_sorted.shape[0]
         for name, config in {"default": RasterizerConfig(), **EXACT_OFF}.items()
     }
     assert pairs["constant extent"] > pairs["default"]

@@ -134,7 +134,7 @@ def test_text_that_was_edited_beside_a_binary_file_is_told(tmp_path: Path) -> No
     for stem in ("images", "points3D"):
         os.utime(folder / f"{stem}.txt", (2000, 2000))
     read, newer = "images.bin, points3D.bin", "images.txt, points3D.txt"
-    told = f"{folder}: {read} is read and not the newer {newer}; remove what is not meant"
+    told = f"{folder}: {read} is read and not the newer {newer}; remove the one that is not meant"
     assert warnings_of(lambda: read_model(folder)) == [told]
 
 

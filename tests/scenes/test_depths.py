@@ -204,7 +204,7 @@ def test_a_scene_of_nerfstudio_names_its_maps(tmp_path: Path) -> None:
     scene = with_depths(load_scene(path), MAPS)
     nearness, weights = planes(scene, 1)
     np.testing.assert_allclose(nearness[weights > 0], 1 / depth_of(1)[depth_of(1) > 0], rtol=2e-4)
-    with pytest.raises(InputError, match="wants to know which photographs show a point, expected a COLMAP model"):
+    with pytest.raises(InputError, match="needs to know which photographs show a point, expected a COLMAP model"):
         with_depths(replace(load_scene(path), source=tmp_path), POINTS)
 
 
@@ -231,7 +231,7 @@ def test_what_is_refused(folder: Path) -> None:
     with pytest.raises(InputError, match=r"03\.png"):
         with_depths(scene, MAPS)
     (maps / "03.png").unlink()
-    with pytest.warns(UserWarning, match=r"of 1 photograph\(s\) no depths are known \(03\.png\)"):
+    with pytest.warns(UserWarning, match=r"no depths are known for 1 photograph\(s\) \(03\.png\)"):
         assert with_depths(scene, MAPS).views[3].depth is None
     with pytest.raises(InputError, match="--depth-maps relative"):
         with_depths(scene, RELATIVE)
@@ -243,7 +243,7 @@ def test_maps_in_which_nothing_is_known(folder: Path) -> None:
     add_maps(folder)
     for name, level in (("03", 0), ("04", 65535)):
         write_levels(folder / "depths" / f"{name}.png", np.full((HEIGHT, WIDTH), level, np.uint16))
-    with pytest.warns(UserWarning, match=r"of 2 photograph\(s\) no depths are known \(03\.png, 04\.png\)"):
+    with pytest.warns(UserWarning, match=r"no depths are known for 2 photograph\(s\) \(03\.png, 04\.png\)"):
         with_depths(load_scene(folder), MAPS)
 
 

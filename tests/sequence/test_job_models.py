@@ -177,7 +177,7 @@ def test_the_header_has_the_near_plane_of_the_middle(places: tuple[float, ...], 
 
 
 def test_holdouts_of_a_model_along_rays_with_an_open_shutter(tmp_path: Path) -> None:
-    """Depths of the hold-out become the distances that such a model has, at each sample as in a picture without."""
+    """Depths of the holdout become the distances that such a model has, at each sample as in a picture without."""
     replace(hidden_model(), by_rays=True).save(tmp_path / "model.ply")
     shot, held = cameras(tmp_path, 0, 0), write_flat(tmp_path / "z.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})
     found = []

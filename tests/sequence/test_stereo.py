@@ -276,7 +276,7 @@ def test_each_eye_has_a_holdout(shot: list[str], tmp_path: Path, capsys: Capture
         flags = f"--stereo 0.1 --frames 1 --alpha --holdout {folder}/z.{{eye}}.exr"
         write_flat(folder / "z.left.exr", {"Z": whole})
         assert render(shot, folder / names, flags) == 2
-        assert f"{folder}/z.right.exr: no such hold-out" in error_line(capsys)
+        assert f"{folder}/z.right.exr: no such holdout" in error_line(capsys)
         write_flat(folder / "z.right.exr", {"Z": whole[:, 1:]})
         assert render(shot, folder / names, flags) == 2
         assert "z.right.exr: is of a frame of 95x64, expected 96x64" in error_line(capsys)
@@ -300,7 +300,7 @@ def test_a_map_is_looked_at_for_both_eyes(tmp_path: Path) -> None:
 
 
 def test_a_pair_in_strips_is_no_file_of_one_eye(tmp_path: Path) -> None:
-    """A deep hold-out of many surfaces asks for strips where one of a few does not, which the check goes by."""
+    """A deep holdout of many surfaces asks for strips where one of a few does not, which the check goes by."""
 
     class InStrips(FrameRenderer):
         def _rows(self, camera: Camera, planes: int) -> int:

@@ -22,7 +22,7 @@ from clsplat.stages.duplicate import Band
 
 
 def most_in_a_tile(run: Pipeline) -> int:
-    ranges = run.frame.part.lists.ranges.get().astype(int)
+    ranges = run.frame.listed.lists.ranges.get().astype(int)
     return int((ranges[:, 1] - ranges[:, 0]).max())
 
 
@@ -44,9 +44,9 @@ def check(
     absolute: bool = False,
 ) -> None:
     whole = Pipeline.run(device, NAMED[name](), config=config)
-    total = whole.frame.part.pairs.tile_keys.shape[0]
+    total = whole.frame.listed.pairs.tile_keys.shape[0]
     banded = in_bands(device, name, capacity or most_in_a_tile(whole), config)
-    assert whole.frame.bands == (Band(0, len(whole.frame.part.lists.ranges.get())),)
+    assert whole.frame.bands == (Band(0, len(whole.frame.listed.lists.ranges.get())),)
     assert len(banded.frame.bands) >= (2 if most_in_a_tile(whole) < total else 1)
     assert_same_bits(banded.frame.blended.image.get(), whole.frame.blended.image.get())
     assert_same_bits(banded.frame.blended.transmittance.get(), whole.frame.blended.transmittance.get())
@@ -69,7 +69,7 @@ def test_bands_change_no_bit(default_device: Device, name: str) -> None:
 @pytest.mark.parametrize("name", quick(SHAPE_MATTERS, "overlap"))
 def test_in_every_shape(shaped_device: Device, name: str) -> None:
     whole = Pipeline.run(shaped_device, NAMED[name]())
-    check(shaped_device, name, capacity=max(most_in_a_tile(whole), whole.frame.part.pairs.tile_keys.shape[0] // 3))
+    check(shaped_device, name, capacity=max(most_in_a_tile(whole), whole.frame.listed.pairs.tile_keys.shape[0] // 3))
 
 
 @pytest.mark.parametrize("name", ["random_cloud", "overlap", "many_per_tile"])
@@ -84,7 +84,7 @@ def test_absolute_gradients(default_device: Device) -> None:
 
 def test_bands_begin_and_end_within_a_row_of_tiles(default_device: Device) -> None:
     whole = Pipeline.run(default_device, random_cloud(300, 11, 70, 50))
-    ranges = whole.frame.part.lists.ranges.get().astype(int)
+    ranges = whole.frame.listed.lists.ranges.get().astype(int)
     counts, tiles_x = ranges[:, 1] - ranges[:, 0], 5
     capacity = int(counts.max())
     bands = in_bands(default_device, "random_cloud", capacity).frame.bands
@@ -106,7 +106,7 @@ def test_a_pixel_that_the_first_gaussian_of_a_band_ends(default_device: Device) 
 
 
 def test_one_tile_too_full_says_so(default_device: Device) -> None:
-    with pytest.raises(CapacityError, match=r"one tile of 16x16 pixels has \d+ Gaussians, .* is enough for 3 "):
+    with pytest.raises(CapacityError, match=r"one tile of 16x16 pixels has \d+ Gaussians, .* enough is left for 3: "):
         in_bands(default_device, "many_per_tile", 3)
 
 
@@ -115,7 +115,7 @@ def test_counted_pairs_are_those_of_one_band(default_device: Device) -> None:
         work, splats = run.rasterizer.work, run.frame.projected.splats
         found = [
             count_pairs(default_device, work, part.lists, splats, run.frame.background, run.camera)
-            for part in (run.rasterizer.part(run.frame, band) for band in run.frame.bands)
+            for part in (run.rasterizer.listed(run.frame, band) for band in run.frame.bands)
         ]
         return [sum(column) for column in zip(*found, strict=True)]
 

@@ -122,7 +122,7 @@ def test_the_gradient_by_gaussian(device: Device, count: int) -> None:
     fields = SlotFields(absolute=True, contributions=True)
     runs = [Pipeline.run(shaped(device, *shape), scene) for shape in ((1, 1), (1, 32, True), (1, 64, True))]
     (wanted, wanted_screen), *others = (run.screened(d_image, fields) for run in runs)
-    assert runs[0].frame.part.lists.gaussian_from_sorted.shape == (count,)
+    assert runs[0].frame.listed.lists.gaussian_from_sorted.shape == (count,)
     for got, screen in others:
         pairs = [(getattr(got, name), getattr(wanted, name)) for name in PARAMETERS]
         pairs.append((screen.gradients.get(), wanted_screen.gradients.get()))
@@ -148,7 +148,7 @@ def test_sums_by_sub_groups_have_the_bits_of_rows(device: Device, items: int, fi
         opened = rows.with_switches(switches)
         frame = (run := Pipeline.run(opened, scene)).frame
         values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
-        of = (opened, run.rasterizer.work, frame.part.lists, frame.inputs, frame.blended)
+        of = (opened, run.rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
         slots[str(switches)] = blend_grad(*of, upload(opened, values), fields=fields).get()
     wanted, *others = slots.values()
     assert wanted.any() and len(others) >= 4
@@ -166,7 +166,7 @@ def test_the_gradient_by_gaussian_has_its_bits_with_every_switch(device: Device,
         opened = by_gaussian.with_switches(kernel_defines(config))
         frame = (run := Pipeline.run(opened, scene)).frame
         values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
-        of = (opened, run.rasterizer.work, frame.part.lists, frame.inputs, frame.blended)
+        of = (opened, run.rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
         slots.append(blend_grad(*of, upload(opened, values)).get() + np.float32(0))
     assert_same_bits(slots[0], slots[1])
     assert slots[0].any()
@@ -252,11 +252,11 @@ def check_record(device: Device, name: str) -> None:
     assert blended.cells_from_sorted is not None
     values = np.random.default_rng(0).standard_normal(blended.image.shape).astype(np.float32)
     gradient = upload(rasterizer.device, values)
-    of = (rasterizer.device, rasterizer.work, frame.part.lists, frame.inputs)
+    of = (rasterizer.device, rasterizer.work, frame.listed.lists, frame.inputs)
     recorded = blend_grad(*of, blended, gradient).get()
     assert_same_bits(recorded, blend_grad(*of, replace(blended, cells_from_sorted=None), gradient).get())
     empty = blended.cells_from_sorted.get() == 0
-    assert not recorded[frame.part.lists.slot_from_sorted.get()[empty]].any()
+    assert not recorded[frame.listed.lists.slot_from_sorted.get()[empty]].any()
     assert recorded.any()
 
 
@@ -278,7 +278,7 @@ def check_skip(device: Device, name: str) -> None:
     values[:, :, : values.shape[2] // 2] = 0.0
     values[:, 5] = 0.0
     device_of = run.rasterizer.device
-    of = (device_of, run.rasterizer.work, frame.part.lists, frame.inputs, frame.blended)
+    of = (device_of, run.rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
     slots = [
         blend_grad(*of, upload(device_of, values), fields=fields).get()[:, :SLOT_PLAIN] + np.float32(0)
         for fields in (SlotFields(), SlotFields(contributions=True))
@@ -293,7 +293,7 @@ def test_gradients_in_padding_are_not_looked_at(shaped_device: Device, rubbish: 
     run = Pipeline.run(shaped_device, scenes.random_cloud(200, 3, 33, 19))
     frame, rasterizer = run.frame, run.rasterizer
     values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
-    of = (rasterizer.device, rasterizer.work, frame.part.lists, frame.inputs, frame.blended)
+    of = (rasterizer.device, rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
     slots = []
     for padding in (0.0, rubbish):
         values[:, 19:], values[:, :, 33:] = padding, padding

@@ -83,8 +83,8 @@ def by_capacity(
 ) -> tuple[ForwardPass, dict[str, int]]:
     """A frame with room for so many pairs, and what its copy of the counts has."""
     frame = rasterizer.forward(held, exact.camera, exact.background, room=PairCapacity(pairs, 1))
-    assert frame.part.counted.arriving is not None
-    arrived = frame.part.counted.arriving()
+    assert frame.listed.counted.arriving is not None
+    arrived = frame.listed.counted.arriving()
     return frame, {name: int(arrived[READBACK.index(name)]) for name in NAMES}
 
 
@@ -95,13 +95,13 @@ def test_a_pass_with_room_is_the_exact_one(shaped_device: Device, name: str, spa
     _, _, exact = drawn(shaped_device, name)
     rasterizer, held, _ = drawn(shaped_device, "few")  # a workspace with something else in it
     held = upload_gaussians(shaped_device, scene(name)[0])
-    count = exact.part.counted.pairs
+    count = exact.listed.counted.pairs
     assert (count == 0) == (name == "hidden")
     frame, counts = by_capacity(rasterizer, held, exact, max(count + spare, 1))
-    assert (counts["VISIBLE"], counts["PAIRS"], counts["STOPPED"]) == (exact.part.counted.visible, count, 0)
+    assert (counts["VISIBLE"], counts["PAIRS"], counts["STOPPED"]) == (exact.listed.counted.visible, count, 0)
     assert_same_bits(frame.blended.image.get(), exact.blended.image.get())
-    assert_same_bits(frame.part.lists.ranges.get(), exact.part.lists.ranges.get())
-    assert_same_bits(frame.part.lists.slot_from_sorted.get()[:count], exact.part.lists.slot_from_sorted.get())
+    assert_same_bits(frame.listed.lists.ranges.get(), exact.listed.lists.ranges.get())
+    assert_same_bits(frame.listed.lists.slot_from_sorted.get()[:count], exact.listed.lists.slot_from_sorted.get())
     gradient = upload(shaped_device, np.random.default_rng(1).normal(size=frame.blended.image.shape).astype(np.float32))
     slots = rasterizer.pair_gradients(frame, gradient).values.get()[:count]
     assert_same_bits(slots, Rasterizer(shaped_device).pair_gradients(exact, gradient).values.get())
@@ -111,13 +111,13 @@ def test_a_pass_with_room_is_the_exact_one(shaped_device: Device, name: str, spa
 @pytest.mark.parametrize("cause", ["one pair too many", "a refused element", "an earlier stop"])
 def test_a_pass_that_stops_changes_nothing(shaped_device: Device, cause: str) -> None:
     rasterizer, held, exact = drawn(shaped_device, "cloud")
-    count, flags = exact.part.counted.pairs, np.zeros(len(READBACK), np.uint32)
+    count, flags = exact.listed.counted.pairs, np.zeros(len(READBACK), np.uint32)
     if cause != "one pair too many":
         flags[READBACK.index("STOPPED" if cause == "an earlier stop" else "REFUSED_MOMENTS")] = 1
         rasterizer.readback.set(flags)
     frame, counts = by_capacity(rasterizer, held, exact, count - (cause == "one pair too many"))
     assert (counts["VISIBLE"], counts["PAIRS"], counts["STOPPED"]) == (0, 0, 1)
-    assert not frame.part.lists.ranges.get().any()
+    assert not frame.listed.lists.ranges.get().any()
     assert not frame.projected.tile_counts.get().any()
     moments = [allocate_gaussians(shaped_device, held.count, held.coefficients, zero=True) for _ in range(2)]
     moments[0]["means"].fill(0.5)  # which alone would move what is not in view
@@ -133,4 +133,4 @@ def test_a_pass_that_stops_changes_nothing(shaped_device: Device, cause: str) ->
         assert_same_bits(one, other)
     assert not any(array.get().any() for array in statistics.named().values())
     exact_again = rasterizer.forward(held, exact.camera, exact.background)
-    assert exact_again.part.counted.pairs == count, "what is exact takes no notice"
+    assert exact_again.listed.counted.pairs == count, "what is exact takes no notice"

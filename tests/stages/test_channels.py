@@ -49,7 +49,7 @@ def run(device: Device, scene: tuple[Gaussians, Camera], wanted: Features = ALL)
     before = upload(device, pack_camera(earlier(camera)))
     motion = Motion(after, before)
     rows = features(device, work, wanted, pipeline.gaussians, frame.camera_array, frame.projected, motion)
-    found = channels(device, work, wanted, rows, frame.part.lists, frame.inputs, frame.blended)
+    found = channels(device, work, wanted, rows, frame.listed.lists, frame.inputs, frame.blended)
     means, whole = pipeline.crop(found.means.get()), pipeline.crop(found.whole.get())
     result = {name: means[:, :, at : at + width] for name, at, width in fields(wanted)}
     result.update(median=means[:, :, -2], first=means[:, :, -1], count=whole[:, :, 0], index=whole[:, :, 1])

@@ -61,7 +61,7 @@ def test_gather_takes_rows_and_zeros(device: Device, count: int, coefficients: i
         np.testing.assert_array_equal(source[name].get(), host[name], err_msg=f"{name} of the source")
 
 
-RULES = MarkRules(gradient=2.0, strongest=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5)
+RULES = MarkRules(gradient=2.0, cut_off=(3.0, 40), large=0.5, transparent=-1.0, oversized=2.0, oversized_half=1.5)
 
 
 @pytest.mark.parametrize("count", SIZES)
@@ -89,7 +89,7 @@ def test_marks_are_the_twins(device: Device, count: int, wide: bool, streamed: b
     model = replace(to_host(source), rows=device.row_alignment) if streamed else source
     marker = DeviceMarker(device, work, model, statistics)
     limits = (MarkRules(), RULES, replace(RULES, radius=4.0, contribution=0.25))
-    for limit in (*limits, replace(limits[2], gradient=0.0, strongest=(-np.inf, 0))):
+    for limit in (*limits, replace(limits[2], gradient=0.0, cut_off=(-np.inf, 0))):
         rules = limit
         if not wide:
             rules = replace(rules, contribution=-np.inf)

@@ -73,7 +73,7 @@ def test_few_tiles_are_listed_in_vain(device: Device, name: str, monkeypatch: py
 def test_lists_are_front_to_back(shaped_device: Device, name: str) -> None:
     run = Pipeline.run(shaped_device, make(name))
     depths = run.splat("DEPTH")[:, 0]
-    lists = run.frame.part.lists
+    lists = run.frame.listed.lists
     gaussians = lists.gaussian_from_sorted.get()
     for begin, end in lists.ranges.get():
         listed = gaussians[begin:end]
@@ -83,7 +83,7 @@ def test_lists_are_front_to_back(shaped_device: Device, name: str) -> None:
 
 def test_equal_depths_go_by_index(device: Device) -> None:
     run = Pipeline.run(device, scenes.equal_depth())
-    pairs = run.frame.part.pairs
+    pairs = run.frame.listed.pairs
     gaussians = pairs.pair_ids.get()[:, 1]
     assert len(np.unique(gaussians)) > 1
     np.testing.assert_array_equal(gaussians, np.sort(gaussians))
@@ -139,7 +139,7 @@ def test_sorting_all_pairs_makes_the_same_lists(shaped_device: Device, key_bits:
     config = BenchSwitches(depth_sort="pairs", key_bits=key_bits)  # type: ignore[arg-type]  # one of them
     got = Pipeline.run(shaped_device, make(name), config=config).frame
     for array in ("ranges", "gaussian_from_sorted", "slot_from_sorted"):
-        arrays = [getattr(frame.part.lists, array).get() for frame in (got, wanted)]
+        arrays = [getattr(frame.listed.lists, array).get() for frame in (got, wanted)]
         np.testing.assert_array_equal(*arrays, array)
 
 

@@ -149,7 +149,7 @@ def test_numbers_of_tiles_that_are_powers_of_two(device: Device, tiles: int) -> 
     run = Pipeline.run(device, scene)
     forward = reference.forward(*scene, BACKGROUND)
     assert_close_images(run.image, forward.blended.image, 1e-5, ignore=forward.blended.margin < 1e-4)
-    assert run.frame.part.lists.ranges.shape[0] == tiles
+    assert run.frame.listed.lists.ranges.shape[0] == tiles
 
 
 @pytest.mark.parametrize("depth", [-1e-3, -1.0, -1e7])

@@ -150,11 +150,11 @@ def test_penalties_are_added_in_view(shaped_device: Device) -> None:
     frame = Rasterizer(shaped_device).forward(held, camera, upload(shaped_device, np.zeros(3, np.float32)))
     visible = frame.projected.tile_counts.get() > 0
     assert 20 < visible.sum() < count - 30
-    assert frame.part.counted.first_slots is not None
-    slots = upload(shaped_device, np.zeros((frame.part.counted.pairs, 9), np.float32))
+    assert frame.listed.counted.first_slots is not None
+    slots = upload(shaped_device, np.zeros((frame.listed.counted.pairs, 9), np.float32))
     gradients = allocate_gaussians(shaped_device, count, held.coefficients, zero=True)
     screen = Screen(upload(shaped_device, np.zeros((count, 2), np.float32)))
-    view = (frame.camera_array, frame.projected, Slots(slots, frame.part.counted.first_slots))
+    view = (frame.camera_array, frame.projected, Slots(slots, frame.listed.counted.first_slots))
     project_grad(shaped_device, held, *view, gradients, screen, explore=explore)
     by_scales, by_logits = penalty_grad(
         explore, gaussians.log_scales.astype(np.float64), gaussians.opacity_logits.astype(np.float64)

@@ -89,10 +89,10 @@ def steps(
     pairs = int(counts.sum())
     rng = np.random.default_rng(count)
     values = rng.normal(0, 1, (pairs, case.fields.floats)).astype(np.float32)
-    assert frame.part.counted.first_slots is not None
+    assert frame.listed.counted.first_slots is not None
     if spoil == "gradient" and pairs:
-        values[frame.part.counted.first_slots.get()[np.argmax(counts)]] = np.nan
-    slots = Slots(upload(device, values), frame.part.counted.first_slots, case.fields)
+        values[frame.listed.counted.first_slots.get()[np.argmax(counts)]] = np.nan
+    slots = Slots(upload(device, values), frame.listed.counted.first_slots, case.fields)
     if case.added_up:
         slots = Slots(add_slots(device, work, frame.projected.tile_counts, slots, None), fields=case.fields)
     results = []

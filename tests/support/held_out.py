@@ -13,4 +13,4 @@ from clsplat.training.trainer import Trainer
 def psnr_of(trainer: Trainer, cameras: Sequence[Camera]) -> float:
     """Mean PSNR of the held-out views through these cameras."""
     look = held_out_looks(trainer.appearance.record())
-    return trainer.judges.psnr(lambda camera: trainer.draw(camera).image, look, cameras)
+    return trainer.validation_views.psnr(lambda camera: trainer.draw(camera).image, look, cameras)

@@ -97,7 +97,7 @@ class Pipeline:
 
     def tiles_of(self) -> list[set[int]]:
         """For each Gaussian the tiles whose lists hold it."""
-        lists = self.frame.part.lists
+        lists = self.frame.listed.lists
         ranges, listed = lists.ranges.get(), lists.gaussian_from_sorted.get()
         found: list[set[int]] = [set() for _ in range(self.gaussians.count)]
         for tile, (begin, end) in enumerate(ranges):

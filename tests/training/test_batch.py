@@ -260,7 +260,7 @@ def test_trouble_on_a_further_device_ends_the_training(
 def test_a_device_that_is_there_twice_is_refused(scene: Scene, default_device: Device) -> None:
     """Two threads would set arguments of the same kernels; a limit makes no other device of it."""
     for twin in (default_device, default_device.with_memory_limit(2**30)):
-        with pytest.raises(InputError, match="one queue and one set of kernels; expected each opened on its own"):
+        with pytest.raises(InputError, match="of which two share a queue and kernels; expected each opened on its own"):
             train(scene, TWO, device=[default_device, twin])
 
 
@@ -280,7 +280,7 @@ def test_a_view_without_a_finite_loss_is_named(scene: Scene, default_device: Dev
         trainer.photographs._on_device.clear()
         trainer.train_step()
         trainer.mend(look=True)
-        (incident,) = trainer.watch.incidents
+        (incident,) = trainer.monitor.incidents
         assert (incident.stage, incident.view) == ("loss", bad)
         assert all(np.isfinite(trainer.parameters[group].get()).all() for group in PARAMETER_GROUPS)
         trainer.close()

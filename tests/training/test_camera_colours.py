@@ -214,7 +214,7 @@ def test_refined_cameras_are_judged_through_the_lens(
     """A render that is right comes to what its photograph shows; without the lens's look it would be far off."""
     trainer = Trainer(scene, replace(OF_CAMERAS, refine_poses=True), default_device)
     vignette = {"vignette": [CORNERS, 0.0, 0.0], "centre": [0.5, 0.5], "log2_gains": [0.0] * 3}
-    cameras = [view.camera for view in trainer.judges.views]
+    cameras = [view.camera for view in trainer.validation_views.views]
     found = {}
     for name, row in (("through", vignette), ("without", {"log2_gains": [0.0] * 3})):
         record = {"held_out": {view.name: row for view in scene.test_views}}
@@ -227,10 +227,10 @@ def test_refined_cameras_are_judged_through_the_lens(
 
 
 def dark(trainer: Trainer) -> Callable[..., np.ndarray]:
-    """Loads what the model shows of a judge's view, dark in the corners."""
+    """Loads what the model shows of a validation view, dark in the corners."""
 
     def load(self: ImageCache, index: int, factor: float) -> np.ndarray:
-        camera = trainer.judges.views[index].camera
+        camera = trainer.validation_views.views[index].camera
         renderer = Renderer(trainer.device, trainer.rasterizer)
         image = renderer.render(trainer.parameters, trainer.local(camera), (0, 0, 0)).image[:, :, :3]
         middle = camera.width / 2, camera.height / 2

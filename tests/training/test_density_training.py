@@ -55,9 +55,9 @@ def test_a_limit_that_held_the_growth_is_told_of(scene: Scene, default_device: D
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         train(scene, config, device=default_device)
-    held = [str(one.message) for one in told if "has held the growth" in str(one.message)]
+    held = [str(one.message) for one in told if "has limited the growth" in str(one.message)]
     assert len(held) == (growth == "paper" and most == 60)
-    assert all(text.startswith("--density.max-gaussians 60 has held the growth: --density.growth") for text in held)
+    assert all(text.startswith("--density.max-gaussians 60 has limited the growth: --density.growth") for text in held)
 
 
 def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

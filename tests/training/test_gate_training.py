@@ -20,7 +20,7 @@ from clsplat.device.context import Device
 from clsplat.evaluation.held_out import EvaluatedModel, evaluate
 from clsplat.images.alpha import background_colour
 from clsplat.rendering.renderer import Renderer
-from clsplat.report.figures import read_figures
+from clsplat.report.run_numbers import read_run_numbers
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
@@ -86,7 +86,7 @@ def test_bad_poses_are_gone_back_from(
     assert figures[60] > last + 0.5  # what is left of the training makes good use of them
     assert len(told) == 1
     assert f"the cameras are again those of step {gate['best']}" in told[0]
-    assert any(f"ended at step {ended}" in note for note in read_figures(run).notes)
+    assert any(f"ended at step {ended}" in note for note in read_run_numbers(run).notes)
     assert run.model_path.read_bytes() != undisturbed
 
 

@@ -174,7 +174,7 @@ def test_training_in_poisoned_memory(
         trainer = Trainer(many_points if pieces else scene, config, memory)
         for _ in range(config.iterations):
             trainer.train_step()
-        assert trainer.watch.latest is None
+        assert trainer.monitor.latest is None
         assert trainer.plan.streamed == pieces
         found.append(trainer.checkpoint()[0])
     assert found[0].keys() == found[1].keys()
@@ -224,11 +224,11 @@ def assert_well(trainer: Trainer) -> None:
     """Every number of the model is finite, and no trouble is left that a later step would meet."""
     arrays, _ = trainer.checkpoint()
     assert all(np.isfinite(values).all() for name, values in arrays.items() if not name.startswith("statistics"))
-    trainer.watch.incidents.clear()
+    trainer.monitor.incidents.clear()
     for _ in range(3):
         assert np.isfinite(trainer.train_step().read()).all()
     trainer.mend(look=True)
-    assert trainer.watch.incidents == []
+    assert trainer.monitor.incidents == []
 
 
 def assert_others_alike(one: Trainer, other: Trainer) -> None:
@@ -257,7 +257,7 @@ def test_broken_parameters_are_not_drawn_and_removed(
         assert np.isfinite(loss).all()
         poisoned.train_step()  # which notices
         poisoned.checkpoint()  # which finds what was hidden as well
-        (incident,) = poisoned.watch.incidents
+        (incident,) = poisoned.monitor.incidents
         assert (incident.stage, incident.count) == ("parameters", 1), value
         assert poisoned.parameters.count == hidden.parameters.count - 1
         assert_well(poisoned)
@@ -310,7 +310,7 @@ def test_a_broken_gradient_costs_its_gaussian_alone(
         assert poisoned.parameters[group].get().reshape(40, -1)[ROW, -1] == before, "it was not moved"
         assert_others_alike(poisoned, plain)
         poisoned.mend(look=True)
-        (incident,) = poisoned.watch.incidents
+        (incident,) = poisoned.monitor.incidents
         # A finite one of which the square is not is the optimiser's own trouble.
         assert (incident.stage, incident.count) == ("adam" if value == 1e30 else "project_grad", 1)
         assert poisoned.parameters.count == 39
@@ -336,7 +336,7 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
         for moments in (poisoned.first, poisoned.second):
             assert moments[group].get().reshape(40, -1)[ROW, -1] == 0
         poisoned.mend(look=True)
-        (incident,) = poisoned.watch.incidents
+        (incident,) = poisoned.monitor.incidents
         assert incident.stage == "adam"
         assert poisoned.parameters.count == 40
         assert_well(poisoned)
@@ -416,7 +416,7 @@ def test_a_broken_loss_is_no_fault_of_the_gaussians(
     assert sum(moved) > 0
     assert sum(moved) < 40 or where == "target", "without SSIM's windows most Gaussians are out of the pixel's reach"
     poisoned.mend(look=True)
-    (incident,) = poisoned.watch.incidents
+    (incident,) = poisoned.monitor.incidents
     assert incident.stage == "loss"
     assert incident.step == 4
     assert poisoned.parameters.count == 40
@@ -445,7 +445,7 @@ def test_a_broken_slot_costs_its_gaussian_alone(
     assert_others_alike(poisoned, plain)
     poisoned.train_step()
     poisoned.mend()
-    (incident,) = poisoned.watch.incidents
+    (incident,) = poisoned.monitor.incidents
     assert (incident.stage, incident.count, incident.step) == ("project_grad", 1, 4)
     statistics = poisoned.statistics.named()
     assert all(np.isfinite(array.get()).all() for array in statistics.values())
@@ -479,7 +479,7 @@ def test_rows_that_are_streamed_are_looked_after_too(many_points: Scene, default
     trainer.train_step()
     trainer.train_step()
     trainer.mend()
-    (incident,) = trainer.watch.incidents
+    (incident,) = trainer.monitor.incidents
     assert (incident.stage, incident.count) == ("parameters", 2)
     assert trainer.parameters.count == count - 2
     assert_well(trainer)

@@ -107,23 +107,23 @@ def test_what_is_broken_and_what_is_refused() -> None:
 
 
 def test_patience() -> None:
-    patience = RetryBudget()
+    retries = RetryBudget()
     for index in range(MAX_TROUBLED_STEPS - 1):
-        patience.note(10 * index + 1)
-        patience.note(10 * index + 1)  # the same step
-        assert not patience.over
-    patience.note(TROUBLE_WINDOW_STEPS + 1)  # the first is forgotten by now
-    assert not patience.over
-    patience.note(TROUBLE_WINDOW_STEPS + 2)
-    assert patience.over
+        retries.note(10 * index + 1)
+        retries.note(10 * index + 1)  # the same step
+        assert not retries.over
+    retries.note(TROUBLE_WINDOW_STEPS + 1)  # the first is forgotten by now
+    assert not retries.over
+    retries.note(TROUBLE_WINDOW_STEPS + 2)
+    assert retries.over
     for index in range(MAX_CHECKPOINT_RETURNS):
-        assert not patience.spent
-        patience = patience.after_return()
-        assert not patience.over
-        assert patience.rate_factor == RETURN_RATE_FACTOR ** (index + 1)
-    assert patience.spent
-    patience.note(7, lost=True)
-    assert patience.over
+        assert not retries.spent
+        retries = retries.after_return()
+        assert not retries.over
+        assert retries.rate_factor == RETURN_RATE_FACTOR ** (index + 1)
+    assert retries.spent
+    retries.note(7, lost=True)
+    assert retries.over
 
 
 def test_what_is_not_drawn_for_its_colour_is_over_the_limit() -> None:
@@ -145,10 +145,10 @@ def test_a_gaussian_that_breaks_is_removed_and_told_once(scene: Scene, default_d
     told, rest = lines
     assert re.fullmatch(
         r"step 7, view 0\d\.png, stage parameters: parameters of 1 Gaussian are not finite, or far too large; 1 "
-        r"removed \(more of this kind will be counted only\)",
+        r"removed \(further ones of this kind are only counted\)",
         told,
     )
-    assert rest == "2 more steps had something that was not finite"
+    assert rest == "2 more steps had values that were not finite"
     for values in (result.means, result.quaternions, result.log_scales, result.opacity_logits, result.sh):
         assert np.isfinite(values).all()
     assert [record["step"] for record in run.read_metrics()] == [10, 20, 30, 40]
@@ -188,7 +188,7 @@ def test_repeated_trouble_goes_back_with_smaller_steps(scene: Scene, default_dev
     seen: list[tuple[int, float]] = []
 
     def due(trainer: Trainer) -> bool:
-        factor = trainer.watch.patience.rate_factor
+        factor = trainer.monitor.retries.rate_factor
         seen.append((trainer.step, factor))
         return trainer.step >= 21 and factor == 1.0
 
@@ -196,8 +196,8 @@ def test_repeated_trouble_goes_back_with_smaller_steps(scene: Scene, default_dev
         train(scene, CHECKED, device=default_device, run=run)
     back = next(line for line in lines if "back to" in line)
     match = re.fullmatch(
-        r"step (\d+): 5 of the last 100 steps had trouble: back to step (\d+), with learning rates of 0\.5 of what "
-        r"they would be",
+        r"step (\d+): 5 of the last 100 steps had trouble: back to step (\d+), with learning rates multiplied "
+        r"by 0\.5",
         back,
     )
     assert match is not None
@@ -221,7 +221,7 @@ def test_a_model_that_is_mostly_broken_is_not_mended(scene: Scene, default_devic
     real = Trainer.train_step
 
     def step(self: Trainer, **options: bool) -> object:
-        if self.step == 17 and self.watch.patience.rate_factor == 1.0:
+        if self.step == 17 and self.monitor.retries.rate_factor == 1.0:
             self.parameters["sh_dc"].fill(np.nan)
         return real(self, **options)
 
@@ -235,9 +235,9 @@ def test_a_model_that_is_mostly_broken_is_not_mended(scene: Scene, default_devic
 
 def test_without_a_checkpoint_it_starts_again(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     for run in (None, Run.create(tmp_path / "run", CONFIG)):
-        with heard() as lines, spoilt(lambda trainer: trainer.watch.patience.rate_factor == 1.0):
+        with heard() as lines, spoilt(lambda trainer: trainer.monitor.retries.rate_factor == 1.0):
             train(scene, CONFIG, device=default_device, run=run)
-        assert any("back to step 0, with learning rates of 0.5" in line for line in lines)
+        assert any("back to step 0, with learning rates multiplied by 0.5" in line for line in lines)
 
 
 # Training gives up
@@ -298,10 +298,10 @@ def test_a_bundle_of_a_sound_step_says_so(
     trainer = Trainer(scene, CONFIG, default_device)
     for _ in range(7):
         trainer.train_step()
-    trainer.watch.loss_failed()
+    trainer.monitor.loss_failed()
     trainer.mend()
-    assert trainer.watch.latest is not None
-    path = repro_bundle.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    assert trainer.monitor.latest is not None
+    path = repro_bundle.write_bundle(tmp_path, trainer, trainer.monitor.latest)
     assert repro_bundle.read_bundle(path).record["of"] == [40, 40]
     assert not repro_bundle.read_bundle(path).record["reproduced"]
     assert repro_bundle.main([str(path)]) == 1
@@ -313,10 +313,10 @@ def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
 ) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
     trainer.train_step()
-    trainer.watch.loss_failed()
+    trainer.monitor.loss_failed()
     trainer.mend()
-    assert trainer.watch.latest is not None
-    path = repro_bundle.write_bundle(tmp_path, trainer, trainer.watch.latest)
+    assert trainer.monitor.latest is not None
+    path = repro_bundle.write_bundle(tmp_path, trainer, trainer.monitor.latest)
     saved = read_checkpoint(path)
     earlier = "[train.rasterizer]\nsh_angle = 1.5\nrow_skip = false"
     settings = saved.state["settings"].replace("[train.rasterizer]", earlier)
@@ -340,7 +340,11 @@ def test_what_is_no_bundle_is_named(tmp_path: Path, capsys: Capture) -> None:
 
 def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device: Device) -> None:
     config = replace(CONFIG, iterations=100)
-    with heard(), spoilt(lambda _: True), pytest.raises(ClsplatError, match="give a run, and what reproduces it"):
+    with (
+        heard(),
+        spoilt(lambda _: True),
+        pytest.raises(ClsplatError, match=r"with run=\.\.\., a file that reproduces it"),
+    ):
         train(scene, config, device=default_device)
 
 

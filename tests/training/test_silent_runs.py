@@ -189,7 +189,7 @@ LATE = {
     "cooldown": (
         {"optimiser": OptimiserConfig(cooldown=6, cooldown_to=0.25)},
         (
-            "--optimiser.cooldown 6: the learning rates begin at 0.5 of what they are, training has 3 steps; expected "
+            "--optimiser.cooldown 6: the learning rates begin at 0.5 of their values, training has 3 steps; expected "
             "at most --iterations 3"
         ),
     ),

@@ -69,7 +69,7 @@ def assert_alike(one: Result, other: Result) -> None:
     for name, values in one[0].items():
         assert_same_bits(values, other[0][name], name)
     assert one[1] == other[1]
-    assert list(map(str, one[2].watch.incidents)) == list(map(str, other[2].watch.incidents))
+    assert list(map(str, one[2].monitor.incidents)) == list(map(str, other[2].monitor.incidents))
 
 
 TOO_SMALL = {"none": (), "within": (7,), "twice": (12, 13), "before density control": (15, 25), "last": (40,)}
@@ -110,7 +110,7 @@ def test_trouble_is_mended_and_told_as_with_exact_counts(
 
     results = [trained(scene, default_device, monkeypatch, capacity=on, before=spoil) for on in (False, True)]
     assert_alike(*results)
-    assert len(results[1][2].watch.incidents) == 1
+    assert len(results[1][2].monitor.incidents) == 1
     assert results[1][2].pending.redone == 2
 
 

@@ -122,7 +122,7 @@ def judged(values: list[float], config: TrainConfig = CONFIG) -> tuple[CameraGat
     gate, said = CameraGate(config, 2), []
     for index, (step, value) in enumerate(zip(steps_of(config), values, strict=False)):
         assert gate.is_due(step)
-        back, text = gate.judge(step, value, arrays(index))
+        back, text = gate.validate(step, value, arrays(index))
         assert (back is not None) == (gate.ended == step)
         if back is not None:
             best = int(np.argmax(values[: index + 1]))
@@ -156,13 +156,13 @@ def test_the_warning_has_the_figures_and_a_way_on() -> None:
     gate, said = judged([25.126, 24, 23.5, 28])
     text = (
         "--refine-poses: held-out views had 25.13 dB at step 100, 24.00 and 23.50 dB at steps 200 and 300: the cameras "
-        "are again those of step 100, and stay; try a smaller --pose-reach, or none of --refine-poses"
+        "are again those of step 100, and stay; try a smaller --pose-reach, or train without --refine-poses"
     )
     assert said == [text]
     assert gate.record()["best"] == 100
     assert gate.record()["ended"] == 300
     lenses = replace(CONFIG, refine_poses=False, refine_lenses=True)
-    assert judged([25, 24, 23], lenses)[1][0].endswith("try a smaller --lens-reach, or none of --refine-lenses")
+    assert judged([25, 24, 23], lenses)[1][0].endswith("try a smaller --lens-reach, or train without --refine-lenses")
     late = judged([*[25] * 8, 24, 24])[1]
     assert "no step is left to go back" in late[0]
 
@@ -191,7 +191,7 @@ def test_a_checkpoint_has_all_of_it(values: list[float]) -> None:
     assert (again.measured, again.ended) == (gate.measured, gate.ended)
     assert again.arrays().keys() == gate.arrays().keys()
     for step, value in zip(steps_of(CONFIG)[len(values) :], (19, 19, 30), strict=False):
-        mine, theirs = gate.judge(step, value, arrays(9)), again.judge(step, value, arrays(9))
+        mine, theirs = gate.validate(step, value, arrays(9)), again.validate(step, value, arrays(9))
         assert mine[1] == theirs[1]
         assert (mine[0] is None) == (theirs[0] is None)
         for name, array in (mine[0] or {}).items():

@@ -57,7 +57,7 @@ def measure(device: Device, count: int, width: int, height: int, repeat: int) ->
 
     frames = [draw() for _ in range(2)]  # kernels are built in the first, and the memory has grown after it
     ms = statistics.median(device.timed(draw)[1] for _ in range(repeat))
-    pairs = frames[-1].part.pairs.tile_keys.shape[0]
+    pairs = frames[-1].listed.pairs.tile_keys.shape[0]
     return {"gaussians": count, "width": width, "height": height, "pairs": pairs, "ms": ms}
 
 

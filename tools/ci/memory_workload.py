@@ -122,7 +122,7 @@ def frames(device: Device) -> None:
             raise SystemExit("a gradient is not finite")
         if not small:
             count_pairs(
-                rasterizer.device, rasterizer.work, frame.part.lists, frame.projected.splats, background, frame.camera
+                rasterizer.device, rasterizer.work, frame.listed.lists, frame.projected.splats, background, frame.camera
             )
 
 
@@ -323,7 +323,7 @@ def density(device: Device) -> None:
     gaussians = cloud(count, camera(20, 17), 9, degree=1)
     statistics = new_statistics(device, count, contributions=True)
     statistics.load({name: np.linspace(0, 2, count, dtype=np.float32) for name in statistics.named()})
-    rules = MarkRules(gradient=0.5, strongest=(0.8, 9), large=-2.0, transparent=-5.0, contribution=0.01, radius=1.9)
+    rules = MarkRules(gradient=0.5, cut_off=(0.8, 9), large=-2.0, transparent=-5.0, contribution=0.01, radius=1.9)
     for model in (upload_gaussians(device, gaussians), host_gaussians(gaussians, device.row_alignment)):
         listed = DeviceMarker(device, Workspace(device), model, statistics).rows(rules)
         after = new_statistics(device, listed.count, contributions=True)

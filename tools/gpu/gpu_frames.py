@@ -43,7 +43,7 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
     gaussians = upload_gaussians(device, subject.gaussians)
     frame = rasterizer.forward(gaussians, camera, upload(device, np.zeros(3, np.float32)), backward=False)
     require(len(frame.bands) == 1, f"{name}: the frame needs more memory than there is, expected one band")
-    lists, counted = frame.part.lists, frame.part.counted
+    lists, counted = frame.listed.lists, frame.listed.counted
     ranges = lists.ranges.get().astype(np.int64)
     stops = frame.blended.stops.get()
     tiles = stops.reshape(stops.shape[0] // TILE, TILE, stops.shape[1] // TILE, TILE)

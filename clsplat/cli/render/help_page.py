@@ -9,7 +9,7 @@ MOST_NEEDED_FLAGS = (
     *("output", "cameras", "path", "frames", "width", "height", "channels", "colorspace"),
     *("shutter-angle", "skip-existing", "device", "dry-run"),
 )
-"""Twelve flags, in addition to the model."""
+"""The twelve flags of the first group. The model is listed above them."""
 RENDER_GROUPS: Groups = (
     ("Needed most", ("RUN|MODEL", *MOST_NEEDED_FLAGS)),
     (

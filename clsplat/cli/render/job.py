@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Job of `clsplat render`, and the checks that need the job instead of the flags."""
+"""Job of `clsplat render`, and the checks that need the job rather than the flags alone."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from clsplat.version import package_version
 class Job:
     """Call of `clsplat render`, parsed and checked.
 
-    devices: selectors; None for the default device.
+    devices: selector of each device; None for the default device.
     spaces: colour space of the model and of the pictures.
-    video: encoding, with the frame rate.
-    on_farm: other processes render, workers or a Dask cluster.
+    video: encoding of the video, with its frame rate; None for pictures.
+    on_farm: True if other processes render: workers on this machine, or a Dask cluster.
     """
 
     options: RenderOptions
@@ -70,7 +70,7 @@ class Job:
 def frames_there(job: Job) -> set[str]:
     """Keys of the frames that `--skip-existing` leaves out.
 
-    Warns of files that do not record their settings, and of frames that are rendered again.
+    Warns if files do not record their settings, and if existing frames have to be rendered again.
     """
     if not job.skip_existing:
         return set()
@@ -91,7 +91,7 @@ def frames_there(job: Job) -> set[str]:
 
 
 def _video_there(job: Job) -> set[str]:
-    """Keys of all frames or none: a video is written as a whole."""
+    """Keys of all frames, or of none: a video is complete only as a whole."""
     path, wanted = job.tasks[0].path, finished_frames.made_of(job.tasks, job.options, job.video)
     if is_file(path) and video_record(path, len(job.tasks)) == wanted:
         return {task.key for task in job.tasks}
@@ -109,7 +109,7 @@ def is_ours(path: Path) -> bool:
 
 
 def check_foreign(job: Job, there: Collection[str]) -> None:
-    """Raise InputError if a frame outside `there` would replace a picture by another program."""
+    """Raise InputError if a frame that is not in `there` would replace a picture made by another program."""
     if others := finished_frames.foreign([task for task in job.tasks if task.key not in there]):
         raise InputError(
             f"{examples(others)}: exist, and clsplat did not make them; name other files, or give --overwrite to "
@@ -139,15 +139,15 @@ def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
 
 
 def warp_for_workers(warp: WarpConfig) -> WarpConfig:
-    """Lens settings with the absolute path of the map, for the same reason."""
+    """Lens settings with the absolute path of the map, for processes in other folders."""
     return replace(warp, stmap=str(Path(warp.stmap).absolute())) if warp.stmap else warp
 
 
 def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
     """Check all pictures before rendering.
 
-    Raises InputError for a frame that does not suit the framing, and for a video with frames of several sizes.
-    Raises InputError for deep stereo pairs in one file, and for eyes that cannot share a file.
+    Raises InputError in these cases: the framing does not suit a frame, a video has frames of several sizes, deep
+    stereo pairs are in one file, or two eyes cannot share a file.
     """
     if options.deep is not None and tasks[0].right is not None:
         raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
@@ -179,7 +179,7 @@ def _check_pair(task: Task, left: Camera, right: Camera) -> None:
     if sizes[0] != sizes[1]:
         what = f"is {sizes[0]} for the left eye and {sizes[1]}"
         raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
-    # compared as in the header of a stage's frames
+    # compared with the precision of the headers of frames from a stage
     shapes = [str(np.float32(eye.fy / eye.fx)) for eye in (left, right)]
     if task.optics is not None and shapes[0] != shapes[1]:
         what = f"has pixels of the aspect ratio {shapes[0]} for the left eye and {shapes[1]}"
@@ -226,7 +226,10 @@ def check_colours(output: str, colours: Colours) -> None:
 
 
 def with_models(options: RenderOptions, cast: JobModels, mattes: Mapping[str, Matte], space: str) -> RenderOptions:
-    """The options with the models' colour space, digest and mattes. space: the pictures' colour space."""
+    """The options with the models' colour space, digest and mattes.
+
+    space: colour space of the pictures.
+    """
     attributes = {
         "Software": f"clsplat {package_version()}",
         "clsplat:model": cast.digest,

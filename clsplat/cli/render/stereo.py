@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shots for the flags of `clsplat render`: one, or one for each eye with --stereo."""
+"""Shots for the flags of `clsplat render`: a single shot, or with --stereo one for each eye."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ STEREO_ROLE_ATTRIBUTE = "stereoRole"
 
 @dataclass(frozen=True)
 class Asked:
-    """Shot that the flags ask for. The other fields are as in `Render`.
+    """Flags that choose the shot. Fields not listed here are as in `RenderVerb`.
 
-    model: loads the models, for paths around them.
+    model: function that loads the models, for paths around them.
     own: cameras of a run's photographs, for paths among them.
     """
 
@@ -43,10 +43,10 @@ class Asked:
 
 
 def shots_asked(asked: Asked, pairs: StereoConfig) -> tuple[dict[str, Shot], JobModels | None]:
-    """Shots with all frames, before --frames: one for each eye of a pair, else one under "".
+    """Shots by eye, with all frames, before --frames selects some. Without stereo there is one shot, under "".
 
-    Also returns the models if the shots depend on them: for paths around them, and for one still camera, which is then
-    that of all frames of a model. Raises InputError.
+    Also returns the models if the shots depend on them. This is so for paths around the models, and for a single still
+    camera, which then shows every frame of a changing model. Raises InputError.
     """
     shots, cast = _cameras_asked(asked, pairs)
     if all(len(shot.frames) == 1 for shot in shots.values()):
@@ -89,11 +89,11 @@ def stage_cameras(stereo: StereoConfig, cameras: Path | None, usd_camera: str | 
 
 
 def shots_of(stereo: StereoConfig, whole: Shot, read: Callable[[str], Shot], paths: dict[str, str]) -> dict[str, Shot]:
-    """Shot of each eye; one under "" without stereo.
+    """Shot of each eye. Without stereo there is one shot, under "".
 
     whole: shot of the cameras themselves, or of the stage camera of the first eye.
-    read: reads the shot of another camera of the stage.
-    paths: of the stage's cameras.
+    read: function that reads the shot of another camera of the stage, by its path.
+    paths: path of each eye's camera in the stage.
     Raises InputError.
     """
     if not stereo.eyes:
@@ -102,7 +102,7 @@ def shots_of(stereo: StereoConfig, whole: Shot, read: Callable[[str], Shot], pat
         shots = [whole, *(read(path) for path in list(paths.values())[1:])]
         numbers = {tuple(frame.number for frame in shot.frames) for shot in shots}
         if len(numbers) > 1:
-            raise InputError(f"--stereo stage: {' and '.join(paths.values())} have other frames, expected the same")
+            raise InputError(f"--stereo stage: {' and '.join(paths.values())} have different frames, expected the same")
         return dict(zip(paths, shots, strict=True))
     convergence = math.inf if stereo.convergence is None else stereo.convergence
     return {eye: shot_of(whole, eye, stereo.distance, convergence) for eye in stereo.eyes}

@@ -23,7 +23,8 @@ _PIXEL_CENTRE_TOLERANCE_PX = 1e-3
 def with_stage(
     options: RenderOptions, source: object, shot: Shot, tasks: Sequence[Task]
 ) -> tuple[RenderOptions, tuple[str, ...]]:
-    """Options with the stage's data window and the first frame's shutter and lens, and the stage settings not applied.
+    """Options with the stage's data window and the first frame's shutter and lens, and the names of stage settings that
+    are not applied.
 
     Raises InputError for a data window without a pixel.
     """
@@ -43,7 +44,7 @@ def with_stage(
 
 
 def _shape_unsaid(task: Task) -> tuple[str, ...]:
-    """Report a stage's pixel aspect ratio if the file format cannot store it and shows square pixels."""
+    """A note on the stage's pixel aspect ratio, if the file format cannot store it and so shows square pixels."""
     shape, kind = task.camera.fy / task.camera.fx, task.path.suffix.lower()
     if task.optics is None or kind == ".exr" or abs(shape - 1) < _STAGE_FLOAT32_TOLERANCE:
         return ()
@@ -53,10 +54,10 @@ def _shape_unsaid(task: Task) -> tuple[str, ...]:
 def _framing(
     framing: FramingConfig, source: object, window: tuple[float, float, float, float], camera: Camera
 ) -> FramingConfig | None:
-    """The framing with a data window as region or as overscan of the camera's frame. It contains the pixels whose
-    centres it covers.
+    """The framing that renders a data window, as a region or an overscan of the camera's frame.
 
-    None if the window extends beyond the frame but is no overscan.
+    A pixel is rendered if the window covers its centre. The result is None if the window extends beyond the frame on
+    one side but is not an overscan.
     """
     left, bottom, right, top = window
     width, height = camera.width, camera.height
@@ -76,9 +77,9 @@ def _framing(
 
 
 def _lens_unapplied(options: RenderOptions, tasks: Sequence[Task]) -> tuple[str, ...]:
-    """Report the stage's lens if no flag overrides it and no picture shows it.
+    """A note on the stage's lens, if no flag overrides it and no picture shows its blur.
 
-    The lens lacks a focus distance then, or the camera is orthographic.
+    This happens if the lens has no focus distance, or the camera is orthographic.
     """
     flags = options.pictures.sampling
     if flags.aperture is not None or flags.f_stop is not None:

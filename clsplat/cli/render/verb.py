@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`clsplat render`: its flags, and its run from the call to the exit status.
 
-A call becomes a `clsplat.cli.render.job.Job`. `clsplat.cli.render.dry_run` is --dry-run.
-`clsplat.sequence.workers` runs the job, `clsplat.sequence.frame_renderer` one frame, `clsplat.sequence.farm` clusters.
+A command line becomes a `clsplat.cli.render.job.Job`, which `clsplat.cli.render.dry_run` prints for --dry-run.
+`clsplat.sequence.workers` renders the job, on clusters with `clsplat.sequence.farm`. `clsplat.sequence.frame_renderer`
+renders one frame.
 """
 
 from __future__ import annotations
@@ -183,7 +184,7 @@ class RenderVerb(Verb):
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
 
     def completed(self, given: Collection[str]) -> RenderVerb:
-        """Take the rasterizer's settings from the preset or else the run, and the lenses from the run."""
+        """Take the rasterizer's settings from the preset, or without one from the run, and the lenses from the run."""
         from clsplat.models.formats import model_path
         from clsplat.runs.run import Run, is_run
 
@@ -223,12 +224,12 @@ def run(verb: RenderVerb, services: Services) -> int:
         ]
         for renderer in renderers:
             renderer.check(job.tasks)
-    with terminable():  # again, because pycolmap and kernel compilers install handlers of their own
+    with terminable():  # installed again: pycolmap and kernel compilers have installed handlers of their own
         return _write_frames(verb, job, renderers)
 
 
 def _read_job(verb: RenderVerb) -> Job:
-    """Check everything that needs no rendering. Raises InputError and DeviceError; writes nothing."""
+    """Check everything that can be checked without rendering. Raises InputError and DeviceError; writes nothing."""
     from clsplat.cli.render.job import Job, check_colours, check_pictures, is_ours, resizer, with_models
     from clsplat.cli.render.stereo import shots_asked
     from clsplat.cli.render.usd_stage import with_stage

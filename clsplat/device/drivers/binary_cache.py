@@ -24,7 +24,8 @@ from clsplat.device.drivers.quirks import TARGET_VARIABLE_PREFIX, wants_cache
 from clsplat.files.atomic import atomic_write
 
 MAX_BINARY_CACHE_BYTES = 256 << 20
-"""Limit of all files together; the oldest are removed. A binary takes 30 to 500 KB, all tests together 90 MB."""
+"""Most bytes of all files together; beyond it the oldest are removed. A binary takes 30 to 500 KB, all tests together
+take 90 MB."""
 
 BINARIES_VARIABLE = "CLSPLAT_BINARIES"
 """Environment variable that names another folder for the cache."""
@@ -40,14 +41,14 @@ def _path(device: cl.Device, digest: str) -> Path:
         f"{name}={value}" for name, value in os.environ.items() if name.startswith(TARGET_VARIABLE_PREFIX)
     )
     driver = (device.name, device.platform.version, device.driver_version)
-    # a processor's name is not enough: several machines may share a home
+    # the processor's features are part of the name: several machines may share a home
     processor = " ".join((platform.machine(), platform.processor(), *sorted(features())))
     key = "\0".join((digest, *driver, processor, *settings))
     return folder() / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.bin"
 
 
 def load(context: cl.Context, device: cl.Device, digest: str, options: Sequence[str]) -> cl.Program | None:
-    """The saved program for a variant's digest; None if there is none, or it cannot be used any more."""
+    """The saved program for a variant's digest; None if there is none, or it cannot be used."""
     if not wants_cache(device):
         return None
     path = _path(device, digest)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Traits of a device that select an algorithm, and CLSPLAT_PRETEND, which overrides them.
+"""Capabilities of a device that select an algorithm, and CLSPLAT_PRETEND, which overrides them.
 
-It tests the code paths of a GPU, a small device and a plain compiler on machines that have none.
+With CLSPLAT_PRETEND a machine without a GPU, a small device or a plain compiler can test the code paths for these.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ if TYPE_CHECKING:
     import pyopencl as cl
 
 PRETEND_VARIABLE = "CLSPLAT_PRETEND"
-"""Environment variable with the traits to pretend for every device, separated by commas."""
+"""Environment variable with the capabilities to pretend for every device, separated by commas."""
 
 
 @dataclass(frozen=True)
-class Traits:
+class Capabilities:
     """The kind, limits and arithmetic of a device.
 
     kind: cpu, gpu or other.
     group: the most work-items of a group.
-    local_memory, allocation: the most bytes of a group's local memory and of a buffer.
-    exact_division: the device supports correctly rounded division and square roots.
-    contraction: the device may be probed for fused multiply-adds.
+    local_memory: the most bytes of a group's local memory.
+    allocation: the most bytes of a buffer.
+    exact_division: True if the device supports correctly rounded division and square roots.
+    contraction: True if the device may be probed for fused multiply-adds.
     """
 
     kind: str
@@ -39,12 +40,12 @@ class Traits:
     contraction: bool = True
 
 
-_TRAITS_BY_WORD: dict[str, dict[str, Any]] = {
+_CAPABILITIES_BY_WORD: dict[str, dict[str, Any]] = {
     "gpu": {"kind": "gpu"},
     "no-exact-division": {"exact_division": False},
     "no-contraction": {"contraction": False},
 }
-"""Traits by the word that pretends them."""
+"""Capabilities by the word that pretends them."""
 _LIMIT_FIELDS = {"group": "group", "local-memory": "local_memory", "allocation": "allocation"}
 """Limits by the name that pretends a lower one."""
 
@@ -54,25 +55,25 @@ def pretended() -> str:
     return os.environ.get(PRETEND_VARIABLE, "")
 
 
-def traits_of(device: cl.Device) -> Traits:
-    """The traits of a device, with the changes of CLSPLAT_PRETEND. Raises DeviceError if that is invalid."""
+def capabilities_of(device: cl.Device) -> Capabilities:
+    """The capabilities of a device, with the changes of CLSPLAT_PRETEND. Raises DeviceError if that is invalid."""
     from pyopencl import device_fp_config
 
     exact = bool(device.single_fp_config & device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT)
     group, local, allocation = (
         int(limit) for limit in (device.max_work_group_size, device.local_mem_size, device.max_mem_alloc_size)
     )
-    traits = Traits(kind_of(device), group, local, allocation, exact_division=exact)
+    capabilities = Capabilities(kind_of(device), group, local, allocation, exact_division=exact)
     for part in filter(None, pretended().split(",")):
         name, _, number = part.strip().partition("=")
-        if name in _TRAITS_BY_WORD and not number:
-            traits = replace(traits, **_TRAITS_BY_WORD[name])
+        if name in _CAPABILITIES_BY_WORD and not number:
+            capabilities = replace(capabilities, **_CAPABILITIES_BY_WORD[name])
         elif name in _LIMIT_FIELDS and number.isascii() and number.isdigit() and int(number) > 0:
             limit = _LIMIT_FIELDS[name]
-            traits = replace(traits, **{limit: min(getattr(traits, limit), int(number))})
+            capabilities = replace(capabilities, **{limit: min(getattr(capabilities, limit), int(number))})
         else:
             raise DeviceError(
-                f"{PRETEND_VARIABLE}={pretended()}: {part.strip()!r} is none of {', '.join(_TRAITS_BY_WORD)}, "
+                f"{PRETEND_VARIABLE}={pretended()}: {part.strip()!r} is none of {', '.join(_CAPABILITIES_BY_WORD)}, "
                 f"{', '.join(f'{size}=NUMBER' for size in _LIMIT_FIELDS)}"
             )
-    return traits
+    return capabilities

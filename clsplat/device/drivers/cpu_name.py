@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A processor name that PoCL 3.0's compiler knows.
 
-The LLVM 14 in the PoCL that pip installs knows AMD processors by their family. It has no name for Zen 5 and later, and
-reports "generic", which its own front end refuses, so nothing can be built. It takes Zen 4 for Zen 3, without AVX-512,
-while PoCL links built-ins that use AVX-512: kernels with vectors of 16 then end the process. Later versions of PoCL
-name the processor by its features, as this module does. See docs/decisions/0020-processors-are-named-by-features.md.
+The PoCL that pip installs has LLVM 14, which knows AMD processors by their family. For Zen 5 and later LLVM 14 reports
+"generic", which its own front end refuses, so nothing can be built. It takes Zen 4 for Zen 3, which has no AVX-512, but
+PoCL links built-ins that use AVX-512: kernels with vectors of 16 then end the process. Later versions of PoCL name the
+processor by its features, as this module does. See docs/decisions/0020-processors-are-named-by-features.md.
 """
 
 from __future__ import annotations
@@ -45,8 +45,7 @@ def features(path: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
 
 
 def better_name(name: str, present: frozenset[str]) -> str:
-    """A better name for a processor with these features that LLVM 14 calls `name`; `name` itself if it is good
-    enough."""
+    """LLVM's name that suits a processor with these features; `name`, the name from LLVM 14, if that suits already."""
     if not present or not (name == "generic" or name.startswith("znver")):
         return name
     by_features = next(better for better, needed in CPU_NAMES_BY_FEATURES if needed <= present)
@@ -94,7 +93,7 @@ def _text(address: int) -> str | None:
 
 
 def _memory(address: int, size: int) -> bytes:
-    """Bytes of this process; empty at an address that is not mapped, so any number is safe to follow."""
+    """Bytes in this process's memory; empty at an address that is not mapped, so that any address may be asked for."""
     with suppress(OSError, OverflowError), open("/proc/self/mem", "rb", buffering=0) as memory:
         return os.pread(memory.fileno(), size, address)
     return b""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.device.drivers.quirks import GPU_MAKERS_BY_PCI_VENDOR, driver_advice, driver_files, gpu_advice, of_maker
-from clsplat.device.drivers.worker_process import patience, python_module
+from clsplat.device.drivers.worker_process import driver_timeout, python_module
 
 _PCI_DISPLAY_CLASS = "0x03"
 """Beginning of a display controller's class code on the PCI bus."""
@@ -84,7 +84,7 @@ def _driver(path: Path) -> Diagnostic:
             [sys.executable, "-c", _LOAD_LIBRARY_CODE, name],
             capture_output=True,
             text=True,
-            timeout=patience(),
+            timeout=driver_timeout(),
             check=False,
         )
     except subprocess.TimeoutExpired:
@@ -99,9 +99,9 @@ def listed_devices() -> tuple[list[dict[str, Any]], str]:
     """The devices that `clsplat devices --json` lists, and the reason if it failed, or an empty string."""
     command = [*python_module("clsplat", "devices", "--json")]
     try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=patience(), check=False)
+        result = subprocess.run(command, capture_output=True, text=True, timeout=driver_timeout(), check=False)
     except subprocess.TimeoutExpired:
-        return [], f"a driver does not come back within {patience():g} s"
+        return [], f"a driver does not come back within {driver_timeout():g} s"
     if result.returncode == 0:
         return json.loads(result.stdout[result.stdout.index("[") :]), ""
     if result.returncode < 0:
@@ -144,10 +144,12 @@ def loader_finding() -> Diagnostic:
     code = "import pyopencl; print(pyopencl.VERSION_TEXT)"
     try:
         result = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=patience(), check=False
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=driver_timeout(), check=False
         )
     except subprocess.TimeoutExpired:
-        return Diagnostic("loader", "missing", f"pyopencl does not come back from its import within {patience():g} s")
+        return Diagnostic(
+            "loader", "missing", f"pyopencl does not come back from its import within {driver_timeout():g} s"
+        )
     if result.returncode == 0:
         return Diagnostic("loader", "ok", f"pyopencl {result.stdout.strip()}")
     text = f"pyopencl cannot be imported: {_last_line(result)}"

@@ -24,7 +24,7 @@ from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import reason_of
 from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import parse_json
-from clsplat.files.locks import locked
+from clsplat.files.locks import briefly_locked
 from clsplat.version import package_version
 
 BREAK_KERNEL_VARIABLE = "CLSPLAT_BREAK_KERNEL"
@@ -39,8 +39,9 @@ class Entry:
     """The record of one driver in one shape.
 
     stages: self-test stages that passed.
-    kernels: builds and launches that succeeded, named as in `sandbox`, with the salt that the kernel text needs.
-    failed: how the driver failed, or empty. None in an addition keeps the recorded failure.
+    kernels: builds and launches that succeeded, named as in `sandbox`, each with the salt that the kernel text needs.
+    failed: description of the driver's failure, or empty. In an addition to the record, None keeps the recorded
+    failure.
     trial: if a single kernel failed, its name and the input of `sandbox.again`.
     """
 
@@ -51,7 +52,8 @@ class Entry:
 
 
 def cache_folder() -> Path:
-    """Our folder in the user's cache; an unwritable path if the user has no home, as in some containers."""
+    """The folder of clsplat in the user's cache. It is an unwritable path if the user has no home, as in some
+    containers."""
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clsplat"
     except RuntimeError:
@@ -70,7 +72,7 @@ def _kernels_digest(broken: str) -> str:
 
 
 def device_key(device: cl.Device) -> str:
-    """Key of a device and its driver, with any pretended traits."""
+    """Key of a device and its driver, with any pretended capabilities."""
     words = [device.name.strip(), device.platform.version.strip(), device.driver_version.strip()]
     return " | ".join([*words, pretended()] if pretended() else words)
 
@@ -82,7 +84,7 @@ def driver_key(device: cl.Device) -> str:
 
 
 def _entry(value: object) -> Entry:
-    """Parse an entry of the file. An entry that clsplat did not write counts as absent."""
+    """Parse an entry of the file. A value that clsplat cannot have written gives an empty entry."""
     if not isinstance(value, dict):
         return Entry()
     stages, kernels, failed = value.get("stages", []), value.get("kernels", {}), value.get("failed", "")
@@ -95,7 +97,7 @@ def _entry(value: object) -> Entry:
 
 
 _RECORDS_LOCK = threading.Lock()
-"""Several devices may be at work at once."""
+"""Lock of the additions below, as several devices may work in threads."""
 _unwritten: dict[Path, list[tuple[str, str, Entry]]] = {}
 """Additions that could not be written yet, by file: driver, shape and addition to the entry."""
 
@@ -145,9 +147,9 @@ def remember(
     """Add to the driver's entry for a shape, LANESxITEMS.
 
     failed: None keeps the recorded failure.
-    trial: see `Entry`.
+    trial: the failed trial, as in `Entry`.
 
-    An unwritable folder is a warning; until it is writable, each process tests everything again.
+    If the folder is not writable, it warns; each process then tests everything again.
     """
     path = memory_path()
     addition = Entry(frozenset(stages), kernels or {}, failed, trial or {})
@@ -155,7 +157,7 @@ def remember(
         _unwritten.setdefault(path, []).append((driver_key(device), shape, addition))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with locked(path):
+            with briefly_locked(path):
                 saved = _read()
                 for oldest in list(saved)[:-MAX_DRIVER_RECORDS]:
                     del saved[oldest]

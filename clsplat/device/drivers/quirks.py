@@ -119,7 +119,7 @@ def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
 
 
 def misnames_processors(device: cl.Device) -> bool:
-    """True for PoCL 3.0, whose compiler may not know the name that it gives to the processor."""
+    """True for PoCL 3.0, whose compiler may refuse the processor name that it has found itself."""
     return str(device.platform.version).startswith("OpenCL 3.0 PoCL 3.0")
 
 
@@ -132,7 +132,7 @@ def tells_group_sizes(device: cl.Device) -> bool:
 
 
 def caches_programs(device: cl.Device) -> bool:
-    """True for a driver that caches its builds on disk, so that a second build takes no time."""
+    """True for a driver that caches its builds on disk, so that a second build takes almost no time."""
     return _pocl_version(device) is not None
 
 
@@ -142,7 +142,7 @@ def compiles_by_size(device: cl.Device) -> bool:
 
 
 def wants_cache(device: cl.Device) -> bool:
-    """True for a driver that is known to build everything again in each process, and to load its binaries again.
+    """True for a driver that needs our cache: it builds everything again in each process, and can load saved binaries.
 
     That is Intel's runtime for CPUs. Other drivers have their own cache, or have not been tried.
     """
@@ -196,7 +196,8 @@ def of_maker(platform_name: str, device_name: str, maker: str) -> bool:
 def driver_files(environment: Mapping[str, str] = os.environ) -> list[Path]:
     """The .icd files; each names a driver's library in one line.
 
-    They are in the system's folder, or the folder set in its place, and in Python packages.
+    They are in the system's folder, or in the folder that an environment variable names instead, and in Python
+    packages.
     """
     folders = [Path(environment.get(_ICD_VENDORS) or "/etc/OpenCL/vendors")]
     spec = importlib.util.find_spec("pyopencl")
@@ -229,8 +230,8 @@ def offer_packaged(
 def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Path | None:
     """Give PoCL a cache folder for this process and its children if it could not make its own below the home.
 
-    Without one PoCL shows no device, as if it were not installed. Returns the folder, which is removed when this
-    process ends; None if nothing was needed, or possible.
+    Without a cache folder PoCL shows no device, as if it were not installed. Returns the folder, which is removed when
+    this process ends; None if no folder was needed, or none could be made.
     """
     if os.name == "nt" or environment.get(_POCL_CACHE):
         return None
@@ -256,9 +257,9 @@ def make_cache_folder(environment: MutableMapping[str, str] = os.environ) -> Pat
 def pin_threads(environment: MutableMapping[str, str] = os.environ) -> None:
     """Pin each PoCL thread to the processor of its number, in this process and its children.
 
-    Otherwise two threads that wake up together share a processor for whole kernels while another idles. Not pinned if
-    the process may use only some processors, or PoCL is set to use fewer: two processes of one thread each would share
-    the first processor. A variable that is already set is kept.
+    Otherwise two threads that wake up together share a processor for whole kernels while another processor idles.
+    Threads are not pinned if the process may use only some processors, or PoCL is set to use fewer. Two processes
+    of one thread each would then share the first processor. A variable that is already set is kept.
     """
     if sys.platform != "linux" or any(name in environment for name in (_POCL_AFFINITY, *_POCL_COUNTS)):
         return

@@ -13,7 +13,7 @@ from pathlib import Path
 import pyopencl as cl
 
 from clsplat.device.drivers import driver_records
-from clsplat.device.drivers.capabilities import traits_of
+from clsplat.device.drivers.capabilities import capabilities_of
 from clsplat.device.drivers.quirks import most_lanes, subgroup_ways, title
 from clsplat.device.drivers.worker_process import regardless
 from clsplat.errors import DeviceError, reason_of
@@ -34,11 +34,13 @@ class Shape:
     """The shape of the kernels for a device.
 
     lanes: pixels per vector in the blend kernels (1 on GPUs).
-    items: work-items per work-group in kernels that co-operate (1 on CPUs, where a group is one sequential loop).
+    items: work-items per work-group in kernels whose items co-operate (1 on CPUs, where a group is one sequential
+    loop).
     chunks: pieces that a scan or sort is divided into if `items` is 1.
-    by_gaussian: in the gradient of blending, an item takes one Gaussian and loops over the pixels, instead of the
+    by_gaussian: in the gradient of blending, a work-item takes one Gaussian and loops over the pixels, instead of the
     reverse (docs/decisions/0023-a-group-shares-a-tile.md). It needs 1 lane and items as in BY_GAUSSIAN_SHAPES.
-    subgroups: items make these sums by exchange within sub-groups, to the same bits, with items as in SUBGROUP_SHAPES.
+    subgroups: in the gradient of blending, work-items sum by exchange within sub-groups, with the same bits. It needs
+    items as in SUBGROUP_SHAPES.
     """
 
     lanes: int
@@ -85,8 +87,8 @@ class Shape:
     def local_bytes(self) -> int:
         """The most local memory that a group needs.
 
-        With one item it holds the sort's counters of wide digits. Otherwise it holds a tile of 16 keys an item, 16
-        counters of 16 bits and a sum for each item, padding between them, and a counter for each digit.
+        With one item the local memory holds the sort's counters of wide digits. Otherwise it holds a tile of 16 keys
+        per item, 16 counters of 16 bits and a sum per item, padding between these, and a counter per digit.
         """
         if self.items == 1:
             return 32 << 10
@@ -96,7 +98,7 @@ class Shape:
 
 def default_shape(device: cl.Device) -> Shape:
     """The shape by device type and vector width; docs/decisions/0003-one-source-many-shapes.md explains the shapes."""
-    if traits_of(device).kind != "cpu":
+    if capabilities_of(device).kind != "cpu":
         items = next((n for n in (64, 32, 16) if n <= most_items(device)), 1)
         return Shape(lanes=1, items=items, chunks=4 * device.max_compute_units)
     lanes = min(16 if device.native_vector_width_float >= 16 else 8, most_lanes(device))
@@ -104,18 +106,18 @@ def default_shape(device: cl.Device) -> Shape:
 
 
 def most_items(device: cl.Device) -> int:
-    """The most work-items in a group of our kernels, by the device's limit and its local memory."""
-    traits = traits_of(device)
-    most = traits.group
-    while most > 1 and Shape(1, most, 1).local_bytes > traits.local_memory:
+    """The most work-items in a group of clsplat's kernels, by the device's limit and its local memory."""
+    capabilities = capabilities_of(device)
+    most = capabilities.group
+    while most > 1 and Shape(1, most, 1).local_bytes > capabilities.local_memory:
         most //= 2
     return most
 
 
 def candidates(device: cl.Device) -> list[Shape]:
-    """The shapes that are worth a trial, the default first."""
+    """The shapes that `clsplat tune` measures, the default first."""
     default = default_shape(device)
-    if traits_of(device).kind == "cpu":
+    if capabilities_of(device).kind == "cpu":
         others = [replace(default, lanes=lanes) for lanes in (16, 8)]
     else:
         others = [replace(default, items=items) for items in (32, 128, 256) if items <= most_items(device)]
@@ -152,17 +154,17 @@ def wanted_shape(device: cl.Device) -> Shape:
     lacking = shape is not None and shape.subgroups and not subgroup_ways(device)
     if shape is None or (not text and (lacking or shape.items > most_items(device))):
         return default
-    name, traits = device.name.strip(), traits_of(device)
+    name, capabilities = device.name.strip(), capabilities_of(device)
     if lacking:
         raise DeviceError(
             f"CLSPLAT_SHAPE={text}: {name} has no sub-groups whose items exchange values; expected a shape without the "
             f"s, such as {text.strip()[:-1]}"
         )
-    if shape.items > traits.group:
-        raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {traits.group} items in a work-group")
+    if shape.items > capabilities.group:
+        raise DeviceError(f"CLSPLAT_SHAPE={text}: {name} has at most {capabilities.group} items in a work-group")
     if shape.items > most_items(device):
         raise DeviceError(
-            f"CLSPLAT_SHAPE={text}: {name} has {traits.local_memory >> 10} KiB of local memory, and a group of "
+            f"CLSPLAT_SHAPE={text}: {name} has {capabilities.local_memory >> 10} KiB of local memory, and a group of "
             f"{shape.items} items needs {shape.local_bytes >> 10} KiB; expected at most {most_items(device)} items"
         )
     return shape
@@ -186,7 +188,7 @@ def shape_of(device: cl.Device) -> tuple[Shape, str]:
         for other in shapes_in_turn(device):
             if other.label not in failed:
                 return other, instead(device, wanted, other, failed[wanted.label])
-    return wanted, ""  # if none is left, the error is raised when it fails again
+    return wanted, ""  # if no other shape is left, the error is raised when this one fails again
 
 
 def shape_text(device: cl.Device) -> str:

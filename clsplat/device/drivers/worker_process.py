@@ -22,9 +22,10 @@ from clsplat.errors import DriverError, InputError, switched_on
 from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, Interrupted, apart, endings
 
 CHILD_MESSAGE_PREFIX = "clsplat-child "
-"""Prefix of a line for the parent; drivers print other lines."""
+"""Prefix of a line that is a message to the parent. Lines that drivers print do not have it."""
 DRIVER_TIMEOUT_SECONDS = 120.0
-"""Seconds without a message after which a driver counts as hung: the slowest working one builds a kernel in 60."""
+"""Seconds without a message after which a driver counts as hung. The slowest working driver takes 60 to build a
+kernel."""
 DRIVER_TIMEOUT_VARIABLE = "CLSPLAT_DRIVER_TIMEOUT"
 TRUST_DRIVER_VARIABLE = "CLSPLAT_TRUST_DRIVER"
 SIGKILL_NUMBER = 9
@@ -35,7 +36,7 @@ class TrialInterrupted(Interrupted):
     """This process was asked to end while it waited for a driver's trial."""
 
 
-def patience() -> float:
+def driver_timeout() -> float:
     """Seconds after which a driver counts as hung: CLSPLAT_DRIVER_TIMEOUT, else DRIVER_TIMEOUT_SECONDS. Raises
     InputError."""
     text = os.environ.get(DRIVER_TIMEOUT_VARIABLE, "")
@@ -51,17 +52,17 @@ def patience() -> float:
 
 
 def regardless() -> bool:
-    """True if CLSPLAT_TRUST_DRIVER=1 disables every test and trial of a driver. Raises InputError."""
+    """True if CLSPLAT_TRUST_DRIVER=1 disables the self-test and all trials of kernels. Raises InputError."""
     return switched_on(TRUST_DRIVER_VARIABLE)
 
 
 def tell(**values: object) -> None:
-    """Send a message from the child to its parent, on its own line regardless of a driver's output."""
+    """Send a message from this process to its parent, on a line of its own even if a driver has printed something."""
     print(f"\n{CHILD_MESSAGE_PREFIX}{json.dumps(values)}", flush=True)
 
 
 def end_with_parent() -> None:
-    """End this process when the parent ends, even if a driver hangs; for a child that reads no messages."""
+    """End this process when the parent ends, even if a driver hangs. It is for a process that reads no messages."""
 
     def wait() -> None:
         while os.read(0, 1 << 10):
@@ -75,8 +76,8 @@ def end_with_parent() -> None:
 def ending_at_once() -> Iterator[None]:
     """Raise TrialInterrupted in the block on a signal that asks this process to end.
 
-    The signal's own handler, which may only record the signal, runs first. No effect outside the main thread: other
-    threads get no signals.
+    The signal's own handler, which may only record the signal, runs first. Outside the main thread the block has no
+    effect, as other threads get no signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -99,7 +100,7 @@ def ending_at_once() -> Iterator[None]:
                 signal.signal(number, handler)
 
 
-_alive: weakref.WeakSet[Child] = weakref.WeakSet()
+_alive: weakref.WeakSet[WorkerProcess] = weakref.WeakSet()
 
 
 def abandon() -> None:
@@ -108,7 +109,7 @@ def abandon() -> None:
         child.abandon()
 
 
-class Child:
+class WorkerProcess:
     """A process that answers in lines of JSON. Ctrl-C does not reach it: it ends with its parent, or by `close`.
 
     Raises DriverError if it cannot be started.
@@ -153,7 +154,7 @@ class Child:
             self._errors.append(line.strip())
 
     def send(self, message: object) -> None:
-        """Send a line to the child; ignored if it has ended, which `receive` reports."""
+        """Send a line to the process. If it has ended, nothing is sent, and `receive` reports the end."""
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.write(json.dumps(message) + "\n")
@@ -182,7 +183,7 @@ class Child:
         return message
 
     def ending(self, where: str = "") -> str:
-        """How the process ended, as the end of a sentence: its status, the place if known, and its last output."""
+        """The end of a sentence about how the process ended: its status, `where` if given, and its last output."""
         status = self._process.wait()
         self._readers[1].join(timeout=5)
         words = [line for line in self._errors if line]
@@ -192,15 +193,15 @@ class Child:
 
     @property
     def crashed(self) -> bool:
-        """True if the process crashed, as drivers make it do.
+        """True if the process crashed, which only a driver can cause.
 
-        False for a Python error, which has status 1 or 2, and if the system killed it for using too much memory.
+        False after a Python error, which has status 1 or 2, and if the system killed the process for lack of memory.
         """
         return self._process.wait() not in (0, 1, 2, *(-number for number in (signal.SIGTERM, SIGKILL_NUMBER)))
 
     @property
     def killed(self) -> bool:
-        """True if the system killed the process, as it does if memory is short."""
+        """True if the system killed the process, as it does when memory runs out."""
         return self._process.wait() == -SIGKILL_NUMBER
 
     def abandon(self) -> None:

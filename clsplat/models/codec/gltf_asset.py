@@ -36,8 +36,8 @@ GLB_JSON_CHUNK, GLB_BIN_CHUNK = 0x4E4F534A, 0x004E4942
 COMPONENT_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 ACCESSOR_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MAX_SCENE_NODES, MAX_GAUSSIAN_PRIMITIVES = 100_000, 4096
-"""Limits of a scene's nodes, and of its primitives with Gaussians. A decompression bomb may repeat one mesh in many
-nodes."""
+"""Largest numbers of nodes in a scene, and of its primitives with Gaussians. A decompression bomb may repeat one mesh
+in many nodes."""
 
 Array = NDArray[Any]
 

@@ -15,7 +15,7 @@ from clsplat.arrays import Float32
 CODEBOOK_SAMPLES = 1 << 16
 LLOYD_ITERATIONS = 20
 DISTANCE_TILE_ROWS = 64
-"""Vectors, and centres, in one block of the distance computation."""
+"""Number of vectors, and of centres, in one block of the distance computation."""
 PRINCIPAL_AXIS_SAMPLES, POWER_ITERATIONS = 128, 30
 """Sampled vectors, and power iterations, for the direction of largest variance."""
 
@@ -61,7 +61,7 @@ def palette(
     Two-level k-means: clusters first, and in each a share of the palette that grows with its squared error. The cost is
     n d sqrt(size) instead of n d size.
 
-    progress: called with the finished fraction.
+    progress: function that is called with the finished fraction.
     """
     count, width = vectors.shape
     size = min(size, count)

@@ -28,10 +28,10 @@ from clsplat.models.codec.values import IO_BLOCK_ROWS
 
 MAX_PLY_HEADER_LINES = 10_000
 MAX_PLY_HEADER_BYTES = 1 << 24
-"""Limit of the whole header, which is held in memory."""
+"""Largest size of the whole header in bytes, as it is held in memory."""
 MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
 MAX_NUMBER_TEXT_BYTES = 128
-"""Longest number in text; in the array of a row, every element is as wide as the widest."""
+"""Longest number in text, bytes. It bounds the array of a row, whose elements are all as wide as the widest."""
 
 _PLY_1_0_DTYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8"}  # fmt: skip

@@ -29,7 +29,7 @@ Activated = Literal["opacities", "scales", "both"]
 DRAWN_QUATERNION_SQUARES = (1e-29, 1e29)
 """Squared lengths of the quaternions that are kept as they are; project.cl accepts 1e-30 to 1e30."""
 MIN_GAUSSIANS_FOR_DOUBTS = 100
-"""Fewest Gaussians whose values show how they are encoded."""
+"""Smallest number of Gaussians whose values show how they are encoded."""
 BYTE_LOGIT_ERROR = 0.02
 """Largest error of a logit between 0 and 1 after an 8-bit format."""
 LARGEST_USEFUL_LOGIT = 20.0

@@ -19,7 +19,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import SH_C0
 
 IO_BLOCK_ROWS = 1 << 15
-"""Rows read or written at once; whole chunks of the compressed PLY."""
+"""Number of rows that are read or written at once: whole chunks of the compressed PLY."""
 MIN_SCALE = 2.0**-149
 """Replacement for a scale of 0, whose log has to be finite: the smallest float32."""
 LOG_SCALES_MIN_NEGATIVE_SHARE = 0.01
@@ -28,7 +28,8 @@ LOG_SCALES_MIN_NEGATIVE_SHARE = 0.01
 In a model in metres nearly all logs are negative. A file of scales with a few damaged ones stays below.
 """
 MAX_UNCHECKED_GAUSSIANS = 1 << 20
-"""Gaussians that a compressed file of any length may have; beyond that, one for each byte.
+"""Number of Gaussians that a compressed file of any length may have. A file may have more only if it has a byte for
+each.
 
 Any real scene stays below, as positions alone take several bytes each. A decompression bomb asks for more.
 """

@@ -40,16 +40,21 @@ SMALL_MODEL_NEAR_PLANES = 10.0
 class Format:
     """A row of the table.
 
-    name: for messages. suffixes: suffixes of its files in lower case; one without a dot is a whole name. read(path):
-    reads the Gaussians; raises InputError, one line with the path, for a damaged file. write(path, gaussians,
-    **options): writes atomically; None for a read-only format. recognises(head): True if the first bytes, at most
-    FORMAT_HEAD_BYTES, are of the format; None if it has no signature. loses: short description of the information that
-    the format does not keep. floats: True if it keeps floats. sh_degree: the highest degree that it holds.
-    describe(path): the format's part of `clsplat info`. order(gaussians): (n,), the Gaussian of each row of a written
-    file; None if the order is kept. blocks(path): yields the Gaussians in world coordinates, some rows at a time; None
-    if the file is read whole. side_files(path): the other files of a model of this name. space(path): colour space of
-    its colours. marks: byte strings; a file with Gaussians has at least one of them near its beginning. Empty if all
-    files have Gaussians.
+    name: its name in messages.
+    suffixes: suffixes of its files in lower case; one without a dot is a whole name.
+    read(path): reads the Gaussians. Raises InputError, one line with the path, for a damaged file.
+    write(path, gaussians, **options): writes atomically; None for a read-only format.
+    recognises(head): True if the first bytes, at most FORMAT_HEAD_BYTES, are of the format; None without a signature.
+    loses: short description of the information that the format does not keep.
+    floats: True if it keeps floats.
+    sh_degree: the highest degree that it holds.
+    describe(path): the format's part of `clsplat info`.
+    order(gaussians): (n,), the Gaussian of each row of a written file; None if the order is kept.
+    blocks(path): yields the Gaussians in world coordinates, some rows at a time; None if the file is read whole.
+    side_files(path): the other files of a model of this name.
+    space(path): colour space of its colours.
+    marks: byte strings, of which a file with Gaussians has at least one near its beginning; empty if all files have
+    Gaussians.
     """
 
     name: str
@@ -243,7 +248,7 @@ def _near_of(gaussians: Gaussians) -> float:
 def save(path: str | os.PathLike[str], gaussians: Gaussians, **options: Any) -> None:
     """Write a model file atomically, in the format of its name.
 
-    options: for the format's `write`; unknown ones are ignored.
+    options: keyword arguments of the format's `write`; unknown ones are ignored.
     Raises InputError for a suffix that cannot be written.
     """
     write = format_of_name(path, writable=True).write

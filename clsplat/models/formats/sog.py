@@ -341,10 +341,10 @@ def write(
 ) -> None:
     """Write version 2: a .sog archive, or a meta.json with its images in the same folder, images first.
 
-    iterations: of k-means for the palette.
+    iterations: number of k-means iterations for the palette.
     sort: order the Gaussians by position (Morton order), so that the images compress better. They are read back in that
       order.
-    progress: called with the current task and its finished fraction.
+    progress: function that is called with the current task and its finished fraction.
     Means are relative to the world's origin, and lose more far from it. Equal Gaussians give equal values. Raises
     InputError for non-finite values.
     """

@@ -318,8 +318,8 @@ def write(
 ) -> None:
     """Write an SPZ file, atomically; equal Gaussians give equal bytes.
 
-    fractional_bits: of positions. The default is 12, like the format's library; more for a model so small that 12 would
-      be coarse, fewer for one that does not fit.
+    fractional_bits: number of fractional bits of positions. The default is 12, like the format's library; more for a
+    model so small that 12 would be coarse, fewer for one that does not fit.
     sh_bits: bits of band 1 and of the higher bands, 1 to 8.
     Means are relative to the world's origin, and lose more far from it. Raises InputError for non-finite values and for
     positions that fit no number of bits. Raises ValueError for settings out of range.

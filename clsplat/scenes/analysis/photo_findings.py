@@ -38,9 +38,9 @@ Kind = Literal[
 ]
 
 EXPOSURE_SPREAD_STOPS = 0.2
-"""Standard deviation of a channel's brightness over the photographs, in stops, from which exposures vary.
+"""Standard deviation of a channel's brightness over the photographs, in stops, from which exposures count as varying.
 
-Occlusion and highlights alone give up to 0.1 for cameras with locked exposure. Learnt gains pay from about 0.2.
+With locked exposure, occlusion and highlights alone cause up to 0.1. Learnt gains improve a model from about 0.2.
 """
 DISTANCE_SPREAD_RATIO = 4.0
 """Ratio of the 90th to the 10th percentile of distance / focal length that counts as a wide range.
@@ -48,11 +48,11 @@ DISTANCE_SPREAD_RATIO = 4.0
 At 4, a Gaussian one pixel wide in one photograph is a quarter of a pixel, or four pixels, wide in another.
 """
 CUT_OUT_BORDER_FRACTION = 0.9
-"""Fraction of the border pixels that masks leave out if they cut an object out of its background."""
+"""Minimum fraction of the border pixels that masks leave out, to count as cutting an object out of its background."""
 SAMPLED_MASKS = 12
 """Number of masks that are sampled to recognise cut-outs. The sample may be up to twice as large."""
 TRANSPARENT_PIXEL_FRACTION = 0.02
-"""Fraction of a photograph's pixels that are transparent if its alpha has a meaning. Seams and corners cover less."""
+"""Minimum fraction of transparent pixels in a photograph whose alpha has a meaning. Seams and corners cover less."""
 WIDE_FISHEYE_DEGREES = 100.0
 """Field of view of a fisheye in degrees from which undistortion loses much: pinhole pictures grow with the tangent."""
 FEW_TRAINING_VIEWS = 16
@@ -70,20 +70,23 @@ bonsai do best with 64 to 85 pixels per Gaussian, and the 50 photographs of fox 
 (docs/quality.md, Few photographs and Growth).
 """
 SUPPORTED_GAUSSIANS_PER_POINT = 1.5
-"""Number of Gaussians per point that few photographs support whatever their pixels: small photographs repeat less."""
+"""Number of Gaussians per point that few photographs support even if they have few pixels, as small photographs repeat
+less."""
 FEW_STEPS_PER_VIEW = 60
-"""Steps per training photograph below which high learning rates pay (docs/decisions/0031-high-rates.md)."""
+"""Steps per training photograph below which high learning rates give better models
+(docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
-"""Training lengths in steps that are close to those measured with high learning rates (2000 to 7000)."""
+"""Lengths of training in steps for which high learning rates are recommended. They were measured from 2000 to 7000."""
 BLUR_SHARPNESS_RATIO = 0.72
 """Sharpness, relative to the scene's median, below which a photograph counts as blurred.
 
 A blur of 1.5 pixels gives this ratio. The content of a photograph changes the ratio by 0.1 to 0.2.
 """
 BLUR_OUTLIER_SIGMAS = 3.5
-"""Standard deviations (from quartiles) that a blurred photograph must also lie below the median, in log sharpness."""
+"""A blurred photograph must also lie below the median log sharpness by this many standard deviations, from
+quartiles."""
 DUPLICATE_RMS = 1.5 / 255
-"""Maximum RMS difference of two thumbnails of the same picture. JPEG rounding causes half of it."""
+"""Maximum RMS difference of two thumbnails that count as the same picture. JPEG rounding causes half of it."""
 FEATURELESS_THUMBNAIL_STD = 8 / 255
 """Standard deviation of a thumbnail up to which it is featureless and never counts as a duplicate."""
 MIN_SKY_PIXEL_FRACTION, MIN_SKY_VIEW_FRACTION = 0.06, 0.3
@@ -93,7 +96,7 @@ MAX_SKY_POINT_DENSITY_RATIO = 0.1
 MAX_SKY_PIXEL_STEP, MIN_SKY_LUMA = 0.025, 0.45
 """Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma."""
 MIN_SKY_BLUE_EXCESS = 0.02
-"""Minimum of blue minus red in a sky; a wall under lamps is below 0. A white sky must exceed MAX_EXPOSURE_COLOUR
+"""Minimum of blue minus red in a blue sky; a wall under lamps is below 0. A white sky must be over MAX_EXPOSURE_COLOUR
 instead."""
 
 

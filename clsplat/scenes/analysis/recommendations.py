@@ -41,7 +41,7 @@ SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.n
 """Settings that a schedule changes, apart from the number of steps."""
 ADVICE_BY_FINDING: Mapping[Kind, str] = {
     "sky": "--sky 1000 starts with points far away for it",
-    "strange masks": "rename or remove what is no mask",
+    "strange masks": "rename or remove files that are no masks",
     "blur": "leave them out where others show the same",
     "duplicates": "remove the copies",
 }
@@ -53,7 +53,7 @@ class Answer:
     """A finding and the settings that answer it.
 
     settings: empty if no setting answers the finding, or none is compatible with the other settings.
-    given: name of a setting of the user that takes precedence, "" for none.
+    given: name of a setting that the user has given, and that takes precedence; "" for none.
     """
 
     finding: Finding
@@ -116,7 +116,7 @@ def _options(finding: Finding) -> Sequence[Mapping[str, Any]]:
 
 
 def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
-    """First given setting, by name, that an option or its schedule would change; "" for none."""
+    """First setting in `given`, by name, that an option or its schedule would change; "" for none."""
     names = {*option, *((*SCHEDULED_SETTINGS, "density.start") if SCHEDULE_SETTING in option else ())}
     return min((name for name in given if name in names or name.partition(".")[0] in names), default="")
 

@@ -31,18 +31,19 @@ MAX_CHECKED_VIEWS = 8
 CHECK_DOWNSCALE = 4
 """Factor by which checked pictures are downscaled."""
 MANY_START_POINTS = 1_000_000
-"""Number of start points above which more hardly help.
+"""Number of start points above which further points hardly improve a model.
 
 Published models of rooms and gardens grow to 1 to 6 million Gaussians from 50,000 to 200,000 points.
 """
 MAX_COINCIDENT_FRACTION = 0.05
 """Fraction of the points that may coincide with others."""
 PRINCIPAL_POINT_MARGIN = 0.5
-"""Distance by which a principal point may lie outside the picture, as a fraction of its width or height."""
+"""Maximum distance of a principal point outside the picture, as a fraction of its width or height."""
 WHITE_LEVEL, BLACK_LEVEL = 0.98, 0.02
 """Minimum of each channel in a white pixel, and maximum in a black one."""
 BACKGROUND_BORDER_FRACTION = 0.9
-"""Fraction of the photographs' border pixels that have the background's colour if the photographs have a background."""
+"""Minimum fraction of the photographs' border pixels with the background's colour, to count as having that
+background."""
 
 
 def of_scene(scene: Scene, background: Background) -> list[str]:
@@ -139,7 +140,7 @@ def _coincident(scene: Scene) -> str:
     if lost <= MAX_COINCIDENT_FRACTION * count:
         return ""
     return (
-        f"{lost:,} of {count:,} points lie where another one does: their Gaussians start with next to no size, or "
+        f"{lost:,} of {count:,} points lie where another one does: their Gaussians start with almost no size, or "
         "as copies; leave doubles out of the cloud"
     )
 

@@ -14,7 +14,7 @@ from clsplat.scenes.point_files import of_one_colour
 from clsplat.scenes.scene import Scene, View
 
 MAX_SAMPLED_SCENE_POINTS = 4000
-"""Maximum number of scene points that are sampled. More change a median brightness by less than 0.01."""
+"""Maximum number of scene points that are sampled. A larger sample changes a median brightness by less than 0.01."""
 THUMBNAIL_OCCLUSION_DEPTH_RATIO = 1.15
 """Depth relative to the nearest point of the cell, above which a point counts as occluded."""
 THUMBNAIL_OCCLUSION_CELL_PX = 8
@@ -26,7 +26,7 @@ MIN_EXPOSURE_COLOUR, MAX_EXPOSURE_COLOUR = 0.06, 0.94
 COLOUR_NOISE_FLOOR = 1 / 255
 """Colour value up to which its logarithm is noise: one 8-bit step.
 
-A higher limit would drop the darkest points of a dark photograph, which would then seem brighter.
+A higher limit would drop the darkest points of a dark photograph, so that the photograph would seem brighter.
 """
 EXPOSURE_IRLS_ITERATIONS, MIN_EXPOSURE_RESIDUAL_STOPS = 10, 0.02
 """Iterations of reweighted least squares, and the residual in stops below which all points have the same weight."""

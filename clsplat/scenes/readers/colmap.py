@@ -53,9 +53,9 @@ MAX_NAME_BYTES = 4096
 MAX_LINE_CHARACTERS = 1 << 26
 """Maximum characters of a text line. The observations of a picture and the track of a point are one line each."""
 EDITED_AFTER_SECONDS = 60.0
-"""Seconds by which a text file is newer than its binary file if it was edited since.
+"""A text file that is newer than its binary file by more seconds than this counts as edited.
 
-Tools that write or copy both files finish the second one sooner.
+Tools that write or copy both files finish within less time.
 """
 RECORD_COUNT_COMMENT = re.compile(r"# *Number of (?:cameras|images|points): *(\d{1,18})\b")
 IMAGE_LINE_FIELDS = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
@@ -172,7 +172,7 @@ def _named(path: Path, name: str) -> str:
 
 
 class _Binary:
-    """Reader of little-endian records. Raises InputError where the file ends."""
+    """Reader of little-endian records. Raises InputError if the file ends before the end of a record."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
         self.path, self.file = path, file
@@ -267,7 +267,7 @@ def _warn_of_newer_text(folder: Path) -> None:
             edited.append(stem)
     if edited:
         read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
-        warn(f"{folder}: {read} is read and not the newer {not_read}; remove what is not meant")
+        warn(f"{folder}: {read} is read and not the newer {not_read}; remove the one that is not meant")
 
 
 def _check_count(path: Path, count: int) -> None:

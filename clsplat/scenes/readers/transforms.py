@@ -43,7 +43,7 @@ COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
 """Default scale and offset of instant-ngp: its position is scale times the file's, plus offset."""
 LAST_ROW_TOLERANCE = 1e-6
-"""Maximum deviation of a pose's last row from 0 0 0 1. Products of float32 matrices are this exact."""
+"""Maximum deviation of a pose's last row from 0 0 0 1. Products of float32 matrices deviate by less."""
 FOCAL_ANGLE_TOLERANCE = 0.02
 """Relative tolerance between a focal length and the angle of view in the same file.
 
@@ -129,7 +129,7 @@ def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
 
 
 def _moved(file: Path | None, copies: dict[Path, Path]) -> Path | None:
-    """Same file in the downscaled copy of its folder, if there is one."""
+    """The file in the downscaled copy of its folder, or the file itself if there is no copy."""
     usual = next((parent for parent in copies if file is not None and parent in file.parents), None)
     return file if file is None or usual is None else copies[usual] / file.relative_to(usual)
 

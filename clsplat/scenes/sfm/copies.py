@@ -358,7 +358,7 @@ def _found(
 ) -> dict[str, Copy]:
     """Copies in each group: photographs that match one before them in the order of `rank`, which may itself be a copy.
 
-    why: called with the kept and the other photograph; empty if they differ.
+    why: function of the kept and the other photograph that returns the evidence; empty if they differ.
     """
     copies: dict[str, Copy] = {}
     for group in groups:

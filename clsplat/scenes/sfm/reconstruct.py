@@ -62,7 +62,7 @@ class SfmSettings:
         photographs.
     camera_model: COLMAP name of the lens model that is fitted. "auto" is OPENCV for cameras with 20 photographs or
         more, otherwise SIMPLE_RADIAL (one distortion coefficient).
-    shared_camera: see `sfm_photos.camera_groups`.
+    shared_camera: which photographs share a camera, as in `photos.camera_groups`.
     max_image_size: longest side in pixels, for features only; the undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
     seed: the same seed gives the same cameras, bit by bit up to 80 photographs.
@@ -110,7 +110,7 @@ def reconstruct(
     overwrite: replace a result of other photographs.
     masks: find no features where masks or alpha leave pixels out. The output also gets the masks, as
         `masks/IMAGE.jpg.png`, white for pixels that count.
-    progress: called with a text and a fraction or None in every stage.
+    progress: function that is called with a text and a fraction or None in every stage.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 

@@ -25,28 +25,28 @@ if TYPE_CHECKING:
 
 INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
-"""The authors' lower bound of the mean squared distance, which keeps coincident points alive.
+"""The authors' lower bound of the mean squared distance, which gives coincident points a size. In world units squared.
 
-World units squared, for scenes whose extent is within ORDINARY_EXTENTS. Others use the same fraction of the extent as
-at the nearer end.
+It holds for scenes whose extent is within ORDINARY_EXTENTS. In other scenes it is scaled with the square of the extent,
+from the nearer end of that range.
 """
 ORDINARY_EXTENTS = (1.0, 100.0)
 MIN_START_COLOUR = 1 / 512
-"""Half a step of an 8-bit image. A channel that starts at 0 is at the colour clamp, where it has no gradient.
+"""Smallest initial value of a colour channel: half a step of an 8-bit image.
 
-Rounding may then keep it at 0.
+A channel that starts at 0 is at the colour clamp, where it has no gradient. Rounding may then keep it at 0.
 """
 SCALE_NEIGHBOURS = 3
 COLOUR_VIEWS_PER_POINT = 15
 """Number of nearest photographs that give a point its colour.
 
-Distant photographs blend a point with its surroundings. With few photographs, one that shows something else has too
-much weight.
+In distant photographs the colour of a point is mixed with its surroundings. With fewer photographs than this, one that
+shows something else in front of the point would have too much weight.
 """
 POINTS_PER_OCCLUSION_CELL = 16
 """Mean number of points in an occlusion cell.
 
-With fewer points, occluded ones show through. With more, cells are so wide that they cover adjacent objects.
+With fewer points, occluded points show through the gaps. With more, cells are so wide that they cover adjacent objects.
 """
 MAX_OCCLUSION_CELL_FRACTION = 1 / 25
 """Maximum side of an occlusion cell, relative to the picture's longer side. With few points, hardly any is occluded."""

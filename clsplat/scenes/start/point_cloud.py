@@ -27,7 +27,8 @@ MAX_CHECKED_CLOUD_POINTS = 20_000
 MIN_CLOUD_POINTS_IN_VIEW = 0.05
 """Minimum fraction of a cloud's points that the training photographs show."""
 MAX_CLOUD_DEPTH_RATIO = 30.0
-"""Maximum ratio between the distances of the cloud and of the scene's points from the cameras that see them."""
+"""Maximum ratio, either way, between the cloud's distance from the cameras that see it and that of the scene's
+points."""
 MAX_CLOUD_DISTANCE_EXTENTS = 1000.0
 """Maximum distance of a cloud from the cameras in scene extents, if the scene has no points."""
 VOXEL_SIZE_TOLERANCE = 0.02

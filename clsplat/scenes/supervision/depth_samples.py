@@ -18,7 +18,7 @@ from clsplat.images.depth_maps import read_map
 from clsplat.scenes.dataset import Lens, pixels_of
 
 NO_DEPTH_VALUE = 65535
-"""Value that some sensors write for unknown depth in metric maps of integers; 0 is another."""
+"""Value that some sensors write for unknown depth in metric maps of integers. 0 also means unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class KnownDepth:
     def at(self, camera: Camera, lens: Lens) -> tuple[NDArray[np.int64], Float32, Float32]:
         """Pixels with known depth in a picture of the camera's size.
 
-        lens: of the depth map, and of a camera that is not a pinhole camera.
+        lens: lens of the depth map, and of a camera that is not a pinhole camera.
         Returns ascending pixel indices (k,), inverse depths in 1 / world units, and weights.
         """
         if self.path is not None:

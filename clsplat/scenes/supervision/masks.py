@@ -27,16 +27,18 @@ OTHER_MASK_FOLDERS = (
 DYNAMIC_FOLDER_PREFIX = "dynamic"
 """Prefix of the name of a folder whose white pixels may be moving objects."""
 MASK_THRESHOLD = 0.5
-"""Minimum mask value of a pixel that counts, and minimum fraction of its area that counts after a change of size."""
+"""Minimum mask value of a pixel that counts. After a change of size, also the minimum fraction of its area that
+counts."""
 COMPARED_MASKS = 12
-"""Number of masks that are sampled to learn whether others reach a half or have void. At most twice as many are
+"""Number of masks in a folder that are sampled for values of at least a half and for void. At most twice as many are
 read."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
 """Maximum of the other labels. Soft masks have larger values."""
 MAX_LABEL_NOISE_RATIO = 0.01
-"""Ratio of the area labelled 1 to the area labelled 255, below which a mask is black and white with noise."""
+"""A mask whose area labelled 1 is smaller than this times its area labelled 255 is taken for black and white with
+noise."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
         return values
     raise InputError(
         f"{path}: the mask's values are {_stored(pixels, most)}, all of them dark, expected 0 and {most}, where a half "
-        "or more counts (or 0 and 1); make white what counts"
+        "or more counts (or 0 and 1); make white the pixels that count"
     )
 
 
@@ -151,7 +153,7 @@ def _without_void(path: Path, values: Float32) -> Float32:
         what = "labels of several things and void" if several else "labels of 0 and 1 with void, or black and white"
         raise InputError(
             f"{path}: the mask's values are {found} and {most}, {what}, expected 0 and {most}, where a half or more "
-            "counts (or 0 and 1); make white what counts and black all else"
+            "counts (or 0 and 1); make white the pixels that count, and black all others"
         )
     return _labels(np.rint(values * most), most)
 

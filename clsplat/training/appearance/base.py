@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base of the appearance models: colours of each photograph, learnt with the model."""
+"""Base class of the appearance models, which learn the colours of each photograph together with the model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Appearance(Component):
     """Appearances of all training views. The base class learns nothing and leaves the model's colours unchanged."""
 
     def of_views(self, views: Sequence[int], step: int) -> Sequence[ViewPart]:  # noqa: ARG002
-        """Appearances of the views of a step; empty for the model's own colours.
+        """Appearance of each view of a step. The list is empty if the views have the model's own colours.
 
         step: number of the last view.
         """
@@ -44,7 +44,7 @@ class Appearance(Component):
         self.take(named("appearance/"))
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load arrays by name without the prefix."""
+        """Load the arrays of a checkpoint, by name without the prefix."""
 
     def write(self, run: Run) -> None:
         """Write appearance.json and appearance.npz."""

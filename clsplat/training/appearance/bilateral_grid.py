@@ -69,9 +69,9 @@ class ViewGrid(ViewPart):
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
     ) -> DeviceArray:
-        """Turn `gradient` into the gradient of the image, in place, and return the grid's for `update`.
+        """Turn `gradient` into the gradient by the image, in place, and return the gradient by the grid for `update`.
 
-        `update` is tried here, before anything changes.
+        The kernels of `update` are tried here in the sandbox, before anything changes.
         """
         of_view, size = (self.grids, self.view, image, gradient), (width, height)
         by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
@@ -81,8 +81,10 @@ class ViewGrid(ViewPart):
         return by_grid
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step. After a pass the mean of all grids becomes the identity, as their common part belongs to
-        the model."""
+        """Take Adam's step. After a pass through all views the mean of all grids is made the identity.
+
+        The part that all grids have in common belongs to the model.
+        """
         assert own is not None, "made by `gradient`"
         step_grid(self.device, self.grids, self.view, own, self.visit, self.rate, readback)
         if self.ends:
@@ -100,7 +102,7 @@ class GridsOfAll(Appearance):
 
     @property
     def pixel_bytes(self) -> int:
-        """Bytes per pixel on the device, including the grids, divided over the largest picture."""
+        """Bytes on the device per pixel of the largest picture. The bytes of the grids are divided over its pixels."""
         return device_bytes(self._count, [(view.camera.width, view.camera.height) for view in self._scene.views])
 
     def of_views(self, views: Sequence[int], step: int) -> list[ViewGrid]:

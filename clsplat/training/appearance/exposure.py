@@ -29,25 +29,27 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 CODED_OCTAVES_PER_LIGHT_OCTAVE = 1 / 2.2
-"""Approximate octaves of a coded value per octave of light. It converts EXIF exposures of non-linear photographs to
-initial gains, if points give none."""
+"""Approximate octaves of a coded colour value per octave of light.
+
+Initial gains come from the colours of points. If points give none, they come from EXIF exposures by this factor.
+"""
 
 START_GAIN_STEP_OCTAVES = 2.0**-10
-"""Octaves to which gains from points are rounded. Processors sum in different orders, but start with the same gains."""
+"""Octaves to which gains from points are rounded, so that processors that sum in different orders start equally."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
 """Weights of the pulls towards the gains from points, as fractions of the distance in octaves, in the loss's gradient.
 
-The first pulls each photograph, the second its common part with its neighbours. Neighbouring views may all become
-slightly brighter if their exclusive content is darker; there the points are better. Gains without points have no pull,
-as it would hold them at the mean.
+The first pulls the gains of each photograph. The second pulls the part of them that it has in common with its
+neighbours: neighbouring views may all become slightly too bright if what only they show is dark, and there the points
+know better. Gains without points are not pulled, as the pull would hold them at the mean.
 """
 
 GAIN_RATE_END_FRACTION = 0.001
 """Fraction of the learning rate that is left at the last step.
 
-The size of Adam's steps is the rate, even at the optimum. At ten times this, the last steps of a photograph among 127
-change it by 0.25 %.
+Adam's steps are as large as the rate even at the optimum. With ten times this fraction, the last steps of one of 127
+photographs change its gain by 0.25 %.
 """
 
 GAIN_CHECKPOINT_ARRAYS = ("logs", "start", "first", "second", "gains")
@@ -111,7 +113,7 @@ class ViewGains(ViewPart):
 
 
 def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
-    """Exposures `told` relative to the mean of the known ones in `of`; NaN if unknown."""
+    """Exposures `told`, from EXIF, relative to the mean of the known ones in `of`; NaN for unknown ones."""
     known = [value for value in of if value is not None]
     return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
 

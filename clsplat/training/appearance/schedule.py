@@ -14,18 +14,19 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 
 APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
-"""Steps of the warm-up, at most a tenth of all, and the fraction of the rate at its start."""
+"""Steps of the warm-up, unless a tenth of all steps is less, and the fraction of the rate at its start."""
 FULL_LENGTH_STEPS = 10_000
-"""Number of steps below which a training is short. In as many steps a gain can change by about 2 octaves, at the rate
-of the settings."""
+"""Number of steps below which a training counts as short. In this many steps, and at the rate of the settings, a gain
+can change by about 2 octaves."""
 
 
 def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
     """Learning rate of step number `step`.
 
-    views: a photograph has a gradient in one of so many steps, which makes Adam's steps smaller by the root of it.
+    views: number of photographs. Each has a gradient in one of so many steps, so its Adam steps shrink by the root of
+    it.
     ends: fraction of the rate that is left at the last step.
-    hastens: raise the rate in a short training, so that gains can change by the same amount.
+    hastens: True to raise the rate in a short training, so that gains can change by as much as in a long one.
     """
     rise: float = WARM_UP_START_FRACTION ** (1 - min(step / min(APPEARANCE_WARM_UP_STEPS, config.iterations / 10), 1.0))
     fall: float = ends ** (step / config.iterations)

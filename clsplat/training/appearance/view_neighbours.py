@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs with nearby cameras: pictures hardly determine the common part of their gains."""
+"""Photographs with nearby cameras, and the part of their gains that they have in common.
+
+The pictures hardly determine that part, so that `exposure` pulls it to its start.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,14 @@ NEIGHBOUR_DISTANCE_LIMIT = 2.5
 """Distance at which cameras stop being neighbours.
 
 It combines two distances: between centres, relative to the median distance from the middle, and between unit viewing
-directions. At a quarter of it about half of the weight is left. Colours by direction, of SH degree 3, can vary over
-about that distance.
+directions. At a quarter of the limit about half of the weight is left. Over about that distance a colour of SH degree 3
+can vary with the direction.
 """
 MAX_MEAN_NEIGHBOURS = 256
-"""Maximum mean number of neighbours of a camera, including itself. The distance is reduced to keep it."""
+"""Maximum mean number of neighbours of a camera, including itself. The distance limit is reduced so far if
+necessary."""
 NEIGHBOUR_WEIGHT_STEP = 2.0**-20
-"""Weights are multiples of this, so that they are equal on processors that round differently."""
+"""Step to which weights are rounded, so that they are equal on processors that round differently."""
 
 
 def places(cameras: Sequence[Camera]) -> Float64:
@@ -40,12 +44,13 @@ def places(cameras: Sequence[Camera]) -> Float64:
 def common(cameras: Sequence[Camera], told: NDArray[np.bool_]) -> csr_array:
     """Symmetric matrix (n, n) that extracts the common part of neighbouring photographs' values.
 
-    told: (n,), photographs that count; rows and columns of the others are 0.
+    told: (n,), True for photographs that count; rows and columns of the others are 0.
 
-    It keeps up to all of the common part, and half of the value of a photograph without neighbours. Its entries are w /
-    sqrt(t t'), where w is (1 - r)^6 (6 r + 1) at a distance of r NEIGHBOUR_DISTANCE_LIMIT. t and t' are 1 more than the
-    sums of their w. These w are positive definite in six dimensions (Wendland, Advances in Computational Mathematics 4,
-    1995). So the matrix is positive semidefinite, except for rounding to `NEIGHBOUR_WEIGHT_STEP`.
+    For a photograph with many neighbours the matrix keeps nearly all of the common part. For one without neighbours it
+    keeps half of its value. Its entries are w / sqrt(t t'), where w is (1 - r)^6 (6 r + 1) at a distance of r
+    NEIGHBOUR_DISTANCE_LIMIT. t and t' are 1 more than the sums of their w. These w are positive definite in six
+    dimensions (Wendland, Advances in Computational Mathematics 4, 1995). So the matrix is positive semidefinite, except
+    for rounding to `NEIGHBOUR_WEIGHT_STEP`.
     """
     numbers = np.flatnonzero(told)
     if not len(numbers):

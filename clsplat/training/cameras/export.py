@@ -23,7 +23,7 @@ LENS_WARNING_FOCAL_LENGTHS = 0.1
 def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, along: Drift | None) -> None:
     """Write the refined cameras, and warn of any camera with a large change.
 
-    along: mean motion of the refined poses, which is applied to held-out poses and to the points.
+    along: common motion of the refined poses, which held-out poses and points follow; None without refined poses.
     """
     cameras, points = {view.name: view.camera for view in scene.views}, scene.points
     if along is not None:
@@ -38,17 +38,17 @@ def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, al
         names = [view.name for view, one in zip(scene.train_views, far, strict=True) if one]
         warnings.warn(
             f"--refine-poses: {examples(names)}: moved by up to {degrees.max():.1f} degrees and {shifts.max():.3g} "
-            "world units; look at their renders, or leave them out"
+            "world units; check their renders, or leave them out"
         )
     if (most := lenses.largest) > LENS_WARNING_FOCAL_LENGTHS:
         warnings.warn(
-            f"--refine-lenses: a focal length or principal point has changed by {most:.1%} of the focal length; look "
-            "at the renders, or leave them as they are"
+            f"--refine-lenses: a focal length or principal point has changed by {most:.1%} of the focal length; "
+            "check the renders, or train without --refine-lenses"
         )
 
 
 def doubt_poses(mean: Mapping[str, float], most: float) -> None:
-    """Warn if the model's world has left the given cameras' world, by more than `most` dB."""
+    """Warn if the model's world has moved away from the given cameras: if aligned poses score over `most` dB better."""
     lost = mean.get("psnr_aligned", 0.0) - mean["psnr"]
     if 0 < most < lost:
         warnings.warn(

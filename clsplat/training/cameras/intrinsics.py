@@ -44,7 +44,7 @@ class RefinedLenses:
         self._start, count = first_step(config), len(self._rows)
         self._shares = np.bincount(self._of_view) / len(views)
         self.changes = np.zeros((count, LENS_PARAMETERS))
-        # room for the six motions that `descend` takes; the last three stay 0
+        # six parameters, as `descend` takes; the last three stay 0
         self._first, self._second = np.zeros((count, 6)), np.zeros((count, 6, 6))
         self._visits = np.zeros(count, np.int64)
 
@@ -53,7 +53,7 @@ class RefinedLenses:
         return self.on and step > self._start
 
     def move(self, view: int, step: int, camera: Camera, gradient: Float64) -> None:
-        """Take Adam's step of a view's lens; none for a gradient that is not finite.
+        """Take Adam's step of a view's lens. A gradient that is not finite causes no step.
 
         camera: the camera with which the gradient was computed.
         gradient: (4,), with respect to ln fx, ln fy, cx and cy.

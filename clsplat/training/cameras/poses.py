@@ -18,7 +18,7 @@ from clsplat.scenes.scene import View
 
 POSE_BETA1, POSE_BETA2 = 0.9, 0.99
 MIN_AXIS_MOMENT_RATIO, MIN_AXIS_MOMENT = 1e-2, 1e-30
-"""Minimum second moment along an axis: relative to the largest one, and absolute."""
+"""Lower bounds of the second moment along an axis: relative to the largest one, and absolute."""
 JACOBI_PAIRS = [
     np.array(pairs)
     for pairs in (
@@ -37,13 +37,13 @@ CAMERA_RATE_END_FRACTION = 0.01
 
 
 def fallen(reach: float, part: float, visits: float) -> float:
-    """Rate of a visit after fraction `part` of the training. It falls exponentially, and all visits sum to `reach`."""
+    """Rate at fraction `part` of the training. It falls exponentially, and the rates of all `visits` sum to `reach`."""
     mean = (1 - CAMERA_RATE_END_FRACTION) / -np.log(CAMERA_RATE_END_FRACTION)
     return float(reach / max(visits * mean, 1.0) * CAMERA_RATE_END_FRACTION**part)
 
 
 def first_step(config: TrainConfig) -> int:
-    """Step after which cameras are refined: the model has to be recognisable by then."""
+    """Step after which cameras are refined. Before it the model is not recognisable enough."""
     return min(500, config.iterations // 10)
 
 
@@ -83,7 +83,7 @@ def axes_of(matrix: Float64) -> tuple[Float64, Float64]:
 
 
 def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64:
-    """Adam's step (6,) at rate 1, along the axes of the gradients' second moments: docs/gradients.md, (143).
+    """Adam's step (6,) at rate 1, in the axes of the gradients' second moments: docs/gradients.md, (143).
 
     first, second: moments (6,) and (6, 6), updated in place.
     by: the gradient (6,).
@@ -102,8 +102,8 @@ def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64
 class Poses:
     """Cameras of the training views, which move if poses are refined.
 
-    Adam has moments for each view. Two views are fixed: the first, and the farthest from it, ignoring stray cameras.
-    They fix the model's place and size.
+    Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first one,
+    and the one farthest from it. Outlier cameras are not chosen.
     """
 
     def __init__(self, config: TrainConfig, views: Sequence[View], extent: float) -> None:
@@ -114,7 +114,7 @@ class Poses:
         if not self.on:
             return
         if len(views) < 3:
-            raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two are held")
+            raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two do not move")
         places = np.array([camera.position for camera in self.cameras])
         near = ~stray_cameras(self.cameras)
         first = int(near.argmax())
@@ -135,7 +135,7 @@ class Poses:
         return fallen(reach, part, steps / len(self.cameras))
 
     def move(self, view: int, step: int, gradient: Float64) -> None:
-        """Take Adam's step of a view's pose; none for a gradient that is not finite."""
+        """Take Adam's step of a view's pose. A gradient that is not finite causes no step."""
         by = gradient * self._scale  # translations relative to the extent
         if not np.isfinite(by).all():
             return
@@ -166,7 +166,7 @@ class Poses:
         values = checked_arrays(self.arrays(), arrays, "poses/")
         turned = values["rotations"]
         if np.abs(turned @ turned.transpose(0, 2, 1) - np.eye(3)).max() > ROTATION_TOLERANCE:
-            raise ValueError("has poses/rotations that are none")
+            raise ValueError("has poses/rotations that are no rotation matrices")
         poses = zip(self._given, values["rotations"], values["translations"], strict=True)
         self.cameras = [given.posed(rotation, translation) for given, rotation, translation in poses]
         self._first, self._second, self._visits = values["first"], values["second"], values["visits"]

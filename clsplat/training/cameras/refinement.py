@@ -36,8 +36,8 @@ class CameraSums(ViewPart):
     """Gradients with respect to the pose and the lens of a step's view, of a model of `count` rows.
 
     `add_rows` receives all rows, in order.
-    pose, lens: which gradients to sum.
-    move: called with the sums after Adam.
+    pose, lens: True for each gradient to sum.
+    move: function that is called with the sums after Adam's step.
     """
 
     wants_gradients = True
@@ -51,11 +51,11 @@ class CameraSums(ViewPart):
     _sums: dict[int, DeviceArray] = field(default_factory=dict, init=False)
 
     def lens_gradients(self, rows: int) -> DeviceArray | None:
-        """Room (rows, 4) for the rows' gradients with respect to the lens, if they are needed."""
+        """Array (rows, 4) for the rows' gradients with respect to the lens; None if they are not needed."""
         return self.work.array("by_lens", (rows, LENS_NUMBERS)) if self.lens else None
 
     def add_rows(self, rows: StepRows) -> None:
-        """Sum the rows' gradients. Later kernels are tried here, before anything changes."""
+        """Sum the rows' gradients. Kernels that follow are tried here in the sandbox, before anything changes."""
         assert rows.gradients is not None, "asked for where cameras are refined"
         counts = rows.projected.tile_counts
         if self._device is None:
@@ -93,10 +93,10 @@ class CameraSums(ViewPart):
 
 
 class Cameras(Component):
-    """Cameras of the training views. Refined poses and lenses change until their gate ends it.
+    """Cameras of the training views. Refined poses and lenses change until the gate ends the refinement.
 
     work: memory for sums over the model's rows.
-    held_out: number of held-out views that the gate uses.
+    held_out: number of held-out views with which the gate validates the cameras.
     """
 
     def __init__(self, config: TrainConfig, scene: Scene, work: Workspace | None = None, held_out: int = 0) -> None:
@@ -107,7 +107,8 @@ class Cameras(Component):
 
     @property
     def models(self) -> int:
-        """Parameters, two moments and a view's gradients, if cameras are refined."""
+        """Arrays on the device for each parameter: parameter, two moments and a view's gradient if cameras are
+        refined."""
         return REFINEMENT_ARRAYS_PER_PARAMETER if self._config.refines else 0
 
     @property
@@ -130,7 +131,7 @@ class Cameras(Component):
         return replace(inputs, parts=(*inputs.parts, sums))
 
     def _move(self, inputs: ViewInputs, step: int, sums: CameraSums) -> None:
-        """Change the view's camera by the gradients; waits for the device."""
+        """Change the view's camera along the gradients; waits for the device."""
         if sums.pose:
             self.poses.move(inputs.view, step, sums.by_pose())
         if sums.lens:

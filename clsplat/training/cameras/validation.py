@@ -36,10 +36,12 @@ class ValidationViews:
         self._measure = metrics.psnr if config.appearance == "none" else metrics.psnr_corrected
 
     def psnr(self, draw: Draw, look: Look, cameras: Sequence[Camera]) -> float:
-        """Mean PSNR in dB of the views through these cameras; 0 if no photograph counts.
+        """Mean PSNR in dB of the views, rendered from these cameras; 0 if no photograph counts.
 
-        look: the views' appearance, as far as it is known. If appearance is learnt, colours are fitted. A photograph
-        counts if its mask keeps a pixel.
+        A photograph counts if its mask keeps a pixel. If appearance is learnt, colours are fitted before the
+        comparison.
+
+        look: function that gives a view's appearance, as far as it is known.
         """
         found = []
         for index, camera in enumerate(cameras):
@@ -53,18 +55,19 @@ class ValidationViews:
         return float(np.mean(found)) if found else 0.0
 
 
-def judge(cameras: Cameras, judges: ValidationViews, step: int, draw: Draw, look: Look) -> None:
-    """Measure the held-out views with the refined cameras. If the gate rejects them, go back to earlier ones with a
-    warning.
+def validate(cameras: Cameras, validation_views: ValidationViews, step: int, draw: Draw, look: Look) -> None:
+    """Measure the held-out views with the refined cameras. If the gate rejects the cameras, warn and go back to earlier
+    ones.
 
-    Poses of held-out views are as given, or moved by the drift of the refined poses, whichever fits better. The given
-    ones are right if only some training poses were wrong, and the moved ones if the whole frame drifts.
+    Held-out views are measured twice, with their given poses and with these moved by the drift of the refined poses.
+    The better result counts. The given poses are right if only some training poses were wrong, and the moved ones if
+    the whole world has drifted.
     """
-    seen = [cameras.lenses.seen(view.lens, view.camera) for view in judges.views]
-    psnr = judges.psnr(draw, look, seen)
+    seen = [cameras.lenses.seen(view.lens, view.camera) for view in validation_views.views]
+    psnr = validation_views.psnr(draw, look, seen)
     if (drift := cameras.drift()) is not None:
-        psnr = max(psnr, judges.psnr(draw, look, [drift.taken_along(camera) for camera in seen]))
-    best, warning = cameras.gate.judge(step, psnr, cameras.refined_arrays())
+        psnr = max(psnr, validation_views.psnr(draw, look, [drift.taken_along(camera) for camera in seen]))
+    best, warning = cameras.gate.validate(step, psnr, cameras.refined_arrays())
     if best is not None:
         cameras.go_back(best)
     if warning:

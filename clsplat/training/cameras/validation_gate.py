@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gate that uses held-out photographs to return to earlier cameras. Policy only, no OpenCL."""
+"""Gate of refined cameras: it returns to earlier cameras if held-out photographs get worse. Policy only, no OpenCL."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ MAX_GATE_VIEWS = 8
 GATE_MEASUREMENTS = 10
 """Measurements in a training, in addition to the one when refinement begins."""
 LOW_MEASUREMENTS_IN_A_ROW = 2
-"""Consecutive measurements below the bound that end refinement. A single one may follow a densification."""
+"""Number of consecutive low measurements that end refinement. A single one may be low because of a densification."""
 RESET_SETTLING_DIVISOR = 3
-"""Divisor of the interval between opacity resets that gives the time a model needs to recover from one. Until then it
-cannot judge its cameras."""
+"""Divisor of the interval between opacity resets. The quotient is the number of steps in which a model recovers from a
+reset; until then its cameras cannot be validated."""
 DRIFT_ITERATIONS, MIN_DRIFT_RESIDUAL = 10, 1e-12
-"""Iterations of a drift's weights, and the smallest residual and spread that do not count as zero."""
+"""Number of reweighted fits of a drift, and the residual and spread below which they count as zero."""
 
 
 def steps_of(config: TrainConfig) -> tuple[int, ...]:
-    """Steps after which cameras are judged, rising: when refinement begins and at every tenth of the training.
+    """Steps after which cameras are validated, rising: when refinement begins, and at every tenth of the training.
 
-    Just after a densification, and for long after an opacity reset, a model cannot judge its cameras. The measurement
-    then moves to the last step before, as a step measures first and then changes the model.
+    Just after a densification, and for long after an opacity reset, the model is too bad to validate cameras with. The
+    measurement then moves to the last step before, where it comes before the change of the model.
     """
     density, first = config.density, first_step(config)
     settling = (density.opacity_reset_every or DensityConfig.opacity_reset_every) // RESET_SETTLING_DIVISOR
@@ -65,7 +65,7 @@ class Drift:
     shift: Float64
 
     def taken_along(self, camera: Camera) -> Camera:
-        """Camera that sees in the drifted world the same as this one in the original world."""
+        """Camera that sees in the drifted world what this one sees in the original world."""
         rotation = camera.rotation @ self.rotation.T
         position = self.scale * self.rotation @ camera.position + self.shift
         return camera.posed(rotation, -rotation @ position)
@@ -79,10 +79,10 @@ class Drift:
 def drift(given: Sequence[Camera], refined: Sequence[Camera], extent: float) -> Drift:
     """Similarity that best maps the given poses to the refined ones, n each.
 
-    A camera's residual is the root of (angle^2 + (distance/extent)^2), angles in radians. Squares have Huber weights
-    with the median residual as the bound, so that a few outliers have little influence. The rotation fits positions and
-    axes together (Kabsch 1976), as cameras may lie on a line or in a point. The scale is Umeyama's (1991), from the
-    positions.
+    A camera's residual is the root of (angle^2 + (distance/extent)^2), angles in radians. Squared residuals have Huber
+    weights with the median residual as the bound, so that a few outliers have little influence. The rotation fits
+    positions and axes together (Kabsch 1976), as cameras may lie on a line or in one point. The scale is Umeyama's
+    (1991), from the positions.
     """
     old, new = (np.array([camera.rotation for camera in cameras]) for cameras in (given, refined))
     at, to = (np.array([camera.position for camera in cameras]) / extent for cameras in (given, refined))
@@ -118,17 +118,17 @@ class CameraGate:
         self._best: dict[str, NDArray[Any]] = {}
 
     def is_due(self, step: int) -> bool:
-        """True if the cameras have to be judged after this step, or if a due step was passed without a measurement."""
+        """True if the cameras have to be validated after this step, or if a due step has passed without it."""
         last = self.measured[-1][0] if self.measured else -1
         return any(last < due <= step for due in self._steps)
 
     @property
     def best(self) -> tuple[int, float]:
-        """Step and dB of the best measurement before refinement ended; the first of equal ones."""
+        """Step and dB of the best measurement before refinement ended; of equal ones, the first."""
         known = [each for each in self.measured if self.ended is None or each[0] <= self.ended]
         return max(known, key=lambda each: each[1])
 
-    def judge(
+    def validate(
         self, step: int, psnr: float, cameras: Mapping[str, NDArray[Any]]
     ) -> tuple[dict[str, NDArray[Any]] | None, str]:
         """Record a measurement in dB.
@@ -152,7 +152,7 @@ class CameraGate:
             " and ".join(each) for each in zip(*((f"{value:.2f}", str(on)) for on, value in low), strict=True)
         )
         found = f"{flag}: held-out views had {best:.2f} dB at step {at}, {figures} dB at steps {steps}"
-        advice = f"try a smaller {reach}, or none of {flag}"
+        advice = f"try a smaller {reach}, or train without {flag}"
         if step >= self._config.iterations:
             return None, f"{found}: no step is left to go back; {advice}"
         self.ended = step
@@ -172,9 +172,9 @@ class CameraGate:
         return {f"gate/{name}": array for name, array in own.items()}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], cameras: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint, by name without the prefix. There are none before the first measurement.
+        """Load the arrays of a checkpoint, by name without the prefix. They are empty before the first measurement.
 
-        cameras: arrays with the shapes of the best measurement's.
+        cameras: arrays of the cameras now, whose shapes the stored ones must have.
         Raises ValueError for arrays of other views.
         """
         self.measured, self.ended, self._best = [], None, {}

@@ -18,9 +18,9 @@ from clsplat.optimisation.density_rules import MarkRules
 class StatisticsNeeds:
     """Statistics that a strategy needs.
 
-    gradients: sums of screen-space gradients, number of views, and radii.
-    absolute: sums of the absolute per-pixel gradients (AbsGS).
-    contributions: shares in the pictures of an epoch.
+    gradients: True for sums of screen-space gradients, number of views, and radii.
+    absolute: True if the gradients are sums of the absolute values per pixel (AbsGS).
+    contributions: True for contributions to the pictures of an epoch.
     """
 
     gradients: bool = False
@@ -62,12 +62,12 @@ class HostCopy(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
-    """A strategy's view of the model, of `count` Gaussians after `step` steps.
+    """The model as a strategy sees it: `count` Gaussians after `step` steps.
 
-    extent: the scene's, in world units.
-    parameters: by group.
-    statistics: by their names in a checkpoint.
-    marker: compares Gaussians with rules.
+    extent: the scene's extent, in world units.
+    parameters: parameter arrays by group.
+    statistics: arrays by their names in a checkpoint.
+    marker: compares the Gaussians with rules.
     """
 
     count: int
@@ -87,15 +87,15 @@ SPLIT_GROUPS = ("means", "quaternions", "log_scales")
 class RowPlan:
     """Planned rows of the model.
 
-    rows: (m,) uint32, the source row of each; None if all stay.
-    fresh: (m,) bool, rows whose moments start at zero and whose contributions are unknown.
-    listed: the list of the model's marker, instead of `rows` and `fresh`.
+    rows: (m,) uint32, the source row of each new row; None if all rows stay.
+    fresh: (m,) bool, True for rows whose moments start at zero and whose contributions are unknown.
+    listed: list from the model's marker, which takes the place of `rows` and `fresh`.
     values: by parameter group, indices of the new rows that change, and their values (k, ...).
-    halves: computes the values of a list's halves from the groups `halved` of the split Gaussians.
-    changes: by group, computes new values for all rows.
+    halves: function that computes the values of the halves from the groups `halved` of the split Gaussians.
+    changes: by group, function that computes new values for all rows.
     restarted: groups whose moments start at zero in every row.
-    new_statistics: all statistics except contributions start from zero.
-    forget_contributions: contributions become unknown in every row.
+    new_statistics: True if all statistics except contributions start from zero.
+    forget_contributions: True if contributions become unknown in every row.
     """
 
     rows: NDArray[np.uint32] | None = None
@@ -122,11 +122,11 @@ class Strategy:
         raise NotImplementedError
 
     def is_due(self, step: int) -> bool:
-        """True if `before_step` may have a plan after `step` steps. The model is then repaired first."""
+        """True if `before_step` may have a plan after `step` steps. The model is repaired before it is asked."""
         raise NotImplementedError
 
     def before_step(self, model: ModelState) -> RowPlan | None:
-        """Plan after `model.step` steps, which is carried out when the next step begins."""
+        """Plan after `model.step` steps. It is carried out when the next step begins."""
         raise NotImplementedError
 
     def after_gradient(self, model: ModelState) -> RowPlan | None:  # noqa: ARG002  # most have none
@@ -138,7 +138,7 @@ class Strategy:
         return None
 
     def rearranged(self, rows: NDArray[np.uint32], fresh: NDArray[np.bool_]) -> None:
-        """Note that row j of the model is now the old row rows[j]. The cause is this strategy's plan, or a repair."""
+        """Called after this strategy's plan, or a repair, has moved rows: row j of the model is the old row rows[j]."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """State of the strategy by name, for a checkpoint."""

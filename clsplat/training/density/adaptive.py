@@ -17,10 +17,10 @@ from clsplat.optimisation.density_rules import MarkRules, edge
 from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, StatisticsNeeds, Strategy
 
 HALF_OFFSET_DEVIATIONS, LONG_AXIS_HALF_RATIO, SHORT_AXIS_HALF_RATIO, HALF_OPACITY_RATIO = 1.35, 0.55, 0.893, 0.6
-"""Halves along the longest axis (Improved-GS, Deng et al. 2025).
+"""Constants of halves along the longest axis (Improved-GS, Deng et al. 2025).
 
-Distance of their means from the original mean, in standard deviations, then factors on that axis, the other axes and
-the opacity.
+They are the distance of the halves' means from the original mean, in standard deviations, and the factors on the scale
+of that axis, on the scales of the other axes, and on the opacity.
 """
 
 
@@ -31,7 +31,7 @@ class Adaptive(Strategy):
         self.config, self.white = config.density, config.background == "white"
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Gradients while Gaussians are densified; the others while this or a later pruning uses them."""
+        """Gradients while Gaussians are densified; contributions while this or a later pruning uses them."""
         config = self.config
         densifies = config.every > 0 and step < config.stop
         prunes = config.min_contribution > 0 and (config.prune_every > 0 or densifies)
@@ -73,7 +73,8 @@ def is_pruning_due(config: DensityConfig, step: int) -> bool:
 
 
 def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
-    """True if opacities are reset after this step; once early for a white background, as in the authors' code."""
+    """True if opacities are reset after this step. A white background has one more early reset, as in the authors'
+    code."""
     if config.every <= 0 or step >= config.stop:
         return False
     return (config.opacity_reset_every > 0 and step % config.opacity_reset_every == 0) or (
@@ -85,9 +86,9 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
     """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
     or contribute little.
 
-    Kept ones come first and in order. Clones and halves are fresh.
+    Kept Gaussians come first and in order. Clones and halves are fresh.
     """
-    # Each rule uses the float widths of array comparisons: float32 with a Python number.
+    # Each rule compares like NumPy: a float32 array with a Python number, in float32.
     too_large, dense = config.max_world_fraction * model.extent, config.dense_fraction * model.extent
     shrinks = 1 / LONG_AXIS_HALF_RATIO if config.long_axis else config.split_factor
     rules = replace(
@@ -103,7 +104,7 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
         )
         if config.max_screen_radius > 0:
             rules = replace(rules, radius=edge(lambda radius: radius > config.max_screen_radius))
-    listed = model.marker.rows(replace(rules, strongest=_strongest(config, model, rules)))
+    listed = model.marker.rows(replace(rules, cut_off=_cut_off(config, model, rules)))
     if config.long_axis:
         return RowPlan(listed=listed, halves=long_halves, halved=(*SPLIT_GROUPS, "opacity_logits"), new_statistics=True)
     return RowPlan(listed=listed, halves=partial(draw_halves, config, rng=model.rng), new_statistics=True)
@@ -117,8 +118,8 @@ def plan_pruning(config: DensityConfig, model: ModelState) -> RowPlan:
 def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
     """Rules for pruning transparent Gaussians and Gaussians that no view needs.
 
-    Contributions are in pixels, and infinite while unknown. Totals cover the views of the last whole epoch. The largest
-    contributions cover any view in that epoch and the current one.
+    Contributions are in pixels, and infinite while unknown. The largest contribution is the maximum over the views of
+    the last whole epoch and of the current one.
     """
     opaque = np.log(config.min_opacity / (1 - config.min_opacity))
     rules = MarkRules(transparent=edge(lambda logit: logit >= opaque))
@@ -129,10 +130,10 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
     return rules
 
 
-def _strongest(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
-    """Score and row of the weakest Gaussian that still fits when cloned or split, for `MarkRules`.
+def _cut_off(config: DensityConfig, model: ModelState, rules: MarkRules) -> tuple[float, int]:
+    """Score and row of the weakest Gaussian that may still be cloned or split, for `MarkRules.cut_off`.
 
-    The marker computes scores only if room may be short.
+    Scores are computed only if the cap may leave too little room for all Gaussians that pass the other rules.
     """
     room = config.max_gaussians - model.count
     if config.growth == "budget":
@@ -152,8 +153,8 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
     """Number of Gaussians after this step's densification, from `count` before it.
 
     Taming 3DGS (Mallick et al. 2024): A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N, from S to B in N
-    densifications. That is B - (B - S)(1 - x/N)^2, so each densification reduces the remaining gap by a known ratio.
-    Gaussians pruned in between are thus replaced on the way. The last densification reaches B.
+    densifications. That is B - (B - S)(1 - x/N)^2, so each densification reduces the gap to B by a known ratio,
+    whatever was pruned since the last one. The last densification reaches B.
     """
     last = (config.stop - 1) // config.every * config.every
     before = max(step - config.every, config.start)
@@ -217,6 +218,6 @@ def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
 
 
 def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:
-    """Limit opacities to `opacity_reset_to`."""
+    """Opacity logits of opacities that are at most `opacity_reset_to`."""
     ceiling = np.log(config.opacity_reset_to / (1 - config.opacity_reset_to))
     return np.minimum(opacity_logits, np.float32(ceiling))

@@ -23,9 +23,9 @@ from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, Statisti
 from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 
 MAX_GAUSSIANS_PER_PLACE = 51
-"""Maximum number of Gaussians that share the place of one."""
+"""Maximum number of Gaussians that together replace one."""
 MAX_SHARED_OPACITY = 1 - 1e-7
-"""Upper limit of opacities in computations, where a float32 logit has no precision left."""
+"""Upper limit of opacities in computations, as above it a float32 logit has no precision left."""
 MIN_DRAWN_OPACITY = 1 / 255
 """Opacity up to which a Gaussian is invisible in every picture."""
 SCORE_ALL_RULES = MarkRules(gradient=-inf, large=-inf)
@@ -91,7 +91,7 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Move the remaining dead as published: to the places of others, drawn by their opacities.
+        """Move the remaining dead Gaussians as published: to the places of live ones, drawn by their opacities.
 
         groups, rows: updated in place.
         Returns the rows that change.
@@ -148,7 +148,9 @@ def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
     """Indices (count,) drawn with replacement, with probabilities proportional to the weights."""
     sums = np.cumsum(weights)
     found: NDArray[np.int64] = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
-    last = int(np.flatnonzero(weights)[-1])  # a product that was rounded up to the sum belongs to this one
+    last = int(
+        np.flatnonzero(weights)[-1]
+    )  # a drawn number that was rounded up to the sum of the weights selects this one
     found[found > last] = last
     return found
 
@@ -157,8 +159,8 @@ def shared(opacities: Float64, numbers: NDArray[np.int64], least: float) -> tupl
     """Opacities of Gaussians that together replace one, and the increments of their log scales: docs/gradients.md,
     (94).
 
-    opacities: of the replaced ones.
-    numbers: how many replace each.
+    opacities: opacities of the replaced Gaussians.
+    numbers: number of Gaussians that replace each.
     least: lower limit of the new opacities.
     All arrays are (n,).
     """

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from clsplat.gaussians import PARAMETER_GROUPS
 
 MAX_TROUBLED_STEPS = 5
-"""Troubled steps among the last TROUBLE_WINDOW_STEPS at which training goes back to a checkpoint."""
+"""Number of troubled steps among the last TROUBLE_WINDOW_STEPS at which training goes back to a checkpoint."""
 TROUBLE_WINDOW_STEPS = 100
 MAX_CHECKPOINT_RETURNS = 3
-"""Maximum number of returns to a checkpoint. The next trouble ends the run."""
+"""Maximum number of returns to a checkpoint. If one more would be needed, training ends with an error."""
 RETURN_RATE_FACTOR = 0.5
 """Factor on the learning rates at each return, for the rest of the run."""
 MAX_BROKEN_FRACTION = 0.5
 """Fraction of broken Gaussians above which a model is not repaired: training goes back at once."""
 MAX_INCIDENT_GAUSSIANS = 1000
-"""Maximum number of an incident's Gaussians that are copied."""
+"""Maximum number of Gaussians that are copied for an incident."""
 
 Model = Mapping[str, NDArray[np.float32]]
 """Arrays by parameter group; the first axis is the Gaussians."""
@@ -33,8 +33,8 @@ Model = Mapping[str, NDArray[np.float32]]
 def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Gaussians with a broken parameter (n,), and Gaussians with a non-finite moment (n,).
 
-    A parameter is broken if it is not finite or over its limit. A non-finite moment is also `adam`'s mark for a refused
-    step.
+    A parameter is broken if it is not finite or over its limit. `adam` also writes a non-finite moment to mark a step
+    that it has refused.
     """
     count = len(parameters["means"])
     broken, refused = np.zeros(count, bool), np.zeros(count, bool)
@@ -47,21 +47,21 @@ def examine(parameters: Model, first: Model, second: Model) -> tuple[NDArray[np.
 
 
 def lost(stage: str, broken: NDArray[np.bool_], refused: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Gaussians to remove. A Gaussian without a gradient is not at fault for a non-finite loss."""
+    """Gaussians to remove. If the loss is not finite, Gaussians whose step was refused are not at fault and stay."""
     return broken if stage == "loss" else broken | refused
 
 
 def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Copy with zeros in place of non-finite values; moments start at zero too."""
+    """Copy with zeros in place of non-finite values. It repairs moments, as zero is their initial value."""
     return np.where(np.isfinite(values), values, np.float32(0))
 
 
 @dataclass(frozen=True, eq=False)
 class Incident:
-    """Non-finite numbers, and the response.
+    """An occurrence of non-finite numbers, and the response to it.
 
-    step, view: where they arose.
-    stage: the first that showed them: "loss", "project_grad", "parameters" or "adam".
+    step, view: step and view in which they arose.
+    stage: first stage that showed them: "loss", "project_grad", "parameters" or "adam".
     count: number of Gaussians concerned, or of array elements if no Gaussian is.
     done: the response in words.
     gaussians: up to MAX_INCIDENT_GAUSSIANS of the Gaussians concerned, by "parameters/means" and so on.
@@ -90,7 +90,7 @@ class Incident:
 
 @dataclass
 class RetryBudget:
-    """Count of recent trouble, and the effects of earlier trouble; saved in checkpoints."""
+    """Count of recent trouble, and effects of earlier trouble on the training. Checkpoints contain it."""
 
     troubled: list[int] = field(default_factory=list)
     rate_factor: float = 1.0
@@ -107,7 +107,7 @@ class RetryBudget:
 
     @property
     def over(self) -> bool:
-        """True if it is time to go back."""
+        """True if training has to go back to a checkpoint."""
         return self.lost or len(self.troubled) >= MAX_TROUBLED_STEPS
 
     @property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watch over a training: notices that `adam` has refused steps, finds the stage at fault, and returns a remedy."""
+"""Monitor of a training: it notices that `adam` has refused steps, finds the stage at fault, and returns a repair."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from clsplat.training.stability.health import Incident, RetryBudget
 
 @dataclass(frozen=True, eq=False)
 class LastStep:
-    """A step to inspect if it turns out to have had trouble.
+    """A step that is inspected if it turns out to have had trouble.
 
-    sums: returns the sums of its loss, until the next step has a loss.
-    others: its further views.
+    sums: function that returns the sums of its loss, until the next step has a loss.
+    others: further views of the same step.
     """
 
     step: int
@@ -32,7 +32,7 @@ class LastStep:
     others: tuple[LastStep, ...] = ()
 
     def with_bad_loss(self) -> LastStep | None:
-        """The first of its views whose loss is not finite."""
+        """The first view of the step whose loss is not finite; None if there is none."""
         return next((one for one in (self, *self.others) if not np.isfinite(one.sums()).all()), None)
 
 
@@ -49,18 +49,18 @@ class Repair:
 
 
 class NonFiniteMonitor:
-    """State of the watch.
+    """State of the monitor.
 
     readback: the values that a pass reads back; the last four are `adam`'s counts (`Rasterizer.readback`).
     names: names of the views.
-    last: the step under way, once it has its loss.
+    last: the current step, once it has its loss.
     incidents: incidents not reported yet.
-    patience: the count of trouble.
+    retries: the count of trouble.
     """
 
     def __init__(self, readback: DeviceArray, names: Sequence[str]) -> None:
         self.readback, self.names = readback, names
-        self.patience = RetryBudget()
+        self.retries = RetryBudget()
         self.incidents: list[Incident] = []
         self.latest: Incident | None = None
         self.last: LastStep | None = None
@@ -72,7 +72,7 @@ class NonFiniteMonitor:
         self.readback.fill(0)
 
     def begin(self, view: LastStep) -> None:
-        """Remember a view of the step under way, after its loss."""
+        """Remember a view of the current step, after its loss."""
         last = self.last
         same = last is not None and last.step == view.step
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
@@ -91,12 +91,12 @@ class NonFiniteMonitor:
         self.notice([int(value) for value in self.readback.get()[-len(REFUSED) :]])
 
     def loss_failed(self) -> None:
-        """Record a non-finite loss. If no Gaussian is broken, `adam` has nothing to refuse."""
+        """Record a non-finite loss, which `adam` does not report if no Gaussian is broken."""
         if self.last is not None and self._noticed is None:
             self._noticed = (self.last.with_bad_loss() or self.last, "loss", 0)
 
     def examine(self, models: Mapping[str, AnyGaussians]) -> Repair | None:
-        """Remedy for the noticed trouble, or None without trouble.
+        """Repair for the noticed trouble; None without trouble.
 
         models: parameters, first and second moments.
         """
@@ -109,14 +109,14 @@ class NonFiniteMonitor:
         )
 
     def examine_all(self, arrays: Mapping[str, NDArray[np.float32]]) -> Repair | None:
-        """Remedy, or None, after a check of every number, including numbers that `adam` has not visited.
+        """Repair, or None, after a check of every number, including numbers that `adam` has not visited.
 
-        arrays: by "parameters/means" and so on.
+        arrays: arrays by "parameters/means" and so on.
         """
         host = {
             kind: {g: arrays[f"{kind}/{g}"] for g in PARAMETER_GROUPS} for kind in ("parameters", "first", "second")
         }
-        if self.last is None or self.patience.lost or not np.any(health.examine(**host)):
+        if self.last is None or self.retries.lost or not np.any(health.examine(**host)):
             return None
         return self._judge(self.last, "parameters", 0, host)
 
@@ -142,7 +142,7 @@ class NonFiniteMonitor:
             },
         )
         self.incidents.append(self.latest)
-        self.patience.note(last.step, lost=hopeless)
+        self.retries.note(last.step, lost=hopeless)
         if hopeless:
             return None
         moments = {k: {g: health.finite_or_zero(v) for g, v in host[k].items()} for k in ("first", "second")}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Components of a training in addition to the Gaussians: appearance, refined cameras, mip filter, known depths.
 
-`Trainer` loops over a list of components. A new one is a subclass of `Component`, and a line in `Trainer._start`.
+`Trainer` loops over a list of components. A new one is a subclass of `Component` and a line in `Trainer._start`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Named = Callable[[str], Mapping[str, NDArray[Any]]]
 
 
 class Component:
-    """Part of a training with state of its own. By default no method does anything."""
+    """Component of a training, with state of its own. By default no method does anything."""
 
     @property
     def models(self) -> int:
-        """Arrays on the device for each parameter; 0 if a step of one view needs no more than usual."""
+        """Number of arrays that the device needs for each parameter; 0 if the usual number is enough."""
         return 0
 
     @property
@@ -42,10 +42,10 @@ class Component:
         return False
 
     def before_step(self, gaussians: AnyGaussians) -> None:
-        """Do the work that is due. Repeating it has no further effect."""
+        """Do the work that is due. Doing it twice must have the effect of doing it once."""
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Views of a step, with the component's share.
+        """Views of a step, each with the component's part in it (`ViewPart`).
 
         step: number of the last view.
         count: number of Gaussians.
@@ -56,7 +56,7 @@ class Component:
         """Change the parameters after Adam's step."""
 
     def rows_moved(self) -> None:
-        """Forget data of individual rows, as the rows have changed."""
+        """Forget data about individual rows, as rows have moved."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gradient of one view and Adam's step along it: the work of a training step, which `repro_bundle` repeats."""
+"""The gradient of one view and Adam's step along it: the work of a training step, which `repro_bundle` can replay."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ R = TypeVar("R")
 
 
 class StepProbe:
-    """Observer of a step. Each method is called after its stage is launched. By default none does anything."""
+    """Observer of a step. Each method is called after its stage is launched. By default no method does anything."""
 
     def forward(self, frame: ForwardPass) -> None:
         """The view is rendered."""
@@ -53,8 +53,8 @@ class GradientStep:
     """Forward, loss, backward and Adam of one view, on a device and in a rasterizer's memory.
 
     fields: the slot fields that the step fills.
-    turn: see `loss`.
-    room: see `Rasterizer.forward`.
+    turn: `turn` of `stages.loss.loss`.
+    room: `room` of `Rasterizer.forward`.
     explore: noise and penalties of the step.
     """
 
@@ -85,9 +85,9 @@ class GradientStep:
     ) -> Loss:
         """Update the model (parameters, first and second moments) by a view.
 
-        gradients: room for the gradients of the rows on the device at once, for a probe or a share that reads them.
-        They are zero before and after. The model has the same bits without them.
-        reads_loss: the loss will be read.
+        gradients: arrays for the gradients of the rows on the device at once, if a probe or a part reads them. They are
+        zero before and after. The model has the same bits without them.
+        reads_loss: True if the loss will be read.
         """
         rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
         frame = rasterizer.forward(
@@ -107,7 +107,7 @@ class GradientStep:
         own = [part.gradient(work, frame.blended.image, result.gradient, *size) for part in inputs.parts]
         slots = self.replayed(
             model[0],
-            (frame.part, frame.background, result.gradient, self.fields),
+            (frame.listed, frame.background, result.gradient, self.fields),
             lambda: rasterizer.pair_gradients(frame, result.gradient, fields=self.fields),
         )
         probe.pair_gradients(slots)
@@ -143,7 +143,7 @@ class GradientStep:
         keys = tuple(term.key for term in terms)
         if None in keys:
             return compared()
-        return self.replayed(of, (frame.part, image.buffer, inputs.kept, keys, self.turn), compared)
+        return self.replayed(of, (frame.listed, image.buffer, inputs.kept, keys, self.turn), compared)
 
     def _rows(
         self,
@@ -155,7 +155,7 @@ class GradientStep:
         slots: Slots,
         gradients: DeviceGaussians | None,
     ) -> StepRows:
-        """Rows of a part of the model, with room for their gradients."""
+        """Rows [start, stop) of the model, with arrays for their gradients."""
         by_lens = (part.lens_gradients(stop - start) for part in inputs.parts)
         return StepRows(
             start,
@@ -196,14 +196,14 @@ class GradientStep:
     ) -> R:
         """`Workspace.replayed` if the step is by capacity.
 
-        A step with exact counts has new arrays each time, so its tape would never be reused.
+        A step with exact counts has new arrays each time, so its command buffer would never be reused.
         """
         if self.room is None:
             return make()
         return self.rasterizer.work.replayed(of, key, make, numbers)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Take Adam's step of the view's shares, along their own gradients."""
+        """Take Adam's step of the view's parts, along their own gradients."""
         for part, gradient in zip(inputs.parts, own, strict=True):
             part.update(gradient, self.rasterizer.readback)
 
@@ -229,7 +229,7 @@ class GradientStep:
 
 
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
-    """Room for a view's gradients of the rows that are on the device at once.
+    """Arrays for a view's gradients of the rows that are on the device at once.
 
     zero: fill it with zeros, as `GradientStep.run` requires.
     """
@@ -244,6 +244,6 @@ def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = Fa
 def slot_fields(needs: StatisticsNeeds, *, nearness: bool = False) -> SlotFields:
     """Slot fields that these statistics need.
 
-    nearness: depths are compared.
+    nearness: True if depths are compared.
     """
     return SlotFields(needs.absolute, needs.contributions, nearness)

@@ -23,13 +23,13 @@ class ViewInputs:
 
     view: its index among the training views.
     photograph: (H, W, 3 to 5): colours, then alpha and mask.
-    camera: of the photograph's size.
+    camera: its camera, of the photograph's size.
     begins: True if an epoch begins with it.
     kept: number of pixels that its mask keeps, None without a mask.
     depth: known depths, if they are compared.
-    area: full-resolution pixels per pixel.
+    area: number of full-resolution pixels per pixel.
     place: its number in the step.
-    parts: components' shares in it.
+    parts: the components' parts in it.
     """
 
     view: int
@@ -46,7 +46,7 @@ class ViewInputs:
 
 @dataclass(frozen=True, eq=False)
 class ViewRows:
-    """Rows [start, stop) of the model, on the device at once; all of them if the model fits.
+    """Rows [start, stop) of the model that are on the device at once: all rows if the model fits.
 
     projected: projection of these rows in the step's view.
     screen: their screen-space gradients, valid after the rows have changed.
@@ -60,12 +60,12 @@ class ViewRows:
 
 @dataclass(frozen=True, eq=False)
 class StepRows(ViewRows):
-    """Rows with everything that a step has for them.
+    """Rows with all data that a step has for them.
 
-    model: their parameters, and their moments or whatever else the step changes.
-    device: with the switches of the view's projection.
+    model: their parameters, then the arrays that the step changes with these: moments, or sums of gradients.
+    device: the device with the switches of the view's projection.
     camera_array, slots: the step's camera, and the gradients of the rows' pairs.
-    gradients: gradients of the rows, if requested.
+    gradients: gradients by the rows' parameters, if requested.
     by_lens: (rows, 4), gradients with respect to the view's lens.
     """
 
@@ -88,13 +88,13 @@ class StepRows(ViewRows):
 
 
 class ViewPart:
-    """A component's share (`training.component`) in one view of a step. By default no method does anything."""
+    """A component's part (`training.step.component`) in one view of a step. By default no method does anything."""
 
     wants_gradients = False
     """True if `add_rows` reads the rows' gradients."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """The same share on another device, made from `values`, to compare and to compute its gradient there."""
+        """The same part on another device, made from `values`, to compare and to compute its gradient there."""
         return self
 
     def values(self) -> NDArray[np.float32]:
@@ -123,15 +123,15 @@ class ViewPart:
         width: int,  # noqa: ARG002
         height: int,  # noqa: ARG002
     ) -> DeviceArray | None:
-        """Turn dL/d(compared image) into dL/d(image), in place. Returns the share's own gradient."""
+        """Turn dL/d(compared image) into dL/d(image), in place. Returns the gradient by the part's own parameters."""
         return None
 
     def lens_gradients(self, rows: int) -> DeviceArray | None:  # noqa: ARG002
-        """Room (rows, 4) for the rows' gradients with respect to the lens, if they are needed."""
+        """Array (rows, 4) for the rows' gradients with respect to the lens; None if they are not needed."""
         return None
 
     def add_rows(self, rows: StepRows) -> None:
         """Sum the gradients of these rows, before the rows change."""
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step along the share's own gradient. It changes nothing if a step by capacity has stopped."""
+        """Take Adam's step along the part's own gradient. It changes nothing if a step by capacity has stopped."""

@@ -22,7 +22,7 @@ def depth_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:  # n
 
 
 LOSS_TERMS: tuple[Callable[[TrainConfig, ViewInputs], LossTerm | None], ...] = (alpha_term, depth_term)
-"""Terms beside L1 and D-SSIM, in the order of their gradients' planes."""
+"""Terms in addition to L1 and D-SSIM, in the order of their gradients' planes."""
 
 
 def loss_terms(config: TrainConfig, inputs: ViewInputs) -> tuple[LossTerm, ...]:

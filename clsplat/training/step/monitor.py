@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trainer's probe of a training step: non-finite values, rehearsal of kernels, statistics."""
+"""The trainer's probe of a training step: non-finite values, trials of kernels, statistics."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from clsplat.training.step.speculative_steps import SpeculativeSteps
 
 @dataclass(frozen=True, eq=False)
 class StepMonitor(StepProbe):
-    """Probe that notices non-finite values, rehearses the kernels that change the state, and adds density control's
-    statistics.
+    """Probe that notices non-finite values, tries the kernels that change the state, and adds statistics for density
+    control.
 
-    number: views so far, including this one.
+    number: number of views so far, including this one.
     rehearsed: keys of the steps whose kernels were tried; this step's key is added.
-    changes: called before the model changes.
+    changes: function that is called before the model changes.
     """
 
     step: GradientStep
@@ -32,33 +32,33 @@ class StepMonitor(StepProbe):
     inputs: ViewInputs
     needs: StatisticsNeeds
     statistics: DensityStatistics
-    watch: NonFiniteMonitor
+    monitor: NonFiniteMonitor
     pending: SpeculativeSteps
-    rehearsed: set[tuple[object, ...]]
+    tried: set[tuple[object, ...]]
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
         """Take the counts of the step before, which this pass has read back."""
-        self.watch.notice(frame.refused)
+        self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 
     def loss(self, result: Loss) -> None:
-        """Remember the step, to inspect it if it turns out to have had trouble."""
+        """Remember the step, as it is inspected if it turns out to have had trouble."""
         sums = result.copy or result.sums.get
-        self.watch.begin(LastStep(self.number, self.inputs.view, self.inputs.background, sums))
+        self.monitor.begin(LastStep(self.number, self.inputs.view, self.inputs.background, sums))
 
     def before_rows(self, rows: StepRows) -> None:
-        """Rehearse every kernel that changes the state, before the first row changes. A driver may fail in any of
-        them."""
+        """Try every kernel that changes the state in the sandbox, before the first row changes: a driver may fail in
+        any."""
         step, parameters = self.step, rows.parameters
         size = (parameters.count, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
         key = (*size, *build, *self.inputs.camera.model.defines.items())
-        if key not in self.rehearsed:
+        if key not in self.tried:
             with only_tried(step.device), only_tried(step.rasterizer.device), only_tried(rows.device):
                 step.update(rows)
                 self.add_statistics(self.statistics.rows(0, rows.stop - rows.start), rows)
-            self.rehearsed.add(key)
+            self.tried.add(key)
         self.changes()
 
     def after_rows(self, rows: ViewRows) -> None:
@@ -66,7 +66,7 @@ class StepMonitor(StepProbe):
         self.add_statistics(self.statistics.rows(rows.start, rows.stop), rows)
 
     def add_statistics(self, statistics: DensityStatistics, rows: ViewRows) -> None:
-        """Add the step to the statistics of some rows, as far as density control needs them."""
+        """Add the view to those statistics of some rows that density control needs."""
         device, camera, screen = self.step.device, self.inputs.camera, rows.screen
         if self.needs.gradients:
             size = (camera.width, camera.height, camera.fx)

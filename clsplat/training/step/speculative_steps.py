@@ -25,7 +25,7 @@ BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
 """Variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
 
 Run = Callable[[int, PairCapacity | None], Loss]
-"""A function that runs one step, with a turn, and a room or None for the exact number of pairs."""
+"""A function that runs one step. It takes the step's turn, and a capacity, or None to count the pairs first."""
 
 
 @dataclass(eq=False)
@@ -33,7 +33,7 @@ class _Step:
     """A step whose counts the host has not read.
 
     readback, counts: the counts on the device, and a function that waits for their copy.
-    before: the watched step before this one.
+    before: the monitor's `last` step before this one.
     kept: host memory that the device may still have to read.
     """
 
@@ -47,20 +47,21 @@ class _Step:
 
 
 def by_capacity(device: Device) -> bool:
-    """True if this device launches steps by capacity where possible. Raises InputError."""
+    """True if this device launches steps by capacity if possible. Raises InputError."""
     return switched_on(BY_CAPACITY_VARIABLE) if os.environ.get(BY_CAPACITY_VARIABLE) else device.kind != "cpu"
 
 
 class SpeculativeSteps:
     """A training's steps launched by capacity, at most two at a time, and the capacity of the next one.
 
-    begin: called before a step is repeated, which begins by repairing the trouble that `watch` has noticed.
+    begin: function that is called before a step is repeated, which begins by repairing the trouble that `monitor` has
+    noticed.
     redone: number of repeated steps.
     """
 
-    def __init__(self, device: Device, watch: NonFiniteMonitor, begin: Callable[[], None]) -> None:
+    def __init__(self, device: Device, monitor: NonFiniteMonitor, begin: Callable[[], None]) -> None:
         self.on = by_capacity(device)
-        self._device, self._watch, self._begin = device, watch, begin
+        self._device, self._monitor, self._begin = device, monitor, begin
         self._steps: list[_Step] = []
         self._kept: list[object] = []
         self._most: int | None = None
@@ -80,18 +81,19 @@ class SpeculativeSteps:
         self._most = None
 
     def seen(self, frame: ForwardPass) -> None:
-        """Note a step's frame, as soon as it is launched."""
+        """Note a step's frame, right after its launch."""
         self._frame = frame
-        if frame.part.counted.arriving is None:
-            self._count(frame.part.counted.pairs if len(frame.bands) == 1 else None)
+        if frame.listed.counted.arriving is None:
+            self._count(frame.listed.counted.pairs if len(frame.bands) == 1 else None)
 
     def _count(self, pairs: int | None) -> None:
         self._most = None if pairs is None else max(pairs, self._most or 0)
 
     def room(self, rasterizer: Rasterizer, size: object, gaussians: int) -> int:
-        """Number of pairs to reserve: a quarter more than the most seen at this photograph size.
+        """Number of pairs to reserve: a quarter more than the most seen at this photograph size, scaled by the growth
+        in Gaussians.
 
-        Scaled by the growth in Gaussians. 0 if the number is unknown or exceeds the capacity.
+        0 if no number is known yet, or if it exceeds the rasterizer's capacity.
         """
         if (before := self._of) != (size, gaussians):
             self._of = size, gaussians
@@ -100,25 +102,27 @@ class SpeculativeSteps:
         if self._most is None:
             return 0
         wanted = max(self._most + self._most // 4, 1024)
-        step = 1 << (wanted.bit_length() - 4)  # few sizes, so that arrays keep theirs
+        step = 1 << (wanted.bit_length() - 4)  # rounded to few sizes, so that arrays seldom change theirs
         wanted = -(-wanted // step) * step
         return wanted if wanted <= rasterizer.capacity else 0
 
     def launch(self, run: Run, room: int, *, reads_loss: bool) -> Loss:
-        """Run a step, by capacity if there is room, and then check the step before.
+        """Run a step, by capacity unless `room` is 0, and then check the step before.
 
-        reads_loss: check this one too.
+        reads_loss: True to check this step too, as its loss will be read.
         """
         if not self.on:
             return run(0, None)
         if not room:
             self.settle()
-        turn = self._turn = (self._turn + 1) % self.turns  # exact steps too, as their loss is read a step later
-        before, result = self._watch.last, run(turn, PairCapacity(room, turn) if room else None)
+        turn = self._turn = (
+            self._turn + 1
+        ) % self.turns  # exact steps take turns too, as their loss is read a step later
+        before, result = self._monitor.last, run(turn, PairCapacity(room, turn) if room else None)
         if not room:
             return result
         assert self._frame is not None, "each step has a frame"
-        counted, under_way = self._frame.part.counted, self._device.under_way
+        counted, under_way = self._frame.listed.counted, self._device.under_way
         assert counted.arriving is not None, "it was launched by capacity"
         assert counted.on_device is not None, "it was launched by capacity"
         step = _Step(run, turn, result, counted.on_device, counted.arriving, before, list(under_way))
@@ -136,7 +140,7 @@ class SpeculativeSteps:
     def settle(self) -> None:
         """Wait until all steps are known to be complete, or repeat them.
 
-        Call it before reading or changing the model, its statistics or the random state that steps use.
+        Call it before reading or changing the model, its statistics, or the random state that steps use.
         """
         self._look(0)
 
@@ -148,7 +152,9 @@ class SpeculativeSteps:
                 self._again()
                 return
             self._count(int(counts[READBACK.index("PAIRS")]))
-            self._kept = self._steps.pop(0).kept  # copies launched after the counts may be under way
+            self._kept = self._steps.pop(
+                0
+            ).kept  # the device may still be reading memory for copies launched after the counts
 
     def _again(self) -> None:
         """Repeat the steps that the device has skipped, with exact counts."""
@@ -156,7 +162,7 @@ class SpeculativeSteps:
         values = steps[0].readback.get()
         values[READBACK.index("STOPPED")] = 0
         steps[0].readback.set(values)
-        self._watch.last = steps[0].before
+        self._monitor.last = steps[0].before
         for step in steps:
             self._begin()
             step.result = step.run(step.turn, None)

@@ -21,7 +21,7 @@ from clsplat.training.step.component import Component
 from clsplat.training.step.inputs import ViewInputs
 
 MAX_TARGET_NEARNESS = 1e6
-"""Exclusive limit of inverse depth times the scene's extent. Nearer depths come from damaged maps."""
+"""Exclusive upper limit of inverse depth times the scene's extent. Depths nearer than that come from damaged maps."""
 
 
 def weight_at(config: TrainConfig, step: int) -> float:
@@ -33,7 +33,7 @@ def weight_at(config: TrainConfig, step: int) -> float:
 class DepthTargets(Component):
     """Known depths of all training views at one resolution; inactive unless the settings ask for depths.
 
-    pixels: returns a view's photograph (H, W, 3 to 5) at the step's size, on the host.
+    pixels: function that returns a view's photograph (H, W, 3 to 5) at the step's size, on the host.
     """
 
     def __init__(
@@ -62,7 +62,8 @@ class DepthTargets(Component):
     def aims(self, view: int, camera: Camera, step: int, photograph: NDArray[Any] | None = None) -> DepthTerm | None:
         """Depths to compare with a view's render, of the size of the step's camera; None without depths.
 
-        photograph: the view's, (H, W, 3 to 5). The fifth channel is a mask, under which no depth counts.
+        photograph: the view's photograph (H, W, 3 to 5). Its fifth channel is a mask; depths of masked-out pixels do
+        not count.
         """
         if not self._config.depth_use:
             return None

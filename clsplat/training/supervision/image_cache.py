@@ -23,7 +23,9 @@ def kept_pixels(image: NDArray[Any]) -> int | None:
 
 
 class ImageCache:
-    """Pixels of the training views at one resolution, decoded once each; uint8 if it represents them exactly.
+    """Pixels of the training views at one resolution. Each view is decoded once, and stored as uint8 if that is exact.
+
+    Only device memory is bounded. The host keeps every view that a step has used at this resolution.
 
     allowed: maximum number of bytes on the device.
     """
@@ -52,7 +54,8 @@ class ImageCache:
     def load(self, index: int, factor: float) -> NDArray[Any]:
         """View `index` at 1/factor of its size; do not write to it.
 
-        (H, W, 3 or 4), straight alpha, or 5 channels with its mask, 0 where a pixel does not count.
+        The shape is (H, W, 3), or 4 channels with straight alpha, or 5 with a mask that is 0 for pixels that do not
+        count.
         """
         if factor != self._factor:
             self._factor = factor
@@ -79,10 +82,10 @@ class ImageCache:
         return self._kept[index, factor]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
-        """This image, on the device if there is room for it.
+        """This image: a device array if the device has room for it, else the host's array.
 
-        It is uploaded once and stays, or it has been sent `ahead`. A device that shares the host's memory reads it
-        there.
+        An image is uploaded once and stays, unless `ahead` has already sent it to the upload ring. A device that shares
+        the host's memory reads the host's array.
         """
         image = self.load(index, factor)
         if index not in self._on_device:
@@ -102,9 +105,9 @@ class ImageCache:
         return self._on_device.get(index, image)
 
     def ahead(self, index: int, factor: float) -> None:
-        """Send this image to the device while it is busy, for the next `bring` of it, if there is no room to keep it.
+        """Begin to send this image to the upload ring, for the next `bring`, if the device has no room to keep it.
 
-        Call it after launching a step.
+        Call it after launching a step: the upload then runs while the device computes.
         """
         if self._device.shares_memory or index in self._on_device:
             return

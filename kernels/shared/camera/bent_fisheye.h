@@ -42,7 +42,7 @@ static inline floatL angle_of(floatL radius, CAMERA_SPACE float *camera) {
 }
 
 #ifdef NEEDS_TANGENTS
-// A lens shows nothing beyond its fold-over.
+// A lens shows nothing beyond the angle at which its image folds over.
 static inline int is_shown(const float *f, __constant float *camera) {
   const float across = sqrt(fma1(f[0], f[0], f[1] * f[1]));
   return half_atan(across, f[2]) < FARTHEST_ANGLE(camera);

@@ -25,7 +25,8 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 #ifdef NEEDS_GRADIENT
 // (52): the mean in the camera's frame, through the image position and through J. Where the ratio is clamped, J
 // depends on z alone. at: the mean; limited: rx, ry; jx, jy: of the Jacobian; d_mx, d_my: the gradient by the image
-// position; by_j02, by_j12: by the Jacobian's last column, over -jx and -jy; d_size: by the log of the size. Fills
+// position; by_j02, by_j12: the gradient by the Jacobian's last column, divided by -jx and -jy; d_size: by the log of
+// the size. Fills
 // d[3], and beyond[2]: (145), a clamped ratio is a fixed position on the image.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {

@@ -35,7 +35,7 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
 
 #ifdef NEEDS_BOXES
 #define NO_END 1e15f
-#define LEAST_AHEAD 1e-4f // per length of the direction; less is outside every picture
+#define LEAST_AHEAD 1e-4f // least z of a unit direction; with less it is outside every picture
 
 // (32), one side: the image range, in focal lengths, of the directions within an angle of a given one. `sine` is the
 // sine of that angle; along and z are the direction's coordinates. An end that crosses the camera's plane is unbounded.

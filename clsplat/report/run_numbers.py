@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a run, read from its files. Nothing is measured again; missing or damaged files become notes."""
+"""Numbers of a run, read from its files. Nothing is measured again; missing or damaged files become notes."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ SCORE_NAMES = ("psnr", "ssim", "lpips")
 CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 """Keys of every record in metrics.jsonl."""
 MAX_NAME_CHARACTERS = 200
-"""Characters that are shown of the name of a view, a stage or a device."""
+"""Largest number of characters that are shown of the name of a view, a stage or a device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
 """Limits for foreign files; clsplat itself writes fewer entries. The last samples and sessions are kept."""
 MAX_DRAWN_VALUE = 1e30
 
 
 @dataclass
-class Figures:
-    """Figures from a run's files.
+class RunNumbers:
+    """Numbers of a run, from its files.
 
     curves: lists of equal length, by the key of the records.
     stages: step, and milliseconds by stage.
@@ -82,54 +82,54 @@ class Figures:
         return [(float(at), psnr) for at, psnr in points if at is not None and psnr is not None]
 
     def document(self) -> Record:
-        """All figures as data, for --json."""
+        """All numbers as data, for --json."""
         document = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "run"}
         scene = self.run.scene.name if self.run.scene is not None else None
         return {**document, "settings": asdict(self.run.config), "scene": scene}
 
 
-def read_figures(run: Run, model: Gaussians | None = None, *, describe: bool = True) -> Figures:
-    """Read all figures of a run's folder.
+def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool = True) -> RunNumbers:
+    """Read all numbers of a run's folder.
 
     model: content of model.ply, if already loaded.
-    describe: read the model.
+    describe: True to read and describe the model.
     Raises InputError if metrics.jsonl cannot be read. Anything else missing or damaged becomes a note.
     """
     records = [
         record for record in run.read_metrics() if all(number(record.get(name)) is not None for name in CURVE_KEYS)
     ]
     curves = {name: [float(record[name]) for record in records] for name in CURVE_KEYS}
-    figures = Figures(run, run.path.resolve().name, curves)
+    numbers = RunNumbers(run, run.path.resolve().name, curves)
     for record in records:
         stages = record.get("stages")
         if isinstance(stages, dict) and (times := _numbers(stages, MAX_STAGES)).get("all"):
-            figures.stages.append({"step": int(record["step"]), "ms": times})
+            numbers.stages.append({"step": int(record["step"]), "ms": times})
         if (evaluation := _evaluation(record.get("eval"))) is not None:
-            figures.evaluations.append({**_summary(evaluation), "step": int(record["step"])})
+            numbers.evaluations.append({**_summary(evaluation), "step": int(record["step"])})
         if isinstance(session := record.get("session"), dict):
-            figures.sessions.append(_session(session))
-    for listed in (figures.stages, figures.evaluations):
+            numbers.sessions.append(_session(session))
+    for listed in (numbers.stages, numbers.evaluations):
         del listed[:-MAX_SAMPLES]
-    del figures.sessions[:-MAX_SESSIONS]
-    figures.elapsed = _elapsed(records)
-    _add_evaluation(figures)
+    del numbers.sessions[:-MAX_SESSIONS]
+    numbers.elapsed = _elapsed(records)
+    _add_evaluation(numbers)
     if describe:
-        _add_model(figures, model)
-    _add_contributions(figures, records)
-    _add_gate(figures, records)
+        _add_model(numbers, model)
+    _add_contributions(numbers, records)
+    _add_gate(numbers, records)
     iterations = run.config.iterations
-    if figures.step < iterations:
-        figures.notes.insert(0, f"Not finished: at step {figures.step:,} of {iterations:,}.")
+    if numbers.step < iterations:
+        numbers.notes.insert(0, f"Not finished: at step {numbers.step:,} of {iterations:,}.")
     if not records:
-        figures.notes.append("metrics.jsonl has no records: there are no curves.")
-    elif not figures.sessions:
-        figures.notes.append("A run of an earlier version: device, times of stages and contributions are not known.")
+        numbers.notes.append("metrics.jsonl has no records: there are no curves.")
+    elif not numbers.sessions:
+        numbers.notes.append("A run of an earlier version: device, times of stages and contributions are not known.")
     else:
-        if not figures.stages:
-            figures.notes.append("The time of each stage was not measured (--stages-every 0).")
-        if "contribution" not in figures.histograms and figures.step >= iterations:
-            figures.notes.append("Contributions were not measured: --no-report, or the device's memory is limited.")
-    return figures
+        if not numbers.stages:
+            numbers.notes.append("The time of each stage was not measured (--stages-every 0).")
+        if "contribution" not in numbers.histograms and numbers.step >= iterations:
+            numbers.notes.append("Contributions were not measured: --no-report, or the device's memory is limited.")
+    return numbers
 
 
 def number(value: object) -> float | None:
@@ -140,7 +140,7 @@ def number(value: object) -> float | None:
 
 
 def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """Each setting with the name of its flag."""
+    """The name of the flag and the value of each setting."""
     for setting in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
         value, name = getattr(config, setting.name), prefix + setting.name.replace("_", "-")
         if is_dataclass(value):
@@ -216,49 +216,49 @@ def _elapsed(records: list[Record]) -> float | None:
     return None if last is None else total + last
 
 
-def _add_evaluation(figures: Figures) -> None:
-    run = figures.run
+def _add_evaluation(numbers: RunNumbers) -> None:
+    run = numbers.run
     if not run.eval_path.exists():
-        figures.notes.append("eval.json is not there: no held-out view has been measured at the end.")
+        numbers.notes.append("eval.json is not there: no held-out view has been measured at the end.")
         return
     try:
         evaluation = _evaluation(parse_json(read_document(run.eval_path, "the evaluation of a run")))
     except (InputError, ValueError):
         evaluation = None
     if evaluation is None:
-        figures.notes.append("eval.json is damaged, and left out.")
+        numbers.notes.append("eval.json is damaged, and left out.")
         return
-    figures.evaluation = evaluation
+    numbers.evaluation = evaluation
     if not evaluation["views"]:
-        figures.notes.append("eval.json has no held-out views.")
+        numbers.notes.append("eval.json has no held-out views.")
     if (step := evaluation["step"]) is None:
         return
-    others = [other for other in figures.evaluations if other["step"] != step]
-    figures.evaluations = sorted([*others, {**_summary(evaluation), "step": step}], key=lambda record: record["step"])
-    last = figures.curves["step"][-1] if figures.curves["step"] else None
+    others = [other for other in numbers.evaluations if other["step"] != step]
+    numbers.evaluations = sorted([*others, {**_summary(evaluation), "step": step}], key=lambda record: record["step"])
+    last = numbers.curves["step"][-1] if numbers.curves["step"] else None
     if last is not None and step != last:
-        figures.notes.append(f"eval.json is of step {step:,}, metrics.jsonl goes to step {int(last):,}.")
+        numbers.notes.append(f"eval.json is of step {step:,}, metrics.jsonl goes to step {int(last):,}.")
 
 
-def _add_model(figures: Figures, model: Gaussians | None) -> None:
-    path: Path = figures.run.model_path
+def _add_model(numbers: RunNumbers, model: Gaussians | None) -> None:
+    path: Path = numbers.run.model_path
     if not path.exists():
-        figures.notes.append("model.ply is not there: there is no model to describe.")
+        numbers.notes.append("model.ply is not there: there is no model to describe.")
         return
     try:
         model = model or Gaussians.load(path)
         size, sha256 = path.stat().st_size, digest(path)
     except (InputError, OSError) as error:
-        figures.notes.append(f"model.ply cannot be read: {str(error).removeprefix(f'{path}: ')}")
+        numbers.notes.append(f"model.ply cannot be read: {str(error).removeprefix(f'{path}: ')}")
         return
-    figures.model = {"gaussians": len(model), "sh_degree": model.sh_degree, "bytes": size, "sha256": sha256}
+    numbers.model = {"gaussians": len(model), "sh_degree": model.sh_degree, "bytes": size, "sha256": sha256}
     scales = np.sort(model.log_scales, axis=1) / np.float32(np.log(10))
     low, high = (np.floor(scales.min() * 5) / 5, np.ceil(scales.max() * 5) / 5) if len(model) else (0.0, 1.0)
     edges = np.linspace(low, max(high, low + 0.2), 41)
     for name, axis in (("smallest scale", 0), ("largest scale", 2)):
-        figures.histograms[name] = _histogram(scales[:, axis], edges)
+        numbers.histograms[name] = _histogram(scales[:, axis], edges)
     opacities = 1 / (1 + np.exp(-np.clip(model.opacity_logits, -80, 80)))
-    figures.histograms["opacity"] = _histogram(opacities, np.linspace(0.0, 1.0, 41))
+    numbers.histograms["opacity"] = _histogram(opacities, np.linspace(0.0, 1.0, 41))
 
 
 def _histogram(values: NDArray[Any], edges: NDArray[np.float64]) -> Record:
@@ -266,7 +266,7 @@ def _histogram(values: NDArray[Any], edges: NDArray[np.float64]) -> Record:
     return {"edges": np.round(edges, 6).tolist(), "counts": counts.tolist()}
 
 
-def _add_contributions(figures: Figures, records: list[Record]) -> None:
+def _add_contributions(numbers: RunNumbers, records: list[Record]) -> None:
     record = records[-1].get("contributions") if records else None
     if not isinstance(record, dict):
         return
@@ -275,15 +275,15 @@ def _add_contributions(figures: Figures, records: list[Record]) -> None:
     if sums and len(edges) == len(counts) + 1 > 1 and edges == sorted(edges):
         views, total, none = map(int, sums)
         histogram = {"edges": edges, "counts": list(map(int, counts)), "views": views, "of": total, "none": none}
-        figures.histograms["contribution"] = histogram
+        numbers.histograms["contribution"] = histogram
 
 
-def _add_gate(figures: Figures, records: list[Record]) -> None:
+def _add_gate(numbers: RunNumbers, records: list[Record]) -> None:
     """Add a note if the refinement of cameras was ended early."""
     gates = (gate for record in reversed(records) if isinstance(gate := record.get("gate"), dict))
     gate = next(gates, {})
     if (ended := number(gate.get("ended"))) is not None and (best := number(gate.get("best"))) is not None:
-        figures.notes.append(
+        numbers.notes.append(
             f"Refined cameras did not suit the held-out views: refinement ended at step {ended:,.0f}, and the cameras "
             f"are those of step {best:,.0f}."
         )

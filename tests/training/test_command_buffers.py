@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training with launches from tapes has the bytes of training without them, whatever of a step is another each time."""
+"""Training with launches from command buffers gives the bytes of training without, whatever changes from step to
+step."""
 
 from __future__ import annotations
 
@@ -75,7 +76,7 @@ Result = tuple[Mapping[str, NDArray[Any]], list[tuple[float, float]], int]
 
 def trained(scene: Scene, config: TrainConfig, device: Device, monkeypatch: pytest.MonkeyPatch, **how: str) -> Result:
     """The arrays of a checkpoint after a training, its losses, and how many steps were made again."""
-    for name, value in ((BY_CAPACITY_VARIABLE, how.get("capacity", "1")), (TAPES, how["tapes"])):
+    for name, value in ((BY_CAPACITY_VARIABLE, how.get("capacity", "1")), (TAPES, how["command_buffers"])):
         monkeypatch.setenv(name, value)
     trainer, losses = Trainer(scene, config, device), []
     real = trainer.pending.room
@@ -107,7 +108,8 @@ FAST = ("plain",)
 def test_every_setting_has_its_bytes(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch, setting: str
 ) -> None:
-    """Without tapes, with them, and with each launch held against its tape; in a group's shape too."""
+    """Without command buffers, with them, and with each launch compared with the recorded one; in a group's shape
+    too."""
     config, replayed, checked = CONFIGS[setting], [], []
     scene = with_depths(load_scene(folder, masks=config.mask_use), config.depth_use)
     group = default_device.with_shape(lanes=1, items=64)
@@ -115,10 +117,10 @@ def test_every_setting_has_its_bytes(
         real = getattr(CommandBuffer, name)
         monkeypatch.setattr(CommandBuffer, name, lambda *given, real=real, calls=calls: (calls.append(1), real(*given)))
     for device, uses in ((default_device, ("0", "1", CHECK_TAPES)), (group, ("1",))):
-        exact = trained(scene, config, device, monkeypatch, capacity="0", tapes="0")
+        exact = trained(scene, config, device, monkeypatch, capacity="0", command_buffers="0")
         for use in uses:
             replayed.clear(), checked.clear()
-            other = trained(scene, config, device, monkeypatch, tapes=use)
+            other = trained(scene, config, device, monkeypatch, command_buffers=use)
             assert_alike(exact, other)
             assert (other[2] > 0) == (config.batch == 1)
             assert (len(replayed) > 20) == (use == "1" and config.batch == 1)
@@ -126,14 +128,14 @@ def test_every_setting_has_its_bytes(
 
 
 @pytest.mark.parametrize("batch", [1, 2])
-def test_a_step_with_exact_counts_makes_no_tape(
+def test_a_step_with_exact_counts_makes_no_command_buffer(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch, batch: int
 ) -> None:
-    """Its arrays are new each time: a tape would never be used, and its kernel objects take the host a millisecond."""
+    """Arrays are new each time: a command buffer would never be used, and takes the host a millisecond to make."""
     made: list[int] = []
     monkeypatch.setattr(CommandBuffer, "add_launch", lambda *_: made.append(1))
     config = replace(PLAIN, batch=batch, iterations=6)
-    trained(load_scene(folder), config, default_device, monkeypatch, capacity="0", tapes="1")
+    trained(load_scene(folder), config, default_device, monkeypatch, capacity="0", command_buffers="1")
     assert not made
 
 
@@ -143,8 +145,8 @@ def test_a_number_that_is_not_declared_is_found(
     monkeypatch.setattr(project, "LaunchParameter", float)
     monkeypatch.setattr(project, "step_numbers", real := project.step_numbers)
     monkeypatch.setattr("clsplat.training.step.gradient_step.step_numbers", lambda *given: real(*given)[:0])
-    with pytest.raises(AssertionError, match="project_step on a tape has other arguments than now"):
-        trained(load_scene(folder), PLAIN, default_device, monkeypatch, tapes=CHECK_TAPES)
+    with pytest.raises(AssertionError, match="project_step in a command buffer has other arguments than now"):
+        trained(load_scene(folder), PLAIN, default_device, monkeypatch, command_buffers=CHECK_TAPES)
 
 
 def test_a_number_that_is_not_given_is_found(
@@ -152,8 +154,8 @@ def test_a_number_that_is_not_given_is_found(
 ) -> None:
     real = project.step_numbers
     monkeypatch.setattr("clsplat.training.step.gradient_step.step_numbers", lambda *given: (*real(*given)[:-1], 0.5))
-    with pytest.raises(AssertionError, match="numbers given to a tape are"):
-        trained(load_scene(folder), PLAIN, default_device, monkeypatch, tapes=CHECK_TAPES)
+    with pytest.raises(AssertionError, match="numbers given to a command buffer are"):
+        trained(load_scene(folder), PLAIN, default_device, monkeypatch, command_buffers=CHECK_TAPES)
 
 
 def test_another_word_than_those_is_refused(
@@ -164,17 +166,17 @@ def test_another_word_than_those_is_refused(
         Trainer(load_scene(folder), PLAIN, default_device)
 
 
-def test_kernel_objects_go_from_tape_to_tape(default_device: Device) -> None:
+def test_kernel_objects_are_used_by_other_command_buffers(default_device: Device) -> None:
     """Making one takes longer than many launches."""
     work, owned = Workspace(default_device), []
     numbers = upload(default_device, np.arange(100, dtype=np.uint32))
     out, total = work.array("out", (100,), np.uint32), work.array("total", (1,), np.uint32)
     for _ in range(3):
-        _, tape = default_device.record(lambda: scan(default_device, work, numbers, out, total))
-        assert tape is not None
-        owned.append({own.int_ptr for _, own in tape._owned})
+        _, commands = default_device.record(lambda: scan(default_device, work, numbers, out, total))
+        assert commands is not None
+        owned.append({own.int_ptr for _, own in commands._owned})
         total.fill(0)
-        default_device.replay(tape)
+        default_device.replay(commands)
         assert total.get()[0] == 4950
-        del tape
+        del commands
     assert owned[0] == owned[1] == owned[2] != set()

@@ -9,7 +9,7 @@ import re
 import pytest
 from pages import Element, parse
 
-from clsplat.report.svg import (
+from clsplat.report.charts import (
     MAX_LINE_POINTS,
     PLOT_BOTTOM_PX,
     PLOT_LEFT_PX,
