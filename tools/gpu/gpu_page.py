@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE, PLOT = ROOT / "docs/gpu-static.md", ROOT / "docs/images/gpu-static.svg"
 SHAPE, TARGET, GPU = "1x64", "sm_89", "RTX 4090"
 """Of the tables that show one of each."""
-LETTERS = 140
+LETTERS = 128
 """Of a line of text."""
 PARTS = {
     "project": ("project",),
