@@ -117,8 +117,8 @@ def _compiled(context: cl.Context, device: cl.Device, variant: Variant) -> cl.Pr
 class Kernel:
     """A built kernel.
 
-    tried: the forms of launch (`launch.form_of`) that the driver has passed. At the first one pyopencl is told the
-    types of the kernel's scalars, as each scalar would otherwise cost 10 microseconds a launch.
+    tried: the forms of launch (`launch.form_of`) that the driver has passed. Before the first launch
+    pyopencl gets the types of the kernel's scalars. Without them each scalar costs 10 microseconds a launch.
     spare: kernel objects of dropped command buffers, which new command buffers may use.
     """
 

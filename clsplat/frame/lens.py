@@ -107,7 +107,7 @@ class Warp:
 
     @property
     def shown(self) -> Camera:
-        """A camera of the warped frame's size. Its pixels are those of the frame, but its rays have no meaning."""
+        """A camera of the warped frame's size. Use only its pixels: its rays are not those of the warped pixels."""
         width, height = self.source.size(self.frame)
         return replace(self.frame, width=width, height=height)
 

@@ -49,7 +49,7 @@ rounded."""
 DrawAt = Callable[[float], Draw]
 """The Draw of a frame at a time in frames from the frame. The time is 0 if nothing moves."""
 Pass = Callable[[DrawAt], DrawAt]
-"""A step of a frame: it makes its pictures from those of the step before."""
+"""One step in making a frame. It takes the Draw of the step before and returns its own."""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def plan_step(
 ) -> Plan:
     """Memory plan of a training step with any of the cameras. Raises CapacityError.
 
-    models: arrays per parameter; by default those of a step of one view.
+    models: number of arrays per parameter. The default is the number for a step of one view.
     """
     planes, extra = 0, step.masks * (target.MASK_PIXEL_BYTES + loss_terms.ALPHA_PIXEL_BYTES + step.turns)
     for camera in cameras:

@@ -129,8 +129,7 @@ class Renderer:
             Return contiguous arrays. False returns views of planes, which is faster.
         holdout : Surfaces, optional
             Surfaces of CG elements, which hide the part of the model behind them. Their depths are measured as the
-            kernels
-            measure depths: z, or distances for cameras that draw along rays.
+            kernels measure depths: z, or distances for cameras that draw along rays.
 
         Returns
         -------
