@@ -19,7 +19,6 @@ from typing import Any, TypeVar
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
-from scipy import sparse
 
 from clsplat.arrays import Float32
 from clsplat.errors import InputError, examples, reason_of
@@ -375,6 +374,8 @@ def png_is_whole(path: Path) -> bool:
 
 def _resampling(source: int, target: int) -> Any:
     """Sparse matrix (target, source) that resamples an axis; each row's weights sum to 1."""
+    from scipy import sparse  # a quarter of a second, of which most commands have no use
+
     if target >= source:
         centres = (np.arange(target) + 0.5) * (source / target) - 0.5
         first = np.clip(np.floor(centres).astype(int), 0, source - 1)

@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid, launch_items
 from clsplat.device.profile import stage
 from clsplat.layouts.columns import TILE
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 GAINS_PIXEL_BYTES = 2
 """Bytes of the partial sums, per pixel with padding."""
@@ -72,6 +75,8 @@ class Gains:
 
 def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[str, DeviceArray]:
     """The begins, others and weights of a matrix; None gives a zero matrix."""
+    from scipy.sparse import csr_array
+
     matrix = csr_array((photographs, photographs), dtype=np.float32) if pull is None else pull
     spare = np.zeros(1)  # device arrays need at least one element
     parts = {
