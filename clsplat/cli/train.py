@@ -222,6 +222,9 @@ def _train_run(
     resume."""
     from clsplat.training.forecast import Forecast
 
+    views = scene.train_views
+    pixels = sum(view.camera.width * view.camera.height for view in views) / len(views)
+
     def print_plan(plan: Plan) -> None:
         if devices[0].memory.limit is not None or any(plan.pieces):
             print(f"{plan.need.gaussians:,} Gaussians: {plan}", file=sys.stderr)
@@ -229,7 +232,7 @@ def _train_run(
     try:
         with (
             page(scene, run.config) if page else nullcontext() as between,
-            TrainProgress(run.config.iterations, Forecast(run.config)) as progress,
+            TrainProgress(run.config.iterations, Forecast(run.config, len(views), pixels)) as progress,
         ):
             services.train(
                 scene,

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,13 +31,12 @@ RECENT_DENSIFICATIONS = 4
 """Number of latest densifications that predict the next ones."""
 PRIOR_GROWTH_WEIGHT = 0.5
 """Weight of the prior: it counts as much as this many measured densifications at the peak."""
-PRIOR_COST_SHARES = np.array([0.75, 0.1, 0.15])
-"""Prior shares of a step's cost at the start, as on CPUs.
-
-The three costs are proportional to the pixels, to the Gaussians, and to both, as more Gaussians overlap each pixel.
-"""
-PRIOR_COST_WEIGHT_SECONDS = 0.003
-"""Weight of the prior shares: they count as much as this many measured seconds."""
+PRIOR_COSTS = np.array([8000.0, 0.6, 1.2, 80_000.0])
+"""Prior costs of a step, of a pixel, of a Gaussian and of reading a photograph, relative to each other, as on CPUs."""
+PRIOR_COST_WEIGHT_SECONDS = 0.03
+"""Weight of the prior costs: they count as much as this many measured seconds."""
+OUTLIER_FACTOR = 4.0
+"""Reports that took this many times their usual time tell nothing about the next ones: a kernel was built."""
 PACE_WINDOW_SECONDS = 60.0
 """Seconds of recent steps that give the machine's current speed."""
 
@@ -50,16 +49,35 @@ class TimedStep(Protocol):
     seconds: float
 
 
-class Forecast:
-    """Seconds until the end of a training. Call `see` with each report, in order."""
+class Span(NamedTuple):
+    """Steps of one size and number of Gaussians.
 
-    def __init__(self, config: TrainConfig) -> None:
-        self.config = config
+    factor: of the size (`Sizes`).
+    reads: photographs that are read.
+    seconds: of a span that has passed.
+    """
+
+    factor: float
+    gaussians: float
+    steps: int
+    reads: float
+    seconds: float = 0.0
+
+
+class Forecast:
+    """Seconds until the end of a training. Call `see` with each report, in order.
+
+    photographs: number of photographs to train on. Each is read when it is first seen in a size.
+    pixels: of a photograph at full size.
+    """
+
+    def __init__(self, config: TrainConfig, photographs: int, pixels: float) -> None:
+        self.config, self.photographs, self.pixels = config, photographs, pixels
         self.sizes = by_doubling(config.warmup)
         self.begun: tuple[int, int] | None = None
         self.last: tuple[int, int, float] | None = None
-        self.spans: list[tuple[float, float, int, float]] = []
-        """Spans between two reports: factor of the size, Gaussians, steps, seconds."""
+        self.spans: list[Span] = []
+        """Steps between two reports."""
         self.added: list[tuple[int, int]] = []
         """Step of each densification, and the number of Gaussians that it added."""
 
@@ -73,7 +91,8 @@ class Forecast:
         density = self.config.density
         due = [each for each in range(before, step) if is_due(density, each)]
         self.added += [(each, (count - previous) // len(due)) for each in due]
-        self.spans.append((self.sizes.factor(step), count, step - before, max(seconds - at, 0.0)))
+        reads = self._reads(before, step)
+        self.spans.append(Span(self.sizes.factor(step), count, step - before, reads, max(seconds - at, 0.0)))
         self.last = (step, count, seconds)
 
     def left(self) -> float | None:
@@ -83,10 +102,26 @@ class Forecast:
         step, count, _ = self.last
         ahead = self._ahead(step, count)
         cost, pace = self._cost()
-        return pace * float(sum(steps * (cost @ self._shares(factor, number)) for factor, number, steps in ahead))
+        return pace * float(sum(span.steps * (cost @ self._amounts(span)) for span in ahead))
 
-    def _ahead(self, step: int, count: int) -> list[tuple[float, float, int]]:
-        """Remaining steps, in spans of constant size and number: factor, Gaussians, steps."""
+    def _reads(self, before: int, step: int) -> float:
+        """Number of photographs that the steps after `before` up to `step` read: those not yet seen in this size.
+
+        Each epoch shows every photograph once, in a random order, and a size may begin in the middle of one.
+        """
+        assert self.begun is not None
+        begin = max([self.begun[0] - 1, *(last for last, _ in self.sizes.until if last <= before)])
+        epoch = self.photographs / self.config.batch
+        epoch_end = math.ceil(begin / epoch) * epoch
+        unseen = 1 - (epoch_end - begin) / epoch  # in the epoch after that
+
+        def read(until: int) -> float:
+            return min(until, epoch_end) - begin + unseen * min(max(until - epoch_end, 0), epoch)
+
+        return self.config.batch * (read(step) - read(max(before, begin)))
+
+    def _ahead(self, step: int, count: int) -> list[Span]:
+        """Remaining steps."""
         density, last, number = self.config.density, self.config.iterations, float(count)
         height, peak = self._height()
         bounds = {last, *(each for each, _ in self.sizes.until if step < each < last)}
@@ -95,7 +130,7 @@ class Forecast:
         if is_due(density, step):
             number = self._grown(density, step, number, height, peak)
         for bound in sorted(each for each in bounds if each > step):
-            spans.append((self.sizes.factor(bound), number, bound - at))
+            spans.append(Span(self.sizes.factor(bound), number, bound - at, self._reads(at, bound)))
             if is_due(density, bound):
                 number = self._grown(density, bound, number, height, peak)
             at = bound
@@ -119,20 +154,20 @@ class Forecast:
         added = PRIOR_GROWTH_WEIGHT * before + sum(each for _, each in taken)
         return added / (PRIOR_GROWTH_WEIGHT + sum(_course(self.config.density, step, peak) for step, _ in taken)), peak
 
-    def _shares(self, factor: float, number: float) -> Float64:
-        """Amounts (3,) to which the three costs of a step are proportional, relative to a full-size step with the
-        initial Gaussians."""
-        assert self.begun is not None
-        pixels, gaussians = 1 / factor**2, number / max(self.begun[1], 1)
-        return np.array([pixels, gaussians, pixels * gaussians])
+    def _amounts(self, span: Span) -> Float64:
+        """Factors (4,) of the costs in a step: 1, pixels, Gaussians, photographs read."""
+        return np.array([1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps])
 
     def _cost(self) -> tuple[Float64, float]:
-        """Seconds of a step by its parts (3,), and the factor by which recent steps took longer."""
+        """Seconds of a step by its parts (4,), and the factor by which recent steps took longer."""
         spans = self.spans[1:] or self.spans  # the first span includes building kernels
-        parts = np.array([self._shares(factor, number) for factor, number, _, _ in spans])
-        steps, seconds = (np.array(column, np.float64) for column in list(zip(*spans, strict=True))[2:])
-        rate = float(seconds.sum() / max((steps * (parts @ PRIOR_COST_SHARES)).sum(), 1e-12))
-        usual = rate * PRIOR_COST_SHARES
+        parts = np.array([self._amounts(span) for span in spans])
+        steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T
+        rates = seconds / np.maximum(steps * (parts @ PRIOR_COSTS), 1e-12)
+        usual_spans = rates <= OUTLIER_FACTOR * np.median(rates)
+        parts, steps, seconds = parts[usual_spans], steps[usual_spans], seconds[usual_spans]
+        rate = float(seconds.sum() / max((steps * (parts @ PRIOR_COSTS)).sum(), 1e-12))
+        usual = rate * PRIOR_COSTS
         # least squares of relative errors, regularised towards the prior; each cost is at least a tenth of its prior
         weights = np.sqrt(seconds) / np.maximum(parts @ usual, 1e-12)
         strength = math.sqrt(PRIOR_COST_WEIGHT_SECONDS * max(float(seconds.sum()), 1e-9)) / np.maximum(usual, 1e-12)
