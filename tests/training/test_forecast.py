@@ -17,7 +17,7 @@ from clsplat.training.forecast import Forecast
 RECORDED = json.loads((Path(__file__).parent / "recorded_steps.json").read_text())
 """Trainings of 3000 steps on two cores: Gaussians of each hundred steps, milliseconds of each twenty."""
 CPU, GAUSSIANS, OVERHEAD = (1.0, 0.5, 1.0, 20.0), (1.0, 0.1, 2.0, 5.0), (4.0, 0.3, 0.6, 5.0)
-"""Milliseconds of a step, and microseconds of a pixel and a Gaussian by fours; milliseconds of reading a photograph."""
+"""Costs: milliseconds of a step, quarters of a microsecond of a pixel and of a Gaussian, milliseconds of a photograph."""
 
 
 @dataclass
@@ -28,7 +28,7 @@ class Report:
 
 
 def made_up(config: TrainConfig, counts: Sequence[int], costs: tuple[float, float, float, float]) -> list[Report]:
-    """A report each tenth step of a training whose steps cost so; 5 s go before the first, when kernels are built."""
+    """A report every ten steps of a training with these costs. Kernels are built in the first 5 s."""
     sizes, seconds, made = Forecast(config, 30, 38_400).sizes, 5.0, []
     for step in range(1, config.iterations + 1):
         count = counts[(step - 1) // 100]
@@ -50,7 +50,7 @@ def recorded(training: dict[str, Any]) -> list[Report]:
 
 
 def ratios(config: TrainConfig, made: list[Report], every: int, forecast: Forecast | None = None) -> list[float]:
-    """The time told over the time that it then took, at each `every`-th step but the last."""
+    """Forecast over the time that was left, at each `every`-th step but the last."""
     forecast, told = forecast or Forecast(config, 30, 38_400), []
     for report in made:
         forecast.see(report)
