@@ -31,7 +31,7 @@ AMBIGUOUS_POINT_COST_PX = 40.0
 
 @dataclass(frozen=True, eq=False)
 class LabelBox:
-    """Box (4,) of a label, and the leader line (2, 2) from its point if the label lies apart."""
+    """Box (4,) of a label, and the leader line (2, 2) from its point if the label is away from it."""
 
     box: Float64
     leader: Float64 | None
@@ -76,7 +76,7 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
 def _candidates(point: Float64, size: Float64) -> Float64:
     """Boxes around a point, (candidates, 4), ring by ring, starting to the right.
 
-    Each box touches its ring from outside: its offset along the edge follows the direction.
+    Each box lies outside its ring and touches it, at a point of its edge that depends on the direction.
     """
     angles = 2 * pi * np.arange(DIRECTIONS_PER_RING) / DIRECTIONS_PER_RING
     directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 9)

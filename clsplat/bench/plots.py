@@ -194,7 +194,7 @@ def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 def _label_points(
     figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]]
 ) -> None:
-    """Write a text near each point, with a leader line if it lies apart, and avoid crossing `lines`.
+    """Write a text near each point, with a leader line if it is away from the point, and avoid crossing `lines`.
 
     The axes must already have their position and limits.
     """

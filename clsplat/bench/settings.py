@@ -99,7 +99,7 @@ def compare(
 
     Times are medians of a frame and of a training step, measured in turns.
     Errors are differences from the float64 reference on a crop, and from the exact preset's frame on the whole image.
-    If exact and all exact switches off are among the settings, the result has their ratio of times too.
+    If the settings include exact and the one with all exact switches off, the result also has the ratio of their times.
     """
     say = progress or no_progress
     if subject.camera.model.along_rays:

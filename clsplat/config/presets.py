@@ -72,8 +72,8 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
 def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> TrainConfig:
     """Settings that `clsplat train --preset --schedule --iterations` start from.
 
-    fast trains less. Pictures are a quarter of the size for a fourteenth of the steps and half the size until two
-    sevenths. There are fewer Gaussians: splits are along the longest axis, and Gaussians that add less than a tenth of
+    fast trains less. Pictures have a quarter of their size for the first 1/14 of the steps, and half of it until 2/7 of
+    the steps. There are fewer Gaussians: splits are along the longest axis, and Gaussians that add less than a tenth of
     a pixel to every view are pruned. The rates come from the short schedule, with means, scales and rotations up to
     four times higher. The higher SH bands are updated in every second step (docs/decisions/0015-the-fast-preset.md).
     Raises InputError for fast with high-rates.

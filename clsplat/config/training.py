@@ -78,7 +78,7 @@ class OptimiserConfig:
         check_kinds(self, "--optimiser.")
         check_rules(self, "--optimiser.", rules)
         if self.means_rate > 0 and self.means_rate_end == 0:  # then the rate would be 0 from the first step
-            raise InputError("--optimiser.means-rate-end 0.0: expected more than 0, the rate falls log-linearly to it")
+            raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
 
 
 @dataclass(frozen=True)

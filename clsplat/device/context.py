@@ -54,7 +54,7 @@ class DeviceInfo:
 
 
 def all_devices() -> list[cl.Device]:
-    """Every visible OpenCL device, in the order of its index. Raises DeviceError in a forked process (`forks`)."""
+    """All visible OpenCL devices, by index. Raises DeviceError in a forked process (`forks`)."""
     forks.claim()
     with undisturbed():  # otherwise Ctrl-C would end compilers and linkers that a driver's threads start
         devices = _visible()

@@ -64,7 +64,7 @@ def claim(target: Path) -> Path | None:
             if not _is_given_up(path):
                 return None
             path.unlink()
-        except (FileNotFoundError, PermissionError):  # meanwhile given back, or taken over by another process
+        except (FileNotFoundError, PermissionError):  # meanwhile released, or taken over by another process
             continue
     return None
 

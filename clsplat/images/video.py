@@ -243,7 +243,7 @@ class VideoWriter:
         height, width = planes[0].shape if isinstance(planes, tuple) else (planes.shape[0] * 2 // 3, planes.shape[1])
         size = height, width
         if self.frames and size != self._size:
-            raise ValueError(f"frame {size}: expected {self._size}, the size of the first")
+            raise ValueError(f"a frame of {width}x{height}: expected the first one's {self._size[1]}x{self._size[0]}")
         self._size = size
         with self._refusals():
             if self._container is None:

@@ -234,7 +234,7 @@ class _GivenLists:
         tiles = (-(-size[1] // TILE), -(-size[0] // TILE))
         lists = cls(*_lists(isect_offsets, flatten_ids, tiles, prod(batch)))
         if len(batch) > 1 and batch[:-1] != lists.images:
-            raise InputError(f"isect_offsets: of images {lists.images}, expected {batch[:-1]} as of means2d")
+            raise InputError(f"isect_offsets: leading axes {lists.images}, expected {batch[:-1]} as in means2d")
         return lists
 
     @property

@@ -145,7 +145,7 @@ def _lengths(**given: int) -> list[int]:
     found = [whole(value) for value in given.values()]
     lengths = [length for length in found if length is not None and length >= 1]
     if len(lengths) < len(found):
-        raise InputError(f"{', '.join(given)}: got {', '.join(map(str, given.values()))}, expected 1 up")
+        raise InputError(f"{', '.join(given)}: got {', '.join(map(str, given.values()))}, expected at least 1 each")
     return lengths
 
 

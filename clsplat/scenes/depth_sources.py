@@ -35,7 +35,7 @@ MIN_TRACKED_POINTS_IN_VIEW = 0.1
 An undistorted fisheye of 200 degrees keeps 0.4. Cameras in another coordinate frame kept 0.001.
 """
 MAX_DEPTH_SCALE_RATIO = 5.0
-"""Maximum ratio between the scale of a relative map and the median over the photographs."""
+"""Largest factor by which the scale fitted to a relative depth map may differ from the median scale of all maps."""
 
 
 def with_depths(scene: Scene, use: DepthUse) -> Scene:

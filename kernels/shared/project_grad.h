@@ -58,7 +58,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   Lanes m[SLOT_STRIDE];
   int any = 0;
   for (int field = 0; field < SLOT_STRIDE; ++field) m[field].all = (floatL)(0.0f);
-  Lanes whitening[3]; // the splats of Gaussians that are not visible are not written
+  Lanes whitening[3]; // stays zero for invisible Gaussians, whose splats are never written
   for (int k = 0; k < 3; ++k) whitening[k].all = (floatL)(0.0f);
   for (uint lane = 0; lane < LANES; ++lane) {
     const uint count = lane < lanes_used ? tile_counts[first_row + lane] : 0;

@@ -1,12 +1,12 @@
-// The alpha of a Gaussian at a ray, and its whitening on the plane that touches the sphere of directions at its mean:
-// equations of docs/cameras.md. Needs lanes.h.
+// The alpha of a Gaussian along a ray, and the whitened coordinates on the plane tangent to the unit sphere at the
+// direction of the mean: equations of docs/cameras.md. Needs lanes.h.
 
 // (14): log2 of the uncapped alpha, and (u, v), the whitened point where the ray (x, y, z) meets the tangent plane at
 // the mean's direction.
 static inline floatL offset_of_ray(floatL x, floatL y, floatL z, __global const float *splat, floatL *u, floatL *v) {
   const floatL along = fmaL(x, (floatL)(splat[RAY_FX]), fmaL(y, (floatL)(splat[RAY_FY]), z * splat[RAY_FZ]));
   // U and V are at right angles to the mean's direction, so only the ray's difference from it matters. The difference
-  // keeps its digits when the two are close.
+  // loses no precision when the two are close.
   const floatL dx = x - splat[RAY_FX], dy = y - splat[RAY_FY], dz = z - splat[RAY_FZ];
   *u = fmaL(dx, (floatL)(splat[RAY_UX]), fmaL(dy, (floatL)(splat[RAY_UY]), dz * splat[RAY_UZ])) / along;
   *v = fmaL(dx, (floatL)(splat[RAY_VX]), fmaL(dy, (floatL)(splat[RAY_VY]), dz * splat[RAY_VZ])) / along;

@@ -119,6 +119,14 @@ def test_files_and_tests_that_are_named_are_there() -> None:
     assert wrong == []
 
 
+def test_every_environment_variable_has_a_row() -> None:
+    sources = "".join(path.read_text("utf-8") for path in (ROOT / "clsplat").rglob("*.py"))
+    read = set(re.findall(r"CLSPLAT_[A-Z_]+[A-Z]", sources))
+    table = (ROOT / "docs" / "commands.md").read_text("utf-8").split("## Environment variables")[1]
+    assert len(read) > 10
+    assert read - set(re.findall(r"CLSPLAT_[A-Z_]+", table)) == set()
+
+
 def test_links_lead_somewhere() -> None:
     wrong = []
     for page in PAGES:

@@ -114,7 +114,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     header, stream = _open(file, size, path)
     values.require_count(path, header.count, size)
     if header.degree > MAX_SH_DEGREE:
-        warn(f"{path}: SH of degree {header.degree}, those above {MAX_SH_DEGREE} left out")
+        warn(f"{path}: has SH of degree {header.degree}; coefficients above degree {MAX_SH_DEGREE} are left out")
     result = values.empty(header.count, min(header.degree, MAX_SH_DEGREE))
     result.antialiased = bool(header.flags & ANTIALIASED_FLAG)
     if header.version == 4:

@@ -30,22 +30,22 @@ R = TypeVar("R")
 
 
 class StepProbe:
-    """Observer of a step. Each method is called after its stage is launched. By default no method does anything."""
+    """Observer of a step. Its methods are called as the stages are launched, and do nothing by default."""
 
     def forward(self, frame: ForwardPass) -> None:
-        """The view is rendered."""
+        """Called when the view is rendered."""
 
     def loss(self, result: Loss) -> None:
-        """The render is compared with the photograph."""
+        """Called when the loss is computed."""
 
     def pair_gradients(self, slots: Slots) -> None:
-        """The gradient of blending is computed."""
+        """Called when the gradient of blending is computed."""
 
     def before_rows(self, rows: StepRows) -> None:
-        """Adam is about to change these rows."""
+        """Called before Adam changes these rows."""
 
     def after_rows(self, rows: ViewRows) -> None:
-        """Adam has changed these rows."""
+        """Called when Adam has changed these rows."""
 
 
 @dataclass(frozen=True, eq=False)
