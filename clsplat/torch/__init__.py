@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's calls for PyTorch, on any OpenCL device: use `from clsplat.torch import ...` for gsplat's import."""
+"""gsplat's functions for PyTorch on any OpenCL device: replace `from gsplat import` by `from clsplat.torch import`."""
 
 from __future__ import annotations
 
