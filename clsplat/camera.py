@@ -79,7 +79,7 @@ MIN_NEAR_PLANES_PER_EXTENT = 100.0
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
-"""Exclusive upper limit of focal lengths in pixels. Even below it, float32 cannot store a position to a pixel."""
+"""Exclusive upper limit of focal lengths in pixels. Even below it, float32 cannot resolve single pixels."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Camera:
         all are 0, the fisheye is equidistant.
     by_rays : bool
         True for a perspective camera that draws Gaussians along the rays of its pixels, like fisheye and panorama. Use
-        it for a model that was trained so (`Gaussians.by_rays`).
+        it for a model that was trained this way (`Gaussians.by_rays`).
 
     Notes
     -----

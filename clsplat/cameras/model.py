@@ -147,7 +147,7 @@ class CameraModel:
         return math.pi, math.pi
 
     def turn(self, view: Intrinsics) -> float:
-        """Pixels of a whole turn of a panorama; infinite for other models."""
+        """Width of a whole turn of a panorama in pixels; infinite for other models."""
         return 2 * math.pi * view.fx if self.wraps else math.inf
 
     def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
@@ -167,7 +167,7 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def is_whole(self, view: Intrinsics) -> bool:  # noqa: ARG002
-        """True if the picture shows all directions once, by longitude and latitude, the axis in the middle."""
+        """True if the picture shows all directions once, by longitude and latitude, with the axis in the middle."""
         return False
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:
@@ -206,7 +206,7 @@ class CameraModel:
         seen = (z > view.near) & ((ratios > low) & (ratios < high)).all(axis=1)
         return np.where(seen, z / max(view.fx, view.fy), np.inf)
 
-    # On an image plane, for models without RAYS.
+    # Methods for models without RAYS, which draw Gaussians on an image plane.
 
     def divisors(self, z: Float64) -> Float64:
         """Numbers (N,) by which x and y are divided in the projection, for points of depth z (N,)."""
@@ -222,7 +222,7 @@ class CameraModel:
         """Gradient (N, 3) with respect to the points, from the gradients of Jacobian and image position."""
         raise NotImplementedError(self.projection)
 
-    # On the planes that touch the sphere of directions, for models with RAYS.
+    # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
 
     def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
         """Eqs. (9), (10): a tangent plane's axes right and down (N, 3), and a pixel's sides along u and v on it.

@@ -94,5 +94,5 @@ def session_of(device: Device | str | None = None) -> LibrarySession:
     """
     if isinstance(device, Device):
         return _session(device)
-    # cached by the variables: listing every driver again would take as long as projecting half a million Gaussians
+    # the variables are part of the cache's key; listing all drivers again takes as long as projecting 500,000 Gaussians
     return _named(device, tuple(os.environ.get(name) for name in _DEVICE_CHOICE_VARIABLES))

@@ -88,7 +88,7 @@ class EwaProjectedTwin:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """The Gaussians that are not culled, (N,)."""
+        """(N,): True for Gaussians that are not culled."""
         return self.radii[:, 0] > 0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's functions for PyTorch on any OpenCL device: replace `from gsplat import` by `from clsplat.torch import`."""
+"""gsplat's functions for PyTorch on any OpenCL device: import them from `clsplat.torch` instead of `gsplat`."""
 
 from __future__ import annotations
 
