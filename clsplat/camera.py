@@ -69,17 +69,17 @@ CAMERA_MODELS: tuple[CameraModel, ...] = (
 """Every camera model. docs/cameras.md (Adding a camera model) lists the parts of a row."""
 
 PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAMERA_MODELS if not model.option}
-"""The usual model of each projection, by its name, in the order of messages and the self-test."""
+"""The usual model of each projection, keyed by the projection. Messages and the self-test use this order."""
 
 JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
-"""World units: the default near plane, for cameras and models without their own."""
+"""Default near plane in world units, for cameras and models without their own."""
 MIN_NEAR_PLANES_PER_EXTENT = 100.0
-"""A scene gets a smaller near plane if its extent is less than this many times the default one."""
+"""A scene gets a smaller near plane if its extent is less than this many times the default near plane."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
-"""Exclusive upper limit of focal lengths, pixels. Already below it float32 cannot store a position to a pixel."""
+"""Exclusive upper limit of focal lengths in pixels. Even below it, float32 cannot resolve single pixels."""
 
 
 @dataclass(frozen=True)
@@ -106,37 +106,37 @@ class Camera:
     Attributes
     ----------
     width : int
-        Width of the picture, pixels.
+        Width of the picture in pixels.
     height : int
-        Height of the picture, pixels.
+        Height of the picture in pixels.
     fx : float
         Horizontal focal length: pixels per unit of the projected coordinates (see Notes).
     fy : float
         Vertical focal length, in the same unit.
     cx : float
-        Principal point, pixels from the image's left edge; the centre of the first pixel is at 0.5.
+        Distance of the principal point from the image's left edge in pixels; the centre of the first pixel is at 0.5.
     cy : float
-        Principal point, pixels from the image's upper edge; the centre of the first pixel is at 0.5.
+        Distance of the principal point from the image's upper edge in pixels; the centre of the first pixel is at 0.5.
     rotation : (3, 3) float64
         x_cam = rotation @ x_world + translation, COLMAP's `cam_from_world`; no unit.
     translation : (3,) float64
-        Translation of `cam_from_world`, world units.
+        Translation of `cam_from_world` in world units.
     near : float
-        Least depth of a drawn Gaussian's mean, world units. With the default, DEFAULT_NEAR_PLANE, the model's near
+        Least depth of a drawn Gaussian's mean in world units. With the default, DEFAULT_NEAR_PLANE, the model's near
         plane applies (`Gaussians.near`).
     far : float
-        Largest depth of a drawn Gaussian's mean, world units.
+        Largest depth of a drawn Gaussian's mean in world units.
     projection : str
         "perspective", "orthographic", "equirectangular" or "fisheye" (equidistant).
     window : Window, optional
-        Place of the picture in its frame, pixels, if the picture is a part of a frame or extends beyond it. Then width
-        and height are the picture's, and cx and cy are measured from the frame's corner.
+        Place of the picture in its frame, if the picture is a part of a frame or extends beyond it. Width and height
+        then are the picture's, while cx and cy are measured from the frame's corner.
     radial : (4,) float
-        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP), no unit. All 0:
-        equidistant.
+        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP), no unit. If
+        all are 0, the fisheye is equidistant.
     by_rays : bool
         True for a perspective camera that draws Gaussians along the rays of its pixels, like fisheye and panorama. Use
-        it for a model that was trained so (`Gaussians.by_rays`).
+        it for a model that was trained this way (`Gaussians.by_rays`).
 
     Notes
     -----
@@ -173,7 +173,7 @@ class Camera:
 
     @property
     def model(self) -> CameraModel:
-        """Its camera model: properties, formulas and kernels."""
+        """The camera model: properties, formulas and kernels."""
         for model in CAMERA_MODELS:
             if model.option and model.projection == self.projection and np.any(getattr(self, model.option)):
                 return model
@@ -186,8 +186,8 @@ class Camera:
 
     @property
     def fold(self) -> tuple[float, float]:
-        """The largest angle from the axis that a fisheye shows, radians, and its distance from the principal point,
-        focal lengths."""
+        """The largest angle from the axis that a fisheye shows, in radians, and its distance from the principal point,
+        in focal lengths."""
         return self.model.fold(self.radial)
 
     @property
@@ -211,7 +211,7 @@ class Camera:
         for name in ("width", "height"):
             side = getattr(self, name)
             if isinstance(side, bool) or not isinstance(side, int | np.integer) or side < 1:
-                raise InputError(f"camera: {name} is {side}, expected a whole number of pixels from 1 on")
+                raise InputError(f"camera: {name} is {side}, expected a whole number of pixels, at least 1")
         for name in ("fx", "fy"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, expected a finite number over 0")
@@ -226,11 +226,11 @@ class Camera:
         rotation = np.asarray(self.rotation, np.float64)
         if (off := float(np.abs(rotation.T @ rotation - np.eye(3)).max())) > ROTATION_TOLERANCE:
             raise InputError(
-                f"camera: rotation is no rotation matrix, its axes are {off:.2g} off right angles or length 1, "
-                "expected the rotation of cam_from_world, without a scale"
+                f"camera: rotation is not a rotation matrix, its axes are {off:.2g} off right angles or length 1; "
+                "expected the rotation of cam_from_world, without scale"
             )
         if not 0 < self.near < self.far:
-            raise InputError(f"camera: near is {self.near}, far {self.far}, expected 0 < near < far")
+            raise InputError(f"camera: near is {self.near} and far is {self.far}, expected 0 < near < far")
         self._check_projection()
 
     def _check_projection(self) -> None:
@@ -239,15 +239,15 @@ class Camera:
         for model in CAMERA_MODELS:
             if model.option and model.projection != self.projection and np.any(getattr(self, model.option)):
                 raise InputError(
-                    f"camera: {model.option} is {getattr(self, model.option)} of a camera that is {self.projection}, "
-                    f"expected {model.projection}"
+                    f"camera: {model.option} is {getattr(self, model.option)} but projection is {self.projection!r}, "
+                    f"expected {model.projection!r}"
                 )
         if len(self.radial) != 4 or not all(math.isfinite(value) for value in self.radial):
             raise InputError(f"camera: radial is {self.radial}, expected four finite numbers")
 
     def through(self, model: CameraModel, radial: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Camera:
-        """The same intrinsics and pose with another projection: the usual model of `model.projection`, and its
-        coefficients."""
+        """The same intrinsics and pose with another projection: the usual model of `model.projection`, with
+        coefficients `radial`."""
         k1, k2, k3, k4 = radial
         return replace(self, projection=cast("Projection", model.projection), radial=(k1, k2, k3, k4), by_rays=False)
 
@@ -291,7 +291,7 @@ class Camera:
         return replace(self, by_rays=by_rays) if changes else self
 
     def depths_of_distances(self) -> Float32 | None:
-        """Factors (height, width) that turn a perspective camera's distances into depths, z: cosines.
+        """Factors (height, width) that turn a perspective camera's distances into depths z: the `cosines`.
 
         None if the kernels compute depths.
         """
@@ -300,7 +300,7 @@ class Camera:
     def cosines(self) -> Float32 | None:
         """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels.
 
-        None for other projections, whose depths are not along rays or are distances.
+        None for other projections, whose depths are already measured along the rays.
         """
         if not self.is_pinhole:
             return None
@@ -312,20 +312,20 @@ class Camera:
     def depths_of(self, points: Float64) -> Float64:
         """Depths (N,) of points (N, 3) in world coordinates, as files store them.
 
-        They are measured along the optical axis of a camera with an image plane. Other cameras have distances.
+        They are z for a camera with an image plane, and distances for other cameras.
         """
         local = points @ self.rotation.T + self.translation
         return np.asarray(local[:, 2] if self.model.flat else np.linalg.norm(local, axis=1))
 
     def drawn_depths(self, offsets: Float64) -> Float64:
-        """Depths (N,) by which Gaussians are ordered. offsets: (N, 3), from the camera's centre, along the world's
+        """Depths (N,) by which Gaussians are sorted. offsets: (N, 3), from the camera's centre, along the world's
         axes."""
         return np.asarray(
             np.linalg.norm(offsets, axis=1) if self.model.along_rays else offsets @ self.rotation[2], np.float64
         )
 
     def reshaped(self, width: int, height: int) -> Camera:
-        """The camera in another size.
+        """The camera with a picture of another size.
 
         A change of shape, even by rounding, keeps the vertical field of view and the pixel aspect ratio.
         The picture then shows more or less to the left and right, so all sizes of one shape show the same.
@@ -350,7 +350,8 @@ class Camera:
         if window is not None:
             edges = [window.x * sx, window.y * sy, window.width * sx, window.height * sy]
             if any(edge != round(edge) for edge in edges):
-                raise ValueError(f"{window} of {self.width}x{self.height} resized to {width}x{height}: no whole pixels")
+                size = f"resized from {self.width}x{self.height} to {width}x{height}"
+                raise ValueError(f"{window} {size} does not have edges on whole pixels")
             x, y, across, down = (round(edge) for edge in edges)
             window = Window(x, y, across, down, window.clamp)
         return replace(
@@ -366,7 +367,7 @@ class Camera:
 
 
 def focal_length(fov: float, size: float, projection: Projection = "perspective") -> float:
-    """fx (or fy) of a camera that sees the angle `fov`, radians, across `size` pixels around its axis.
+    """fx (or fy) of a camera that sees the angle `fov`, in radians, across `size` pixels around its axis.
 
     Raises ValueError for an angle that the projection cannot show, and for orthographic cameras, which have no angle of
     view.
@@ -375,12 +376,14 @@ def focal_length(fov: float, size: float, projection: Projection = "perspective"
     if model.parallel:
         raise ValueError(f"{model.named} camera has no angle of view")
     if 0 < fov < size / MAX_FOCAL_PX:
-        raise ValueError(f"angle of view {math.degrees(fov):g} degrees, for a focal length of over {MAX_FOCAL_PX:g}")
+        raise ValueError(
+            f"angle of view is {math.degrees(fov):g} degrees, which gives a focal length over {MAX_FOCAL_PX:g} pixels"
+        )
     return model.focal_length(fov, size)
 
 
 def model_with(column: str, value: object) -> CameraModel | None:
-    """The camera model that has `value` among the names of a column, such as "usd"; None if there is none."""
+    """The camera model whose column, such as "usd", contains the name `value`; None if there is none."""
     return next((model for model in CAMERA_MODELS if value in getattr(model, column)), None)
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera models: the float64 formulas of each, which define it. `clsplat.camera` has their table."""
+"""Camera models, each defined by its float64 formulas. `clsplat.camera` has the table of models."""

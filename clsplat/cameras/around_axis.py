@@ -16,7 +16,7 @@ class AroundAxis(CameraModel):
     """Footprints on tangent planes, from the four numbers of `angles_of_pixel`."""
 
     def angles_of_pixel(self, view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64, Float64]:
-        """Radians that fx pixels cover, away from the axis and around it, and their derivatives by theta: p, q, p', q'.
+        """p, q, p', q': radians that fx pixels cover away from the axis and around it, and the derivatives in theta.
 
         theta: (N,), the angle from the axis.
         """

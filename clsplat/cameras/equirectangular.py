@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The panorama of longitude and latitude.
+"""The equirectangular camera: a panorama in longitude and latitude.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -15,7 +15,7 @@ from clsplat.cameras.model import CameraModel, Intrinsics
 
 
 class Equirectangular(CameraModel):
-    """Eqs. (5), (6). Kernels: kernels/shared/camera/equirectangular.h."""
+    """A panorama, eqs. (5), (6). Kernels: kernels/shared/camera/equirectangular.h."""
 
     flat = False
     wraps = True

@@ -16,15 +16,15 @@ from clsplat.cameras.around_axis import AroundAxis
 from clsplat.cameras.model import Intrinsics
 
 MIN_FISHEYE_SLOPE = 0.1
-"""Smallest slope of a fisheye's radius, in pixels per radian relative to the axis. Below it the picture counts as
-folded over and is empty there. Above it float32 finds the angle of every pixel.
+"""Smallest slope of a fisheye's radius over the angle, relative to the slope at the axis. Where the slope is smaller,
+the picture counts as folded over and stays empty. Where it is larger, float32 suffices to find a pixel's angle.
 """
 
 
 def radii(view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64]:
-    """A fisheye's distances from the image's centre, in focal lengths, by the angle from the axis: eq. (18).
+    """Distances from the image's centre, in focal lengths, of rays at angles theta from a fisheye's axis: eq. (18).
 
-    Returns also the first and second derivative.
+    Also returns the first and second derivatives with respect to theta.
     """
     powers, factors = 2 * np.arange(5), np.array([1.0, *view.radial])
     series = theta[:, None] ** powers
@@ -34,12 +34,12 @@ def radii(view: Intrinsics, theta: Float64) -> tuple[Float64, Float64, Float64]:
 
 
 class Fisheye(AroundAxis):
-    """Eq. (4). Kernels: kernels/shared/camera/fisheye.h."""
+    """An equidistant fisheye, eq. (4). Kernels: kernels/shared/camera/fisheye.h."""
 
     flat = False
 
     def angles(self, view: Intrinsics, radius: Float64) -> Float64:  # noqa: ARG002
-        """Angles (N,) from the axis by the distance from the image's centre, in focal lengths."""
+        """Angles (N,) from the axis of pixels at distances `radius` (N,) from the image's centre, in focal lengths."""
         return radius
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:  # noqa: ARG002
@@ -86,8 +86,8 @@ class Fisheye(AroundAxis):
 class BentFisheye(Fisheye):
     """A fisheye with coefficients (Kannala and Brandt), eqs. (18), (19). Kernels: fisheye.h with bent_fisheye.h."""
 
-    self_tested = False  # kernels and shapes are the fisheye's
-    without_motion = "a fisheye with coefficients, expected one without or a pinhole"
+    self_tested = False  # it shares kernels and footprints with Fisheye
+    without_motion = "a fisheye with coefficients, expected a fisheye without them or a pinhole camera"
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:
         return _fold(tuple(radial))
@@ -102,7 +102,7 @@ class BentFisheye(Fisheye):
         return 0.5 * (low + high)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:
-        """True within the fold-over."""
+        """True for points at smaller angles from the axis than the fold-over."""
         return np.asarray(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < view.fold[0])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The base of a camera model, and the names of lenses that it takes.
+"""The base class of camera models, and the table entry of a lens.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -44,14 +44,14 @@ class Intrinsics(Protocol):
 
 
 class LensModel(NamedTuple):
-    """A lens of photographs.
+    """A lens model of photographs.
 
     name: COLMAP's name, or clsplat's own if COLMAP does not have the lens.
     coefficients: number of distortion coefficients that `Camera.radial` takes.
-    with_two: the model with two focal lengths that replaces a model with one, "" for none.
-    with_two_coefficients: number of its coefficients; the model's own are the first.
-    is_colmap: False for a lens of clsplat's own. Its parameters are the width and height of a panorama, otherwise fx,
-        fy, cx and cy.
+    with_two: for a model with one focal length, the model with two that can replace it; "" for none.
+    with_two_coefficients: number of coefficients of that replacement; the first are the coefficients of this model.
+    is_colmap: False for a lens that only clsplat has. The parameters of such a panorama are width and height, and of
+        other such lenses fx, fy, cx and cy.
     """
 
     name: str
@@ -100,7 +100,7 @@ class CameraModel:
     ewa: str = ""
 
     flat: ClassVar[bool] = True
-    """True if it has an image plane. Near and far planes and the depths in files then are z, otherwise distances."""
+    """True if it has an image plane. Then near, far and the depths in files are z; otherwise they are distances."""
     is_pinhole: ClassVar[bool] = False
     """True if the image is linear in x/z and y/z, as in an undistorted photograph."""
     parallel: ClassVar[bool] = False
@@ -108,7 +108,7 @@ class CameraModel:
     wraps: ClassVar[bool] = False
     """True for panoramas: the right edge continues at the left one, and nothing lies beyond the edges."""
     self_tested: ClassVar[bool] = True
-    """True if the self-test has a picture of it, where Gaussians are evaluated along rays."""
+    """True if the self-test renders a picture with it; only for models along rays."""
     without_motion: ClassVar[str] = ""
     """The reason why it has no channel `motion`, and the alternatives; "" if it has one."""
     focal_keys: ClassVar[tuple[str, ...]] = ("fov_x", "fov_y")
@@ -118,24 +118,24 @@ class CameraModel:
 
     @property
     def along_rays(self) -> bool:
-        """True if a Gaussian is evaluated along the ray of each pixel; the order of Gaussians is by distance then.
+        """True if a Gaussian is evaluated along the ray of each pixel; Gaussians are then sorted by distance.
 
-        Otherwise it is an ellipse on the image plane, and the order is by z.
+        Otherwise a Gaussian is an ellipse on the image plane, and they are sorted by z.
         """
         return "RAYS" in self.defines
 
     @property
     def named(self) -> str:
-        """The projection with its article, for messages."""
+        """The projection with its article, such as "a fisheye", for messages."""
         return f"{'an' if self.projection[0] in 'aeiou' else 'a'} {self.projection}"
 
     def focal_length(self, fov: float, size: float) -> float:
-        """Pixels per unit of the projected coordinates if `size` pixels show the angle fov, radians: eq. (7).
+        """Pixels per unit of the projected coordinates if `size` pixels show the angle `fov` in radians: eq. (7).
 
         Raises ValueError for an angle that cannot be shown.
         """
         if not 0 < fov <= 2 * math.pi * (1 + 1e-12):
-            raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and at most 360")
+            raise ValueError(f"angle of view is {math.degrees(fov):g} degrees, expected more than 0 and at most 360")
         return size / fov
 
     def wide_focal(self, width: int) -> float:
@@ -143,17 +143,17 @@ class CameraModel:
         return 0.25 * width
 
     def fold(self, radial: tuple[float, float, float, float]) -> tuple[float, float]:  # noqa: ARG002
-        """The largest angle from the axis that it shows, in radians, and its radius there in focal lengths."""
+        """The largest angle from the axis that the model shows, in radians, and its image radius in focal lengths."""
         return math.pi, math.pi
 
     def turn(self, view: Intrinsics) -> float:
-        """Pixels of a whole turn of a panorama; infinite for other models."""
+        """Width of a whole turn of a panorama in pixels; infinite for other models."""
         return 2 * math.pi * view.fx if self.wraps else math.inf
 
     def wrapped(self, view: Intrinsics, u: Float64) -> Float64:
         """Move u (N,) of a panorama by whole turns to within half a turn of the image's middle: eq. (6).
 
-        So a panorama of a whole turn has every u in [0, width), for any cx.
+        In a panorama of a whole turn, every u is then in [0, width), for any cx.
         """
         if not self.wraps:
             return u
@@ -167,21 +167,28 @@ class CameraModel:
         raise NotImplementedError(self.projection)
 
     def is_whole(self, view: Intrinsics) -> bool:  # noqa: ARG002
-        """True if the picture shows all directions once, by longitude and latitude, the axis in the middle."""
+        """True if the picture shows all directions once, by longitude and latitude, with the axis in the middle."""
         return False
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:
-        """OpenEXR's projection (4, 4) for row vectors, y up, by the display window's size; None without a plane."""
+        """OpenEXR's projection matrix (4, 4): row vectors, y up. None if the model has no image plane.
+
+        width, height: size of the display window.
+        """
         raise NotImplementedError(self.projection)
 
     def rays_of(self, view: Intrinsics, a: Float64, b: Float64) -> tuple[Float64, Float64]:
-        """Origins (N, 3) and unit directions (N, 3) in the camera's axes of pixels, which are a and b (N,) focal
-        lengths from the principal point. NaN for a pixel without a ray."""
+        """Origins (N, 3) and unit directions (N, 3), in the camera's axes, of the rays of pixels. NaN without a ray.
+
+        a, b: (N,), distances of the pixels from the principal point in focal lengths.
+        """
         raise NotImplementedError(self.projection)
 
     def places_of(self, view: Intrinsics, points: Float64) -> tuple[Float64, Float64, Float64]:
-        """Distances a and b (N,) from the principal point, in focal lengths, and depths (N,), of points (N, 3) in the
-        camera's axes. NaN for a point without a pixel."""
+        """Project points (N, 3) in the camera's axes. NaN for a point without a pixel.
+
+        Returns a and b (N,), distances from the principal point in focal lengths, and depths (N,).
+        """
         raise NotImplementedError(self.projection)
 
     def shows(self, view: Intrinsics, points: Float64) -> Bool:  # noqa: ARG002
@@ -189,8 +196,7 @@ class CameraModel:
         return np.ones(len(points), np.bool_)
 
     def pixel_widths(self, view: Intrinsics, points: Float64) -> Float64:
-        """A pixel's width (N,) at points (N, 3) in the camera's axes, world units; infinite if the camera does not see
-        the point.
+        """Width (N,) in world units of a pixel at points (N, 3) in the camera's axes; infinite at unseen points.
 
         Eq. (88) of docs/gradients.md.
         """
@@ -200,10 +206,10 @@ class CameraModel:
         seen = (z > view.near) & ((ratios > low) & (ratios < high)).all(axis=1)
         return np.where(seen, z / max(view.fx, view.fy), np.inf)
 
-    # On an image plane, for models without RAYS.
+    # Methods for models without RAYS, which draw Gaussians on an image plane.
 
     def divisors(self, z: Float64) -> Float64:
-        """Divisors (N,) of x and y in the image position, by z (N,)."""
+        """Numbers (N,) by which x and y are divided in the projection, for points of depth z (N,)."""
         raise NotImplementedError(self.projection)
 
     def projected(self, view: Intrinsics, points: Float64) -> PlaneProjection:
@@ -213,22 +219,24 @@ class CameraModel:
     def mean_grad(
         self, view: Intrinsics, points: Float64, plane: PlaneProjection, d_jacobian: Float64, d_means2d: Float64
     ) -> Float64:
-        """The gradient (N, 3) by points (N, 3), from those by the Jacobian (N, 2, 3) and the image position (N, 2)."""
+        """Gradient (N, 3) with respect to the points, from the gradients of Jacobian and image position."""
         raise NotImplementedError(self.projection)
 
-    # On the planes that touch the sphere of directions, for models with RAYS.
+    # Methods for models with RAYS, which draw Gaussians on planes tangent to the sphere of directions.
 
     def footprints(self, view: Intrinsics, directions: Float64) -> tuple[Float64, Float64, Float64]:
-        """Eqs. (9), (10): right, down (N, 3), and a pixel's size on the tangent plane, (N, 2, 2), columns by u and
-        v."""
+        """Eqs. (9), (10): a tangent plane's axes right and down (N, 3), and a pixel's sides along u and v on it.
+
+        The sides are the columns of (N, 2, 2).
+        """
         raise NotImplementedError(self.projection)
 
     def low_pass_grad(self, view: Intrinsics, directions: Float64, gradients: Float64, low_pass: float) -> Float64:
-        """Eqs. (26) to (28), B: the gradient of the low-pass term by a step of the mean's direction, (N, 2).
+        """Eqs. (26) to (28), B: the gradient (N, 2) of the low-pass term with respect to the mean's direction.
 
-        The step is along the plane's axes.
+        Its two numbers are for steps along the tangent plane's axes.
 
-        gradients: (N, 2, 2), by the covariance.
-        low_pass: variance added to the projected covariance, square pixels.
+        gradients: (N, 2, 2), with respect to the covariance.
+        low_pass: variance in square pixels, which is added to the projected covariance.
         """
         raise NotImplementedError(self.projection)

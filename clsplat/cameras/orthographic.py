@@ -13,7 +13,7 @@ from clsplat.cameras.model import CameraModel, Intrinsics, PlaneProjection
 
 
 class Orthographic(CameraModel):
-    """Eqs. (3), (15) to (17). Kernels: kernels/shared/camera/orthographic.h."""
+    """The orthographic camera, eqs. (3), (15) to (17). Kernels: kernels/shared/camera/orthographic.h."""
 
     parallel = True
     focal_keys = ("pixel_size",)

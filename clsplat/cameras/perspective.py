@@ -16,13 +16,13 @@ from clsplat.cameras.model import CameraModel, Intrinsics, PlaneProjection
 
 
 class Perspective(CameraModel):
-    """Eq. (2). Kernels: kernels/shared/camera/perspective.h."""
+    """The pinhole camera, eq. (2). Kernels: kernels/shared/camera/perspective.h."""
 
     is_pinhole = True
 
     def focal_length(self, fov: float, size: float) -> float:
         if not 0 < fov < math.pi:
-            raise ValueError(f"angle of view {math.degrees(fov):g} degrees, expected more than 0 and less than 180")
+            raise ValueError(f"angle of view is {math.degrees(fov):g} degrees, expected more than 0 and less than 180")
         return 0.5 * size / math.tan(0.5 * fov)
 
     def ndc_from_cam(self, view: Intrinsics, width: int, height: int) -> Float64 | None:
@@ -64,7 +64,7 @@ class Perspective(CameraModel):
     ) -> Float64:
         """Eqs. (36), (37) of docs/gradients.md."""
         x, y, z = points.T
-        # (36): the Jacobian's entries by z and by the clamped ratios; a clamped ratio does not depend on the mean
+        # (36): through the Jacobian, with respect to z and the ratios; a clamped ratio does not depend on the mean
         d00, d02, d11, d12 = d_jacobian[:, 0, 0], d_jacobian[:, 0, 2], d_jacobian[:, 1, 1], d_jacobian[:, 1, 2]
         d_z = (-view.fx * d00 + view.fx * plane.ratios[:, 0] * d02) / z**2
         d_z += (-view.fy * d11 + view.fy * plane.ratios[:, 1] * d12) / z**2
@@ -78,7 +78,7 @@ class Perspective(CameraModel):
 
 
 class PerspectiveByRays(AroundAxis, Perspective):
-    """A pinhole camera that draws Gaussians as a fisheye does, eqs. (30), (31). Kernels: perspective_rays.h."""
+    """A pinhole camera that draws Gaussians along rays like a fisheye: eqs. (30), (31). Kernels: perspective_rays.h."""
 
     def angles_of_pixel(
         self,

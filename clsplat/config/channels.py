@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of channels: each row describes a channel, all but its kernel's arithmetic (docs/channels.md)."""
+"""The table of channels. A row describes everything of a channel except its kernel's arithmetic (docs/channels.md)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Channel:
 
     names: names in a file, one for each float. EXR names follow the OpenEXR documentation ("Technical introduction",
     layers).
-    kind: type of its values in a file. Colour is half or float as requested. Exact is always float, as a half has only
-    11 bits for a depth. Whole is uint32 in a part of its own, else float.
+    kind: type of its values in a file. "colour" is half or float, as requested. "exact" is always float, as a half has
+    only 11 bits. "whole" is uint32 if the channel has a part of its own, else float.
     part: its name in a file of several parts.
-    source: the kernels' planes that hold it. The image comes from blend.cl. Features come from features.cl and are
-    blended by channels.cl. The depths follow the features in the same array, and whole numbers are in another. Shares
-    are blended like features, one for each object.
+    source: the device arrays that hold it. "image": from blend.cl. "features": from features.cl, blended by
+    channels.cl. "depths": in the same array, after the features. "whole": in another array. "shares": blended like
+    features, one for each object.
     kernel: its name in the kernels, which get a feature's offset as FEATURE_NAME.
     signs: factors from the kernel's values to the file's; empty if they are equal.
     """
@@ -37,7 +37,7 @@ class Channel:
 
     @property
     def is_light(self) -> bool:
-        """True if samples and filters sum it. A frame takes the other channels from its middle sample."""
+        """True if the values of several samples are summed. Other channels come from a frame's middle sample."""
         return self.source in ("image", "shares")
 
 
@@ -76,7 +76,7 @@ DEEP_CHANNELS = ("R", "G", "B", "A", "Z", "ZBack")
 
 
 def floats_of(source: Source) -> dict[str, int]:
-    """Floats of each channel of a source, by kernel name, in order."""
+    """The number of floats of each channel with this source, keyed by kernel name, in the order of the planes."""
     return {channel.kernel: len(channel.names) for channel in FRAME_CHANNELS.values() if channel.source == source}
 
 

@@ -29,8 +29,7 @@ def check_rules(config: object, prefix: str, rules: tuple[Rule, ...]) -> None:
 
 
 def check_kinds(config: object, prefix: str) -> None:
-    """Raise InputError naming the flag of the first setting with a wrong type, or too large for config.toml. Python
-    does not check types."""
+    """Raise InputError naming the flag of the first setting that has the wrong type or is too large for config.toml."""
     for name, kind in get_type_hints(type(config)).items():
         value = getattr(config, name)
         if expected := misfit(kind, value):
@@ -69,7 +68,7 @@ def _is_whole(value: object) -> bool:
 def check_steps(flag: str, steps: tuple[int, ...]) -> None:
     """Raise InputError unless the steps are at least 1 and increase."""
     if any(step < 1 for step in steps) or list(steps) != sorted(set(steps)):
-        raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps from 1 up, in order")
+        raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps of at least 1, in ascending order")
 
 
 def parse_bytes(text: str | int | None) -> int | None:

@@ -7,4 +7,4 @@ TEST_EVERY = 8
 VIEWER_HOST, VIEWER_PORT = "127.0.0.1", 8080
 """Address and port of the viewer's server."""
 DEMO_ITERATIONS = 2000
-"""Steps of `clsplat demo`, about a minute on two cores."""
+"""Training steps of `clsplat demo`, which take about a minute on two cores."""

@@ -9,10 +9,10 @@ from typing import Literal
 Depths = Literal["z", "inverse", "ray"]
 
 HOLDOUT_SURFACE_FIELDS = ("Z", "BACK", "KEEP", "RATE")
-"""Values of a surface.
+"""Values of a surface, in order.
 
-Front and back depth, the fraction of light that it transmits, and the binary logarithm of that fraction per length. The
-last is 0 for a surface without length.
+The depths of its front and back, the fraction of light that it transmits, and the binary logarithm of this fraction per
+unit of depth. The last value is 0 for a surface without thickness.
 """
 
 
@@ -21,7 +21,7 @@ class HoldoutConfig:
     """Settings for reading the files of --holdout."""
 
     channel: str = ""
-    """Depth channel in --holdout's files, such as depth.Z; Z if not given. Their alpha is A of the same layer."""
+    """Depth channel in --holdout's files, such as depth.Z; Z if not given. Alpha is the channel A of the same layer."""
     depths: Depths = "z"
     """Kind of the depths. z: along the camera's axis. inverse: 1 / z, as Nuke writes it. ray: distances from the
     camera."""

@@ -12,7 +12,7 @@ AlphaMeaning = Literal["blend", "ignore", "transparent"]
 
 @dataclass(frozen=True)
 class MaskUse:
-    """Meaning of a scene's masks, meaning of its alpha channels, and True if masks are inverted."""
+    """The meanings of a scene's masks and of its alpha channels, and whether masks are inverted."""
 
     masks: MaskMeaning = "none"
     alpha: AlphaMeaning = "blend"

@@ -21,7 +21,7 @@ STRIP_PIXELS = 1 << 24
 DEEP_STRIP_FLOATS = 1 << 24
 """Maximum number of floats for the slices of a strip of a deep picture: 64 MiB."""
 DEEP_MERGE_FLOATS = 1 << 26
-"""Maximum number of floats for all deep pictures that are merged, at once: 256 MiB."""
+"""Maximum number of floats in memory at once while deep pictures are merged: 256 MiB."""
 SENSOR_WIDTH_MM = 36.0
 """Default width of the picture on the sensor, in millimetres."""
 _MAX_SUPERSAMPLES = 64
@@ -103,13 +103,14 @@ class WarpConfig:
     COLMAP model or a transforms.json."""
 
     def check(self, channels: Collection[str] = ()) -> None:
-        """Raise InputError for settings that exclude each other, and for channels that a distorted picture cannot
-        have."""
+        """Raise InputError for settings that exclude each other, and for channels that distortion makes undefined."""
         if self.stmap and self.distort:
-            raise InputError("--stmap and --distort exclude each other: both bend the picture")
+            raise InputError("--stmap and --distort exclude each other: both distort the picture")
         flag = "--stmap" if self.stmap else "--distort" if self.distort else ""
         if flag and (moving := [name for name in channels if name in ("motion", "backward")]):
-            raise InputError(f"{flag}: {', '.join(moving)} of a bent picture is not defined, expected other --channels")
+            raise InputError(
+                f"{flag}: {', '.join(moving)} is not defined for distorted pictures, expected no such --channels"
+            )
 
 
 @dataclass(frozen=True)
@@ -123,10 +124,10 @@ class SamplingConfig:
     """Motion blur: shutter angle in degrees, centred on the frame; 360 is the time between frames, 0 is no blur. If not
     given: the shutter of a USD stage, else none."""
     shutter_open: float | None = None
-    """Opening of the shutter, in frames from the frame, such as -0.25. Replaces --shutter-angle, together with
-    --shutter-close."""
+    """Time at which the shutter opens, in frames relative to the frame, such as -0.25. Replaces --shutter-angle,
+    together with --shutter-close."""
     shutter_close: float | None = None
-    """Closing of the shutter, in frames from the frame, such as 0.25."""
+    """Time at which the shutter closes, in frames relative to the frame, such as 0.25."""
     f_stop: float | None = None
     """Depth of field: f-number of the lens, such as 2.8. Its focal length is the camera's, on a sensor of
     --sensor-width. If neither this nor --aperture is given: the lens of a USD stage, else everything is in focus.
@@ -166,13 +167,13 @@ class SamplingConfig:
                 times = f"--shutter-open {self.shutter_open} --shutter-close {self.shutter_close}"
                 raise InputError(f"{times}: expected two times, the second after the first")
         if self.aperture and self.f_stop is not None:
-            raise InputError("--aperture and --f-stop exclude each other: both are the size of the lens")
+            raise InputError("--aperture and --f-stop exclude each other: both set the size of the lens")
         if self.has_lens and not (0 < (self.focus or 0.0) < inf) and (whole or self.focus is not None):
             raise InputError(f"--focus {self.focus or 0.0}: expected the depth that is in focus, above 0")
 
     @property
     def shutter(self) -> tuple[float, float]:
-        """Opening and closing of the shutter, in frames from the frame."""
+        """Times at which the shutter opens and closes, in frames relative to the frame."""
         if self.shutter_open is not None and self.shutter_close is not None:
             return self.shutter_open, self.shutter_close
         half = (self.shutter_angle or 0.0) / 720
@@ -180,7 +181,7 @@ class SamplingConfig:
 
     @property
     def middle(self) -> float:
-        """Time half way between opening and closing, in frames from the frame."""
+        """Time half way between opening and closing, in frames relative to the frame."""
         begin, end = self.shutter
         return 0.5 * (begin + end)
 
@@ -225,7 +226,7 @@ class PictureConfig:
     def check_deep(self) -> None:
         """Raise InputError for settings that deep pictures do not support."""
         if self.framing.supersample > 1:
-            raise InputError("deep EXR: --supersample has no deep samples, expected a frame without")
+            raise InputError("deep EXR: --supersample cannot filter deep samples, expected --supersample 1")
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,7 @@ class DeepConfig:
     """Slices of a deep EXR."""
 
     bins: int = 16
-    """Slices by depth, which is the maximum number of samples of a pixel. Each pixel places its slices at the
+    """Maximum number of slices by depth, which are the samples of a pixel. Each pixel places its slices at the
     depths that contribute its light."""
 
     def check(self) -> None:
@@ -265,7 +266,7 @@ class VideoConfig:
     def check(self) -> None:
         """Raise InputError naming the first setting whose value is invalid."""
         if self.fps is not None and not 0.01 <= self.fps <= 1000:
-            raise InputError(f"--video.fps {self.fps}: expected 0.01 to 1000 frames a second")
+            raise InputError(f"--video.fps {self.fps}: expected 0.01 to 1000 frames per second")
         if not 0 <= self.crf <= 51:
             raise InputError(f"--video.crf {self.crf}: expected 0 to 51")
         if self.preset not in _ENCODER_PRESETS:

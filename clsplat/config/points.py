@@ -8,7 +8,7 @@ from typing import Literal
 
 PointsUse = Literal["replace", "join"]
 DEFAULT_MAX_FILE_POINTS = 200_000
-"""Default limit on a file's points: scanners write tens of millions."""
+"""Default maximum number of points from a file: scanners write tens of millions."""
 SKY_RADIUS_RATIO = 10.0
 """Radius of the sky's sphere, relative to the distance of the scene's farthest points from its middle.
 

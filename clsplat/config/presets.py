@@ -28,7 +28,7 @@ fast: approximations that are worth their error (docs/performance.md).
 def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
     """Settings that `clsplat train --schedule` starts from.
 
-    paper: the defaults, made for 30,000 steps, for any `iterations`.
+    paper: the default settings, whatever `iterations` is. They are meant for 30,000 steps.
     short: for runs of about 7000 steps, which the paper's rates leave unfinished. Colours, opacities and rotations
     learn faster, and SH degrees rise twice as fast. The means' rate reaches its minimum at the last step. Density
     control ends at five sevenths, and the last seventh is a cooldown (docs/decisions/0013-a-short-schedule.md).

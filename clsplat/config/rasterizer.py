@@ -59,7 +59,7 @@ class BenchSwitches(RasterizerConfig):
     docs/performance.md has the error of each setting, and the time that it saves.
     """
 
-    extent: Literal["opacity", "constant", "3sigma"] = "opacity"  # type: ignore[assignment]  # one value more
+    extent: Literal["opacity", "constant", "3sigma"] = "opacity"  # type: ignore[assignment]  # it allows one more value
     """Reach of a Gaussian. opacity: until its alpha falls to alpha-min. constant: the reach of an opaque one, whatever
     its opacity. 3sigma: three standard deviations, which cuts off visible parts of opaque Gaussians (approximate)."""
     tile_test: Literal["ellipse", "box", "square"] = "ellipse"
@@ -76,11 +76,11 @@ class BenchSwitches(RasterizerConfig):
     column_skip: bool = True
     """Visit only the vectors (pixels that are processed at once) of a row that a Gaussian's bounding box reaches."""
     early_stop: bool = True
-    """Leave a tile when all its pixels are opaque. Otherwise continue to its last Gaussian, without effect."""
+    """Leave a tile when all its pixels are opaque. If off, continue to its last Gaussian, without effect."""
     record_cells: bool = True
-    """Visit in a tile's gradient the cells of pixels in which a Gaussian contributes, as recorded by blending.
-    Otherwise find the cells that the ellipse reaches once more."""
+    """In a tile's gradient, visit only the cells of pixels to which a Gaussian contributes, as recorded by blending.
+    If off, find the cells that the ellipse reaches once more."""
     frustum_cull: bool = True
-    """Leave out a Gaussian that reaches no tile of the image before computing its colour. Otherwise it gets a colour
+    """Leave out a Gaussian that reaches no tile of the image before computing its colour. If off, it gets a colour
     and a place in the depth order, without effect. Gaussians that are not in front of the near plane have no
     projection, and are always left out."""

@@ -20,14 +20,14 @@ class StereoConfig:
     """Pairs of pictures, for the left and the right eye."""
 
     stereo: str = ""
-    """Render a frame for each eye, this far apart in the scene's units; or stage, for the two cameras of a USD stage
+    """Render a frame for each eye: the eyes' distance in the scene's units, or stage for the two cameras of a USD stage
     with stereoRole left and right. Writes two files if -o has {eye}, %V (left, right) or %v (l, r), else one EXR file
     with a part for each eye. '' renders no pairs."""
     convergence: float | None = None
-    """Depth at which both eyes see the same, along the camera's axis. Their principal points are shifted, and the
+    """Depth along the camera's axis at which the pictures of both eyes coincide. The principal points are shifted; the
     cameras are not turned. If not given, the eyes look parallel."""
     eye: Literal["both", "left", "right"] = "both"
-    """Render only one eye of --stereo, such as for a video."""
+    """Eyes of --stereo to render. One eye alone is useful for a video, for example."""
 
     def check(self, *, distort: bool = False) -> None:
         """Raise InputError naming the first setting whose value is invalid.
@@ -37,13 +37,17 @@ class StereoConfig:
         if not self.stereo:
             for flag, given in (("--convergence", self.convergence is not None), ("--eye", self.eye != "both")):
                 if given:
-                    raise InputError(f"{flag}: is of stereo pairs, expected --stereo DISTANCE with it")
+                    raise InputError(f"{flag}: applies only to stereo pairs, expected --stereo DISTANCE too")
             return
         if distort:
-            raise InputError("--stereo and --distort exclude each other: a photograph was taken by one eye")
+            raise InputError(
+                "--stereo and --distort exclude each other: --distort reproduces a photograph's single camera"
+            )
         if self.of_stage:
             if self.convergence is not None:
-                raise InputError("--convergence: the cameras of --stereo stage have their own, expected it without")
+                raise InputError(
+                    "--convergence: the cameras of --stereo stage have their own, expected no --convergence"
+                )
             return
         if not 0 < self.distance < inf:
             raise InputError(

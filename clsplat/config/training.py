@@ -54,9 +54,9 @@ class OptimiserConfig:
     """Steps between updates of the higher SH bands (approximate above 1)."""
     cooldown: int = 0
     """Number of final steps over which every learning rate falls exponentially, to the fraction cooldown-to of itself.
-    0: none falls."""
+    0: the rates do not fall."""
     cooldown_to: float = 0.1
-    """Fraction of every learning rate that is left after the cooldown, more than 0, at most 1."""
+    """Fraction of every learning rate that is left after the cooldown; more than 0, at most 1."""
     beta1: float = 0.9
     """Decay of Adam's first moment, the mean gradient: the fraction that is kept at each step."""
     beta2: float = 0.999
@@ -77,7 +77,7 @@ class OptimiserConfig:
         )
         check_kinds(self, "--optimiser.")
         check_rules(self, "--optimiser.", rules)
-        if self.means_rate > 0 and self.means_rate_end == 0:  # then the rate would be 0 from the first step
+        if self.means_rate > 0 and self.means_rate_end == 0:  # a log-linear rate would be 0 from the first step
             raise InputError("--optimiser.means-rate-end 0.0: expected more than 0; the rate falls to it log-linearly")
 
 
@@ -101,7 +101,7 @@ class DensityConfig:
     dense_fraction: float = 0.01
     """Largest scale of a Gaussian that is cloned, relative to the scene's extent; larger ones are split."""
     split_factor: float = 1.6
-    """Factor by which each half of a split Gaussian is smaller."""
+    """Factor by which each half of a split Gaussian is smaller than the original."""
     min_opacity: float = 0.005
     """Prune Gaussians whose opacity is less than this, 0 to 1."""
     max_world_fraction: float = 0.1
@@ -127,11 +127,11 @@ class DensityConfig:
     """Split Gaussians, small or large, along their longest axis, into two halves on that axis (Improved-GS). Nothing is
     cloned then. Growth mcmc always splits like this."""
     spread: float = 1.0
-    """With growth mcmc, if more Gaussians have to move than there are Gaussians with a gradient: random distance of a
-    moved one from its target's mean. In standard deviations; 0 puts it at the mean, as published."""
+    """With growth mcmc: random distance of a moved Gaussian from its target's mean, in standard deviations. 0 puts it
+    at the mean, as published. Applies only if more Gaussians have to move than have a gradient."""
     noise_rate: float = 5e5
-    """With growth mcmc: noise added to the means each step, in learning rates of the means, for Gaussians of scale 1 in
-    a scene of extent 1. 0 adds none. The cooldown has no noise."""
+    """With growth mcmc: noise added to the means in each step, in multiples of their learning rate, for Gaussians of
+    scale 1 in a scene of extent 1. 0 adds none. The cooldown has no noise."""
     opacity_weight: float = 0.01
     """With growth mcmc: weight of the mean opacity in the loss, summed over the Gaussians that the step's view
     shows."""
@@ -194,8 +194,8 @@ class TrainConfig:
     """Number of training steps, each of one view. Learning rates and density control do not depend on it, except for
     --optimiser.cooldown, --schedule short and high-rates, and --preset fast."""
     batch: int = 1
-    """Views whose gradients are summed before the model changes. Each still counts as a step. Learning rates and Adam's
-    constants are scaled for the batch (Zhao et al. 2024). With several devices, if not given: one for each."""
+    """Views whose gradients are summed before the model changes. Each view still counts as a step. Learning rates and
+    Adam's constants are scaled for the batch (Zhao et al. 2024). If not given: one view for each device."""
     seed: int = 0
     """Seed of everything random. The same seed on the same device gives the same model."""
     sh_degree: int = 3
@@ -222,7 +222,7 @@ class TrainConfig:
     perspective: Perspective = "auto"
     """Projection of a Gaussian in pinhole pictures. plane: as an ellipse on the image plane (Kerbl et al.). rays: along
     the rays of the pixels, as for fisheyes and panoramas, which takes longer. auto: rays if the scene has fisheyes or
-    panoramas, so that all photographs show the same. The model is rendered the same way, and its file says it."""
+    panoramas, so that all photographs share one projection. The model is rendered the same way, and its file says it."""
     masks: MaskMeaning = "none"
     """Meaning of the photographs' masks, which are white where a pixel counts. ignore: the loss ignores black pixels,
     such as people. transparent: black pixels are empty, such as around an object on a turntable. none: masks are not
@@ -249,15 +249,15 @@ class TrainConfig:
     warning, and more are an error. skip: any number is left out. error: none may be missing. The held-out views stay
     the same."""
     lenses: Lenses = "undistort"
-    """Photographs of fisheyes. undistort: convert to the pinhole pictures that they contain. native: train through
-    their own lens, which sees all of them, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) are always trained
-    natively."""
+    """Handling of fisheye photographs. undistort: convert to the pinhole pictures that they contain. native: train with
+    the fisheye lens, which shows the whole photograph, also beyond 180 degrees. Panoramas (EQUIRECTANGULAR) are always
+    trained natively."""
     random_points: int = 100_000
     """Number of Gaussians to start from, at random places, if a scene has no points."""
     points: str = ""
-    """File of points to start from, in the scene's frame: PLY (also COLMAP's fused.ply), or with the extra las LAS and
-    LAZ. Points without colours are coloured by the photographs that show them. A scene without points uses a cloud next
-    to it, such as points3d.ply."""
+    """File of points to start from, in the scene's frame: PLY (also COLMAP's fused.ply), or LAS and LAZ with the extra
+    las. Points without colours are coloured by the photographs that show them. A scene without points uses a cloud
+    next to it, such as points3d.ply."""
     points_use: PointsUse = "replace"
     """replace: the file's points replace the scene's own. join: they are added."""
     points_limit: int = 0
@@ -297,23 +297,23 @@ class TrainConfig:
     """Learning rate of appearance, for base-2 logarithms of gains, or for coefficients of a grid. It is multiplied by
     the root of the number of photographs. For gains, trainings of fewer than 10,000 steps raise it in proportion."""
     refine_poses: bool = False
-    """Refine the poses of the training views with the model; two are fixed. The run's refined/ gets the cameras, a
-    COLMAP model, and eval.json the PSNR of held-out views after aligning them with the model. Not with batches."""
+    """Refine the poses of the training views, except two, with the model. refined/ in the run gets the cameras as a
+    COLMAP model; eval.json gets the PSNR of held-out views after aligning them with the model. Not with batches."""
     pose_reach: float = 5.0
     """Approximate limit of a refined pose's rotation over a training, in degrees. The limit of its movement is as many
     57ths of the scene's extent."""
     refine_lenses: bool = False
-    """Refine focal lengths and principal points with the model. Photographs with the same lens share them. The run's
-    refined/ gets them. For photographs without distortion; not with batches."""
+    """Refine focal lengths and principal points with the model. Photographs with the same lens share them. refined/
+    in the run gets them. For photographs without distortion; not with batches."""
     lens_reach: float = 2.0
     """Approximate limit of the change of the focal length, or the principal point, over a training, in hundredths of
     the focal length."""
     refine_gate: float = 1.0
-    """Tolerance in decibels of the held-out views' mean PSNR. If it is further below its best in two measurements in a
-    row, the refined cameras return to the best and stay. At most 8 views are measured, when refinement begins and at
-    every tenth of the training. Their poses are as given, or moved by the mean motion of the refined ones, whichever
-    fits better. A warning at the end reports if aligned views are ahead of the given ones by more than this. 0 turns
-    both off. There is no gate if no view is held out."""
+    """Tolerated loss of the held-out views' mean PSNR, in decibels. If the PSNR is below its best by more than this in
+    two measurements in a row, the cameras return to the best ones and are refined no more. At most 8 views are
+    measured, when refinement begins and at every tenth of the training. Their poses are as given, or moved by the mean
+    motion of the refined poses, whichever fits better. A warning at the end reports if aligning the views raises the
+    PSNR by more than this. 0 turns both off. Without held-out views there is no measurement."""
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     density: DensityConfig = field(default_factory=DensityConfig)
     rasterizer: RasterizerConfig = field(default_factory=RasterizerConfig)
@@ -370,7 +370,7 @@ class TrainConfig:
             raise InputError(f"--points-use {self.points_use}: no points are given, expected --points FILE too")
         if self.appearance != "none" and "transparent" in (self.masks, self.alpha):
             raise InputError(
-                f"--appearance {self.appearance}: not with --masks transparent or --alpha transparent, expected ignore"
+                f"--appearance {self.appearance}: excludes --masks transparent and --alpha transparent, expected ignore"
             )
         if self.penalty and self.density.growth == "mcmc":
             raise InputError(
@@ -378,10 +378,10 @@ class TrainConfig:
                 "--density.opacity-weight and --density.scale-weight"
             )
         if self.refine_lenses and self.perspective == "rays":
-            raise InputError("--refine-lenses: rays have no gradient by the lens, expected --perspective plane with it")
+            raise InputError("--refine-lenses: not supported with --perspective rays, expected --perspective plane")
         if self.refines and self.batch > 1:
             raise InputError(
-                f"{self._refining}: not with --batch {self.batch}, nor with several devices; expected one view a step"
+                f"{self._refining}: not supported with --batch {self.batch} or several devices, expected --batch 1"
             )
         if self.depth != "maps" and self.depth_maps != "metric":
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
@@ -424,11 +424,11 @@ class TrainConfig:
     def on_devices(self, count: int, *, explicit: bool) -> TrainConfig:
         """Settings for `count` devices. A batch of 1 becomes one view per device, unless `explicit`.
 
-        explicit: the batch was given on the command line.
+        explicit: True if the batch was given on the command line.
         Raises InputError for a batch that the devices cannot share evenly.
         """
         if self.refines and count > 1:
-            raise InputError(f"{self._refining}: not with {count} devices, expected one")
+            raise InputError(f"{self._refining}: not supported with {count} devices, expected one")
         if self.batch == 1 and not explicit:
             return replace(self, batch=count)
         if self.batch % count:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat.rasterize` for JAX: under `jit`, `grad` and `vmap` (the extra `jax`)."""
+"""`clsplat.rasterize` for JAX programs, with `jit`, `grad` and `vmap`. Requires the extra `jax`."""
 
 from __future__ import annotations
 

@@ -38,12 +38,12 @@ def spherical_harmonics(
     Raises
     ------
     InputError
-        If a shape is wrong. Other errors are raised as by `clsplat.jax.rasterize`.
+        If a shape is wrong. JAX raises other errors when the program runs, as for `clsplat.jax.rasterize`.
 
     Notes
     -----
-    `clsplat.library.harmonics.spherical_harmonics`. Kerbl et al. 2023; signs and order of the basis are in
-    docs/conventions.md, as in gsplat's function of this name. Arrays of other dtypes are converted to float32.
+    Calls `clsplat.library.harmonics.spherical_harmonics`. Signs and order of the basis are gsplat's
+    (docs/conventions.md; Kerbl et al. 2023). Arrays of other dtypes are converted to float32.
     """
     directions, coefficients = jnp.asarray(directions, jnp.float32), jnp.asarray(coefficients, jnp.float32)
     batch = directions.shape[:-1]

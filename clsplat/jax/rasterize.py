@@ -26,11 +26,11 @@ from clsplat.library.rasterize import rasterize as rasterize_numpy
 from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE
 
 MAX_CACHED_FORWARD_PASSES = 8
-"""Forward passes that stay on the device for a gradient. For older ones the gradient repeats the pass, bit for bit."""
+"""Maximum number of forward passes cached for their gradients. The gradient of an older pass repeats the pass."""
 
 
 class Rasterized(NamedTuple):
-    """Images, and the projected Gaussians. All arrays but radii and tile_counts are differentiable.
+    """Images, and the projected Gaussians. All arrays except radii and tile_counts are differentiable.
 
     Attributes
     ----------
@@ -106,10 +106,10 @@ def rasterize(
     backgrounds, covars : jax.Array, optional
         The arrays of `clsplat.rasterize`.
     absolute_gradients : bool
-        Let the gradient of means2d_probe be the sum of the pixels' absolute contributions.
+        Let the gradient of means2d_probe be the sum over pixels of the absolute gradients of means2d.
     means2d_probe : (C, N, 2) jax.Array, optional
-        Zeros, whose values are not used. Its gradient is the loss's gradient with respect to `means2d`, for density
-        control.
+        An array of zeros, whose gradient is the loss's gradient with respect to `means2d`, for density control. Its
+        values are not used.
     device : Device or str, optional
         An open OpenCL device, or a name as `clsplat devices` lists them. JAX's own devices are not used.
 
@@ -121,13 +121,13 @@ def rasterize(
     Raises
     ------
     InputError
-        If a shape or setting is wrong, when the function is called or traced. If numbers are not finite or there is no
-        such device, JAX raises its own error with that message when the program runs.
+        If a shape or setting is wrong. It is raised when the function is called or traced. If numbers are not finite or
+        there is no such device, JAX raises its own error with the message when the program runs.
 
     Notes
     -----
-    `clsplat.rasterize` (Kerbl et al. 2023), by jax.pure_callback and jax.custom_vjp. `differentiable` is not an
-    argument, since JAX knows it.
+    Calls `clsplat.rasterize` (Kerbl et al. 2023) through jax.pure_callback and jax.custom_vjp. There is no argument
+    `differentiable`, since JAX knows if a gradient is needed.
     """
     arrays = {
         "means": means,
@@ -195,7 +195,7 @@ class StaticArguments:
     device: Device | str | None
 
     def run(self, arrays: dict[str, Any]) -> Rasterization:
-        """Call the NumPy function with arrays by name; absent arrays are left out."""
+        """Call the NumPy function with arrays keyed by argument name. Arrays that are None are absent from the dict."""
         return rasterize_numpy(
             arrays["means"],
             arrays.get("quaternions"),
@@ -269,7 +269,7 @@ class StaticArguments:
 
 
 class PendingForwards:
-    """Forward passes that await their gradient, by serial number."""
+    """Forward passes that wait for their gradient, keyed by a serial number."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -309,7 +309,7 @@ def _forward(call: StaticArguments, arrays: dict[str, Any]) -> Any:
     shapes = call.shapes(arrays)
 
     def run(arrays: dict[str, Any]) -> Any:
-        # copies: the library reads arrays in place until the gradient, and XLA reuses its memory before
+        # copies, since the library reads its arrays until the gradient, and XLA reuses their memory earlier
         result = call.run({name: np.array(array) for name, array in arrays.items()})
         return _results(result, shapes), _kept.add(result)
 

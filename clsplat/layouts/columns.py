@@ -17,22 +17,22 @@ TILE = 16
 LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_COLUMNS = 2, 640, 32
 """Block sizes of the loss kernel.
 
-LOSS_ROWS: rows that a group of one item processes together, as their windows share pixels.
-LOSS_COLUMNS: the most columns of its block.
-LOSS_GROUP_COLUMNS: the most columns of a block for a group of several items.
+LOSS_ROWS: rows that a work-group of one item processes together, as their windows share pixels.
+LOSS_COLUMNS: maximum number of columns of such a work-group's block.
+LOSS_GROUP_COLUMNS: maximum number of columns of a block for a work-group of several items.
 
-Five fields of a block must fit in 32 KiB of local memory. A block has LOSS_ROWS rows, or with several items up to
-sixteen.
+Five fields of a block must fit in 32 KiB of local memory. A block has LOSS_ROWS rows, or up to sixteen if the
+work-group has several items.
 """
 
 LOSS_RING = 16
-"""Rows of derivatives that a group of one item keeps.
+"""Rows of derivatives that a work-group of one item stores.
 
 It is a power of two, and at least the window's 11 plus LOSS_ROWS - 1, rounded up to a multiple of LOSS_ROWS.
 """
 
 POSE_ROWS = 64
-"""Gaussians whose contributions to the gradient by a camera's pose are summed sequentially."""
+"""Number of Gaussians whose contributions to the gradient of a camera's pose are summed sequentially."""
 
 _TRANSFORM = (
     *(f"R{row}{column}" for row in range(3) for column in range(3)),
@@ -54,8 +54,8 @@ In order:
 - HAND: 1, or -1 if the rotation is a reflection.
 - The first pixel in its frame (`Camera.window`).
 - A fisheye's coefficients, and the largest angle and distance from the axis that it shows.
-- _LOW: the errors of rounding these to float32. With them a mean's place on the image is accurate to 1e-6 pixels, and a
-  needle's ellipse to 1e-4.
+- _LOW: the errors of rounding the values of the first item to float32. With them a mean's place on the image is
+  accurate to 1e-6 pixels, and a needle's ellipse to 1e-4.
 """
 
 _EWA_ROUNDED = (
@@ -73,17 +73,17 @@ EWA_CAMERA = (
 
 In order:
 
-- The view matrix, which may be any; intrinsics; the limits of x/z and y/z in the Jacobian; the cofactors of the
-  matrix's 3 x 3 part.
+- The view matrix, which need not be a rotation; intrinsics; the limits of x/z and y/z in the Jacobian; the cofactors
+  of the matrix's 3 x 3 part.
 - Near and far plane, the image's size, the low-pass in px^2, and the radius up to which Gaussians are culled.
-- _LOW: the errors of rounding to float32.
+- _LOW: the errors of rounding the values of the first item to float32.
 """
 
 EWA_GRADIENT = _TRANSFORM
-"""The fields of a camera by which `kernels/ewa_grad.cl` computes gradients."""
+"""The fields of a camera with respect to which `kernels/ewa_grad.cl` computes gradients."""
 
 SUM_ROWS = 64
-"""Neighbouring numbers that an item of `kernels/sums.cl` sums."""
+"""How many neighbouring numbers a work-item of `kernels/sums.cl` sums."""
 
 _SEEN = ("LOG2O", "RED", "GREEN", "BLUE", "DEPTH")
 """The fields with the same meaning and place in SPLAT and RAY: blending reads them from either."""
@@ -119,10 +119,10 @@ COLUMNS, ROWS: the box in tiles, 16 bits each for the first and one past the las
 """
 
 SLOT = ("G", "GU", "GV", "GUU", "GUV", "GVV", "RED", "GREEN", "BLUE", "ABSX", "ABSY")
-"""Partial gradients of one (tile, Gaussian) pair; the last two only if absolute gradients are kept.
+"""Partial gradients of one (tile, Gaussian) pair; the last two only with absolute gradients.
 
-If contributions are kept, the sum of the blending weights follows. If depths are compared, the gradient by nearness
-follows last (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
+The sum of the blending weights follows if contributions are computed. The gradient with respect to nearness, 1 / depth,
+follows last if depths are compared (`kernels/shared/splat.h`: SLOT_WEIGHT, SLOT_NEAR).
 """
 
 SLOT_PLAIN = SLOT.index("ABSX")
@@ -137,19 +137,19 @@ READBACK = (*COUNTED, "STOPPED", *(f"REFUSED_{reason.upper()}" for reason in REF
 
 VISIBLE, PAIRS: totals of visible Gaussians and of pairs.
 KEY_COMPLEMENT, LARGEST_KEY: the complement of the smallest depth key, and the largest depth key.
-STOPPED: 1 after a pass by capacity has stopped (duplicate.cl).
+STOPPED: 1 after a pass with BY_CAPACITY has stopped (duplicate.cl).
 REFUSED_*: the refused steps that `adam` has counted.
 """
 
 
 DEEP_SLICE = ("RED", "GREEN", "BLUE", "ALPHA", "DEPTH")
-"""A pixel's slice of a deep picture: colour, associated with alpha; alpha; and its depth."""
+"""A pixel's slice of a deep picture: colour, premultiplied with alpha; alpha; and its depth."""
 
 DEEP_LEVELS = 64
 """Number of levels of the slack with which a pixel's slices are cut."""
 
 DEEP_PICTURES = 16
-"""The most deep pictures that are merged at once."""
+"""Maximum number of deep pictures that are merged at once."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class SlotFields:
 
     absolute: absolute gradients (AbsGS).
     contributions: the contribution to the image.
-    nearness: the gradient by nearness (one over the depth).
+    nearness: the gradient with respect to nearness (one over the depth).
     """
 
     absolute: bool = False
@@ -167,7 +167,7 @@ class SlotFields:
 
     @property
     def floats(self) -> int:
-        """Floats from one slot to the next."""
+        """Number of floats per slot."""
         return (len(SLOT) if self.absolute else SLOT_PLAIN) + self.contributions + self.nearness
 
     @property

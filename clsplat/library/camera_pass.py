@@ -138,7 +138,7 @@ class PassSettings:
     mode: one of RASTERIZE_RENDER_MODES.
     alpha_max: the cap of alpha.
     compensated: multiply opacities by the compensation for the low-pass filter.
-    absolute: also keep absolute gradients.
+    absolute: also sum absolute gradients over pixels.
     differentiable: prepare for a gradient.
     """
 
@@ -151,11 +151,11 @@ class PassSettings:
 
 @dataclass(frozen=True, eq=False)
 class ViewGradients:
-    """Gradients of one view's blended values, on the host. None counts as 0.
+    """Gradients with respect to one view's projected Gaussians, on the host. None counts as 0.
 
-    on_image: gradients by the arrays of `Ewa`, by name, without the compensations.
-    opacities: (N,), of the compensated ones.
-    colors: (N, D).
+    on_image: with respect to the arrays of `Ewa` except the compensations, keyed by their names.
+    opacities: (N,), with respect to the compensated opacities.
+    colors: (N, D), with respect to the blended colours.
     """
 
     on_image: dict[str, Float32]
@@ -196,7 +196,7 @@ class CameraPass:
                 harmonics(device, self._harmonics, self._colours.array)
             factors = self.compensations
             self.opacities: Float32 = given.opacities.copy() if factors is None else given.opacities * factors
-            """(N,), after compensation. It belongs to this call, even if the caller changes its own array."""
+            """(N,), after compensation. A copy, so that the caller may change the array."""
             splats, blended = self.projected.arrays, self.opacities if settings.compensated else covers
             flat = (splats.means2d, splats.conics, blended, self._values(), splats.depths, splats.radii)
             view = (screen_gaussians(device, *flat), (camera.width, camera.height), self._behind(background))
@@ -223,12 +223,12 @@ class CameraPass:
 
     @property
     def depths(self) -> Float32:
-        """(N,)."""
+        """Depths (N,) in world units."""
         return self.splats("depths")
 
     @property
     def compensations(self) -> Float32 | None:
-        """(N,), or None."""
+        """Factors (N,) of the opacities for the low-pass filter, or None."""
         return None if self.projected.arrays.compensations is None else self.splats("compensations")
 
     @property
@@ -241,12 +241,12 @@ class CameraPass:
 
     @cached_property
     def alpha(self) -> Float32:
-        """(H, W)."""
+        """Alpha (H, W), 0 to 1."""
         return self.pixels.alpha
 
     @cached_property
     def image(self) -> Float32:
-        """(H, W, X)."""
+        """The blended image (H, W, X). An expected depth is divided by alpha."""
         image = self.pixels.image
         if not self._settings.mode.endswith("ED"):
             return image
@@ -258,7 +258,7 @@ class CameraPass:
         """Gradients of this view for `Rasterization.vjp_pixels`."""
         shape = (self._camera.height, self._camera.width)
         by_image = gradient("d_images", d_image, self.image.shape)
-        assert by_image is not None, "`Rasterization.vjp_pixels` asks for one of each camera"
+        assert by_image is not None, "`Rasterization.vjp_pixels` passes one for each camera"
         by_alpha = gradient("d_alphas", d_alpha, (*shape, 1))
         by_alpha = None if by_alpha is None else by_alpha.reshape(shape)
         if self._settings.mode.endswith("ED"):
@@ -285,7 +285,7 @@ class CameraPass:
         return found
 
     def add_gradients(self, gradients: Gradients, by: ViewGradients, *, cameras: bool) -> None:
-        """Propagate the gradients of the blended values, `by`, to the arguments, and add them to `gradients`."""
+        """Add to `gradients` the gradients of the arguments, from the gradients `by` of the projected Gaussians."""
         session, given, device = self._session, self._given, self._session.device
         on_image, compensations = by.on_image, self.compensations
         if by.opacities is not None:
@@ -313,14 +313,14 @@ class CameraPass:
     def _colours_back(
         self, gradients: Gradients, d_means: DeviceArray, by_colour: Float32 | None, *, cameras: bool
     ) -> DeviceArray | None:
-        """Add the gradient of the SH coefficients, and its contribution to the means.
+        """Add the gradients of the SH coefficients, and of the means through the viewing directions.
 
         Returns the gradient of the camera's centre if `cameras` is set.
         """
         session, count = self._session, self._given.count
         if self._harmonics is None:
             return None
-        assert isinstance(self._colours, Hosted), "harmonics are made on the device"
+        assert isinstance(self._colours, Hosted), "harmonics are computed on the device"
         placed = from_host(session.device, np.zeros((count, 3), np.float32) if by_colour is None else by_colour)
         session.device.under_way.append(placed)
         d_sh, add = gradients.sh(session.device)

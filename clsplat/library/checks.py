@@ -32,7 +32,7 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)
-        raise InputError(f"{name}: [{place}] is {array[at]}, expected finite numbers within float32")
+        raise InputError(f"{name}: [{place}] is {array[at]}, expected finite numbers in float32's range")
     return result
 
 
@@ -57,13 +57,13 @@ def matrices(name: str, given: Any, side: int, count: int | str) -> Float64:
 
 
 def plain(given: Any) -> Any:
-    """A Python number if the argument is an array or tensor with one element; any other argument unchanged."""
+    """The Python number in an array or tensor with one element. Any other argument is returned unchanged."""
     one = hasattr(given, "item") and prod(getattr(given, "shape", (0,))) == 1
     return given.item() if one else given
 
 
 def whole(given: Any) -> int | None:
-    """An integer, also from a float (40.0) or from an array or tensor with one element; None for any other argument."""
+    """An integer from an integer, a whole float (40.0), or an array or tensor with such an element; else None."""
     number = plain(given)
     if isinstance(number, bool) or not isinstance(number, (int, float)) or number != number // 1:
         return None

@@ -44,7 +44,7 @@ class HarmonicColors:
         -------
         dict
             float32 arrays: "directions" (..., 3) and "coefficients" (..., K, 3). Both are zero where the mask is False;
-            the second is also zero above the degree.
+            coefficients above the degree have zero gradients too.
 
         Raises
         ------
@@ -53,13 +53,13 @@ class HarmonicColors:
         """
         values = gradient("colors", colors, self.colors.shape)
         if values is None:
-            raise InputError("colors: expected the gradient by them")
+            raise InputError("colors is None, expected the gradient with respect to the colours")
         session, given = self._session, self._given
         with session.lock:
             device = session.device
             by_directions, by_sh = hosted(device, given.directions.shape), hosted(device, given.sh.shape)
             d_colours = from_host(device, values.reshape(-1, 3))
-            colours = given.directions  # any array: the kernel reads colours only for a camera's directions
+            colours = given.directions  # a placeholder: the kernel reads colours only for a camera's directions
             gradients = HarmonicsGradients(by_sh.array, by_directions.array)
             harmonics_grad(device, session.scratch, given, colours, d_colours, gradients)
             batch = self.colors.shape[:-1]
@@ -131,7 +131,7 @@ def spherical_harmonics(
 
 
 def _mask(masks: ArrayLike, batch: tuple[int, ...]) -> NDArray[np.int32]:
-    """1 where a colour is wanted, flat. Raises InputError."""
+    """The masks as one axis of integers, 1 where a colour is evaluated. Raises InputError."""
     shown = np.asarray(masks)
     if shown.shape != batch:
         raise InputError(f"masks: got shape {shown.shape}, expected {batch}")

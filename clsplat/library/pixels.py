@@ -42,7 +42,7 @@ class Listed:
 
 @dataclass(frozen=True, eq=False)
 class PixelGradients:
-    """Gradients of the arrays of `PixelPass`; zero for Gaussians in no pixel.
+    """Gradients with respect to the arrays of `PixelPass`; zero for Gaussians that contribute to no pixel.
 
     means2d: (n, 2).
     conics: (n, 3).
@@ -63,7 +63,7 @@ class PixelGradients:
 class ListedPixels:
     """An image from lists of projected Gaussians. It keeps the device memory for its gradient until it is dropped.
 
-    listing: fills the lists, in the workspace that it gets.
+    listing: function that fills the tile lists, in arrays of the workspace that it is called with.
     The other arguments are the same as in `PixelPass`.
     """
 
@@ -96,7 +96,8 @@ class ListedPixels:
             if depth > SPLAT_VALUES:
                 rows = (listed.projected, gaussians.values, self._background, blended)
                 values(capped, ValuePass(listed.lists, *rows), self._image.array)
-            device.under_way.append((gaussians, self._background, self._image, self._alpha))  # kept until it is done
+            # host memory must live until the device is done
+            device.under_way.append((gaussians, self._background, self._image, self._alpha))
 
     @property
     def image(self) -> Float32:
@@ -144,7 +145,7 @@ class ListedPixels:
     def gradient_on_device(
         self, d_image: NDArray[Any], d_alpha: NDArray[Any] | None = None, *, absolute: bool = False
     ) -> PixelGradients:
-        """Compute `gradient` on the device, for kernel stages that use it there.
+        """Compute the arrays of `gradient`, without background, and leave them on the device.
 
         The arguments must not change before the device is done.
         """
@@ -189,11 +190,11 @@ class PixelPass(ListedPixels):
     size: width and height, pixels.
     background: (D,) float32, or None for black.
     alpha_max: the cap of alpha, below 1.
-    backward: True if a `gradient` is likely; it makes it faster.
+    backward: True if `gradient` will probably be called, which is then faster.
 
     A Gaussian contributes to a pixel if its alpha there is at least 1/255. Blending ends before the Gaussian that would
-    leave a transmittance of 1e-4 or less. A Gaussian is culled if its mean is over 1e9 pixels away, or its a or c is
-    outside 1e-15 to 1e15. Raises CapacityError if the device has no room for the (tile, Gaussian) pairs.
+    leave a transmittance of 1e-4 or less. A Gaussian is culled if its mean is over 1e9 pixels away, or if a or c of
+    its conic is outside 1e-15 to 1e15. Raises CapacityError if the device has no room for the (tile, Gaussian) pairs.
     """
 
     def __init__(
@@ -215,7 +216,7 @@ class PixelPass(ListedPixels):
 def screen_gaussians(
     device: Device, means2d: Array, conics: Array, opacities: Array, colours: Array, depths: Array, radii: Array
 ) -> ScreenGaussians:
-    """Projected Gaussians on the device, from arrays there or on the host. Callers hold the session's lock.
+    """Projected Gaussians on the device, from device or host arrays. Callers hold the session's lock.
 
     means2d: (n, 2), pixels; the first pixel's centre is at 0.5.
     conics: (n, 3), a, b, c of the inverse covariance.
@@ -231,19 +232,19 @@ def screen_gaussians(
 
 
 def placed(device: Device, array: Array, dtype: DTypeLike = np.float32) -> DeviceArray:
-    """The array on the device: unchanged if it is there, else from the host, without a copy if possible."""
+    """A device array unchanged, or a host array on the device, without a copy if possible."""
     return array if isinstance(array, DeviceArray) else from_host(device, np.asarray(array, dtype))
 
 
 def listed_by_depth(device: Device, work: Workspace, gaussians: ScreenGaussians, width: int, height: int) -> Listed:
-    """The lists of an image's tiles, each front to back. Waits for the device. Raises CapacityError."""
+    """Fill the tile lists of an image, each from front to back. Waits for the device. Raises CapacityError."""
     projected = splats(device, work, gaussians, width, height)
     counted = count(device, work, projected)
     most = min(device.max_allocation // (4 * WIDEST_SLOTS.floats), MAX_PAIRS_PER_BAND)
     if counted.pairs > most:
         raise CapacityError(
-            f"the Gaussians reach {counted.pairs:,} tiles of {TILE}x{TILE} pixels, counted for each, and {device.name} "
-            f"has room for {most:,}: use fewer or smaller Gaussians, or a smaller image"
+            f"there are {counted.pairs:,} pairs of a Gaussian and a tile of {TILE}x{TILE} pixels that it reaches, and "
+            f"{device.name} has room for {most:,}: use fewer or smaller Gaussians, or a smaller image"
         )
     tiles = (-(-width // TILE), -(-height // TILE))
     band = Band(0, tiles[0] * tiles[1])

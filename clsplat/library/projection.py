@@ -30,7 +30,7 @@ from clsplat.stages.ewa import (
 )
 
 _PROJECTED_ARRAY_WIDTHS = {"means2d": 2, "depths": None, "conics": 3, "compensations": None}
-"""Outputs that have gradients, and the numbers per Gaussian of each; None for a scalar."""
+"""Outputs that have gradients, and how many numbers each has per Gaussian; None for a scalar."""
 
 
 class ProjectedView:
@@ -64,14 +64,14 @@ class ProjectedView:
     ) -> DeviceArray | None:
         """Fill `gradients` like `stages.ewa.ewa_grad`.
 
-        by_camera: also return the gradient of the camera (16,).
+        by_camera: also return the gradient (16,) with respect to the camera.
         """
         session, view = self._session, (self._gaussians, self._camera, self.arrays)
         return ewa_grad(session.device, session.scratch, *view, given, gradients, add=add, by_camera=by_camera)
 
 
 def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradients:
-    """Gradients on the device, from arrays on the host by their names in `Ewa`."""
+    """Gradients on the device, from host arrays keyed by their names in `Ewa`."""
 
     def at(name: str) -> DeviceArray | None:
         return from_host(device, by[name]) if name in by else None
@@ -80,7 +80,7 @@ def image_gradients(device: Device, by: Mapping[str, Float32]) -> EwaImageGradie
 
 
 class HostedGradients(NamedTuple):
-    """Gradients of Gaussians: device arrays for `EwaGradients`, and their host copies by argument names."""
+    """Gradients of Gaussians: device arrays for `EwaGradients`, and their host copies, keyed by argument name."""
 
     arrays: EwaGradients
     hosted: dict[str, Hosted]
@@ -105,11 +105,11 @@ class Projection:
     Attributes
     ----------
     radii : (C, N, 2) int32
-        Half sides of the bounding box, whole pixels; 0 if culled.
+        Half sides of the bounding box in whole pixels; 0 if culled.
     means2d : (C, N, 2) float32
         Pixels; the first pixel's centre is at 0.5.
     depths : (C, N) float32
-        z in the camera, world units.
+        z in the camera's axes, in world units.
     conics : (C, N, 3) float32
         a, b, c of the inverse covariance, 1 / px^2.
     compensations : (C, N) float32 or None
@@ -124,7 +124,7 @@ class Projection:
     _views: list[ProjectedView]
     _session: LibrarySession
     _covariances: str
-    """Layout of the given covariances: empty for none, "upper" or "full"."""
+    """Layout of the caller's covariances: "upper", "full", or empty if there are none."""
 
     def vjp(
         self,
@@ -138,25 +138,25 @@ class Projection:
         Parameters
         ----------
         means2d, depths, conics, compensations : array_like, optional
-            Gradients of the loss with respect to the outputs, of the outputs' shapes. None means 0. The b of a conic
-            counts as one number.
+            Gradients of the loss with respect to the outputs, of the outputs' shapes. None means 0. A conic has
+            three numbers a, b, c: its b counts once.
 
         Returns
         -------
         dict
-            float32 gradients by argument name: "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in
-            the given shape. Also "viewmats" (C, 4, 4), each number of the first three rows taken as free, and
-            "intrinsics" (C, 3, 3), of fx, fy, cx and cy. Culled Gaussians have no gradient. An off-diagonal number of
-            covars (N, 6) has the gradient of both its places; in (N, 3, 3) each place has half of it.
+            float32 gradients, keyed by argument name: "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or
+            "covars" in the given shape. Also "viewmats" (C, 4, 4), the numbers of whose first three rows are treated as
+            independent, and "intrinsics" (C, 3, 3) for fx, fy, cx and cy. Culled Gaussians have no gradient. In covars
+            (N, 6) an off-diagonal number has its whole gradient; in (N, 3, 3) each of its two places has half of it.
 
         Raises
         ------
         InputError
-            If a shape is wrong, or compensations are given that `calc_compensations` did not ask for.
+            If a shape is wrong, or compensations are given although `calc_compensations` was False.
         """
         values = {"means2d": means2d, "depths": depths, "conics": conics, "compensations": compensations}
         if compensations is not None and self.compensations is None:
-            raise InputError("compensations: got a gradient, but they were not asked for (calc_compensations)")
+            raise InputError("compensations: got a gradient, expected None, as calc_compensations was False")
         shape = self.depths.shape
         arrays = {
             name: array
@@ -214,25 +214,25 @@ def fully_fused_projection(
     quaternions : (N, 4) array_like or None
         w, x, y, z, of any length but 0. None if covars are given.
     scales : (N, 3) array_like or None
-        Standard deviations, world units. None if covars are given.
+        Standard deviations in world units. None if covars are given.
     viewmats : (C, 4, 4) or (4, 4) array_like
         Camera from world.
     intrinsics : (C, 3, 3) or (3, 3) array_like
         Pixels. Skew is ignored.
     width, height : int
-        Image size, pixels.
+        Image size in pixels.
     eps2d : float
-        Low-pass filter: variance that is added to the diagonal of each projected covariance, px^2.
+        Low-pass filter: variance in px^2, which is added to the diagonal of each projected covariance.
     near_plane, far_plane : float
-        Gaussians whose depth is not strictly between these are culled, world units.
+        World units. Gaussians whose depth is not strictly between these are culled.
     radius_clip : float
-        Gaussians whose radii are at most this are culled, pixels.
+        Pixels. Gaussians whose radii are at most this are culled.
     calc_compensations : bool
         Also compute sqrt(det(covariance without eps2d) / det(covariance with eps2d)).
     camera_model : str
         "pinhole", "ortho" or "fisheye" (equidistant).
     opacities : (N,) array_like, optional
-        0 to 1. With them the radii end where alpha is 1/255, and fainter Gaussians are culled.
+        0 to 1. If given, the radii end where alpha is 1/255, and Gaussians with less opacity are culled.
     device : Device or str, optional
         An open device, or a name as `clsplat devices` lists them.
 
@@ -290,7 +290,7 @@ def checked_cameras(
 ) -> list[EwaCamera]:
     """The cameras of viewmats (C, 4, 4) and intrinsics (C, 3, 3), or of one (4, 4) and one (3, 3).
 
-    width, height: pixels, of all cameras or one number per camera.
+    width, height: pixels; one number for all cameras, or one for each.
     Raises InputError, which names the argument.
     """
     poses = matrices("viewmats", viewmats, 4, "C")
@@ -299,7 +299,7 @@ def checked_cameras(
     if len(lenses) != count:
         raise InputError(f"intrinsics has {len(lenses)} matrices, expected {count}, one for each of viewmats")
     if not (lenses[:, [0, 1], [0, 1]] != 0).all():
-        raise InputError("intrinsics: a focal length is 0, expected those of a camera")
+        raise InputError("intrinsics: a focal length is 0, expected numbers other than 0")
     listed = zip(poses, lenses, sizes("width", width, count), sizes("height", height, count), strict=True)
     return [EwaCamera(pose, lens, across, down, *planes) for pose, lens, across, down in listed]
 
@@ -317,11 +317,11 @@ class CameraPlanes(NamedTuple):
 def checked_planes(
     near_plane: float, far_plane: float, eps2d: float, radius_clip: float, camera_model: str
 ) -> CameraPlanes:
-    """The settings of all cameras. Raises InputError, which names the argument."""
+    """Check the settings that all cameras share. Raises InputError, which names the argument."""
     choice("camera_model", camera_model, EWA_CAMERA_MODELS)
     near, far = number("near_plane", near_plane, -np.inf), number("far_plane", far_plane, -np.inf)
     if not near < far:
-        raise InputError(f"near_plane is {near_plane} and far_plane {far_plane}, expected the second to be larger")
+        raise InputError(f"near_plane is {near_plane} and far_plane is {far_plane}, expected near_plane < far_plane")
     most = float(np.finfo(np.float32).max)
     low_pass, clip = number("eps2d", eps2d, 0.0, most), number("radius_clip", radius_clip, 0.0, most)
     return CameraPlanes(near, far, low_pass, clip, camera_model)
@@ -333,7 +333,7 @@ def check_given(covars: object, quaternions: object, scales: object) -> None:
         missing = "quaternions" if quaternions is None else "scales"
         raise InputError(f"{missing} is None, expected an array, as covars is None too")
     if covars is not None and (quaternions is not None or scales is not None):
-        raise InputError("covars: expected either these, or quaternions and scales")
+        raise InputError("covars: expected either covars, or quaternions and scales, not both")
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +366,7 @@ class GivenShapes:
         return cls(covariances=np.ascontiguousarray(upper, np.float32), covariance_layout="full")
 
     def inputs(self, means: DeviceArray, opacities: DeviceArray | None) -> EwaInputs:
-        """The Gaussians on the device of the means."""
+        """The Gaussians as arrays on the device that holds `means`."""
         quaternions, scales, covariances = (
             None if array is None else from_host(means.device, array)
             for array in (self.quaternions, self.scales, self.covariances)
@@ -375,15 +375,15 @@ class GivenShapes:
 
 
 def full_gradient(upper: Float32) -> Float32:
-    """Gradients of the nine numbers of each matrix, from the gradients of the upper triangles."""
+    """Gradients of all nine numbers of symmetric matrices, from the gradients of their upper triangles."""
     halves = upper * np.array([1, 0.5, 0.5, 1, 0.5, 1], np.float32)
     return np.asarray(halves[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3), np.float32)
 
 
 def stacked(arrays: list[NDArray[Any]], each: NDArray[Any] | None = None) -> NDArray[Any]:
-    """The arrays of all cameras in one. A single camera's array is not copied.
+    """Stack one array per camera. A single camera's array is not copied.
 
-    each: an array of the same shape and dtype, for calls that may have no camera.
+    each: an array with the shape and dtype of each camera's, for calls that may have no camera.
     """
     if len(arrays) == 1:
         return arrays[0][None]

@@ -20,7 +20,7 @@ from clsplat.library.session import session_of
 from clsplat.rendering.build_flags import DEFAULT_ALPHA_MAX
 
 RASTERIZE_RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-"""Colour, depth, expected depth, and colour with each of them. The depth is the last channel."""
+"""Colour, depth, expected depth, and colour with either depth. The depth is the last channel."""
 RASTERIZE_FILTER_MODES = ("classic", "antialiased")
 
 
@@ -28,7 +28,7 @@ class Rasterization:
     """Images of C cameras, and the projected Gaussians, on the host.
 
     The first access to an array waits for the device. The object holds device memory for the vector-Jacobian products
-    until it is dropped. An array's rows of Gaussians that are not visible are 0.
+    until it is dropped. In every array, rows of Gaussians that are not visible are 0.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Rasterization:
     alphas : (C, H, W, 1) float32
         0 to 1, or a list like `images`.
     radii : (C, N, 2) int32
-        Half sides of a Gaussian's bounding box, pixels.
+        Half sides of a Gaussian's bounding box in pixels.
     means2d : (C, N, 2) float32
         Pixels; the first pixel's centre is at 0.5.
     depths : (C, N) float32
@@ -75,9 +75,7 @@ class Rasterization:
 
     @cached_property
     def means2d(self) -> Float32:
-        """(C, N, 2) float32: pixels; the first pixel's centre is at 0.5. This and the arrays below are 0 where not
-        visible.
-        """
+        """(C, N, 2) float32: pixels; the first pixel's centre is at 0.5. 0 if the Gaussian is not visible."""
         return stacked([view.splats("means2d") for view in self._views])
 
     @cached_property
@@ -121,8 +119,8 @@ class Rasterization:
         Returns
         -------
         dict
-            float32 gradients: "means2d" (C, N, 2); "conics" (C, N, 3), b as one number; "opacities" (C, N), of the
-            compensated ones. Also "colors2d" (C, N, D); "depths" (C, N) if the images have depth; "backgrounds" (C, D)
+            float32 gradients: "means2d" (C, N, 2); "conics" (C, N, 3), whose b counts once; "opacities" (C, N), after
+            compensation. Also "colors2d" (C, N, D); "depths" (C, N) if the images have depth; "backgrounds" (C, D)
             if they were given. Also "absolute" (C, N, 2) with `absolute_gradients`: sums over pixels of absolute
             gradients of means2d.
 
@@ -164,8 +162,8 @@ class Rasterization:
         -------
         dict
             "means" (N, 3); "quaternions" (N, 4) and "scales" (N, 3), or "covars" in the given shape; "opacities" (N,);
-            "colors" in the given shape, all float32. With `cameras` also float64 "viewmats" (C, 4, 4), each number of
-            the first three rows taken as free, and "intrinsics" (C, 3, 3), of fx, fy, cx and cy.
+            "colors" in the given shape, all float32. With `cameras` also float64 "viewmats" (C, 4, 4), the numbers of
+            whose first three rows are treated as independent, and "intrinsics" (C, 3, 3) for fx, fy, cx and cy.
 
         Raises
         ------
@@ -273,7 +271,7 @@ def rasterize(
     quaternions : (N, 4) array_like or None
         w, x, y, z, of any length but 0. None if covars are given.
     scales : (N, 3) array_like or None
-        Standard deviations, world units. None if covars are given.
+        Standard deviations in world units. None if covars are given.
     opacities : (N,) array_like
         0 to 1.
     colors : (N, D) or (C, N, D) array_like
@@ -283,19 +281,19 @@ def rasterize(
     intrinsics : (C, 3, 3) or (3, 3) array_like
         Pixels.
     width, height : int or sequence of int
-        Pixels, of all cameras or one number per camera.
+        Pixels; one number for all cameras, or one for each.
     near_plane, far_plane : float
-        Gaussians whose depth is not strictly between these are not drawn, world units.
+        World units. Gaussians whose depth is not strictly between these are not drawn.
     radius_clip : float
-        Gaussians whose radii are at most this are not drawn, pixels.
+        Pixels. Gaussians whose radii are at most this are not drawn.
     eps2d : float
-        Low-pass filter: added to both variances on the image, px^2.
+        Low-pass filter in px^2, which is added to both variances on the image.
     sh_degree : int, optional
         Degree of the spherical harmonics, 0 to 4. None if colors are not SH coefficients.
     backgrounds : (C, D) or (D,) array_like, optional
         Black if None.
     render_mode : str
-        "RGB", "D" (depth), "ED" (expected depth), "RGB+D" or "RGB+ED". Depths are along the camera's axis, world units.
+        "RGB", "D" (depth), "ED" (expected depth), "RGB+D" or "RGB+ED". Depths are along the camera's axis.
     rasterize_mode : str
         "classic", or "antialiased": lower opacities to compensate for eps2d.
     camera_model : str
@@ -307,8 +305,8 @@ def rasterize(
     absolute_gradients : bool
         Also compute sums of the absolute gradients of means2d.
     differentiable : bool
-        False if only images are wanted, which takes less time and memory. A gradient is still possible: slower, with
-        the same bits.
+        False if only images are needed; it saves time and memory. A gradient can still be computed, with the same
+        bits, but takes longer.
     device : Device or str, optional
         An open device, or a name as `clsplat devices` lists them.
 
@@ -360,7 +358,7 @@ def check_channels(channels: int) -> None:
 
 
 def checked_modes(render_mode: str, rasterize_mode: str, alpha_max: float) -> float:
-    """The cap of alpha. Raises InputError, which names the argument."""
+    """Check the modes, and return the cap of alpha. Raises InputError, which names the argument."""
     choice("render_mode", render_mode, RASTERIZE_RENDER_MODES)
     choice("rasterize_mode", rasterize_mode, RASTERIZE_FILTER_MODES)
     return number("alpha_max", alpha_max, 1 / 255, 1 - 1e-6)

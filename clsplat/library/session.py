@@ -19,7 +19,7 @@ from clsplat.rendering.build_flags import kernel_defines
 
 _PAIR_ARRAY_NAMES = ("ranges", "gaussian_from_sorted", "slot_from_sorted", "cells_from_sorted")
 BACKWARD_ARRAY_NAMES = frozenset(("splats", "tile_counts", "first_slots", "transmittance", "stops", *_PAIR_ARRAY_NAMES))
-"""Arrays of a forward pass that its gradient reads; each pass has its own. All other arrays are the session's."""
+"""Arrays of a forward pass that its gradient reads; each pass has its own. Passes share all other arrays."""
 MAX_IDLE_WORKSPACES = 4
 """Largest number of workspaces of finished passes that are kept for later passes."""
 
@@ -53,7 +53,7 @@ class LibrarySession:
         self._idle: list[PassWorkspace] = []
 
     def workspace(self, owner: object) -> PassWorkspace:
-        """A workspace for a pass, until its owner is collected."""
+        """A workspace for a pass. When `owner` is garbage-collected, later passes may use the workspace."""
         with self.lock:
             work = self._idle.pop() if self._idle else PassWorkspace(self.device, self.scratch)
         finalize(owner, self._take_back, work).atexit = False
@@ -86,12 +86,13 @@ def _named(selector: str | None, _variables: tuple[str | None, ...]) -> LibraryS
 
 
 def session_of(device: Device | str | None = None) -> LibrarySession:
-    """The session of an open device, or of the one that a string selects (see `clsplat devices`); one session per
-    device.
+    """The session of an open device, or of the device that a string selects (see `clsplat devices`).
+
+    There is one session per device.
 
     Raises DeviceError.
     """
     if isinstance(device, Device):
         return _session(device)
-    # listing every driver again would take as long as projecting half a million Gaussians
+    # the variables are part of the cache's key; listing all drivers again takes as long as projecting 500,000 Gaussians
     return _named(device, tuple(os.environ.get(name) for name in _DEVICE_CHOICE_VARIABLES))

@@ -108,7 +108,7 @@ def rasterize_to_pixels(
     Parameters
     ----------
     means2d : (..., N, 2) array_like
-        Pixels; the first pixel's centre is at 0.5. Packed: (M, 2), as all arrays below without the axis N.
+        Pixels; the first pixel's centre is at 0.5. Packed: (M, 2), and M replaces ..., N below.
     conics : (..., N, 3) array_like
         a, b, c of the inverse covariance, 1 / px^2.
     colors : (..., N, D) array_like
@@ -118,7 +118,7 @@ def rasterize_to_pixels(
     image_width, image_height : int
         Pixels.
     tile_size : int
-        16.
+        16, the only size that the kernels support.
     isect_offsets : (..., tile_height, tile_width) array_like of int
         Start of each tile's list in flatten_ids.
     flatten_ids : (pairs,) array_like of int
@@ -172,9 +172,9 @@ def rasterize_to_pixels(
 
 @dataclass(frozen=True, eq=False)
 class _GivenSplats:
-    """Checked splats of all images, their leading axes in one: (rows, 2), (rows, 3), (rows, D) and (rows,).
+    """Checked splats, their leading axes flattened to one: (rows, 2), (rows, 3), (rows, D) and (rows,).
 
-    batch: the leading axes of the arguments, the last of them N.
+    batch: the leading sizes of the arguments; the last is N.
     """
 
     batch: tuple[int, ...]
@@ -192,12 +192,12 @@ class _GivenSplats:
         values = floats("colors", colors, (*batch, "D"))
         covers = floats("opacities", opacities, batch).reshape(-1)
         if (depth := values.shape[-1]) < 1:
-            raise InputError(f"colors: have {depth} channels, expected 1 or more")
+            raise InputError(f"colors has {depth} channels, expected 1 or more")
         return cls(batch, means.reshape(-1, 2), shapes, values.reshape(-1, depth), covers)
 
     @property
     def depth(self) -> int:
-        """Values per splat."""
+        """D, the number of values per splat."""
         return int(self.colors.shape[1])
 
     def rows(self, own: slice) -> _GivenSplats:
@@ -208,14 +208,14 @@ class _GivenSplats:
 
 @dataclass(frozen=True, eq=False)
 class _ImageLists:
-    """The tile lists of one image: the start and length of each in `gaussians`, the listed rows."""
+    """The tile lists of one image: the start and the length of each list in `gaussians`, the array of listed rows."""
 
     begins: Int64
     counts: Int64
     gaussians: Int64
 
     def from_row(self, first: int) -> _ImageLists:
-        """The lists with rows counted from the image's first."""
+        """The lists with rows counted from `first`."""
         return _ImageLists(self.begins, self.counts, self.gaussians - first)
 
 
@@ -234,12 +234,12 @@ class _GivenLists:
         tiles = (-(-size[1] // TILE), -(-size[0] // TILE))
         lists = cls(*_lists(isect_offsets, flatten_ids, tiles, prod(batch)))
         if len(batch) > 1 and batch[:-1] != lists.images:
-            raise InputError(f"isect_offsets: leading axes {lists.images}, expected {batch[:-1]} as in means2d")
+            raise InputError(f"isect_offsets: got leading sizes {lists.images}, expected {batch[:-1]} as in means2d")
         return lists
 
     @property
     def images(self) -> tuple[int, ...]:
-        """The axes of the images."""
+        """The leading sizes of the offsets. Their product is the number of images."""
         return self.offsets.shape[:-2]
 
     def of_image(self, image: int, shown: NDArray[np.bool_]) -> _ImageLists:
@@ -257,10 +257,12 @@ class _GivenLists:
 def _checked_size(tile_size: int, image_width: int, image_height: int) -> tuple[int, int]:
     """Width and height in pixels. Raises InputError."""
     if whole(tile_size) != TILE:
-        raise InputError(f"tile_size: got {tile_size}, expected {TILE}, which the kernels are made for")
+        raise InputError(f"tile_size: got {tile_size}, expected {TILE}, the only size that the kernels support")
     size = whole(image_width) or 0, whole(image_height) or 0
     if min(size) < 1:
-        raise InputError(f"image_width, image_height: got {image_width} x {image_height}, expected 1 x 1 up")
+        raise InputError(
+            f"image_width, image_height: got {image_width} x {image_height}, expected at least 1 x 1 pixels"
+        )
     return size
 
 
@@ -288,7 +290,7 @@ def _pixels(
 def _listed(
     device: Device, work: Workspace, gaussians: ScreenGaussians, lists: _ImageLists, size: tuple[int, int]
 ) -> Listed:
-    """The given lists as `library.pixels.listed_by_depth` would make them."""
+    """Convert the caller's lists to the form that `library.pixels.listed_by_depth` returns."""
     drawn, listed = splats(device, work, gaussians, *size, listed=True), lists.gaussians
     by_gaussian = np.bincount(listed, minlength=gaussians.count)
     slots = np.empty(len(listed), np.uint32)
@@ -315,10 +317,10 @@ def _lists(isect_offsets: ArrayLike, flatten_ids: ArrayLike, tiles: tuple[int, i
     if ids.ndim != 1 or ids.dtype.kind not in "iu":
         raise InputError(f"flatten_ids: got {ids.dtype} of shape {ids.shape}, expected integers (pairs,)")
     if len(ids) and not 0 <= int(ids.min()) <= int(ids.max()) < count:
-        raise InputError(f"flatten_ids: from {ids.min()} to {ids.max()}, expected 0 to {count - 1}, as of means2d")
+        raise InputError(f"flatten_ids: got {ids.min()} to {ids.max()}, expected 0 to {count - 1}, the rows of means2d")
     steps = np.diff(np.concatenate([[0], offsets.reshape(-1).astype(np.int64), [len(ids)]]))
     if (steps < 0).any():
-        raise InputError(f"isect_offsets: expected numbers that do not fall, from 0 to the {len(ids)} pairs")
+        raise InputError(f"isect_offsets: expected ascending numbers from 0 to {len(ids)}, the number of pairs")
     return offsets.astype(np.int64), ids.astype(np.int64)
 
 
@@ -329,12 +331,12 @@ def _masks(masks: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
         return np.ones((prod(shape[:-2]), tiles), np.bool_)
     given = np.asarray(masks)
     if given.shape != shape or given.dtype != np.bool_:
-        raise InputError(f"masks: got {given.dtype} of shape {given.shape}, expected bool of {shape}")
+        raise InputError(f"masks: got {given.dtype} of shape {given.shape}, expected bool of shape {shape}")
     return given.reshape(-1, tiles)
 
 
 def _own_of(listed: Int64, batch: tuple[int, ...], image: int) -> slice:
-    """The rows of one image's Gaussians. In packed arrays: the range that its lists use."""
+    """The rows of one image's Gaussians. In packed arrays, the range of rows that the image's lists contain."""
     if len(batch) > 1:
         return slice(image * batch[-1], (image + 1) * batch[-1])
     return slice(int(listed.min()), int(listed.max()) + 1) if len(listed) else slice(0, 0)

@@ -28,7 +28,7 @@ def isect_tiles(
     image_ids: ArrayLike | None = None,
     n_images: int | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
-    """List the (tile, Gaussian) pairs: each tile that overlaps the Gaussian's box, its mean plus and minus the radii.
+    """List the (tile, Gaussian) pairs whose tile overlaps the Gaussian's box: its mean plus and minus the radii.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def isect_tiles(
     depths : (..., N) array_like
         Packed: (M,).
     tile_size : int
-        Side of a tile, pixels.
+        Side of a tile in pixels.
     tile_width, tile_height : int
         Number of tiles across and down.
     sort : bool
@@ -50,7 +50,7 @@ def isect_tiles(
     Returns
     -------
     tiles_per_gauss : (..., N) or (M,) int32
-        Tiles of each Gaussian, 0 if a radius is not over 0.
+        Number of tiles of each Gaussian; 0 if one of its radii is not above 0.
     isect_ids : (pairs,) int64
         From the high bits down: the image, the tile in row-major order, the 32 bits of the depth.
     flatten_ids : (pairs,) int32
@@ -75,7 +75,9 @@ def isect_tiles(
     counts, owner, tile = _tiles_of_boxes(means.reshape(-1, 2), reach, tile_size, (tile_width, tile_height))
     tile_bits = (tile_width * tile_height).bit_length()
     if images.bit_length() + tile_bits + ISECT_ID_DEPTH_BITS > 64:
-        raise InputError(f"{images} images of {tile_width} x {tile_height} tiles: ids have 64 bits, expected fewer")
+        raise InputError(
+            f"{images} images of {tile_width} x {tile_height} tiles do not fit in 64-bit ids, expected fewer"
+        )
     ids = (
         (image[owner] << (tile_bits + ISECT_ID_DEPTH_BITS))
         | (tile << ISECT_ID_DEPTH_BITS)
@@ -92,7 +94,7 @@ def _tiles_of_boxes(
 ) -> tuple[Int64, Int64, Int64]:
     """The number of tiles of each Gaussian's box, and the Gaussian and the tile of each pair.
 
-    tiles: their number across and down.
+    tiles: number of tiles across and down.
     """
     middle, side = means / np.float32(tile_size), reach / np.float32(tile_size)
     low = np.clip(np.floor(middle - side), 0, np.array(tiles)).astype(np.int64)
@@ -135,7 +137,7 @@ def isect_offset_encode(isect_ids: ArrayLike, n_images: int, tile_width: int, ti
     bits = tiles.bit_length()
     image, tile = keys >> bits, keys & ((1 << bits) - 1)
     if len(keys) and (int(image.max()) >= n_images or int(image.min()) < 0 or int(tile.max()) >= tiles):
-        raise InputError(f"isect_ids: of images or tiles beyond {n_images} of {tile_width} x {tile_height}")
+        raise InputError(f"isect_ids: found ids beyond the {n_images} images of {tile_width} x {tile_height} tiles")
     counts = np.bincount(image * tiles + tile, minlength=n_images * tiles)
     return (np.cumsum(counts) - counts).astype(np.int32).reshape(n_images, tile_height, tile_width)
 
@@ -145,12 +147,12 @@ def _lengths(**given: int) -> list[int]:
     found = [whole(value) for value in given.values()]
     lengths = [length for length in found if length is not None and length >= 1]
     if len(lengths) < len(found):
-        raise InputError(f"{', '.join(given)}: got {', '.join(map(str, given.values()))}, expected at least 1 each")
+        raise InputError(f"{', '.join(given)}: got {', '.join(map(str, given.values()))}, expected at least 1 for each")
     return lengths
 
 
 def _batched(*row: int | str, of: ArrayLike) -> list[tuple[int | str, ...]]:
-    """The shape of rows, with the leading axes of the array."""
+    """The expected shape: the leading axes of the array in any size, then `row`."""
     more = max(np.ndim(of) - len(row), 0)
     return [(*(f"axis {axis}" for axis in range(more)), *row)]
 
@@ -163,8 +165,8 @@ def _images(count: tuple[int, ...], image_ids: ArrayLike | None, n_images: int |
     given = np.asarray(image_ids)
     if given.shape != count or len(count) != 1 or given.dtype.kind not in "iu":
         raise InputError(
-            f"image_ids: got {given.dtype} of shape {given.shape}, expected integers {count} of packed arrays"
+            f"image_ids: got {given.dtype} of shape {given.shape}, expected integers of shape {count} for packed arrays"
         )
     if n_images is None or (len(given) and not 0 <= int(given.min()) <= int(given.max()) < n_images):
-        raise InputError(f"image_ids: expected to be below n_images, which is {n_images}")
+        raise InputError(f"image_ids: expected numbers from 0 to below n_images, which is {n_images}")
     return n_images, given.astype(np.int64)

@@ -20,7 +20,7 @@ UNWANTED, USELESS = -1.0, -2.0
 
 @dataclass(frozen=True)
 class MarkRules:
-    """Thresholds (`edge`) that divide the Gaussians; the defaults change nothing.
+    """Thresholds, computed with `edge`, by which Gaussians are densified or pruned; the defaults change nothing.
 
     A Gaussian is densified if its mean gradient is over `gradient` and it passes `cut_off`. It is split if the log of
     its largest scale is over `large`, else cloned.
@@ -32,7 +32,7 @@ class MarkRules:
     - It is not new and its radius is over `radius`.
     - It contributes at most `contribution` to every view.
 
-    cut_off: (value, row). A Gaussian passes if its score is over the value, or equal to it and its row is at most this.
+    cut_off: (value, row). A Gaussian passes if its score is over `value`, or equal to it and its row is at most `row`.
     """
 
     gradient: float = inf
@@ -63,11 +63,11 @@ def edge(holds: Callable[[Float32], Any]) -> float:
 
 
 def _ordered(value: float) -> int:
-    """An integer in the order of the float32 numbers."""
+    """An integer for a float32 number; integers have the order of the numbers."""
     bits = int(np.float32(value).view(np.uint32))
     return -(bits & 0x7FFFFFFF) if bits >> 31 else bits
 
 
 def _number(order: int) -> Float32:
-    """The float32 at this place in the order, as an array (1,), so that it is compared like one."""
+    """The inverse of `_ordered`, as an array (1,), so that NumPy compares it like other arrays of float32."""
     return np.array([order if order >= 0 else -order | 0x80000000], np.uint32).view(np.float32)

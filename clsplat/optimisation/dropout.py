@@ -16,8 +16,8 @@ THINNING_KEY_OFFSET = 0x5EED
 class Thinning:
     """The Gaussians that one step drops.
 
-    rate: the fraction of them.
-    key: two 32-bit words. With its row they give a Gaussian's random word, which decides if it is dropped.
+    rate: the fraction of all Gaussians that is dropped.
+    key: two 32-bit words. Key and row give a Gaussian's random word, which decides if it is dropped.
     """
 
     rate: float
@@ -25,12 +25,12 @@ class Thinning:
 
     @property
     def threshold(self) -> int:
-        """The bound below which a Gaussian's 32-bit random word drops it."""
+        """A Gaussian is dropped if its 32-bit random word is below this."""
         return round(self.rate * 2**32)
 
     @property
     def factor(self) -> float:
-        """Factor of the opacities of the remaining Gaussians."""
+        """The factor by which the opacities of the remaining Gaussians are multiplied."""
         return 1 / (1 - self.rate)
 
 

@@ -16,10 +16,10 @@ class Exploration:
 
     opacity, scale: weights of two penalties, whose gradients are added to the loss's. They are the sums of opacities
     and of scales (three a Gaussian, world units) over the Gaussians in view.
-    amount: factor of the noise, one over world units, as the noise is this times the covariance, in squared world
-    units.
-    dead: opacity at which half of that is added.
-    key: two 32-bit words that no other step has. With a Gaussian's row they give its noise.
+    amount: factor of the noise, in 1 / world units. The noise is this factor times the covariance, which is in squared
+    world units.
+    dead: opacity at which half of the noise is added.
+    key: two 32-bit words that no other step has. Key and row give a Gaussian's noise.
     """
 
     opacity: float = 0.0
@@ -51,7 +51,7 @@ NO_EXPLORATION = Exploration()
 def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, extent: float) -> Exploration:
     """Penalties and noise of step number `step`, of `count` Gaussians.
 
-    Noise is for growth mcmc, until the cooldown, in units in which the scene's extent is 1.
+    There is noise only with growth mcmc and before the cooldown. It is scaled as if the scene's extent were 1.
     means_rate, extent: world units.
     """
     density = config.density

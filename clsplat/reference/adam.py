@@ -31,7 +31,7 @@ def adam(
 
 
 def add_views(gradients: Sequence[Float64], seen: Sequence[NDArray[np.bool_]]) -> Float64:
-    """Sum the gradients of several views, each (n, ...), over the rows that each view shows, (n,) each."""
+    """Sum the gradients (n, ...) of several views. Each view adds the rows that it shows, where `seen` (n,) is True."""
     total = np.zeros_like(gradients[0])
     for gradient, rows in zip(gradients, seen, strict=True):
         total[rows] += gradient[rows]

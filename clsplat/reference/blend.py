@@ -43,15 +43,15 @@ class BlendedTwin:
 
 @dataclass(frozen=True, eq=False)
 class BlendGradients:
-    """Gradients by the projected Gaussians.
+    """Gradients with respect to the projected Gaussians.
 
     means2d: (N, 2), per pixel of displacement; for rays per radian along the axes of the tangent plane.
-    abs_means2d: (N, 2), the same with the absolute values of every image pixel's part.
-    conics: (N, 3), by a, b, c.
+    abs_means2d: (N, 2), the same sums over pixels, of absolute values.
+    conics: (N, 3), with respect to a, b, c.
     opacities: (N,).
     colors: (N, 3).
     contributions: (N,), each Gaussian's contribution to the image: eq. (55).
-    nearness: (N,), by 1 / depth, (122).
+    nearness: (N,), with respect to 1 / depth: (122).
     """
 
     means2d: Float64
@@ -70,7 +70,7 @@ class Layer:
     position: position in the order of depth.
     before, after: transmittance in front of it and behind it.
     added: the pixels to which it is added.
-    margin: as in `BlendedTwin`; infinite in pixels in which nothing is decided.
+    margin: as in `BlendedTwin`; infinite in pixels that have already ended.
     """
 
     position: int
@@ -136,7 +136,7 @@ def blend_grad(
     d_transmittance: Float64 | None = None,
     d_nearness: Float64 | None = None,
 ) -> BlendGradients:
-    """Gradients by eqs. (22) to (29) and (55), back to front.
+    """Gradients of blending, back to front: eqs. (22) to (29) and (55).
 
     d_image: (H, W, 3), dL/dC.
     d_transmittance: (H, W), dL/dT at the end, (82).
@@ -190,7 +190,7 @@ def blend_grad(
 def _set_shape_gradients(
     gradients: BlendGradients, projected: Seen, gaussian: int, splat: Footprint, d_alpha: Float64, alpha: Float64
 ) -> None:
-    """Eqs. (25) to (29): one Gaussian's gradients by its mean, conic and opacity, from d_alpha (h, w) on its box."""
+    """Eqs. (25) to (29): gradients of one Gaussian's mean, conic and opacity, from d_alpha (h, w) on its box."""
     g = d_alpha * alpha
     dx, dy = splat.dx, splat.dy
     by_x, by_y = (g * along for along in projected.by_mean(gaussian, splat))

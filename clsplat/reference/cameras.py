@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixel to ray and world to pixel in float64, by the camera's model (clsplat/cameras/), which defines both.
+"""From pixel to ray and from world to pixel in float64. The camera's model (clsplat/cameras/) defines both.
 
 Equation numbers refer to docs/cameras.md.
 """
@@ -13,11 +13,11 @@ from clsplat.camera import Camera
 
 
 def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
-    """Origins (N, 3) and unit directions (N, 3) of the rays of pixels (N, 2) in the camera's axes: eqs. (2) to (5).
+    """Origins and unit directions (N, 3), in the camera's axes, of the rays of pixels (N, 2): eqs. (2) to (5).
 
     pixels: (0.5, 0.5) is the centre of the first pixel.
 
-    A pixel without a ray has NaN: in a fisheye beyond half a turn, in an equirectangular image beyond a pole.
+    NaN for a pixel without a ray: beyond half a turn in a fisheye, or beyond a pole in an equirectangular image.
     """
     pixels = np.asarray(pixels, np.float64)
     a = (pixels[:, 0] - camera.cx) / camera.fx
@@ -28,9 +28,9 @@ def cam_from_pixel(camera: Camera, pixels: Float64) -> tuple[Float64, Float64]:
 def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
     """Pixels (N, 2) and depths (N,) of points (N, 3) in the camera's axes: eqs. (2) to (5).
 
-    A point without a pixel has NaN: behind a perspective or orthographic camera, or beyond a fisheye's fold-over. The
-    same holds straight behind a fisheye, where a whole circle shows it. The near and far planes are ignored, and a
-    pixel may lie outside the image.
+    NaN for a point without a pixel: behind a perspective or orthographic camera, beyond a fisheye's fold-over, or
+    straight behind a fisheye, which shows such a point as a circle. The near and far planes are ignored, and a pixel
+    may lie outside the image.
     """
     a, b, depths = camera.model.places_of(camera, np.asarray(points, np.float64))
     u = camera.model.wrapped(camera, camera.cx + camera.fx * a)
@@ -38,12 +38,12 @@ def pixel_from_cam(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
 
 
 def pixel_from_world(camera: Camera, points: Float64) -> tuple[Float64, Float64]:
-    """Pixels (N, 2) and depths (N,) of points (N, 3) in the world: eq. (1), then as `pixel_from_cam`."""
+    """Pixels (N, 2) and depths (N,) of points (N, 3) in the world: eq. (1), then `pixel_from_cam`."""
     return pixel_from_cam(camera, np.asarray(points, np.float64) @ camera.rotation.T + camera.translation)
 
 
 def pixel_grid(camera: Camera) -> Float64:
-    """The centres of all pixels, (height * width, 2), row by row; in the frame if the camera has a window."""
+    """The centres of all pixels, (height * width, 2), row by row; relative to the frame if the camera has a window."""
     x, y = (camera.window.x, camera.window.y) if camera.window else (0, 0)
     u, v = np.meshgrid(x + np.arange(camera.width) + 0.5, y + np.arange(camera.height) + 0.5)
     return np.stack([u.ravel(), v.ravel()], axis=1)

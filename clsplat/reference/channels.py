@@ -21,13 +21,13 @@ from clsplat.reference.render import parameters
 
 @dataclass(frozen=True, eq=False)
 class ChannelsTwin:
-    """Channels, eqs. (60) to (67). All are 0, and index -1, where nothing is added.
+    """Channels, eqs. (60) to (67). In pixels without Gaussians all are 0, except for index, which is -1.
 
     normal, position: (H, W, 3).
     motion, backward: (H, W, 2).
-    doubt: (H, W), the smallest distance of a decision to its threshold, as differences: of the transmittance to one
-    half, and of the largest weight to the second largest.
-    The others are (H, W).
+    doubt: (H, W), the smallest distance of a decision to its threshold: the difference of the transmittance from one
+    half, or of the largest weight from the second largest.
+    The other arrays are (H, W).
     """
 
     depth: Float64
@@ -43,7 +43,7 @@ class ChannelsTwin:
 
 
 def normals(means: Float64, quaternions: Float64, log_scales: Float64, camera: Camera) -> Float64:
-    """Eq. (62): the axis of the smallest scale, the first of equal ones, turned towards the camera, (N, 3)."""
+    """Eq. (62): each Gaussian's axis of the smallest scale (the first if some are equal), facing the camera, (N, 3)."""
     axes = rotation_matrices(quaternions)[np.arange(len(means)), :, np.argmin(log_scales, axis=1)]
     away = (view_directions(means, camera)[0] * axes).sum(axis=1)
     return np.where(away[:, None] > 0, -axes, axes)
@@ -69,7 +69,7 @@ def motions(means: Float64, camera: Camera, after: Camera, moved: Float64 | None
 def features(
     projected: Seen, gaussians: Gaussians, camera: Camera, after: Camera, before: Camera | None = None
 ) -> dict[str, Float64]:
-    """Features of each Gaussian, (N, 1 to 3), by the name of their channel.
+    """Features of each Gaussian, arrays (N, 1 to 3), keyed by channel.
 
     before: the camera of backward motion; None for `after`.
     """

@@ -22,9 +22,9 @@ SLACKS_PER_WALK = 8
 class Deep:
     """A frame in slices by depth.
 
-    slices: (bins, H, W, 5) by (70) to (72): red, green, blue, alpha, depth.
+    slices: (bins, H, W, 5), eqs. (70) to (72): red, green, blue, alpha, depth.
     slack: (H, W), the slack s of each pixel, (74).
-    margin: (H, W), the smallest distance of a decision to its threshold, as differences of transmittance.
+    margin: (H, W), the smallest distance of a decision to its threshold, a difference of transmittance.
     """
 
     slices: Float64
@@ -41,7 +41,7 @@ class _Cut:
         self.margin = np.full(slack.shape, np.inf)
 
     def begins(self, layer: Layer, may: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
-        """True in pixels in which the layer begins a slice. may: True in pixels in which it is allowed to."""
+        """True in pixels in which the layer begins a slice. may: False in pixels in which it must not begin one."""
         box = layer.box
         opened, placed, slack, added = self.open[box], self.placed[box], self.slack[box], layer.added
         in_front = opened - layer.before - slack
@@ -79,11 +79,11 @@ def slacks(taken: Sequence[Layer], whole: Float64, total: Float64, bins: int) ->
 def sliced(
     taken: Sequence[Layer], colours: Sequence[Float64], depths: Sequence[Float64], whole: Float64, bins: int
 ) -> Deep:
-    """Cut layers into slices by (70) to (74).
+    """Cut layers into slices: eqs. (70) to (74).
 
-    colours: (h, w, 3), of each layer on its box, associated with the light that it absorbs.
-    depths: (h, w), of each layer on its box.
-    whole: (H, W), the light in front of them.
+    colours: (h, w, 3), colour of each layer on its box, premultiplied with the light that the layer absorbs.
+    depths: (h, w), depth of each layer on its box.
+    whole: (H, W), the light in front of all layers.
     """
     height, width = whole.shape
     end = whole.copy()

@@ -14,8 +14,10 @@ from clsplat.reference.deep import Deep, sliced
 
 
 def deep_merge(pictures: Float64, weights: Float64) -> Deep:
-    """The weighted mean of deep pictures (P, bins, H, W, 5) by (187), in slices by (73) and (74). weights: (P, H,
-    W)."""
+    """Eq. (187): the weighted mean of deep pictures (P, bins, H, W, 5), cut into slices as in (73) and (74).
+
+    weights: (P, H, W).
+    """
     count, bins, height, width, _ = pictures.shape
     whole = weights.sum(axis=0)
     depths = np.where(pictures[..., 3] > 0, pictures[..., 4], np.inf).reshape(count * bins, height, width)

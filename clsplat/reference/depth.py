@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth loss, and the gradient of nearness by the means.
+"""The depth loss, and the gradient of nearness with respect to the means.
 
 Float64 twins of kernels/depth_loss.cl and of the nearness terms in project_grad.cl.
 """
@@ -13,15 +13,15 @@ from clsplat.camera import Camera
 
 
 def depth_loss(nearness: Float64, aims: Float64, weights: Float64, factor: float) -> tuple[float, Float64]:
-    """Eq. (121): factor times the sum of weighted |N - n|, and its gradient by N; all (H, W)."""
+    """Eq. (121): factor times the sum of weighted |N - n|, and its gradient with respect to N; arrays are (H, W)."""
     difference = weights * (nearness - aims)
     return float(factor * np.abs(difference).sum()), factor * weights * np.sign(difference)
 
 
 def nearness_grad(means: Float64, camera: Camera, d_nearness: Float64) -> Float64:
-    """Eq. (122): the gradient (N, 3) by the means.
+    """Eq. (122): the gradient (N, 3) with respect to the means.
 
-    d_nearness: (N,), the gradient by one over the depth, which is the distance if pixels are rays.
+    d_nearness: (N,), the gradient with respect to one over the depth, or over the distance for models along rays.
     """
     local = means @ camera.rotation.T + camera.translation
     if not camera.model.along_rays:

@@ -19,13 +19,13 @@ def factors(thinning: Thinning, count: int, first_row: int = 0) -> Float64:
 
 
 def thinned_logits(opacity_logits: Float64, by: Float64) -> Float64:
-    """Logits of the opacities times `by` (n,), which must stay below 1; very low where `by` is 0."""
+    """Logits of the opacities times `by` (n,). The products must be below 1; where `by` is 0, the logit is -700."""
     opacities = by / (1 + np.exp(-opacity_logits))
     logits: Float64 = np.where(by > 0, np.log(np.maximum(opacities, 1e-300)) - np.log1p(-opacities), -700.0)
     return logits
 
 
 def logit_grad(opacity_logits: Float64, by: Float64, gradient: Float64) -> Float64:
-    """Gradient by the original logits from the gradient by the logits of `thinned_logits`: eq. (101)."""
+    """Eq. (101): gradient with respect to the original logits, from the gradient of the logits of `thinned_logits`."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return np.where(by > 0, gradient * (1 - opacities) / (1 - by * opacities), 0.0)

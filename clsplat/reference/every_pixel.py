@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of any projection in float64, every Gaussian at every pixel: no tiles, no boxes, no bounds.
+"""Pictures of any projection in float64, with every Gaussian evaluated at every pixel: no tiles, boxes or bounds.
 
 Equation numbers refer to docs/gradients.md (14 to 16) and docs/channels.md (60 to 64).
 """
@@ -57,7 +57,7 @@ def render(
 ) -> Picture:
     """Render front to back by depth. A pixel without a ray shows the background.
 
-    after: the camera that motion leads to.
+    after: the camera after the motion, for the channel motion.
     """
     seen: Seen
     if not camera.model.along_rays:
@@ -85,7 +85,7 @@ def render_grad(
     d_image: (H, W, 3), dL/dimage.
     d_nearness: (H, W), dL/dnearness.
 
-    For rays, the gradients by the means on the image are along the axes of the tangent plane, per pixel there.
+    For rays, gradients with respect to the means on the image are per pixel along the axes of the tangent plane.
     """
     if not camera.model.along_rays:
         return on_plane.render_grad(gaussians, camera, d_image, background, d_nearness=d_nearness)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """EWA projection with gsplat's conventions, and its gradient: float64 twin of kernels/ewa.cl and kernels/ewa_grad.cl.
 
-Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation: its gradient is by its twelve
-numbers, not by rotations alone.
+Equation numbers refer to docs/gradients.md. The view matrix need not be a rotation: its gradient is with respect
+to its twelve numbers, not only to rotations.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class EwaViewTwin:
     viewmat: (4, 4), camera from world.
     intrinsics: (3, 3); the skew is ignored.
     model: pinhole, ortho or fisheye.
-    near, far: Gaussians whose depth is not strictly between these are culled, world units.
+    near, far: world units; Gaussians whose depth is not strictly between these are culled.
     eps2d: px^2, added to the diagonal of the projected covariance.
-    radius_clip: pixels; Gaussians with no larger radius are culled.
+    radius_clip: pixels; Gaussians without a larger radius are culled.
     """
 
     viewmat: Float64
@@ -68,11 +68,11 @@ class EwaProjectedTwin:
     depths: (N,).
     conics: (N, 3), a, b, c.
     compensations: (N,).
-    points: (N, 3), in the camera.
+    points: (N, 3), in the camera's axes.
     jacobians: (N, 2, 3).
-    clamped: (N, 2).
+    clamped: (N, 2), True for a ratio that the Jacobian clamps.
     covariances: (N, 2, 2), with the low-pass.
-    determinants: (N,), without it.
+    determinants: (N,), of the covariances without the low-pass.
     """
 
     radii: NDArray[np.int32]
@@ -88,7 +88,7 @@ class EwaProjectedTwin:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """The Gaussians that are not culled, (N,)."""
+        """(N,): True for Gaussians that are not culled."""
         return self.radii[:, 0] > 0
 
 
@@ -110,7 +110,7 @@ def covariances_of(quaternions: Float64, scales: Float64) -> Float64:
 
 
 def covariances_grad(quaternions: Float64, scales: Float64, gradients: Float64) -> tuple[Float64, Float64]:
-    """Gradients by quaternions (N, 4) and scales (N, 3) from symmetric gradients by covariances (N, 3, 3)."""
+    """Gradients of quaternions (N, 4) and scales (N, 3), from symmetric gradients of covariances (N, 3, 3)."""
     rotations = rotations_of(quaternions)
     d_m = 2 * gradients @ (rotations * scales[:, None, :])
     d_scales = (rotations * d_m).sum(axis=1)
@@ -138,7 +138,7 @@ def full_covariances(upper: Float64) -> Float64:
 
 
 def upper_gradients(full: Float64) -> Float64:
-    """Gradients (N, 6) by the upper triangle from symmetric ones (N, 3, 3): an off-diagonal entry has two places."""
+    """Gradients (N, 6) of upper triangles from symmetric gradients (N, 3, 3), in which off-diagonals occur twice."""
     return np.asarray(full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]] * np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0]), np.float64)
 
 
@@ -167,7 +167,7 @@ def project(
 ) -> EwaProjectedTwin:
     """Project means (N, 3) and covariances (N, 3, 3): equations (150) to (156).
 
-    opacities: (N,), 0 to 1; boxes then end where alpha is 1/255. Include compensations in them if they are used.
+    opacities: (N,), 0 to 1, after compensation if it is used. With opacities, boxes end where alpha is 1/255.
     """
     rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
     fx, fy = view.focal
@@ -220,10 +220,10 @@ def project(
 
 
 def _fisheye_grad(view: EwaViewTwin, points: Float64, d_means2d: Float64, d_j: Float64) -> tuple[Float64, Float64]:
-    """For a fisheye, the gradient (N, 3) by the points in the camera, and the gradient (2,) by the focal lengths
+    """For a fisheye, the gradient (N, 3) of the points in the camera's axes, and the gradient (2,) of the focal lengths
     through the means on the image.
 
-    d_j: (N, 2, 3), by the Jacobians.
+    d_j: (N, 2, 3), the gradient of the Jacobians.
     """
     x, y, z = points.T
     fx, fy = view.focal
@@ -250,8 +250,8 @@ def _pinhole_grad(
     d_means2d: Float64,
     d_j: Float64,
 ) -> tuple[Float64, Float64, Float64]:
-    """For a pinhole camera, the gradients by the points and the focal lengths, like `_fisheye_grad`, and the part (2,)
-    by the principal point that the clamp takes away.
+    """For a pinhole camera, the gradients of the points and focal lengths as in `_fisheye_grad`, and the part (2,) of
+    the principal point's gradient that the clamp removes.
     """
     z = points[:, 2]
     jx, jy = jacobians[:, 0, 0], jacobians[:, 1, 1]
@@ -274,11 +274,11 @@ def project_grad(
     projected: EwaProjectedTwin,
     gradients: Mapping[str, Float64],
 ) -> dict[str, Float64]:
-    """Gradients by means (N, 3), covariances (N, 3, 3), viewmat (4, 4) and intrinsics (3, 3): equations (159) to (166).
+    """Gradients of means (N, 3), covariances (N, 3, 3), viewmat (4, 4) and intrinsics (3, 3): equations (159) to (166).
 
-    gradients: gradients by means2d, depths, conics and compensations; each is optional.
+    gradients: gradients of means2d, depths, conics and compensations; each is optional.
 
-    The gradient by the covariances is symmetric. Culled Gaussians have none.
+    The gradient of the covariances is symmetric. Culled Gaussians have zero gradients.
     """
     seen = projected.visible
     p, j = projected.points[seen], projected.jacobians[seen]

@@ -17,14 +17,13 @@ def identity(shape: tuple[int, int, int]) -> Float64:
 
 
 def _hats(places: Float64, count: int) -> Float64:
-    """Linear interpolation weights (..., count) of the vertices for each coordinate."""
+    """Weights (..., count) of the grid's vertices in linear interpolation at each coordinate."""
     weights: Float64 = np.maximum(1 - np.abs(places[..., None] - np.arange(count)), 0)
     return weights
 
 
 def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, Float64, Float64]:
-    """Weights of each pixel (H, W) for rows, columns and levels, and the level weights' derivatives by the
-    luminance."""
+    """Weights of rows, columns and levels for each pixel, and derivatives of the level weights in luminance."""
     (height, width, _), (levels, rows, columns) = image.shape, shape
     down = _hats((np.arange(height) + 0.5) / height * (rows - 1), rows)
     along = _hats((np.arange(width) + 0.5) / width * (columns - 1), columns)
@@ -37,7 +36,7 @@ def _weights(image: Float64, shape: tuple[int, ...]) -> tuple[Float64, Float64, 
 
 
 def apply(image: Float64, grid: Float64) -> Float64:
-    """The image (H, W, 3) with the colours of a photograph with this grid."""
+    """The image (H, W, 3) with its colours transformed by the grid."""
     down, along, levels, _ = _weights(image, grid.shape[:3])
     maps = np.einsum("yj,xi,yxl,ljiab->yxab", down, along, levels, grid, optimize=True)
     seen: Float64 = np.einsum("yxab,yxb->yxa", maps[..., :3], image) + maps[..., 3]
@@ -45,7 +44,7 @@ def apply(image: Float64, grid: Float64) -> Float64:
 
 
 def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, Float64]:
-    """Gradients by the image and by the grid, from the gradient by the transformed image."""
+    """Gradients of the image and of the grid, from the gradient of the transformed image."""
     down, along, levels, slopes = _weights(image, grid.shape[:3])
     whole = np.concatenate([image, np.ones_like(image[..., :1])], axis=-1)
     by_grid: Float64 = np.einsum("yj,xi,yxl,yxa,yxb->ljiab", down, along, levels, by_seen, whole, optimize=True)
@@ -58,12 +57,12 @@ def gradient(image: Float64, grid: Float64, by_seen: Float64) -> tuple[Float64, 
 
 
 def variation(grid: Float64) -> float:
-    """The mean squared difference between neighbours, summed over the three axes."""
+    """The mean squared difference between neighbouring vertices, summed over the three axes."""
     return float(sum(np.square(np.diff(grid, axis=axis)).mean() for axis in range(3)))
 
 
 def variation_gradient(grid: Float64) -> Float64:
-    """The gradient of `variation` by the grid."""
+    """The gradient of `variation` with respect to the grid."""
     total = np.zeros_like(grid)
     for axis in range(3):
         steps = np.diff(grid, axis=axis)
@@ -81,7 +80,7 @@ def centre(grids: Float64) -> Float64:
 def step(
     grid: Float64, first: Float64, second: Float64, by_grid: Float64, visit: int, rate: float
 ) -> tuple[Float64, Float64, Float64]:
-    """Grid and moments after Adam's step along by_grid, at the photograph's visit number `visit` (from 1)."""
+    """Grid and moments after a step of Adam with the gradient by_grid. visit: number of the step, from 1."""
     first, second = 0.9 * first + 0.1 * by_grid, 0.999 * second + 0.001 * by_grid**2
     change = rate * (first / (1 - 0.9**visit)) / (np.sqrt(second / (1 - 0.999**visit)) + 1e-15)
     return grid - change, first, second

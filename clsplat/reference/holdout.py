@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A held-out frame in float64: twin of kernels/holdout.cl. Equation numbers refer to docs/pictures.md."""
+"""A frame held out by surfaces in float64: twin of kernels/holdout.cl. Equation numbers refer to docs/pictures.md."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def held_out(
     surfaces: Sequence[Surface],
     background: Sequence[float] | Float64 = (0.0, 0.0, 0.0),
 ) -> tuple[Float64, Float64]:
-    """Colour (H, W, 3) and alpha (H, W) by (76) and (77)."""
+    """Eqs. (76), (77): colour (H, W, 3) and alpha (H, W) of the frame that the surfaces hold out."""
     image, seen, left = np.zeros((height, width, 3)), np.zeros((height, width)), np.ones((height, width))
     for layer in layers(projected, width, height):
         through = let_through(surfaces, float(np.float32(projected.depths[layer.gaussian])))[layer.box]

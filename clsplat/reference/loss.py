@@ -33,7 +33,7 @@ def blur(image: Float64) -> Float64:
 
 
 def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """Eqs. (17), (18), (20), (21): the SSIM map (H, W, C), and the gradient of its SUM by x."""
+    """Eqs. (17), (18), (20), (21): the SSIM map (H, W, C), and the gradient of its SUM with respect to x."""
     mean_x, mean_y = blur(x), blur(y)
     var_x = blur(x * x) - mean_x**2
     var_y = blur(y * y) - mean_y**2
@@ -52,7 +52,7 @@ def ssim(x: Float64, y: Float64) -> tuple[Float64, Float64]:
 
 
 def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Eq. (19): loss of the render x against the photograph y, both (H, W, C), and its gradient by x.
+    """Eq. (19): loss of the render x against the photograph y, both (H, W, C), and its gradient with respect to x.
 
     L = (1 - weight) mean |x - y| + weight (1 - mean SSIM), means over pixels and channels.
     """
@@ -64,7 +64,7 @@ def l1_dssim(x: Float64, y: Float64, weight: float = 0.2) -> tuple[float, Float6
 
 
 def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2) -> tuple[float, Float64]:
-    """Eq. (80): the same over the pixels where counts (H, W) is 1; it is 0 elsewhere."""
+    """Eq. (80): `l1_dssim` over the pixels where counts (H, W) is 1. In other pixels counts is 0."""
     mask = counts[:, :, None]
     samples = max(3 * counts.sum(), 1)
     difference = (x - y) * mask
@@ -75,7 +75,7 @@ def masked_l1_dssim(x: Float64, y: Float64, counts: Float64, weight: float = 0.2
 
 
 def alpha_loss(transmittance: Float64, alpha: Float64, counts: Float64, weight: float) -> tuple[float, Float64]:
-    """Eq. (81): weight times the mean |1 - T - alpha| of the pixels that count, and its gradient by T; all (H, W)."""
+    """Eq. (81): weight times the mean |1 - T - alpha| where counts is 1, and its gradient in T; arrays are (H, W)."""
     difference = counts * (1 - transmittance - alpha)
     scale = weight / max(counts.sum(), 1)
     return float(scale * np.abs(difference).sum()), -scale * np.sign(difference)

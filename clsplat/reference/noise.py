@@ -22,7 +22,7 @@ def mixed(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def normal_numbers(key: tuple[int, int], rows: NDArray[np.integer]) -> Float64:
-    """Eq. (93): three numbers (n, 3) for each row (n,)."""
+    """Eq. (93): three normally distributed numbers (n, 3) for each row (n,)."""
     of_row = mixed(rows.astype(np.uint32) ^ np.uint32(key[0])) + np.uint32(key[1])
     counters = np.arange(3 * HALF_WORDS_PER_NORMAL // 2, dtype=np.uint32) * np.uint32(0x9E3779B9)
     words = mixed(of_row[:, None] + counters)
@@ -46,12 +46,12 @@ def displacements(
 
 
 def penalty(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> float:
-    """Penalties in the loss, for Gaussians in view."""
+    """The loss's penalties on the opacities and scales of Gaussians in view."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return float(explore.opacity * opacities.sum() + explore.scale * np.exp(log_scales).sum())
 
 
 def penalty_grad(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> tuple[Float64, Float64]:
-    """Eq. (91): gradients by log scales (n, 3) and opacity logits (n,)."""
+    """Eq. (91): gradients of log scales (n, 3) and opacity logits (n,)."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return explore.scale * np.exp(log_scales), explore.opacity * opacities * (1 - opacities)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gradient by a camera's pose: float64 twin of kernels/pose.cl, (140) to (142) of docs/gradients.md."""
+"""The gradient of a camera's pose: float64 twin of kernels/pose.cl, (140) to (142) of docs/gradients.md."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from clsplat.spherical_harmonics import SH_C0
 def pose_gradient(
     means: Float64, quaternions: Float64, sh: Float64, camera: Camera, sh_degree: int, gradients: Mapping[str, Float64]
 ) -> Float64:
-    """Gradient (6,) by a motion of the camera as in `Camera.moved`: three of the rotation, three of the translation.
+    """Gradient (6,) with respect to a motion of the camera as in `Camera.moved`: rotation, then translation.
 
-    gradients: gradients by means (N, 3), quaternions (N, 4) and sh (N, K, 3), zero where a Gaussian is not seen.
+    gradients: gradients of means (N, 3), quaternions (N, 4) and sh (N, K, 3), zero where a Gaussian is not visible.
     """
     directions, _ = view_directions(means, camera)
     of_direction = sh_basis_grad(directions, sh_degree)

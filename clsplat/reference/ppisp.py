@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A photograph's gains and colour mixes, its lens's vignette, and the gradient by them.
+"""A photograph's gains and colour mixes, its lens's vignette, and the gradient with respect to them.
 
 Float64 twin of kernels/ppisp.cl. It is a reduced PPISP (NVIDIA 2026), whose homography keeps grey and acts on light.
 """
@@ -12,7 +12,7 @@ from clsplat.arrays import Float64
 
 
 def unmixing(mixes: Float64) -> Float64:
-    """The matrix (3, 3) that removes the mixes (6,) from colours. Channel c has the fractions of c + 1 and c + 2."""
+    """The matrix (3, 3) that removes the mixes (6,): two fractions per channel c, of channels c + 1 and c + 2."""
     matrix = np.eye(3)
     for c in range(3):
         for k in range(2):
@@ -29,22 +29,22 @@ def spread(width: int, height: int, centre: tuple[float, float]) -> Float64:
 
 
 def light(vignette: Float64, squared: Float64) -> Float64:
-    """The fraction of light (H, W) that a lens transmits at these squared distances, by its vignette (3,)."""
+    """The fraction of light (H, W) that a lens with this vignette (3,) transmits at these squared distances."""
     result: Float64 = np.exp2(squared * (vignette[0] + squared * (vignette[1] + squared * vignette[2])))
     return result
 
 
 def developed(photograph: Float64, entries: Float64, vignette: Float64, squared: Float64) -> Float64:
-    """Remove gains, mixes and vignette from the photograph (H, W, 3), to the colours of the model."""
+    """Convert the photograph (H, W, 3) to the model's colours: remove gains, vignette and mixes."""
     even = photograph / np.exp2(entries[:3]) / light(vignette, squared)[:, :, None]
     result: Float64 = even @ unmixing(entries[3:]).T
     return result
 
 
 def gradient(image: Float64, by_image: Float64, squared: Float64) -> Float64:
-    """Gradient by the entries and the vignette (12,) at 0, for a loss of the image with these applied.
+    """Gradient (12,) of the entries and the vignette, at 0, for a loss of the image to which they are applied.
 
-    by_image: (H, W, 3), the loss's gradient by that image.
+    by_image: (H, W, 3), the loss's gradient with respect to the resulting image.
     """
     each = image * by_image
     others = [image[:, :, (c + 1 + k) % 3] - image[:, :, c] for c in range(3) for k in range(2)]

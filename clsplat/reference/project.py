@@ -78,7 +78,7 @@ class Seen(ABC):
         """Conic a, b, c of one Gaussian, with q = a dx^2 + 2 b dx dy + c dy^2."""
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Derivatives of -q / 2 by the mean in each pixel, along the axes of dx and dy: eq. (25)."""
+        """Derivatives of -q / 2 in each pixel with respect to the mean, along the axes of dx and dy: eq. (25)."""
         a, b, c = self.conic(gaussian)
         return a * splat.dx + b * splat.dy, b * splat.dx + c * splat.dy
 
@@ -91,8 +91,8 @@ class ProjectedTwin(Seen):
     covariances: (N, 3), sxx, sxy, syy in px^2.
     conics: (N, 3), a, b, c of the inverse, q = a dx^2 + 2 b dx dy + c dy^2.
     whitening: (N, 3), l11, l12, l22 of eq. (8).
-    half_extents: (N, 2), pixels, of the box in which alpha reaches 1/255.
-    visible: passed eq. (13). A visible Gaussian may still lie entirely outside the image.
+    half_extents: (N, 2), in pixels, of the box in which alpha reaches 1/255.
+    visible: True if eq. (13) holds. A visible Gaussian may still lie entirely outside the image.
     """
 
     means2d: Float64
@@ -128,7 +128,7 @@ class ProjectedTwin(Seen):
 class _Geometry:
     """Intermediate values that projection and its gradient share.
 
-    p: (N, 3), in the camera.
+    p: (N, 3), the means in the camera's axes.
     plane: ratios and Jacobian.
     rotations, scales: (N, 3, 3) and (N, 3), of the Gaussians.
     half: (N, 2, 3), M of eq. (5).
@@ -175,7 +175,7 @@ def view_directions(means: Float64, camera: Camera) -> tuple[Float64, Float64]:
 
 
 def _pixels_of(p: Float64, camera: Camera) -> Float64:
-    """Eq. (2): points (N, 3) in the camera on the image, (N, 2), in pixels of the window if there is one."""
+    """Eq. (2): pixels (N, 2) of points p (N, 3) in the camera's axes, relative to the window if there is one."""
     focal = np.array([camera.fx, camera.fy])
     means2d: Float64 = focal * p[:, :2] / camera.model.divisors(p[:, 2])[:, None] + np.array([camera.cx, camera.cy])
     return means2d if camera.window is None else means2d - [camera.window.x, camera.window.y]
@@ -222,10 +222,10 @@ def project(
 ) -> ProjectedTwin:
     """Eqs. (1) to (13); for an orthographic camera (15) to (17) of docs/cameras.md.
 
-    The arrays are as in `Gaussians`, in float64.
+    The arrays are those of `Gaussians`, in float64.
 
     sh_degree: the degree in use; higher bands are ignored.
-    antialiased: apply (83).
+    antialiased: compensate opacities for the low-pass, (83).
     """
     with np.errstate(all="ignore"):  # overflows and divisions by zero are culled below
         geometry = _geometry(means, quaternions, log_scales, camera)
@@ -274,7 +274,7 @@ def compensation(det0: Float64, det: Float64) -> Float64:
 
 
 def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tuple[Float64, Float64]:
-    """Eq. (84): the compensation's terms of dL/dSigma, (N, 2, 2), by the covariances without and with the low-pass.
+    """Eq. (84): the compensation's terms (N, 2, 2) of dL/dSigma, for the covariances without and with the low-pass.
 
     d_logs: (N,), dL/d(ln of the opacity).
     """
@@ -288,7 +288,7 @@ def compensation_grad(plain: Float64, filtered: Float64, d_logs: Float64) -> tup
 def covariance_grad(conics: Float64, d_conics: Float64) -> Float64:
     """Eq. (30), dL/dSigma = -A G A with A the conic matrix: (N, 3), (N, 3) -> (N, 3).
 
-    d_conics is the derivative by the three numbers a, b, c (b occurs twice in the matrix). The result is xx, xy, yy of
+    d_conics is the derivative with respect to a, b and c (b occurs twice in the matrix). The result is xx, xy, yy of
     the symmetric matrix G with dL = sum_ij G_ij dSigma_ij, so dL/dsxy as one number is twice its xy.
     """
     a, b, c = conics.T
@@ -321,9 +321,9 @@ def quaternion_grad(quaternions: Float64, d_rotations: Float64) -> Float64:
 def colour_grad(
     means: Float64, sh: Float64, camera: Camera, sh_degree: int, colors: Float64, d_colors: Float64
 ) -> tuple[Float64, Float64, Float64]:
-    """Eqs. (38) to (40): the SH basis (N, K), and two gradients.
+    """Eqs. (38) to (40): the SH basis (N, K), and two gradients (N, 3).
 
-    They are by the colour before its clamp (N, 3), and by the mean through its viewing direction (N, 3).
+    The first is that of the colour before its clamp, the second that of the mean through its viewing direction.
     """
     directions, distances = view_directions(means, camera)
     basis = sh_basis(directions, sh_degree)
@@ -336,7 +336,7 @@ def colour_grad(
 
 @dataclass(frozen=True, eq=False)
 class ProjectedGradients:
-    """Gradients of a loss by what `project` computes.
+    """Gradients of a loss with respect to the results of `project`.
 
     means2d: (N, 2).
     covariances: (N, 3), xx, xy, yy as in (28).
@@ -377,7 +377,7 @@ def lens_grad(
     *,
     antialiased: bool = False,
 ) -> Float64:
-    """Eqs. (144), (145): gradient (4,) by ln fx, ln fy, cx and cy of a flat camera. Arguments as in `project_grad`."""
+    """Eqs. (144), (145): gradient (4,) of ln fx, ln fy, cx and cy. Arguments are as in `project_grad`."""
     assert not camera.model.along_rays
     rows = np.flatnonzero(projected.visible)
     geometry = _geometry(means[rows], quaternions[rows], log_scales[rows], camera)
@@ -405,9 +405,9 @@ def project_grad(
     *,
     antialiased: bool = False,
 ) -> dict[str, Float64]:
-    """Eqs. (31) to (41), antialiased with (84): gradients by the five parameter arrays, by name; zero where culled.
+    """Eqs. (31) to (41), antialiased with (84): gradients of the five parameters, keyed by name; zero where culled.
 
-    arrays: the parameters, by their names in `project`.
+    arrays: the parameters, keyed by their names in `project`.
     projected: the result of `project`.
 
     For an orthographic camera J is constant, and no colour depends on the mean. `reference.rays` has the gradients for

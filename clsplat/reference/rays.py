@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians of pictures along rays in float64, and their gradient.
+"""Gaussians evaluated along the rays of pixels in float64, and their gradient.
 
 Twin of kernels/project_rays.cl, of a ray's alphas, and of project_grad.cl with RAYS. Equation numbers refer to
 docs/cameras.md.
@@ -38,9 +38,9 @@ from clsplat.spherical_harmonics import sh_basis
 class Tangents(Seen):
     """Gaussians on the planes tangent to the unit sphere at their directions.
 
-    directions: (N, 3), of the means, in the camera.
+    directions: (N, 3), of the means, in the camera's axes.
     right, down: (N, 3), the axes of the tangent plane.
-    covariances: (N, 2, 2) on it, with the low-pass.
+    covariances: (N, 2, 2), on the tangent plane, with the low-pass.
     rays: (P, 3), unit directions of the camera's pixels, 0 for a pixel without a ray.
     """
 
@@ -100,13 +100,13 @@ def tangents(gaussians: Gaussians, camera: Camera) -> Tangents:
 
 
 def pixel_sides(pixels: Float64) -> Float64:
-    """Sides of a pixel along the axes of the tangent plane, (N, 2), of (10); they convert gradients there to pixels."""
+    """Sides (N, 2) of a pixel along the tangent plane's axes, from (10). They convert its gradients to pixels."""
     sides: Float64 = np.linalg.norm(pixels, axis=2)
     return sides
 
 
 def tangents_grad(gaussians: Gaussians, camera: Camera, seen: Tangents, screen: BlendGradients) -> dict[str, Float64]:
-    """Eqs. (22) to (29): gradients by the five parameter arrays, keyed by their names; zero where culled."""
+    """Eqs. (22) to (29): gradients of the five parameter arrays, keyed by their names; zero where culled."""
     rows = np.flatnonzero(seen.visible)
     arrays = parameters(gaussians)
     means, quaternions = arrays["means"][rows], arrays["quaternions"][rows]

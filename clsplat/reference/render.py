@@ -36,9 +36,9 @@ class Forward:
 
 @dataclass(frozen=True, eq=False)
 class GradientsTwin(BlendGradients):
-    """Gradients on the image and by the parameters.
+    """Gradients of the projected Gaussians and of the parameters.
 
-    parameters: arrays by their names in `Gaussians`, with the same shapes.
+    parameters: gradients keyed by the arrays' names in `Gaussians`, with the arrays' shapes.
     visible: (N,).
     """
 
@@ -47,7 +47,7 @@ class GradientsTwin(BlendGradients):
 
 
 def parameters(gaussians: Gaussians) -> dict[str, Float64]:
-    """The five arrays by name, in float64; means in the world."""
+    """The five arrays, keyed by name, in float64; means in world coordinates."""
     fields = dict.fromkeys(group.field for group in PARAMETER_GROUPS.values())
     arrays = {name: np.asarray(getattr(gaussians, name), np.float64) for name in fields}
     return {**arrays, "means": arrays["means"] + gaussians.origin}
@@ -103,8 +103,8 @@ def render_grad(
     """Gradients of a loss.
 
     d_image: (H, W, 3), dL/dimage.
-    d_transmittance: (H, W), by the transmittance at the end.
-    d_nearness: (H, W), by the nearness.
+    d_transmittance: (H, W), dL/dT with T the transmittance behind all Gaussians.
+    d_nearness: (H, W), dL/dN with N the nearness.
     """
     degree, camera = gaussians.sh_degree if sh_degree is None else sh_degree, camera.before(gaussians.near)
     projected = project_model(gaussians, camera, degree)
@@ -116,7 +116,7 @@ def render_grad(
 
 
 def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> ProjectedGradients:
-    """The gradients by covariances instead of conics."""
+    """Replace the gradients of conics by gradients of covariances."""
     by_covariance = covariance_grad(projected.conics, screen.conics)
     return ProjectedGradients(screen.means2d, by_covariance, screen.opacities, screen.colors)
 
@@ -124,7 +124,7 @@ def projected_gradients(projected: ProjectedTwin, screen: BlendGradients) -> Pro
 def render_lens_grad(
     gaussians: Gaussians, camera: Camera, d_image: Float64, background: Sequence[float] | Float64 = BLACK_BACKGROUND
 ) -> Float64:
-    """Gradient (4,) of a loss with dL/dimage = d_image (H, W, 3) by ln fx, ln fy, cx and cy."""
+    """Gradient (4,) with respect to ln fx, ln fy, cx and cy. d_image: (H, W, 3), dL/dimage."""
     arrays, camera = parameters(gaussians), camera.before(gaussians.near)
     projected = project_model(gaussians, camera, gaussians.sh_degree)
     screen = blend_grad(projected, camera.width, camera.height, background, d_image)

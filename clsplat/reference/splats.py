@@ -21,7 +21,7 @@ class Splats:
 
     whitenings: (n, 3), w11, w12, w22 of W with W^T W the conic.
     half_extents: (n, 2), of the box of the ellipse where alpha is 1/255.
-    drawn: (n,), not culled.
+    drawn: (n,), True if not culled.
     """
 
     whitenings: Float64
@@ -42,7 +42,7 @@ def splats(conics: Float64, opacities: Float64, radii: NDArray[np.int32]) -> Spl
 
 @dataclass(frozen=True, eq=False)
 class SplatGradients:
-    """Gradients by means2d (n, 2), conics (n, 3) and opacities (n,), in loss per unit of each."""
+    """Gradients of a loss with respect to means2d (n, 2), conics (n, 3) and opacities (n,)."""
 
     means2d: Float64
     conics: Float64

@@ -13,7 +13,7 @@ from clsplat.reference.project import ALPHA_MIN, ProjectedTwin
 def touched_tiles(
     projected: ProjectedTwin, width: int, height: int, tile: int = 16, threshold: float = ALPHA_MIN
 ) -> list[Int64]:
-    """Per Gaussian the tiles, ascending and row-major, that hold a pixel centre with alpha >= threshold.
+    """For each Gaussian, the ascending row-major indices of tiles that contain a pixel centre with alpha >= threshold.
 
     The kernels' tile set must be a superset of this: a missing tile is a hole in the image, a spare one costs only
     time. The kernels test the ellipse against the tile's rectangle of pixel centres, which it may cut between two

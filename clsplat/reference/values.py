@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blending any number of values per Gaussian and its gradient, every Gaussian at every pixel.
+"""Blending of any number of values per Gaussian and its gradient, with every Gaussian evaluated at every pixel.
 
 Float64 twin of kernels/values.cl and values_grad.cl. Equation numbers refer to docs/gradients.md.
 """
@@ -62,9 +62,9 @@ class ValuesBlended:
 
 @dataclass(frozen=True, eq=False)
 class ValueGradients:
-    """Gradients by means2d (n, 2), conics (n, 3), opacities (n,), values (n, D) and background (D,).
+    """Gradients with respect to means2d (n, 2), conics (n, 3), opacities (n,), values (n, D) and background (D,).
 
-    absolute: (n, 2), sums of the absolute values of every pixel's gradient by means2d.
+    absolute: (n, 2), sums over pixels of the absolute gradients of means2d.
     """
 
     means2d: Float64

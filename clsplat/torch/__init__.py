@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's calls for PyTorch, on any OpenCL device: use `from clsplat.torch import ...` for gsplat's import."""
+"""gsplat's functions for PyTorch on any OpenCL device: import them from `clsplat.torch` instead of `gsplat`."""
 
 from __future__ import annotations
 

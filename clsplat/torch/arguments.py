@@ -19,17 +19,17 @@ from clsplat.errors import InputError, warn
 from clsplat.library.checks import plain, whole
 
 _CONVERSIONS_REPORTED: set[str] = set()
-"""Kinds of tensors whose conversion has been warned about."""
+"""Kinds of tensors, dtype and device, for which `as_array` has already warned."""
 
 
 def refuse(name: str, found: object, expected: str) -> InputError:
-    """The error for an argument: its name, its value, and the expected value."""
+    """Create the error that names an argument, the value found and the value expected."""
     return InputError(f"{name} is {found}, expected {expected}")
 
 
 @contextmanager
 def renamed(**names: str) -> Iterator[None]:
-    """Rename arguments in errors that the library raises inside: `theirs="ours"`."""
+    """In errors raised inside, replace the library's name of an argument: `library_name="name_here"`."""
     try:
         yield
     except InputError as error:
@@ -47,12 +47,12 @@ def check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     numbers.
     """
     if isinstance(value, Tensor) and (is_gradtrackingtensor(value) or is_batchedtensor(value)):
-        raise refuse(name, "a tensor of torch.func", "a plain one: clsplat.torch has the gradients of torch.autograd")
+        raise refuse(name, "a tensor of torch.func", "a plain tensor: clsplat.torch supports torch.autograd only")
     _check_shape(name, value, *shapes)
 
 
 def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
-    """Check like `check_shape`, but accept tensors of torch.func. For functions in pure PyTorch."""
+    """Check like `check_shape`, but accept tensors of torch.func, for functions in pure PyTorch."""
     expected = f"a tensor {' or '.join(_named(shape) for shape in shapes)}"
     if not isinstance(value, Tensor):
         raise refuse(name, f"a {type(value).__name__}", expected)
@@ -66,10 +66,10 @@ def _check_shape(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
 def check(name: str, value: Any, *shapes: Sequence[int | str]) -> None:
     """Raise InputError like `check_shape`, and for NaN. Tensors of torch.func are accepted."""
     _check_shape(name, value, *shapes)
-    # the sum is NaN if any number is; it takes one pass and no further array
+    # a NaN makes the sum NaN; a sum takes one pass and no extra array
     if torch.isnan(value.detach().sum()) and bool((broken := torch.isnan(value.detach())).any()):
         first = tuple(broken.nonzero()[0].tolist())
-        raise InputError(f"{name} has {int(broken.sum())} NaN, the first at {first}; expected numbers")
+        raise InputError(f"{name} has {int(broken.sum())} NaN values, the first at {first}; expected numbers")
 
 
 def _fits(found: Sequence[int], shape: Sequence[int | str]) -> bool:
@@ -95,11 +95,11 @@ def check_size(name: str, value: object) -> int:
 
 
 def check_number(name: str, value: object, least: float = -math.inf, most: float = math.inf) -> float:
-    """A number in a range, also from a tensor of one element. Raises InputError."""
+    """The argument as a float; it may be a tensor of one element. Raises InputError if it is out of range."""
     number = plain(value)
     if isinstance(number, bool) or not isinstance(number, int | float) or not least <= number <= most:
-        limits = [f"{least} or more"] * (least > -math.inf) + [f"{most} or less"] * (most < math.inf)
-        raise refuse(name, repr(value), " and ".join(["a number", *limits]))
+        limits = [f"at least {least}"] * (least > -math.inf) + [f"at most {most}"] * (most < math.inf)
+        raise refuse(name, repr(value), f"a number of {' and '.join(limits)}" if limits else "a number")
     return float(number)
 
 
@@ -112,14 +112,14 @@ def as_array(value: Tensor) -> Float32:
         kind = f"{str(value.dtype).removeprefix('torch.')} on {value.device.type}"
         if kind not in _CONVERSIONS_REPORTED:
             _CONVERSIONS_REPORTED.add(kind)
-            warn(f"tensors of {kind} are copied to float32 on the CPU, in which clsplat takes them, and results back")
+            warn(f"tensors of {kind} are copied to float32 on the CPU for clsplat, and results are copied back")
         value = value.detach().to("cpu", torch.float32)
     array: Float32 = value.detach().contiguous().numpy()
     return array
 
 
 def as_tensor(array: NDArray[Any], like: Tensor) -> Tensor:
-    """A tensor over an array's memory, on the device of `like`, and of its dtype if the numbers are real."""
+    """An array as a tensor on the device of `like`. Real numbers get the dtype of `like`. Copied only if necessary."""
     if not array.flags.writeable or not array.flags.c_contiguous:
         array = array.copy()
     tensor = torch.from_numpy(array)

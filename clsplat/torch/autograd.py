@@ -25,11 +25,11 @@ PROJECTED_SPLAT_NAMES = ("means2d", "conics", "depths", "opacities")
 """Names of the splat arrays that `ProjectionFunction` returns."""
 
 RASTERIZATION_INPUTS = ("means", "quaternions", "scales", "covars", "opacities", "colors", "viewmats", "intrinsics")
-"""Names of the gradients in `Rasterization.vjp_projection`, in the order of `ProjectionFunction.forward`."""
+"""Names of the gradients from `Rasterization.vjp_projection`, in the order of the inputs of `ProjectionFunction`."""
 
 
 class Batches:
-    """A tensor's array, batch by batch. Every item is None if the tensor is None."""
+    """A tensor as one array per batch. Every item is None if the tensor is None."""
 
     def __init__(self, value: Tensor | None, batch: tuple[int, ...]) -> None:
         array = None if value is None else as_array(value)
@@ -42,7 +42,7 @@ class Batches:
 class BatchResults:
     """Results of one call: one library result per batch, and the indices of the splats in view.
 
-    Splats are numbered through batches, cameras and Gaussians, (B, C, N).
+    A splat's index is its place in a flattened array (B, C, N): by batch, then camera, then Gaussian.
     """
 
     def __init__(
@@ -65,17 +65,17 @@ class BatchResults:
         """Indices of the splats in view; None unless packed."""
         if not self.packed:
             return None
-        radii = self.stacked("radii")  # column by column: numpy takes ten times as long over an axis of two
+        radii = self.stacked("radii")  # two comparisons: np.all over an axis of length 2 takes ten times as long
         return np.flatnonzero((radii[..., 0] > 0) & (radii[..., 1] > 0))
 
     def splats(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """SPLATS in the layout of `meta`, with the device and dtype of `like`."""
+        """The arrays PROJECTED_SPLAT_NAMES in the layout of `meta`, with the device and dtype of `like`."""
         arrays = (self.laid_out(self.stacked(name)) for name in PROJECTED_SPLAT_NAMES)
         means2d, conics, depths, opacities = (as_tensor(array, like) for array in arrays)
         return means2d, conics, depths, opacities
 
     def radii(self) -> NDArray[np.int32]:
-        """Radii in the layout of `meta`. A copy each time, since the gradient reads the library's array."""
+        """Radii in the layout of `meta`. Every call returns a copy, since the gradient reads the library's array."""
         radii = self.laid_out(self.stacked("radii"))
         return radii if self.packed else radii.copy()
 
@@ -92,11 +92,11 @@ class BatchResults:
         return first, second, third
 
     def stacked(self, name: str) -> NDArray[Any]:
-        """A result of all batches, (B, ...)."""
+        """The array `name` of the results of all batches, (B, ...)."""
         return stacked([getattr(result, name) for result in self.results])
 
     def by_camera(self, name: str) -> NDArray[Any]:
-        """A result of all batches, (..., C, ...)."""
+        """The array `name` of the results of all batches, in the shape of the call's batches: (..., C, ...)."""
         array = self.stacked(name)
         return array.reshape(*self.batch, *array.shape[1:])
 
@@ -119,10 +119,10 @@ class BatchResults:
         return array.reshape(-1, *array.shape[3:]).take(self.in_view, axis=0)
 
     def whole(self, name: str, value: Tensor | None) -> Any:
-        """A gradient in the layout of `meta`, as (B, C, N, ...).
+        """Convert a gradient from the layout of `meta` to (B, C, N, ...).
 
-        An array that `in_layout` packed is returned as it was, if the tensor is the same and PyTorch's version counter
-        shows no change.
+        If the tensor came from `in_layout` and PyTorch's version counter shows no change, return the array that it was
+        packed from.
         """
         packed, version, array = self._handed_on.pop(name, (None, 0, None))
         if value is None:
@@ -135,7 +135,7 @@ class BatchResults:
         rows = array
         if len(array) < math.prod(self.sizes):
             rows = np.zeros((math.prod(self.sizes), *array.shape[1:]), np.float32)
-            # one item per row: half the time
+            # copying each row as one item takes half the time
             one = np.dtype((np.void, array.itemsize * math.prod(array.shape[1:])))
             rows.reshape(-1).view(one)[self.in_view] = array.reshape(-1).view(one)
         return rows.reshape(*self.sizes, *array.shape[1:])
@@ -151,8 +151,8 @@ class BatchResults:
     def gradients(
         self, each: list[dict[str, Any]], inputs: dict[str, Tensor | None], needed: Sequence[bool]
     ) -> list[Tensor | None]:
-        """Gradients of the needed arguments. If the call is sparse, gradients of SPARSE_GRADIENT_ARGUMENTS arguments
-        have only the rows in view.
+        """Gradients with respect to the arguments that need one, None for the others. If the call is sparse, gradients
+        with respect to SPARSE_GRADIENT_ARGUMENTS have only the rows in view.
         """
         found = [
             self.gradient(each, name, like) if wanted else None
@@ -169,8 +169,8 @@ class BatchResults:
     def in_layout(self, each: list[dict[str, Any]], name: str, like: Tensor, *, hand_on: bool) -> Tensor:
         """Gradients of splats from all batches, in the layout of `meta`.
 
-        hand_on: keep the array for `whole`. Hooks could change the tensor without a new version, so tensors with hooks
-        are not kept.
+        hand_on: keep the array, so that `whole` need not unpack the tensor. Tensors with hooks are excluded: a hook
+        could change the tensor without a new version.
         """
         arrays = [found[name] for found in each]
         array = stacked(arrays)
@@ -181,25 +181,25 @@ class BatchResults:
 
 
 def item(whole: NDArray[Any] | None, index: int) -> NDArray[Any] | None:
-    """A batch's part of an array; None of None."""
+    """The part of an array for batch `index`; None if there is no array."""
     return None if whole is None else whole[index]
 
 
 def _is_same(one: Tensor, other: Tensor) -> bool:
-    """True for one tensor, or for two tensors over the same memory with the same layout."""
+    """True if both tensors have the same memory, shape, strides and dtype."""
     if one.is_sparse or one.data_ptr() != other.data_ptr():
         return False
     return bool(one.shape == other.shape and one.stride() == other.stride() and one.dtype == other.dtype)
 
 
 class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """From Gaussians to splats in the layout of `meta`."""
+    """Projection of Gaussians to splats in the layout of `meta`."""
 
     @staticmethod
     def forward(ctx: Any, call: BatchResults, *inputs: Tensor | None) -> tuple[Tensor | None, ...]:
-        """PROJECTED_SPLAT_NAMES and, with coefficients, colours (..., C, N, 3).
+        """The arrays PROJECTED_SPLAT_NAMES, and the colours (..., C, N, 3) if there are SH coefficients.
 
-        inputs: RASTERIZATION_INPUTS, with the upper triangles of covars, and colors only if they are coefficients.
+        inputs: RASTERIZATION_INPUTS. covars are upper triangles; colors are None unless they are SH coefficients.
         """
         ctx.call = call
         ctx.save_for_backward(*inputs)
@@ -233,7 +233,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
                 depths=item(depths, index),
                 cameras=cameras,
             )
-            if "covars" in found:  # each off-diagonal number stands for two places, with half the gradient in each
+            if "covars" in found:  # an off-diagonal number is in two places of the matrix, each with half its gradient
                 found["covars"] = found["covars"][:, UPPER_TRIANGLE_INDICES[0], UPPER_TRIANGLE_INDICES[1]] * np.array(
                     [1, 2, 2, 1, 2, 1], np.float32
                 )
@@ -242,7 +242,7 @@ class ProjectionFunction(torch.autograd.Function):  # type: ignore[misc]  # torc
 
 
 class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch has no types here
-    """From splats in the layout of `meta` to images and alphas."""
+    """Blending of splats in the layout of `meta` to images and alphas."""
 
     @staticmethod
     def forward(
@@ -257,11 +257,11 @@ class PixelsFunction(torch.autograd.Function):  # type: ignore[misc]  # torch ha
     ) -> tuple[Tensor, Tensor]:
         """Images (..., C, H, W, X) and alphas (..., C, H, W, 1).
 
-        values: (..., N, D) or (..., C, N, D), or None.
+        values: blended values (..., N, D) or (..., C, N, D), or None.
         """
         ctx.call = call
         images, alphas = call.pixels(means2d)
-        # the gradient reads these outputs too: saved, an in-place change of them raises an error
+        # the gradient reads these outputs too; as they are saved, PyTorch raises an error after an in-place change
         read = (images, alphas) if call.expected_depth else (alphas,)
         ctx.save_for_backward(means2d, conics, depths, opacities, values, backgrounds, *read)
         ctx.set_materialize_grads(False)

@@ -16,7 +16,7 @@ _R = TypeVar("_R")
 
 
 def differentiable_once(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """The `backward` of an autograd function without a second derivative. Asking for one raises an error."""
+    """Mark the `backward` of an autograd function as not differentiable: a second derivative raises an error."""
     return once_differentiable(function)  # type: ignore[no-any-return]
 
 

@@ -29,16 +29,16 @@ def quat_scale_to_covar_preci(
     quats : (..., 4) Tensor
         w, x, y, z, of any length over 0.
     scales : (..., 3) Tensor
-        Standard deviations along the axes, in units of the scene. Over 0 if precisions are wanted.
+        Standard deviations along the axes, in units of the scene. Precisions need scales above 0.
     compute_covar, compute_preci : bool
-        The results to compute.
+        Whether to compute covariances and precisions.
     triu : bool
         Return the upper triangles, row by row.
 
     Returns
     -------
     covariances, precisions : (..., 3, 3) or (..., 6) Tensor, or None
-        (..., 6) with `triu`; None if not asked for. Both can be differentiated any number of times.
+        (..., 6) with `triu`; None if not requested. Both can be differentiated any number of times.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 def sparse_upper(covars: Tensor) -> Tensor:
     """The upper triangles (N, 6) of matrices (N, 3, 3).
 
-    Their gradient may be a COO tensor of rows. The gradient of the matrices is then one too.
+    If their gradient is a COO tensor of rows, the gradient of the matrices is a COO tensor too.
     """
     upper: Tensor = _SparseUpper.apply(covars)
     return upper

@@ -42,7 +42,7 @@ def spherical_harmonics(
     Returns
     -------
     (..., 3) Tensor
-        The sums, without the 0.5 and the floor at 0 that `rasterization` adds.
+        The sums. `rasterization` also adds 0.5 to them, and clamps them at 0.
 
     Raises
     ------

@@ -58,17 +58,19 @@ class GivenTensors:
 
     @property
     def require_grad(self) -> bool:
-        """True if a tensor wants a gradient."""
+        """True if any tensor requires a gradient."""
         return any(each.requires_grad for each in self.present)
 
     @property
     def have_tangents(self) -> bool:
-        """True if a tensor is a dual one of PyTorch's forward mode."""
+        """True if any tensor is a dual tensor of PyTorch's forward-mode differentiation."""
         return any(forward_ad.unpack_dual(each).tangent is not None for each in self.present)
 
     def check(self, sh_degree: int | None) -> tuple[int, ...]:
-        """The sizes of the batches. Raises InputError unless shapes fit `rasterization`, and if backgrounds have
-        NaN."""
+        """Check the tensors, and return the sizes of the batches.
+
+        Raises InputError for a shape that does not fit `rasterization`, and for NaN in backgrounds.
+        """
         means, viewmats, colors = self.means, self.viewmats, self.colors
         leading = means.shape[:-2] if isinstance(means, Tensor) and means.dim() >= 2 else ()
         check_shape("means", means, (*leading, "N", 3))
@@ -82,10 +84,10 @@ class GivenTensors:
         check_shape("viewmats", viewmats, (*batch, "C", 4, 4))
         cameras = viewmats.shape[-3]
         if cameras == 0 or 0 in batch:
-            raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "a camera or more in each batch")
+            raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "at least one camera in each batch")
         check_shape("Ks", self.Ks, (*batch, cameras, 3, 3))
         _check_colors(colors, batch, cameras, count, sh_degree)
-        if self.backgrounds is not None:  # with depth only, nothing else checks these numbers
+        if self.backgrounds is not None:  # if only depth is rendered, no other code checks them
             shape = (*batch, cameras, colors.shape[-1])
             check_shape("backgrounds", self.backgrounds, shape)
             check("backgrounds", self.backgrounds, shape)
@@ -135,14 +137,14 @@ class GivenTensors:
 
 
 def _check_colors(colors: Any, batch: tuple[int, ...], cameras: int, count: int, sh_degree: int | None) -> None:
-    """Raise InputError unless colors are colours, or SH coefficients enough for the degree."""
+    """Raise InputError unless colors are colours, or enough SH coefficients for the degree."""
     if sh_degree is None:
         check_shape("colors", colors, (*batch, count, "D"), (*batch, cameras, count, "D"))
         if colors.shape[-1] == 0:
-            raise refuse("colors", "of 0 channels", "1 or more")
+            raise refuse("colors", "a tensor without channels", "at least 1 channel")
         return
     sh_degree = degree("sh_degree", sh_degree, MAX_SH_BASIS_DEGREE, ", or None for colours")
     check_shape("colors", colors, (*batch, count, "K", 3), (*batch, cameras, count, "K", 3))
     if colors.shape[-2] < (needed := (sh_degree + 1) ** 2):
-        found = f"of {colors.shape[-2]} coefficients"
-        raise refuse("colors", found, f"{needed} or more, for sh_degree {sh_degree}")
+        found = f"a tensor of {colors.shape[-2]} SH coefficients"
+        raise refuse("colors", found, f"at least {needed} for sh_degree {sh_degree}")

@@ -12,8 +12,8 @@ from clsplat.torch.compile_guards import outside_graphs
 class Meta(dict[str, Any]):
     """A dictionary with lazy entries. Each function runs once, on the first access to one of its names.
 
-    It behaves like the complete dictionary, except for time and in-place changes. If an entry is changed in place,
-    entries computed from it later use the changed values.
+    It behaves like a dictionary with all entries computed, with one exception: if an entry is changed in place, entries
+    that are later computed from it use the changed values.
     """
 
     def __init__(self, entries: dict[str, Any]) -> None:
@@ -53,7 +53,7 @@ class Meta(dict[str, Any]):
         self._makers.pop(name, None)
         super().__delitem__(name)
 
-    def __iter__(self) -> Iterator[str]:  # without its own, dict(meta) would bypass __getitem__
+    def __iter__(self) -> Iterator[str]:  # without this override, dict(meta) would bypass __getitem__
         return super().__iter__()
 
     def update(self, *given: Any, **named: Any) -> None:

@@ -41,7 +41,7 @@ def rasterize_to_pixels(
     Parameters
     ----------
     means2d : (..., N, 2) Tensor
-        Pixels; the first pixel's centre is at 0.5. With `packed` (nnz, 2), as all tensors below without the axis N.
+        Pixels; the first pixel's centre is at 0.5. With `packed`, (nnz, 2): nnz replaces ..., N in all tensors.
     conics : (..., N, 3) Tensor
         xx, xy, yy of the inverse covariance, 1 / px^2.
     colors : (..., N, D) Tensor
@@ -51,7 +51,7 @@ def rasterize_to_pixels(
     image_width, image_height : int
         Pixels.
     tile_size : int
-        16, the only size that clsplat has.
+        16, the only size that clsplat supports.
     isect_offsets : (..., tile_height, tile_width) Tensor of int
         Start of each tile's list in flatten_ids, from `isect_offset_encode`.
     flatten_ids : (n_isects,) Tensor of int
@@ -61,7 +61,7 @@ def rasterize_to_pixels(
     masks : (..., tile_height, tile_width) Tensor of bool, optional
         Tiles that are False show only the background.
     packed : bool
-        The splats of all images are in one axis.
+        True if the splats of all images are along one axis.
     absgrad : bool
         Let the backward pass set `means2d.absgrad` to the sums over pixels of absolute gradients.
     alpha_max : float
@@ -115,7 +115,7 @@ def _check_splats(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Te
     """Raise InputError unless the shapes fit."""
     leading = tuple(means2d.shape[:-1]) if isinstance(means2d, Tensor) and means2d.dim() > 1 else ("N",)
     if packed and len(leading) != 1:
-        raise refuse("means2d", tuple(means2d.shape), "(nnz, 2) where packed is True")
+        raise refuse("means2d", tuple(means2d.shape), "(nnz, 2), as packed is True")
     check_shape("means2d", means2d, (*leading, 2))
     check_shape("conics", conics, (*leading, 3))
     check_shape("colors", colors, (*leading, "D"))

@@ -17,7 +17,7 @@ from clsplat.torch.autograd import Batches, BatchResults, item
 from clsplat.torch.compile_guards import differentiable_once, outside_graphs
 
 PROJECTION_INPUTS = ("means", "quaternions", "scales", "covars", "viewmats", "intrinsics")
-"""Names of the gradients in the library's vector-Jacobian product, in the order of `_Projection.forward`."""
+"""Names of the gradients that the library's `vjp` returns, in the order of the inputs of `_Projection`."""
 PROJECTION_OUTPUTS = ("means2d", "depths", "conics", "compensations")
 
 
@@ -56,30 +56,30 @@ def fully_fused_projection(
     quats : (..., N, 4) Tensor or None
         w, x, y, z, of any length over 0. Used if covars is None.
     scales : (..., N, 3) Tensor or None
-        Standard deviations over 0, world units. Used if covars is None.
+        Standard deviations above 0 in world units. Used if covars is None.
     viewmats : (..., C, 4, 4) Tensor
         Camera from world.
     Ks : (..., C, 3, 3) Tensor
-        Intrinsics, pixels.
+        Intrinsics in pixels.
     width, height : int
         Pixels.
     eps2d : float
-        Low-pass filter: added to each variance on the image, px^2.
+        Low-pass filter in px^2, which is added to each variance on the image.
     near_plane, far_plane : float
-        Gaussians whose depth is not strictly between these are not in view, world units.
+        World units. Gaussians whose depth is not strictly between these are not in view.
     radius_clip : float
-        Splats whose radii are at most this are not in view, pixels.
+        Pixels. Splats whose radii are at most this are not in view.
     packed : bool
         Return only the splats in view.
     sparse_grad : bool
-        With `packed` and without batches: the gradients of means, covars, quats and scales are COO tensors of the rows
-        in view.
+        Make the gradients of means, covars, quats and scales COO tensors of the rows in view. Requires `packed`, and no
+        batches.
     calc_compensations : bool
         Also compute sqrt(det(covariance without eps2d) / det(covariance with eps2d)).
     camera_model : str
         "pinhole", "ortho" or "fisheye" (equidistant).
     opacities : (..., N) Tensor, optional
-        0 to 1. With them the radii end where alpha is 1/255.
+        0 to 1. If given, the radii end where alpha is 1/255.
     device : Device or str, optional
         An open OpenCL device, or a name as `clsplat devices` lists them.
 
@@ -111,7 +111,7 @@ def fully_fused_projection(
     width, height = check_size("width", width), check_size("height", height)
     leading = _check_tensors(means, covars, quats, scales, viewmats, Ks, opacities)
     if sparse_grad and (leading or not packed):
-        raise refuse("sparse_grad", sparse_grad, "False with batches, and where packed is False")
+        raise refuse("sparse_grad", sparse_grad, "False, as there are batches or packed is False")
     if covars is not None:
         quats = scales = None
     given = (means, covars, quats, scales, viewmats, Ks, opacities)
@@ -153,7 +153,7 @@ def _check_tensors(
     Ks: Tensor,  # noqa: N803
     opacities: Tensor | None,
 ) -> tuple[int, ...]:
-    """The sizes of the batches. Raises InputError unless the shapes fit."""
+    """Check the shapes, and return the sizes of the batches. Raises InputError."""
     leading = tuple(means.shape[:-2]) if isinstance(means, Tensor) and means.dim() >= 2 else ()
     check_shape("means", means, (*leading, "N", 3))
     count = means.shape[-2]
@@ -165,7 +165,7 @@ def _check_tensors(
     check_shape("viewmats", viewmats, (*leading, "C", 4, 4))
     check_shape("Ks", Ks, (*leading, viewmats.shape[-3], 3, 3))
     if viewmats.shape[-3] == 0 or 0 in leading:
-        raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "a camera or more in each batch")
+        raise refuse("viewmats", f"of shape {tuple(viewmats.shape)}", "at least one camera in each batch")
     if opacities is not None:
         check_shape("opacities", opacities, (*leading, count))
     return leading

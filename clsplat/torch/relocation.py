@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Relocation of Gaussians to the place of another one: plain PyTorch, on the tensors' own device."""
+"""Relocation of Gaussians to the place of another Gaussian: plain PyTorch, on the tensors' own device."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from clsplat.torch.arguments import check, refuse
 def compute_relocation(
     opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, *, min_opacity: float = 0.0
 ) -> tuple[Tensor, Tensor]:
-    """Compute opacities and scales of n Gaussians at one place that together look like one, like gsplat 1.5.3's
-    function.
+    """Compute opacities and scales with which n Gaussians at one place look like a single Gaussian.
+
+    Follows gsplat 1.5.3's function of this name.
 
     Parameters
     ----------
@@ -22,9 +23,9 @@ def compute_relocation(
     scales : (N, 3) Tensor
         Standard deviations.
     ratios : (N,) Tensor
-        Number n of Gaussians that share each place, of any dtype; clamped to 1 to n_max.
+        Number n of Gaussians that share each place. Any dtype; clamped to 1 to n_max.
     binoms : (n_max, n_max) Tensor
-        binoms[n, k] = n over k.
+        binoms[n, k] is the binomial coefficient n over k.
     min_opacity : float
         Smallest new opacity, an argument of gsplat 1.6.
 
@@ -42,8 +43,8 @@ def compute_relocation(
 
     Notes
     -----
-    Eq. (9) of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". Its alternating sum is
-    computed in float64.
+    Eq. (9) of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo"; (94) of
+    docs/gradients.md. The alternating sum is computed in float64.
     """
     check("opacities", opacities, ("N",))
     count = len(opacities)

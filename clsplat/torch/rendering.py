@@ -24,14 +24,14 @@ from clsplat.torch.lazy_info import Meta
 from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 
 HIT_DISTANCE_RENDER_MODES = ("d", "Ed", "RGB-d", "RGB-Ed")
-"""Modes of gsplat 1.6, which it supports only with `with_eval3d`."""
+"""Render modes that gsplat 1.6 supports only with `with_eval3d`."""
 GSPLAT_TILE_SIZE_PX = 16
 PACKED_ID_NAMES = ("batch_ids", "camera_ids", "gaussian_ids")
 """Names of a splat's indices in `meta`."""
 
 
 class RollingShutterType(Enum):
-    """gsplat's names of shutters. clsplat supports GLOBAL."""
+    """gsplat's types of shutters. clsplat supports only GLOBAL."""
 
     ROLLING_TOP_TO_BOTTOM = 0
     ROLLING_LEFT_TO_RIGHT = 1
@@ -82,16 +82,16 @@ def rasterization(
     rays: Tensor | None = None,
     lidar_coeffs: Any = None,
     external_distortion_coeffs: Any = None,
-    ut_params: Any = None,  # noqa: ARG001  # of with_ut
+    ut_params: Any = None,  # noqa: ARG001  # settings of with_ut
     extra_signals: Tensor | None = None,
     extra_signals_sh_degree: int | None = None,
     renderer_config: Any = None,
     alpha_max: float = 0.999,
     device: Device | str | None = None,
 ) -> tuple[Tensor, Tensor, Meta]:
-    """Render N Gaussians to images of C cameras: gsplat 1.5.3's function, with gsplat 1.6's further arguments by name.
+    """Render N Gaussians to images of C cameras: gsplat 1.5.3's function, with gsplat 1.6's new keyword arguments.
 
-    The leading sizes `...` are batches, and may be absent. Every tensor has a gradient, `Ks` too.
+    The leading sizes `...` are batches, and may be absent. Every tensor has a gradient, including `Ks`.
 
     Parameters
     ----------
@@ -100,37 +100,37 @@ def rasterization(
     quats : (..., N, 4) Tensor
         w, x, y, z, of any length over 0.
     scales : (..., N, 3) Tensor
-        Standard deviations over 0, in units of the scene.
+        Standard deviations above 0, in units of the scene.
     opacities : (..., N) Tensor
         0 to 1.
     colors : (..., N, D) or (..., C, N, D) Tensor, or None
-        Any D. With `sh_degree`, coefficients (..., N, K, 3) or (..., C, N, K, 3), K at least (sh_degree + 1)^2; order
-        and signs as in 3DGS files. May be None if only depth is rendered.
+        Any D. With `sh_degree`, SH coefficients (..., N, K, 3) or (..., C, N, K, 3), with order and signs as in 3DGS
+        files; K is at least (sh_degree + 1)^2. May be None if only depth is rendered.
     viewmats : (..., C, 4, 4) Tensor
         Camera from world; x right, y down, z forward.
     Ks : (..., C, 3, 3) Tensor
-        Intrinsics, pixels; the first pixel's centre is at 0.5. Skew is ignored.
+        Intrinsics in pixels; the first pixel's centre is at 0.5. Skew is ignored.
     width, height : int
-        Pixels. Sizes and numbers may be tensors of one element, and sizes may be floats such as 40.0.
+        Pixels. All sizes and numbers may be tensors of one element. Sizes may also be floats such as 40.0.
     near_plane, far_plane : float
-        Gaussians whose depth is not strictly between these are not drawn, in units of the scene.
+        In units of the scene. Gaussians whose depth is not strictly between these are not drawn.
     radius_clip : float
-        Splats whose radii are at most this are not drawn, pixels.
+        Pixels. Splats whose radii are at most this are not drawn.
     eps2d : float
-        Low-pass filter: added to the variances of each splat, px^2.
+        Low-pass filter in px^2, which is added to the variances of each splat.
     sh_degree : int, optional
-        Degree to use, 0 to 4. None if colors are colours.
+        SH degree to use, 0 to 4. None if colors are not SH coefficients.
     packed : bool
         Let `meta` list only the splats in view.
     tile_size : int or None
-        Pixels, for the tile lists in `meta` only. None means 16.
+        Side of a tile in pixels, which affects only the tile lists in `meta`. None means 16.
     backgrounds : (..., C, D) Tensor, optional
         Black if None.
     render_mode : str
         "RGB", "D" (depth along z), "ED" (expected depth), "RGB+D" or "RGB+ED". The depth is the last channel.
     sparse_grad : bool
-        With `packed` and without batches: the gradients of means, quats and scales (or covars) are COO tensors of the
-        rows in view.
+        Make the gradients of means, quats and scales (or covars) COO tensors of the rows in view. Requires `packed`,
+        and no batches.
     absgrad : bool
         Let the backward pass set `meta["means2d"].absgrad` to the sums over pixels of absolute gradients.
     rasterize_mode : str
@@ -138,11 +138,11 @@ def rasterization(
     camera_model : str
         "pinhole", "ortho" or "fisheye" (equidistant).
     covars : (..., N, 3, 3) Tensor, optional
-        Covariances instead of quats and scales, which may be None.
+        Covariances that replace quats and scales, which may then be None.
     channel_chunk, segmented, ut_params
         Ignored; they change no result.
     alpha_max : float
-        The cap of alpha, under 1. gsplat's default is 0.999; `clsplat train` and `render` use 0.99.
+        The cap of alpha, below 1. gsplat's default is 0.999; `clsplat train` and `render` use 0.99.
     device : Device or str, optional
         An open OpenCL device, or a name as `clsplat devices` lists them. None means the default device
         (docs/drivers.md).
@@ -160,13 +160,13 @@ def rasterization(
     Returns
     -------
     images : (..., C, height, width, X) Tensor
-        X is D, 1 or D + 1, by the render mode.
+        X is D, 1 or D + 1, depending on the render mode.
     alphas : (..., C, height, width, 1) Tensor
         0 to 1.
     meta : dict
         gsplat's names: "batch_ids", "camera_ids", "gaussian_ids" (nnz,) int64, None unless packed. "radii" (..., C, N,
-        2) or (nnz, 2) int32, pixels, 0 if not in view. "means2d" (..., 2), pixels. "depths". "conics" (..., 3): xx, xy,
-        yy of the inverse covariance, 1 / px^2. "opacities", after compensation. "tiles_per_gauss", "isect_ids",
+        2) or (nnz, 2) int32, in pixels, 0 if not in view. "means2d" (..., 2) in pixels. "depths". "conics" (..., 3):
+        xx, xy, yy of the inverse covariance, 1 / px^2. "opacities", after compensation. "tiles_per_gauss", "isect_ids",
         "flatten_ids" and "isect_offsets" are computed on first access. Also "tile_width", "tile_height", "width",
         "height", "tile_size", "n_batches" and "n_cameras".
 
@@ -179,8 +179,8 @@ def rasterization(
 
     Notes
     -----
-    Kerbl et al. 2023; gsplat 1.5.3, https://docs.gsplat.studio. float32 tensors on the CPU share their memory with a
-    CPU's OpenCL device. Others are copied there and back, with one warning.
+    Kerbl et al. 2023; gsplat 1.5.3, https://docs.gsplat.studio. If OpenCL runs on the CPU, it reads
+    float32 tensors on the CPU in place. Tensors of other types or devices are copied to them and back, with a warning.
     """
     _refuse_missing(
         distributed=distributed,
@@ -233,7 +233,7 @@ def rasterization(
         results = given.rasterized(settings, batch, differentiable=differentiable)
     expected = render_mode.endswith("ED")
     call = BatchResults(results, batch, packed=packed, sparse=sparse_grad, absolute=absgrad, expected_depth=expected)
-    if not differentiable and not given.have_tangents:  # for a dual tensor PyTorch then raises: no forward derivative
+    if not differentiable and not given.have_tangents:  # with dual tensors, PyTorch raises an error below
         return *call.pixels(means), _meta(call, means, None, width, height, tile_size)
     splats, images, alphas = _with_gradient(call, given, settings.sh_degree, depth_alone=depth_alone)
     return images, alphas, _meta(call, means, splats, width, height, tile_size)
@@ -242,7 +242,7 @@ def rasterization(
 def _with_gradient(
     call: BatchResults, given: GivenTensors, sh_degree: int | None, *, depth_alone: bool
 ) -> tuple[list[Tensor], Tensor, Tensor]:
-    """PROJECTED_SPLAT_NAMES, images and alphas with their gradient."""
+    """The arrays PROJECTED_SPLAT_NAMES, the images and the alphas, connected to their gradients."""
     covars, colors = given.covars, given.colors
     if covars is not None:
         covars = (
@@ -259,22 +259,22 @@ def _with_gradient(
 
 
 def _refuse_settings(global_z_order: Any, renderer_config: Any, render_mode: str, rolling_shutter: Any) -> None:
-    """Raise InputError for settings that gsplat has only with `with_ut` or `with_eval3d`."""
+    """Raise InputError for settings that gsplat supports only with `with_ut` or `with_eval3d`."""
     if global_z_order is not True:
         raise refuse(
-            "global_z_order", global_z_order, "True: clsplat.torch has no with_ut, which gsplat has False with"
+            "global_z_order", global_z_order, "True: gsplat allows False only with with_ut, which clsplat.torch lacks"
         )
     if type(renderer_config).__name__ not in {"NoneType", "RendererConfig_MixedBatch"}:
-        raise refuse("renderer_config", f"a {type(renderer_config).__name__}", "None: clsplat.torch has no with_eval3d")
+        raise refuse("renderer_config", f"a {type(renderer_config).__name__}", "None: clsplat.torch lacks with_eval3d")
     if render_mode in HIT_DISTANCE_RENDER_MODES:
         raise refuse(
             "render_mode",
             repr(render_mode),
-            f"one of {', '.join(RASTERIZE_RENDER_MODES)}: clsplat.torch has no with_eval3d, which gsplat has hit "
-            "distances with",
+            f"one of {', '.join(RASTERIZE_RENDER_MODES)}: gsplat renders hit distances only with with_eval3d, which "
+            "clsplat.torch lacks",
         )
     if getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL":
-        raise refuse("rolling_shutter", rolling_shutter, "GLOBAL, the one that clsplat.torch has")
+        raise refuse("rolling_shutter", rolling_shutter, "GLOBAL, the only shutter that clsplat.torch supports")
 
 
 def _refuse_missing(**given: Any) -> None:
@@ -282,19 +282,19 @@ def _refuse_missing(**given: Any) -> None:
         if value is not None and value is not False:
             found = str(value) if isinstance(value, bool) else "given"
             wanted = "False" if isinstance(value, bool) else "None"
-            raise refuse(name, found, f"{wanted}: clsplat.torch does not have it")
+            raise refuse(name, found, f"{wanted}: clsplat.torch does not support it")
 
 
 def _meta(
     call: BatchResults, like: Tensor, splats: Sequence[Tensor] | None, width: int, height: int, tile_size: int
 ) -> Meta:
-    """gsplat's dictionary, in its order.
+    """The dictionary `meta` of `rasterization`, with gsplat's entries in gsplat's order.
 
-    like: a tensor with the device and dtype of tensors that are computed later.
-    splats: PROJECTED_SPLAT_NAMES with their gradient. If None, they have no gradient and are computed on first access.
+    like: a tensor whose device and dtype the entries get.
+    splats: the arrays PROJECTED_SPLAT_NAMES. If None, they have no gradient and are computed on first access.
     """
     batches, cameras, _ = call.sizes
-    like = like.new_empty(0)  # the dictionary would keep the caller's tensor alive
+    like = like.new_empty(0)  # an empty tensor: the dictionary must not keep the caller's tensor alive
     columns, rows = math.ceil(width / tile_size), math.ceil(height / tile_size)
 
     def ids() -> dict[str, Any]:
@@ -306,7 +306,7 @@ def _meta(
     def all_splats() -> dict[str, Any]:
         return dict(zip(PROJECTED_SPLAT_NAMES, call.splats(like) if splats is None else splats, strict=True))
 
-    # None of these refers to the dictionary: a cycle would keep the call's memory until the garbage collector runs.
+    # These functions must not refer to the dictionary: a cycle would keep memory until the garbage collector runs.
     def tiles() -> dict[str, Any]:
         batch_ids, camera_ids, gaussian_ids = (None, None, None) if call.in_view is None else call.ids(like.device)
         means2d, _, depths, _ = call.splats(like)

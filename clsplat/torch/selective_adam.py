@@ -55,7 +55,8 @@ class SelectiveAdam(torch.optim.Adam):  # type: ignore[misc]  # torch has no typ
             if parameter.grad is None:
                 continue
             if parameter.dim() == 0 or len(parameter) != len(rows):
-                raise refuse("visibility", tuple(visibility.shape), f"{len(parameter)} numbers, one for each row")
+                found = f"of shape {tuple(visibility.shape)}"
+                raise refuse("visibility", found, f"{len(parameter)} numbers, one for each row")
             with torch.no_grad():
                 self._update(parameter, rows, group)
 

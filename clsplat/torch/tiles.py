@@ -45,7 +45,7 @@ def isect_tiles(
     depths : (..., N) Tensor
         With `packed` (nnz,).
     tile_size : int
-        Side of a tile, pixels.
+        Side of a tile in pixels.
     tile_width, tile_height : int
         Number of tiles across and down.
     sort : bool
@@ -53,15 +53,15 @@ def isect_tiles(
     segmented : bool
         Ignored; it changes no result.
     packed : bool
-        The splats of all images are in one axis. image_ids, gaussian_ids and n_images are then required.
+        True if the splats of all images are along one axis. Then image_ids, gaussian_ids and n_images are required.
     n_images : int, optional
-        Number of images, with `packed`.
+        Number of images. Required with `packed`.
     image_ids : (nnz,) Tensor of int, optional
         Image of each splat, below n_images.
     gaussian_ids : (nnz,) Tensor of int, optional
         Not used for any result.
     conics, opacities : None
-        Arguments of gsplat 1.6, which skips tiles by them; not supported.
+        Only None is supported. gsplat 1.6 uses these arguments to skip tiles.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def isect_tiles(
     """
     for name, value in (("conics", conics), ("opacities", opacities)):
         if value is not None:
-            raise refuse(name, "given", "None: clsplat.torch has the tiles of a box alone")
+            raise refuse(name, "given", "None: clsplat.torch lists all tiles of a splat's box")
     _check_splats(means2d, radii, depths)
     images = _checked_ids(n_images, image_ids, gaussian_ids) if packed else None
     found = tiles.isect_tiles(
@@ -114,7 +114,7 @@ def _checked_ids(n_images: int | None, image_ids: Tensor | None, gaussian_ids: T
     """The image of each packed splat. Raises InputError if an argument is missing."""
     for name, value in (("n_images", n_images), ("image_ids", image_ids), ("gaussian_ids", gaussian_ids)):
         if value is None:
-            raise refuse(name, None, "given where packed is True")
+            raise refuse(name, None, "a value, as packed is True")
     assert image_ids is not None
     images: NDArray[Any] = image_ids.cpu().numpy()
     return images

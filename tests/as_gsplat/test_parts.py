@@ -126,7 +126,7 @@ def test_adam_of_rows() -> None:
         assert torch.allclose(optimiser.state[parameter]["exp_avg_sq"][row], second)
     parameter.grad = torch.sparse_coo_tensor(torch.tensor([[0, 0]]), some(2, 2), (6, 2)).double()
     optimiser.step(torch.tensor([1.0, 1, 1, 1, 1, 1]))
-    with pytest.raises(InputError, match=r"visibility is \(5,\), expected 6 numbers"):
+    with pytest.raises(InputError, match=r"visibility is of shape \(5,\), expected 6 numbers"):
         optimiser.step(torch.ones(5))
 
 

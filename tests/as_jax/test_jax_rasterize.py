@@ -212,7 +212,7 @@ def test_counts(default_device: Device, count: int) -> None:
         ("backgrounds", np.zeros(4), r"backgrounds: got shape \(4,\), expected \(2, 3\)"),
         ("means", None, "means is None, expected an array"),
         ("scales", None, "scales is None, expected an array, as covars is None too"),
-        ("covars", np.zeros((65, 6)), "covars: expected either these, or quaternions and scales"),
+        ("covars", np.zeros((65, 6)), "covars: expected either covars, or quaternions and scales"),
         ("colors", np.zeros((65, 0)), "colors has 0 channels, expected 1 or more"),
         ("render_mode", "depth", "render_mode is 'depth', expected one of RGB, D"),
         ("rasterize_mode", "smooth", "rasterize_mode is 'smooth', expected one of classic, antialiased"),

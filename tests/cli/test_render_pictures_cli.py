@@ -531,7 +531,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--supersample 0", "a.#.exr", "--supersample 0: expected 1 to 64"),
         ("--shutter-open 0.1", "a.#.exr", "--shutter-open 0.1 --shutter-close None: expected two times"),
         ("--aperture 0.1", "a.#.exr", "--focus 0.0: expected the depth that is in focus"),
-        ("--deep --supersample 2", "a.#.exr", "deep EXR: --supersample has no deep samples"),
+        ("--deep --supersample 2", "a.#.exr", "deep EXR: --supersample cannot filter deep samples"),
         ("--deep --channels rgb,depth", "a.#.exr", "--deep: cannot hold depth, only colour, alpha, depths"),
         ("--deep --parts several", "a.#.exr", "--deep and --parts several exclude each other"),
         ("--deep", "a.#.tif", "cannot hold deep samples, expected an .exr file"),

@@ -123,7 +123,7 @@ def test_back_to_the_space_of_the_model() -> None:
 
 def test_what_deep_pictures_have_not() -> None:
     PictureConfig(framing=FramingConfig(region="0,0,5,5")).check_deep()
-    with pytest.raises(InputError, match="deep EXR: --supersample has no deep samples"):
+    with pytest.raises(InputError, match="deep EXR: --supersample cannot filter deep samples"):
         PictureConfig(framing=FramingConfig(supersample=2)).check_deep()
     PictureConfig(sampling=SamplingConfig(shutter_angle=9.0)).check_deep()
     with pytest.raises(InputError, match="--supersample 0"):

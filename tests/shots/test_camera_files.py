@@ -102,7 +102,7 @@ def test_camera_path_of_other_cameras(tmp_path: Path) -> None:
         ({"camera_path": [{"camera_to_world": POSE, "fov": 10**400}]}, "'fov' is 1000"),
         (
             {"camera_path": [{"camera_to_world": POSE, "fov": 1e-320}]},
-            "key 0: 'fov': angle of view 9.90602e-321 degrees",
+            "key 0: 'fov': angle of view is 9.90602e-321 degrees",
         ),
     ],
 )
@@ -254,10 +254,13 @@ def test_lenses_of_own_format(tmp_path: Path) -> None:
         ({"keys": [key(world_from_cam=[0, 0, 0, 0])]}, "expected a unit quaternion [w, x, y, z]"),
         ({"fov_x": None}, "key 0: has no focal length, expected one of 'fx' (with 'fy' if that differs), 'fov_x' or"),
         ({"fov_y": 50}, "key 0: has 'fov_x' 90, 'fov_y' 50, expected one of 'fx'"),
-        ({"fov_x": 180}, "key 0: 'fov_x': angle of view 180 degrees, expected more than 0 and less than 180"),
-        ({"fov_x": 361, "projection": "fisheye"}, "'fov_x': angle of view 361 degrees, expected more than 0 and at"),
+        ({"fov_x": 180}, "key 0: 'fov_x': angle of view is 180 degrees, expected more than 0 and less than 180"),
+        ({"fov_x": 361, "projection": "fisheye"}, "'fov_x': angle of view is 361 degrees, expected more than 0 and at"),
         ({"fov_x": -5}, "key 0: has 'fov_x' -5, expected more than 0"),
-        ({"fov_x": 1e-320}, "key 0: 'fov_x': angle of view 9.90602e-321 degrees, for a focal length of over 1e+12"),
+        (
+            {"fov_x": 1e-320},
+            "key 0: 'fov_x': angle of view is 9.90602e-321 degrees, which gives a focal length over 1e+12",
+        ),
         ({"fov_x": None, "fx": 1e13}, "key 0: a focal length of 1e+13, expected at most 1e+12"),
         ({"projection": "equirectangular", "fov_x": 1e-320}, "key 0: a focal length of inf, expected at most 1e+12"),
         ({"projection": "orthographic"}, "key 0: has 'fov_x' 90, expected one of 'fx' (with 'fy' if that differs), 'p"),

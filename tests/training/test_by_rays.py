@@ -112,7 +112,7 @@ def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: C
 def test_what_it_does_not_go_with(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     call = ["train", str(folder), "-o", str(tmp_path / "run"), "--perspective", "rays", "--refine-lenses"]
     assert main(call) == 2
-    assert "rays have no gradient by the lens, expected --perspective plane with it" in capsys.readouterr().err
+    assert "not supported with --perspective rays, expected --perspective plane" in capsys.readouterr().err
     assert main(["train", str(folder), "-o", str(tmp_path / "run"), "--perspective", "fisheye"]) == 2
     assert "--perspective" in capsys.readouterr().err
 

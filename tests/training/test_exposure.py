@@ -206,7 +206,7 @@ def test_a_checkpoint_without_gains_is_refused(default_device: Device, scene: Sc
 
 
 def test_settings_that_exclude_each_other() -> None:
-    with pytest.raises(InputError, match=r"--appearance exposure: not with --masks transparent"):
+    with pytest.raises(InputError, match=r"--appearance exposure: excludes --masks transparent"):
         TrainConfig(appearance="exposure", masks="transparent").check()
 
 

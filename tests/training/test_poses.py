@@ -186,12 +186,12 @@ def test_a_checkpoint_that_is_damaged(
 
 def test_settings_that_make_no_sense(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     for config, text in (
-        (replace(CONFIG, batch=2), "--refine-poses: not with --batch 2, "),
+        (replace(CONFIG, batch=2), "--refine-poses: not supported with --batch 2, "),
         (replace(CONFIG, pose_reach=0.0), "--pose-reach 0.0: expected over 0"),
     ):
         with pytest.raises(InputError, match=text):
             config.check()
-    with pytest.raises(InputError, match="--refine-poses: not with 2 devices"):
+    with pytest.raises(InputError, match="--refine-poses: not supported with 2 devices"):
         CONFIG.on_devices(2, explicit=False)
     few = replace(scene, views=[*scene.train_views[:2], *scene.test_views])
     with pytest.raises(InputError, match="--refine-poses: 2 training views, expected 3 or more"):

@@ -128,9 +128,9 @@ def test_what_is_bent_is_refused(scene: Scene) -> None:
 
 
 def test_refusals(scene: Scene, default_device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--refine-lenses: not with --batch 2"):
+    with pytest.raises(InputError, match="--refine-lenses: not supported with --batch 2"):
         TrainConfig(refine_lenses=True, batch=2).check()
-    with pytest.raises(InputError, match="--refine-lenses: not with 2 devices"):
+    with pytest.raises(InputError, match="--refine-lenses: not supported with 2 devices"):
         TrainConfig(refine_lenses=True).on_devices(2, explicit=False)
     with pytest.raises(InputError, match="over 0 and at most 50 hundredths"):
         TrainConfig(lens_reach=0.0).check()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of gsplat 1.5.3 and 1.6 that clsplat does not have. A call of one raises an error that names it."""
+"""Names of gsplat 1.5.3 and 1.6 that clsplat lacks, and their replacements, which raise an error when called."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CUDA_ONLY_NAMES = (
     "spherical_harmonics_l1_plus",
     "world_to_cam",
 )
-"""Functions that gsplat has only in CUDA, and clsplat does not have."""
+"""Functions that gsplat implements only in CUDA and that clsplat lacks."""
 CUDA_ONLY_MODULES = ("gsplat.cuda._wrapper", "gsplat.rendering", "gsplat.losses_fused")
 """gsplat's modules that define these functions."""
 PURE_PYTHON_NAMES = (
@@ -51,16 +51,16 @@ PURE_PYTHON_NAMES = (
     "rasterization_2dgs_inria_wrapper",
     "rasterization_inria_wrapper",
 )
-"""gsplat's own Python names that need no CUDA. They stay gsplat's if it is installed."""
+"""Names of gsplat's Python code that needs no CUDA. They are not replaced if gsplat is installed."""
 
 
 def what_is_absent(name: str) -> str:
-    """The message of the error that clsplat does not have gsplat's function `name`."""
-    return f"{name} is gsplat's, in CUDA alone, and clsplat does not have it: docs/library.md lists what it has"
+    """Error message for a call of gsplat's function `name`, which clsplat lacks."""
+    return f"{name} is a CUDA function of gsplat that clsplat lacks: docs/library.md lists the functions of clsplat"
 
 
 def refuses(name: str, theirs: Callable[..., Any] | None = None) -> Callable[..., NoReturn]:
-    """A replacement for gsplat's function that raises InputError when it is called."""
+    """Create a replacement for gsplat's function `name` that raises InputError when it is called."""
 
     def call(*_: Any, **__: Any) -> NoReturn:
         raise InputError(what_is_absent(name))
@@ -73,5 +73,5 @@ def refuses(name: str, theirs: Callable[..., Any] | None = None) -> Callable[...
 
 
 def is_refused(value: Any) -> bool:
-    """True if `refuses` made the function."""
+    """True if the value is a function that `refuses` created."""
     return "clsplat_refuses" in getattr(value, "__dict__", {})

@@ -27,7 +27,7 @@ from clsplat.torch.selective_adam import SelectiveAdam
 from clsplat.torch.tiles import isect_offset_encode, isect_tiles
 
 GSPLAT_VERSION = "1.5.3"
-"""The version of gsplat whose calls clsplat has."""
+"""The version of gsplat whose interface clsplat implements."""
 REPLACEMENTS_BY_MODULE: dict[str, tuple[Any, ...]] = {
     "gsplat.cuda._wrapper": (
         fully_fused_projection,
@@ -41,12 +41,12 @@ REPLACEMENTS_BY_MODULE: dict[str, tuple[Any, ...]] = {
     "gsplat.relocation": (compute_relocation,),
     "gsplat.rendering": (rasterization,),
 }
-"""Functions and classes, by the gsplat module that defines them."""
+"""clsplat's functions and classes, keyed by the gsplat module that defines the originals."""
 GSPLAT_PACKAGES = ("gsplat", "gsplat.cuda", "gsplat.optimizers")
 TWO_RADII_SINCE_VERSION = (1, 5)
 """The first version of gsplat in which a splat has two radii."""
 FUNCTIONS_CHANGED_IN_1_5 = (fully_fused_projection, isect_tiles)
-"""Functions whose results or arguments changed in that version."""
+"""Functions whose results or arguments changed in gsplat 1.5."""
 
 
 def install_as_gsplat() -> list[str]:
@@ -57,8 +57,8 @@ def install_as_gsplat() -> list[str]:
     Python code stays. For versions before 1.5, `meta["radii"]` of `rasterization` has one radius a splat, as their
     strategies expect.
 
-    If gsplat is not installed, a module `gsplat` with clsplat's names is created. It refuses the other names, and has
-    no strategies. A second call does nothing.
+    If gsplat is not installed, a module `gsplat` with clsplat's names is created. It
+    has no strategies, and gsplat's other names in it raise an error. A second call does nothing.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def strategy(name: str) -> Any:
         raise ImportError(_own(name))
     if (found := _version(import_module("gsplat"))) < TWO_RADII_SINCE_VERSION:
         raise ClsplatError(
-            f"gsplat is {'.'.join(map(str, found))}; its {name} needs 1.5 or later: use install_as_gsplat()"
+            f"gsplat is version {'.'.join(map(str, found))}, but {name} needs 1.5 or later: use install_as_gsplat()"
         )
     operations = import_module("gsplat.strategy.ops")
     for ours in (quat_scale_to_covar_preci, compute_relocation):
@@ -116,18 +116,18 @@ def strategy(name: str) -> Any:
 
 
 def _of_gsplat(place: str, name: str) -> Any:
-    """An attribute of the replacement module `place` that clsplat does not have."""
+    """Handle a name that the replacement module `place` lacks: a refusing function, a gsplat strategy, or an error."""
     if name in absent_names.CUDA_ONLY_NAMES:
         return absent_names.refuses(name)
     if place == "gsplat" and name in {"DefaultStrategy", "MCMCStrategy"}:
         return strategy(name)
     if place == "gsplat" and name in absent_names.PURE_PYTHON_NAMES:
         raise ImportError(_own(name))
-    raise AttributeError(f"module {place!r} has no attribute {name!r}; clsplat.torch is in the place of gsplat")
+    raise AttributeError(f"module {place!r} has no attribute {name!r}; clsplat.torch replaces gsplat here")
 
 
 def _own(name: str) -> str:
-    return f"{name} is gsplat's own: pip install --no-deps gsplat=={GSPLAT_VERSION}; it needs no CUDA here"
+    return f"{name} is part of gsplat, expected gsplat to be installed: pip install --no-deps gsplat=={GSPLAT_VERSION}"
 
 
 def _has(module: str) -> bool:
@@ -147,7 +147,10 @@ def _is_ours(value: Any) -> bool:
 
 
 def _with_one_radius(function: Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]) -> Callable[..., Any]:
-    """`rasterization` with the larger of the two radii, as before gsplat 1.5: (C, N), or (nnz,) if packed."""
+    """`rasterization` with one radius per splat, the larger of the two, as before gsplat 1.5.
+
+    The radii are (C, N), or (nnz,) if packed.
+    """
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
