@@ -13,7 +13,7 @@
 #include "shared/lanes.h"
 #include "shared/adam.h"
 
-// The group as a flat array, LANES elements per work-item. parameters, gradients, first, second (n).
+// Steps the group as a flat array, LANES elements per work-item. parameters, gradients, first, second (n).
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, const float limit2, __global uint *readback, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second) {
@@ -31,8 +31,8 @@ __kernel void adam(const ulong n, const float rate, const float root, const floa
 }
 
 #ifdef WIDTH
-// Only the rows of visible Gaussians, LANES rows per work-item (OptimiserConfig.sparse); the other gradients are zero
-// already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
+// Steps only the rows of visible Gaussians (OptimiserConfig.sparse), LANES rows per work-item. All other gradients are
+// zero already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
                            const float epsilon, const float limit2, __global uint *readback,
                            __global const uint *tile_counts, __global float *parameters, __global float *gradients,

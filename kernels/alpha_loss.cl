@@ -1,12 +1,12 @@
-// The alpha loss: weight times the mean |A - alpha| over the pixels that count, for the render's A = 1 - T, with its
-// gradient by T.
+// The alpha loss: weight times the mean |A - alpha| over the pixels that count, for the render's A = 1 - T; and its
+// gradient with respect to T.
 //
 // Owner: A work-item owns a column of TILE rows.
 // Launch: A grid of stride x rows / TILE.
 // Buffers: stops (rows, stride), negative where a pixel does not count; transmittance, alpha (rows, stride); scale: the
-//   weight divided by the number of pixels that count -> gradient (rows, stride) by the transmittance, 0 in pixels that
-//   do not count; sums (rows / TILE, stride) of |A - alpha|. alpha and gradient are the fourth planes of their buffers,
-//   after the three colour planes.
+//   weight divided by the number of pixels that count -> gradient (rows, stride) with respect to the transmittance, 0
+//   in pixels that do not count; sums (rows / TILE, stride) of |A - alpha|. alpha and gradient are the fourth planes of
+//   their buffers, after the three colour planes.
 // Equations: docs/gradients.md, (81).
 #include "shared/math.h"
 

@@ -1,19 +1,19 @@
 // Exposure and white balance of photographs: a gain for each channel, its gradient, and Adam's step.
 //
 // Owner: A work-item owns a pixel (remove_gains), sixteen pixels of a column (gain_sums), a column of their sums
-//   (column_sums), or one entry of one photograph (move_gains, centre_gains). Sums have one order on every device.
-//   Built with one lane.
+//   (column_sums), or one entry of one photograph (move_gains, centre_gains). Sums are added in the same order on every
+//   device. Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x sums; a work-item for each of the `count` entries.
-// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient by it. logs, start, first, second, moved, gains
-//   (photographs, entries): the first three entries are base-2 logs of gains, the rest are colour mixes (ppisp.cl).
-//   begins (photographs + 1), others, weights: rows of a sparse matrix. partials (sums, tiles_y, stride); columns
-//   (sums, stride), where the photograph's entries begin at row `at`. Shapes are above each kernel.
+// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it. logs, start, first, second,
+//   moved, gains (photographs, entries): the first three entries are base-2 logs of gains, the rest are colour mixes
+//   (ppisp.cl). begins (photographs + 1), others, weights: rows of a sparse matrix. partials (sums, tiles_y, stride);
+//   columns (sums, stride), where the photograph's entries begin at row `at`. Shapes are above each kernel.
 // Equations: docs/gradients.md, "Appearance".
 #include "shared/math.h"
 #include "shared/lanes.h"
 
 #define MOST_LOG 16.0f
-#define MOST_MIX 0.2f // largest mix; up to it the map of any six mixes can be inverted
+#define MOST_MIX 0.2f // largest mix: the map of six mixes up to this size can be inverted
 
 // gains, target -> target: the photograph divided by its gains, so that it has the model's exposure.
 __kernel void remove_gains(const int photograph, const int stride, const int plane, __global const float *gains,
@@ -22,7 +22,7 @@ __kernel void remove_gains(const int photograph, const int stride, const int pla
   for (int c = 0; c < 3; ++c) target[(size_t)plane * c + at] /= gains[3 * photograph + c];
 }
 
-// image, gradient by image -> partials of the gradient by the logs, divided by ln 2.
+// image, gradient with respect to image -> partials: sums for the gradient with respect to the logs, divided by ln 2.
 __kernel void gain_sums(const int height, const int stride, const int plane, const int tiles_y,
                         __global const float *image, __global const float *gradient, __global float *partials) {
   const int x = get_global_id(0), y0 = get_global_id(1) * TILE, y1 = min(y0 + TILE, height);
@@ -45,8 +45,8 @@ __kernel void column_sums(const int stride, const int tiles_y, __global const fl
   columns[(size_t)stride * c + x] = sum;
 }
 
-// columns of one photograph, logs, start, begins, others, weights -> moved; first and second in place. All photographs
-// move; the gradient of the others is 0. Mixes move at `slow` times the rate.
+// columns of one photograph, logs, start, begins, others, weights -> moved; first and second in place. The entries of
+// all photographs are stepped; other photographs' gradients are 0. The learning rate of mixes is `slow` times `rate`.
 __kernel void move_gains(const int count, const int entries, const int photograph, const int stride, const int at,
                          const float rate, const float slow, const float root, const float beta1, const float beta2,
                          const float epsilon, __global const uint *readback, __global const float *columns,
@@ -61,7 +61,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the pull leaves the mean offset of the pulled photographs free
+    float told = 0.0f, apart = 0.0f, pull = 0.0f; // no pull on the pulled photographs' mean offset
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);
     for (int k = begin; k < end; ++k) {

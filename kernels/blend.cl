@@ -3,13 +3,13 @@
 // Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each Gaussian
 //   only the open cells that its ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels, and the
 //   group fetches Gaussians in batches, as in Kerbl et al. Both give the same bits.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, in row-major order (a band of tiles,
-//   or all).
+// Launch: One group of ITEMS work-items for each tile of a band or of the whole image, in row-major order from
+//   first_tile on.
 // Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), with RAYS
 //   camera -> image (3, height, width): colour; transmittance (height, width): final value, 0 to 1; stops (height,
 //   width): the first sorted index that the pixel does not take, -1 in padding; with NEARNESS nearness (height, width):
-//   the sum of weight over depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs): bits of the tile's cells
-//   that the Gaussian contributes to, for the backward pass. Planes are padded to whole tiles, with black.
+//   the sum of weight / depth, 0 in padding; with RECORD_CELLS cells_from_sorted (pairs): bits of the tile's cells that
+//   the Gaussian contributes to, for the backward pass. Planes are padded with black to whole tiles.
 // Equations: docs/gradients.md, (14) to (16), (45) and (120); with RAYS docs/cameras.md, (14); Kerbl et al. 2023,
 //   section 6 and algorithm 2.
 #include "shared/widened.h"
@@ -31,8 +31,8 @@
 #else
 #define RECORD(statements)
 #endif
-// If cells are tested against the ellipse, few vectors are visited in vain, and this test would cost more than it
-// saves.
+// Whether a vector of pixels is worth blending. CELLS_BY_ELLIPSE leaves out most vectors that are not, so that testing
+// the mask too would cost more than it saves.
 #if defined(RECORD_CELLS) && VECTORS > 1 // a cell of two vectors stays open while one of them is open
 #define CONTRIBUTES(mask) RECORDED((mask) & MASKL(pixels[cell].t > 0.0f))
 #elif defined(RECORD_CELLS)
@@ -42,14 +42,14 @@
 #else
 #define CONTRIBUTES(mask) ANYL(mask)
 #endif
-#ifdef COUNT_PAIRS // a build for `clsplat bench`
+#ifdef COUNT_PAIRS // set in a build for `clsplat bench`
 #define COUNT(statements) statements
 #else
 #define COUNT(statements)
 #endif
 
-// `t` is the transmittance of open pixels and 0 in finished ones, whose final value moves to `kept`. With t = 0 every
-// weight is 0 there, and no test is needed.
+// `t` is the transmittance of open pixels, and 0 in finished pixels, whose final transmittance is in `kept`. With t = 0
+// every weight is 0 there, and no test is needed.
 typedef struct {
   floatL t, kept, red, green, blue;
   intL stop;
@@ -58,8 +58,8 @@ typedef struct {
 #endif
 } Pixels;
 
-// Adds the tile's i-th pair to a cell that it reaches. Returns true if the last open pixel of the cell is finished by
-// it.
+// Adds the tile's i-th pair to a cell that it reaches. Returns true if this finishes the cell's last open pixel.
+// TRANSMITTANCE_MIN is from math.h.
 static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, float c_green,
                                float c_blue NEAR_PARAMETER) {
   const floatL before = p->t;
@@ -169,7 +169,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     BARRIER_LOCAL();
     if (busy[turn] == 0) break;
     if (ITEM == 0) busy[turn ^ 1] = 0;
-    for (int j = 0; j < count; ++j) { // no early exit: Intel's CPU runtime reads for items that left a loop
+    for (int j = 0; j < count; ++j) { // no early exit: Intel's CPU runtime reads memory for items that left
       OPEN_CELLS(open)
       const int i = batch + j;
       SPLAT_STAGED(staged[j])

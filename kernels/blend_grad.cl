@@ -2,12 +2,12 @@
 //
 // Owner: A group owns a tile and writes one slot for each of its pairs. No two groups share a slot, so there are no
 //   atomics on global memory.
-// Launch: As in blend.cl, one group of ITEMS work-items for each tile, the first for first_tile. An item owns pixels;
-//   with BY_GAUSSIAN it owns one Gaussian after another.
-// Buffers: blend's inputs, its transmittance and stops; image_gradient (3, height, width): the loss's gradient by
-//   colour, with ALPHA_GRADIENT a fourth plane by the final transmittance, with NEARNESS a last plane by nearness;
-//   slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), all written: sums over the tile's pixels, in the whitened
-//   units of (49).
+// Launch: As in blend.cl, one group of ITEMS work-items for each tile from first_tile on. An item owns pixels; with
+//   BY_GAUSSIAN it owns one Gaussian after another.
+// Buffers: blend's inputs, its transmittance and stops; image_gradient (3, height, width): the loss's gradient with
+//   respect to colour; with ALPHA_GRADIENT a fourth plane, with respect to the final transmittance; with NEARNESS a
+//   last plane, with respect to nearness; slot_from_sorted (pairs) -> slots (pairs, SLOT_STRIDE), all written: sums
+//   over the tile's pixels, in the whitened units of (49).
 // Equations: docs/gradients.md, (14), (22) to (26), (48), (49), (55) and (122); with RAYS docs/cameras.md, (21).
 //
 // Each pixel goes from its last Gaussian to its first. Transmittance is recovered by division. `behind` is the sum of
@@ -29,7 +29,7 @@
 #else
 #define LIVE(cells, live) ((cells) & (live))
 #endif
-#ifdef RECORD_CELLS // by blend: each visited cell has a pixel that takes the Gaussian
+#ifdef RECORD_CELLS // recorded by blend: in each visited cell, a pixel takes the Gaussian
 #define CONTRIBUTES(mask) 1
 #define REACHED_AT_FIRST recorded
 #define ADD_REACHED(mask, cell)
@@ -89,8 +89,8 @@ static inline Share take_out(Pixels *p, uint cell, floatL uncapped, float c_red,
 }
 
 #ifdef RAYS
-// The fields of the mean hold the gradient on its tangent plane. It is not linear in (u, v), because the plane turns
-// with the mean: (21) of docs/cameras.md.
+// The slot's fields for the mean hold the gradient on the mean's tangent plane. This gradient is not linear in (u, v),
+// because the plane turns with the mean: (21) of docs/cameras.md.
 static inline void add_ray_moments(floatL g, floatL u, floatL v, float l11, float l12, float l22, floatL *sums) {
   const floatL q = fmaL(u, u, v * v);
   const floatL y = v / l22, x = fmaL((floatL)(-l12), y, u) / l11;

@@ -1,14 +1,15 @@
 // Auxiliary channels: features blended with the image's weights, and values that depend on the order of the Gaussians.
-// The latter are the depths of the first hit and of half opacity, the number of Gaussians, and the heaviest one.
+// The latter are the depths of the first hit and of half opacity, the number of Gaussians, and the Gaussian with the
+// largest weight.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: blend's ranges, gaussian_from_sorted, splats and stops; features (n, FEATURES) of features.cl; with RAYS
-//   camera -> planes (PLANES, height, width): weighted means of the features, in their units, three planes at
-//   FEATURE_NORMAL normalised; then median depth and first depth, in world units. whole (2, height, width): the number
-//   of Gaussians, and the index of the one with the largest weight, the first on ties, -1 for none. All else is 0 where
-//   nothing was added, and in padding. With HOLDOUT the weights are multiplied by the light that the surfaces of held.h
-//   let through; Gaussians that are fully hidden do not count.
+//   camera -> planes (PLANES, height, width): weighted means of the features, in their units (the three planes from
+//   FEATURE_NORMAL on are normalised); then median depth and first depth, in world units. whole (2, height, width): the
+//   number of Gaussians, and the index of the Gaussian with the largest weight (the first of equals), or -1. All other
+//   values are 0 in padding and where nothing was added. With HOLDOUT the weights are multiplied by the light that the
+//   surfaces of held.h let through; Gaussians that are fully hidden do not count.
 // Equations: docs/channels.md, (60) to (67); with HOLDOUT docs/pictures.md, (75); with RAYS docs/cameras.md, (14).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -1,8 +1,8 @@
-// A deep image: each pixel's light in slices by depth. Up to `bins` slices are cut so that the largest error of the
-// light in front of any depth is as small as possible.
+// A deep image: each pixel's light, cut into at most `bins` slices along depth. The cuts make the largest error of the
+// light in front of any depth as small as possible.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: share: 1 / (DEEP_LEVELS bins); blend's ranges, gaussian_from_sorted, splats, transmittance and stops; with
 //   RAYS camera -> planes (bins, DEEP_SIZE, height, width): premultiplied colour, alpha, and the slice's depth in world
 //   units. All 0 after a pixel's last slice.
@@ -16,7 +16,7 @@
 #include "shared/prefetch.h"
 #include "shared/slices.h"
 
-// Appends the current slice in the lanes of `which`, and begins an empty one there.
+// Appends the current slice in the lanes of `which`, and begins an empty slice there.
 static inline void write_slices(Lanes *values, IntLanes *slices, intL which, __global float *planes, size_t plane,
                                 size_t stride) {
   IntLanes written;
@@ -88,7 +88,7 @@ GROUP __kernel void deep(const int first_tile, const int tiles_x, const int heig
           if (walk < WALKS - 1) {
             for (int k = 0; k < TRIED; ++k) {
               const floatL slack = unit[cell] * (level[cell] + (float)(step * (k + 1)));
-              counts[cell][k] -= begins_slice(open[cell] + k, before, after, slack, taken, taken); // -1 where it begins
+              counts[cell][k] -= begins_slice(open[cell] + k, before, after, slack, taken, taken); // -1 if begun
             }
           } else {
             Lanes *slice = values[cell];

@@ -1,11 +1,12 @@
-// Merges several deep images of one size by weight: the samples of a shutter and a lens, or the source pixels of a
-// warped one. At any depth the transmittance is the weighted mean of theirs.
+// Merges several deep images of one size with weights: the samples of a shutter and a lens, or the source pixels of a
+// warped one. At any depth the transmittance is the weighted mean of the pictures' transmittances.
 //
 // Owner: A work-item owns a pixel.
 // Launch: One work-item for each pixel.
 // Buffers: share: 1 / (DEEP_LEVELS bins); lists (pictures, bins, DEEP_SIZE, pixels): as deep.cl's planes; weights
-//   (pictures, pixels), which add up to 1 -> sources (pictures * bins, pixels): the picture of each slice, front to
-//   back; left (pictures * bins, pixels): the light behind its depth; planes (bins, DEEP_SIZE, pixels): as deep.cl's.
+//   (pictures, pixels), which add up to 1 -> sources (pictures * bins, pixels): the picture that each slice is from,
+//   front to back; left (pictures * bins, pixels): the light left behind the slice; planes (bins, DEEP_SIZE, pixels):
+//   as deep.cl's.
 // Equations: docs/pictures.md, (73), (74) and (187).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -2,8 +2,9 @@
 //
 // Owner: A work-item owns a Gaussian, in gather_rows an output row.
 // Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
-// Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient by the mean's position on the image, per pixel;
-//   splats (n, SPLAT_SIZE) in pixels. Statistics (n) are accumulated in place. The other shapes are above each kernel.
+// Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient with respect to the mean's image position, per
+//   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are accumulated in place. The other shapes are above each
+//   kernel.
 // Equations: docs/gradients.md, (43) and (55); Kerbl et al. 2023, section 5.
 #include "shared/math.h"
 #include "shared/splat.h"
@@ -12,15 +13,15 @@
 #include "shared/rays.h"
 #endif
 
-// Norm of the i-th row of `screen` (n, 2), per pixel, converted to NDC (docs/gradients.md, equation 43).
+// Norm of the i-th row of `screen` (n, 2), converted from per pixel to per unit of NDC (docs/gradients.md, (43)).
 static inline float ndc_norm(__global const float *screen, const size_t i, const float x_scale, const float y_scale) {
   const float gx = x_scale * screen[2 * i], gy = y_scale * screen[2 * i + 1];
   return sqrt(fma1(gx, gx, gy * gy));
 }
 
-// Gaussians with tiles are seen. screen (n, 2): gradient by the mean's position on the image, per pixel; x_scale,
-// y_scale convert to NDC -> gradient_sums (n): sums of norms; seen (n): views; radii (n): largest radius in pixels at 3
-// sigma. Here and below, a view with a value that is not finite does not count.
+// Gaussians with tiles count as seen. x_scale, y_scale: convert `screen` to NDC -> gradient_sums (n): sums of norms;
+// seen (n): numbers of views; radii (n): largest radius at 3 sigma, in pixels. Here and below, a view does not count
+// for a Gaussian whose value there is not finite.
 __kernel void density_statistics(const uint n, const float x_scale, const float y_scale,
 #ifdef RAYS
                                  const float pixels, // pixels per radian
@@ -46,8 +47,8 @@ __kernel void density_statistics(const uint n, const float x_scale, const float 
   radii[i] = radii[i] > radius ? radii[i] : radius;
 }
 
-// contributions (n) of the Gaussians with tiles to this view, in pixels; area: full-size pixels per pixel -> totals,
-// largest (n): sum and maximum over the views.
+// contributions (n) of the Gaussians with tiles to this view, in pixels; area: number of full-size pixels in a pixel of
+// this view -> totals, largest (n): sum and maximum over the views.
 __kernel void contribution_statistics(const uint n, const float area, __global const uint *tile_counts,
                                       __global const float *contributions, __global float *totals,
                                       __global float *largest) {
@@ -59,7 +60,7 @@ __kernel void contribution_statistics(const uint n, const float area, __global c
   largest[i] = largest[i] > contribution ? largest[i] : contribution;
 }
 
-// Scores of the Gaussians for densification. seen (n): views -> scores (n): the mean gradient if it is over
+// Scores of the Gaussians for densification. seen (n): numbers of views -> scores (n): the mean gradient if it is over
 // gradient_edge, else UNWANTED; USELESS if no view has a contribution over contribution_edge. A mean that is not finite
 // counts as 0.
 __kernel void density_scores(const uint n, const float gradient_edge, const float contribution_edge,
@@ -76,7 +77,7 @@ __kernel void density_scores(const uint n, const float gradient_edge, const floa
 }
 
 // Marks `count` of the n rows, beginning at row `first`. scores, radii (n); log_scales (count, 3), logits (count): of
-// these rows; cut_off, cut_off_row: scores above `cut_off` qualify, and equal ones up to row cut_off_row ->
+// these rows; cut_off, cut_off_row: scores above `cut_off` qualify, and scores equal to it up to row cut_off_row ->
 // marks (3, n), 0 or 1: the row stays, is cloned, is split.
 __kernel void density_marks(const uint n, const uint first, const uint count, const float cut_off,
                             const uint cut_off_row, const float large_edge, const float transparent_edge,

@@ -5,8 +5,8 @@
 //   in order_pairs a pair.
 // Launch: One group of ITEMS work-items for each chunk; elsewhere one work-item for each Gaussian or pair, in groups of
 //   64.
-// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n): pairs of each Gaussian, and
-//   their scan. The other shapes are above each kernel.
+// Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n): the number of pairs of each
+//   Gaussian, and the exclusive scan of these numbers. The other shapes are above each kernel.
 // Equations: docs/gradients.md, (47), through shared/tile.h, which project.cl uses to count.
 #include "shared/math.h"
 #include "shared/group.h"
@@ -22,8 +22,8 @@ static inline void band_span(const Ellipse *e, int ty, int part, int tiles_x, in
   *x1 = max(*x0, min(*x1, end_tile - ty * tiles_x));
 }
 
-// shown, tile_counts (n) -> sums (2, groups): the chunk's visible Gaussians and their pairs, at most 0xffffffff; the
-// first four entries of readback become zero. A group owns a chunk.
+// shown, tile_counts (n) -> sums (2, groups): numbers of visible Gaussians and of pairs in each chunk, at most
+// 0xffffffff; the first four entries of readback become zero. A group owns a chunk.
 GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const uint *shown,
                                  __global const uint *tile_counts, __global uint *sums, __global uint *readback) {
   __local uint scratch[ITEMS];
@@ -42,8 +42,9 @@ GROUP __kernel void visible_sums(const uint n, const uint chunk, __global const 
 }
 
 // shown, tile_counts (n), sums (2, groups) -> slots (n): scan of the tile counts; gaussian_from_visible, depth_keys
-// (visible). The first four entries of readback, zero before: visible Gaussians, pairs, the complement of the smallest
-// key, and the largest key. The bits of positive floats sort like the floats. A group owns a chunk.
+// (visible). The first four entries of readback, zero before, become the numbers of visible Gaussians and of pairs, the
+// complement of the smallest key, and the largest key. The bits of positive floats sort like the floats. A group owns a
+// chunk.
 //
 // BY_CAPACITY: a pass stops if it has more than `capacity` pairs, or if Adam has refused an element in an earlier step.
 // All later passes stop too, until the host has reacted. A stopped pass has no visible Gaussians, and its step does not
@@ -101,8 +102,8 @@ GROUP __kernel void compact_visible(const uint n, const uint chunk, __global con
   }
 }
 
-// order (visible): by depth -> gaussian_from_rank, counts (visible). BY_CAPACITY: the tile_counts (n) of a stopped pass
-// become zero, so that it adds nothing to statistics.
+// order (visible): places in gaussian_from_visible by depth -> gaussian_from_rank, counts (visible). BY_CAPACITY: the
+// tile_counts (n) of a stopped pass become zero, so that it adds nothing to statistics.
 __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __global const uint *gaussian_from_visible,
                            __global uint *tile_counts, __global uint *gaussian_from_rank, __global uint *counts
 #ifdef BY_CAPACITY
@@ -121,8 +122,8 @@ __kernel void order_counts(ELEMENTS(visible), __global const uint *order, __glob
   counts[rank] = tile_counts[i];
 }
 
-// tile_counts (n): on the whole image -> counts (tiles), zero before: the length of each tile's list. Integer sums do
-// not depend on the order of the atomics.
+// tile_counts (n): numbers of tiles on the whole image -> counts (tiles), zero before: the length of each tile's list.
+// Integer sums do not depend on the order of the atomics.
 __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, __global const uint *tile_counts,
                             __global const float *splats, __global uint *counts) {
   const uint i = get_global_id(0);
@@ -137,7 +138,7 @@ __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, 
   }
 }
 
-// tile_counts (n): on the whole image -> band_counts (n): among the tiles [first_tile, end_tile)
+// tile_counts (n): numbers of tiles on the whole image -> band_counts (n): those among [first_tile, end_tile).
 __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, const int first_tile, const int end_tile,
                           __global const uint *tile_counts, __global const float *splats, __global uint *band_counts) {
   const uint i = get_global_id(0);
@@ -157,10 +158,10 @@ __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, co
   band_counts[i] = count;
 }
 
-// offsets (visible): scan of the counts by rank; slots (n): scan of the counts by Gaussian -> tile_keys (pairs),
-// pair_ids (pairs): slot and Gaussian. Pairs are in order of depth. Slots are consecutive within a Gaussian and follow
-// the order of the Gaussians, so that sums over slots stream through memory. Only the tiles [first_tile, end_tile) get
-// pairs; keys count from first_tile.
+// offsets (visible): scan of the counts in order of rank; slots (n): scan of the counts in order of the Gaussians ->
+// tile_keys (pairs), pair_ids (pairs): slot and Gaussian. Pairs are in order of depth. Slots are consecutive within a
+// Gaussian and follow the order of the Gaussians, so that sums over slots stream through memory. Only the tiles
+// [first_tile, end_tile) get pairs; keys count from first_tile.
 __kernel void duplicate(ELEMENTS(visible), const int tiles_x, const int tiles_y, const int first_tile,
                         const int end_tile, __global const uint *gaussian_from_rank, __global const uint *offsets,
                         __global const uint *slots, __global const float *splats, __global uint *tile_keys,
@@ -214,7 +215,8 @@ __kernel void duplicate_slots(const uint visible, const int tiles_x, const int t
   }
 }
 
-// slot_from_pair (pairs): by depth; tiles, gaussian_from_slot (pairs): by slot -> tile_keys, pair_ids (pairs): by depth
+// slot_from_pair (pairs), by depth; tiles, gaussian_from_slot (pairs), by slot -> tile_keys, pair_ids (pairs), by
+// depth.
 __kernel void order_pairs(const uint pairs, __global const uint *slot_from_pair, __global const uint *tiles,
                           __global const uint *gaussian_from_slot, __global uint *tile_keys, __global uint2 *pair_ids) {
   const uint pair = get_global_id(0);

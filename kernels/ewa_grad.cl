@@ -1,13 +1,14 @@
-// The gradient of EWA projection: from gradients by the projected values to gradients by the Gaussians and the camera.
+// The gradient of EWA projection: from gradients with respect to the projected values to gradients with respect to the
+// Gaussians and the camera.
 //
 // Owner: A work-item owns LANES Gaussians.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: ewa.cl's inputs except opacities; radii (n, 2); d_means2d (n, 2), d_depths (n), d_conics (n, 3), with b as
-//   one number; with COMPENSATED d_compensations (n) -> d_means (n, 3); d_quaternions (n, 4) and d_scales (n, 3), or
-//   d_covariances (n, 6), where an off-diagonal entry has the gradient of both its places. With ADDED they are added to
-//   the arrays. Culled rows are zero, with ADDED unchanged. With BY_CAMERA by_camera (BY_CAMERA_SIZE, padded): each
-//   Gaussian's gradient by the camera's numbers, zero from n on. These are the view matrix row by row, then its
-//   translation, then fx, fy, cx and cy.
+// Buffers: ewa.cl's inputs except opacities; radii (n, 2); d_means2d (n, 2), d_depths (n), d_conics (n, 3), where b
+//   counts as one number; with COMPENSATED d_compensations (n) -> d_means (n, 3); d_quaternions (n, 4) and d_scales (n,
+//   3), or d_covariances (n, 6), where an off-diagonal entry holds the sum for its two places in the matrix. With ADDED
+//   they are added to the arrays. Culled rows are zero, or unchanged with ADDED. With BY_CAMERA by_camera
+//   (BY_CAMERA_SIZE, padded): each Gaussian's gradient with respect to the camera's numbers, zero from n on. The
+//   numbers are the view matrix row by row, its translation, fx, fy, cx and cy.
 // Equations: docs/gradients.md, (159) to (166), with (58) to (60).
 #include "shared/math.h"
 #define NEEDS_GRADIENT
@@ -73,7 +74,7 @@ __kernel void ewa_grad(const uint n, const uint padded, __constant float *camera
     return;
   }
 
-  // (159): the gradient by the whitened covariance, twice.
+  // (159): twice the gradient with respect to the whitened covariance.
   const floatL l11 = sqrt(p.syy / p.det), l12 = -(p.sxy / p.syy) * l11, l22 = 1.0f / sqrt(p.syy);
   const floatL ga = GATHER(d_conics, 3, 0), gb = 0.5f * GATHER(d_conics, 3, 1), gc = GATHER(d_conics, 3, 2);
   const floatL g_u = fmaL(ga, l11, gb * l12), g_v = fmaL(gb, l11, gc * l12);

@@ -1,13 +1,13 @@
-// Bilateral grids of photographs: the render sliced by a photograph's grid of colour maps, its gradient, and Adam's
-// step.
+// Bilateral grids: applies a photograph's grid of colour maps to the render, computes the gradient of this, and takes
+// Adam's step for the grid.
 //
 // Owner: A work-item owns a pixel (slice, slice_gradient); a channel, a grid column and an image line (line_sums); one
-//   coefficient of one photograph's grid (grid_sums, move_grid) or of all grids (centre_grids). Sums have one order on
-//   every device. Built with one lane.
+//   coefficient of one photograph's grid (grid_sums, move_grid) or of all grids (centre_grids). Sums are added in the
+//   same order on every device. Built with one lane.
 // Launch: Grids of stride x rows, width x height and columns x height x 3; a work-item for each coefficient.
-// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient by it; grids, first, second (photographs,
-//   GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4); lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS); by_grid: the gradient
-//   by one photograph's grid. Shapes are above each kernel.
+// Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it; grids, first, second
+//   (photographs, GRID_LEVELS, GRID_ROWS, GRID_COLUMNS, 3, 4); lines (height, GRID_COLUMNS, 3, 4, GRID_LEVELS);
+//   by_grid: the gradient with respect to one photograph's grid. Shapes are above each kernel.
 // Equations: docs/gradients.md, "Bilateral grids".
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -28,7 +28,8 @@ static inline float level_of(const float luminance) {
   return luminance > 0.0f ? min(luminance, 1.0f) * (GRID_LEVELS - 1) : 0.0f;
 }
 
-// A pixel's colour map and its derivative by the level: bilinear within two levels, then linear between them.
+// A pixel's colour map and the map's derivative with respect to the level. It interpolates bilinearly within two
+// levels, then linearly between them.
 static inline void pixel_map(const float u, const float v, const float level, __global const float *grid, float *map,
                              float *risen) {
   const int i = min((int)u, GRID_COLUMNS - 2), j = min((int)v, GRID_ROWS - 2), l = min((int)level, GRID_LEVELS - 2);
@@ -60,7 +61,7 @@ __kernel void slice(const int photograph, const int stride, const int plane, con
         fma1(map[4 * c], r, fma1(map[4 * c + 1], g, fma1(map[4 * c + 2], b, map[4 * c + 3])));
 }
 
-// grids, image, gradient by seen -> gradient by image, in place.
+// grids, image, gradient with respect to seen -> gradient with respect to image, in place.
 __kernel void slice_gradient(const int photograph, const int stride, const int plane, const float across,
                              const float down, __global const float *grids, __global const float *image,
                              __global float *gradient) {
@@ -86,7 +87,7 @@ __kernel void slice_gradient(const int photograph, const int stride, const int p
   gradient[2 * (size_t)plane + at] = fma1(0.114f, by_luminance, by_blue);
 }
 
-// image, gradient by seen -> lines: sums over the pixels of a line, weighted by column and level.
+// image, gradient with respect to seen -> lines: sums over the pixels of a line, weighted by column and level.
 __kernel void line_sums(const int width, const int stride, const int plane, const float across,
                         __global const float *image, __global const float *gradient, __global float *lines) {
   const int i = get_global_id(0), y = get_global_id(1), c = get_global_id(2);
@@ -110,7 +111,8 @@ __kernel void line_sums(const int width, const int stride, const int plane, cons
   for (int k = 0; k < 4 * GRID_LEVELS; ++k) line[k] = sums[k];
 }
 
-// The smoothness gradient of a coefficient from its neighbours on one axis, `step` floats away.
+// The sum of a coefficient's differences from its neighbours on one axis, `step` floats away: half the gradient of
+// their squares.
 static inline float pull(__global const float *value, const int place, const int count, const int step) {
   float sum = 0.0f;
   if (place > 0) sum += value[0] - value[-step];
@@ -118,7 +120,8 @@ static inline float pull(__global const float *value, const int place, const int
   return sum;
 }
 
-// lines, a photograph's grid -> by_grid: sums over the lines, weighted by row, plus the gradient of the variation.
+// lines, the photograph's grid -> by_grid: the lines weighted by grid row and summed, plus the gradient of the
+// smoothness penalty.
 __kernel void grid_sums(const int photograph, const int height, const float down, const float weight,
                         __global const float *grids, __global const float *lines, __global float *by_grid) {
   const int at = get_global_id(0);
@@ -142,7 +145,7 @@ __kernel void grid_sums(const int photograph, const int height, const float down
   by_grid[at] = fma1(above, pull(value, l, GRID_LEVELS, LEVEL_FLOATS), sum);
 }
 
-// by_grid -> the photograph's grid, first and second, in place.
+// Adam's step: by_grid -> the photograph's grid and its moments `first` and `second`, in place.
 __kernel void move_grid(const int photograph, const float rate, const float root, const float beta1, const float beta2,
                         const float epsilon, __global const uint *readback, __global const float *by_grid,
                         __global float *grids, __global float *first, __global float *second) {

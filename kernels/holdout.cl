@@ -1,7 +1,7 @@
 // Holdout: renders the light of blend.cl that the surfaces of other elements let through.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: blend's ranges, gaussian_from_sorted, splats, background and stops; the surfaces of held.h; with RAYS camera
 //   -> blend's image (3, height, width) and transmittance (height, width), overwritten: colour, and 1 minus the visible
 //   alpha. Pixels without a surface in front of a Gaussian keep their bits.

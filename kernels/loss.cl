@@ -8,12 +8,12 @@
 // Launch: With ITEMS == 1 any number of groups, which share the blocks; otherwise a group of ITEMS for each block.
 //   Blocks are numbered across, then down, then by channel.
 // Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; partials: with ITEMS == 1
-//   (groups, LOSS_RING, 3, field), otherwise (3, 3, height, stride), kind first; gradient (3, rows, stride), 0 right of
-//   the image; sums (3, ...) of SSIM, of |image - target| and of its square: one per block, with ITEMS == 1 per row of
-//   a block.
+//   (groups, LOSS_RING, 3, field), otherwise (3 derivatives, 3 channels, height, stride); gradient (3, rows, stride), 0
+//   right of the image; sums (3, ...) of SSIM, of |image - target| and of its square: one per block, or per row of a
+//   block with ITEMS == 1.
 // Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
 //
-// E[x^2] - E[x]^2 has no digits left in bright, flat pictures. So a window sums differences from its centre pixel
+// In bright, flat pictures E[x^2] - E[x]^2 cancels to nothing. So a window sums differences from its centre pixel
 // (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is a sum of differences too.
 #if ITEMS == 1 && LANES == 8 && defined(FMA_BY_CONTRACTION)
 #undef LANES // Two vectors at once: a window's sum is a chain of dependent additions.
@@ -35,7 +35,7 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
 #if ITEMS == 1
 #define ROWS LOSS_ROWS
-#define COLUMNS LOSS_COLUMNS // most columns of a block
+#define COLUMNS LOSS_COLUMNS // largest number of columns of a block
 #define NEAR_MARGIN (2 * MARGIN)
 #define RING_ROW(y) ((y) & (LOSS_RING - 1))
 #else
@@ -68,9 +68,9 @@ typedef struct {
 #define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
 #define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
 
-// Loop body over the item's vectors of `rows` rows, with `margin` columns on either side; defines x, row and `near_at`.
-// A single item takes vertical windows column by column, because neighbouring rows share pixels, and horizontal windows
-// one row at a time (LINES).
+// FOR_VECTORS and VECTOR loop over the item's vectors in `rows` rows, with `margin` columns on either side; they define
+// x, row and `near_at`. A single item takes vertical windows column by column, because neighbouring rows share pixels,
+// and horizontal windows one row at a time (LINES).
 #if ITEMS == 1
 #define LINES 1
 #define FOR_VECTORS(block, margin, rows)                                                                               \
@@ -88,7 +88,7 @@ typedef struct {
 #endif
 #define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) < 0 || (y) >= (block).height)
 
-// The taps [x, y) of a window around row y that are inside the image.
+// The taps [result.x, result.y) of a window around row y that are inside the image.
 static inline int2 taps_inside(const Block block, const int y) {
   return (int2)(max(0, REACH - y), min(TAPS, block.height + REACH - y));
 }
@@ -128,8 +128,9 @@ static inline void moments(const Block block, const int margin, const int y, __l
   }
 }
 
-// near -> partials: dSSIM by the mean of the image (relative to the centre pixel), twice dSSIM by its variance, and
-// dSSIM by the covariance. All are 0 right of the image. Returns the item's sum of SSIM over the block's own columns.
+// near -> partials: the derivatives of SSIM with respect to the image's mean (relative to the centre pixel), to its
+// variance (doubled), and to the covariance. All are 0 right of the image. Returns the item's sum of SSIM over the
+// block's own columns.
 static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
   FOR_VECTORS(block, margin, LINES) {
@@ -256,7 +257,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
     block.x0 = index % across * columns, block.x1 = min(block.x0 + columns, stride);
     block.x_partials = block.x0 - MARGIN;
     __global float *ssims = sums + (size_t)height * across * channel + index % across;
-    int next = y0 - REACH; // next row of derivatives, also above the image, so that the ring has room
+    int next = y0 - REACH; // next row of derivatives; rows above the image get none
     for (int y = y0; y < y1; y += ROWS) {
       for (; next < min(height, y + ROWS + REACH); next += ROWS) {
         moments(block, 2 * MARGIN, next, near);
@@ -276,7 +277,7 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
   }
 }
 #else
-// The group's sum of a value in a fixed tree, returned to its first item.
+// The group's sum of `value`, added in a fixed tree. Only the group's first item gets it; the others get 0.
 static inline float sum_of_group(const float value, __local float *scratch) {
   const int item = get_local_id(0);
   barrier(CLK_LOCAL_MEM_FENCE);

@@ -1,12 +1,12 @@
 // Noise on the means of nearly transparent Gaussians, along their own ellipsoids: an invisible Gaussian has no gradient
 // that could move it.
 //
-// Owner: A work-item owns a Gaussian. Built with one lane; every shape gives the same bits.
+// Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
 // Buffers: quaternions (n, 4), log_scales (n, 3), opacity_logits (n) -> means (n, 3), world units. first_row: the
 //   model's row of the first Gaussian; key0, key1: the step's key; amount: in 1 / world units; dead: an opacity;
-//   highest: means with at least this logit stay; readback (READBACK_SIZE). After a stopped pass (duplicate.cl) nothing
-//   changes.
+//   highest: Gaussians with at least this logit are not moved; readback (READBACK_SIZE). After a stopped pass
+//   (duplicate.cl) nothing changes.
 // Equations: docs/gradients.md, (92) and (93).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -56,7 +56,7 @@ __kernel void add_noise(const uint n, const uint first_row, const uint key0, con
     const float along = fma1(axes[k][0], e0, fma1(axes[k][1], e1, axes[k][2] * e2)) * s * s * by;
     for (int j = 0; j < 3; ++j) moved[j] = fma1(axes[k][j], along, moved[j]);
   }
-  // Like Adam, it leaves no mean that is not finite.
+  // Like Adam's step, this stores no mean that is not finite.
   if (!(moved[0] * moved[0] < limit2 && moved[1] * moved[1] < limit2 && moved[2] * moved[2] < limit2)) return;
   for (int j = 0; j < 3; ++j) mean[j] = moved[j];
 }

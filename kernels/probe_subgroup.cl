@@ -2,7 +2,7 @@
 //
 // Owner: A group of ITEMS work-items; each item has a place in every row.
 // Launch: One group.
-// Buffers: out (log2 SUBGROUP, ITEMS): row k holds the number of the item that item i received from, through bit k.
+// Buffers: out (log2 SUBGROUP, ITEMS): row k: the number of the item from which item i received, across bit k.
 // Equations: none.
 #include "shared/group.h"
 #include "shared/subgroup.h"

@@ -4,9 +4,9 @@
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
 // Buffers: means (n, 3) in world units; quaternions (n, 4) w x y z; log_scales (n, 3); opacity_logits (n); sh_dc (n,
 //   3); sh_rest (n, coefficients - 1, 3) -> splats (n, SPLAT_SIZE) in pixels, depth in world units, written where
-//   visible; tile_counts (n): 0 where culled. With NO_FRUSTUM_CULL shown (n): 1 where a splat is written, also of
+//   visible; tile_counts (n): 0 where culled. With NO_FRUSTUM_CULL shown (n): 1 where a splat is written, including
 //   Gaussians without a tile. With SH_DEGREES sh_degrees (n): the highest SH degree that each Gaussian uses. With
-//   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the other
+//   THINNED a Gaussian is left out if its random word is under `threshold`, and `factor` multiplies the others'
 //   opacities; model_row: the model's row of the first Gaussian; key0, key1: the step's key.
 // Equations: docs/gradients.md, (1) to (13), (44) to (47) and (53) to (57); orthographic docs/cameras.md, (15) to (17);
 //   Kerbl et al. 2023, section 4.
@@ -96,7 +96,7 @@ __kernel void project(const uint n, const int coefficients, const int tiles_x, c
     for (uint k = 0; k < sizeof(fields) / sizeof(fields[0]); ++k) splat[fields[k]] = field[fields[k]].lane[lane];
     const Ellipse e = ellipse_of(splat, tiles_x, tiles_y);
     const uint count = tile_count(&e, tiles_x);
-#ifdef NO_FRUSTUM_CULL // RasterizerConfig.frustum_cull: kept without a tile
+#ifdef NO_FRUSTUM_CULL // RasterizerConfig.frustum_cull: shown even without a tile
     shown[i] = 1;
 #else
     if (count == 0) continue;

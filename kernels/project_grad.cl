@@ -6,14 +6,15 @@
 // Launch: One work-item for each LANES Gaussians, or for each one, in groups of 64; work-items past the end do nothing.
 //   project_step: groups of one item, or with one lane of ROWS items.
 // Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums (n, SLOT_STRIDE); tile_counts,
-//   first_slots (n): its scan; parameters, splats and camera as in project.cl -> screen (n, 2): gradient by the mean's
-//   image position, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): each Gaussian's blending
-//   weights, summed over all pixels. With LENS by_lens (n, 4): each Gaussian's gradient by the logs of the focal
-//   lengths and by the principal point, per pixel. project_grad: gradients in the parameters' shapes, in loss per unit;
-//   rows that are not visible stay unchanged. project_step, built with ADAM: parameters, moments `first` and `second`;
-//   `readback` (READBACK_SIZE); the scalars of Step, one per group where they differ. Rows that are not visible have a
-//   zero gradient, with SPARSE they stay unchanged. After a stopped pass (duplicate.cl) nothing changes. With PENALTIES
-//   the gradient includes that of opacity_weight o + scale_weight (s_0 + s_1 + s_2).
+//   first_slots (n): its scan; parameters, splats and camera as in project.cl -> screen (n, 2): gradient with respect
+//   to the mean's image position, per pixel, plain or absolute. With CONTRIBUTIONS contributions (n): each Gaussian's
+//   blending weights, summed over all pixels. With LENS by_lens (n, 4): each Gaussian's gradient with respect to the
+//   logs of the focal lengths and, per pixel, to the principal point. project_grad: gradients in the parameters'
+//   shapes, in loss per unit; rows that are not visible stay unchanged. project_step, built with ADAM: parameters,
+//   moments `first` and `second`; `readback` (READBACK_SIZE); the scalars of Step, one per group where they differ.
+//   Rows that are not visible have a zero gradient; with SPARSE they stay unchanged. After a stopped pass
+//   (duplicate.cl) nothing changes. With PENALTIES the gradient includes that of opacity_weight o + scale_weight (s_0 +
+//   s_1 + s_2).
 // Equations: docs/gradients.md, (25) to (41) in the forms (50), (52) and (58) to (61); (55); (42); (91); (144) and
 //   (145). With RAYS docs/cameras.md, (22) to (29).
 #include "shared/math.h"
@@ -105,7 +106,7 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 
 #define BLOCKS (ROWS / LANES)
 #define ROW_ALIGNED __attribute__((aligned(4 * LANES)))
-#define SH_FLOATS (3 * SH_HIGHER) // of a Gaussian's higher SH bands
+#define SH_FLOATS (3 * SH_HIGHER) // floats in a Gaussian's higher SH bands
 
 #if LANES > 1
 // Adam's step of LANES rows, or fewer at the end of n. gradients (LANES, width): zero in rows that are not `shown`.
@@ -164,7 +165,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   Gradients d;
   const uint sh_width = 3 * (coefficients - 1);
 #if LANES > 1
-  // One array of the model after another, in runs that are long enough for the processor's prefetcher.
+  // Steps one array of the model after another, in runs that are long enough for the processor's prefetcher.
   const uint begin = get_global_id(0) * BLOCKS * LANES;
   if (begin >= n || readback[READBACK_STOPPED]) return;
   int shown[ROWS];

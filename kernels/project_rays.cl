@@ -1,10 +1,10 @@
 // Projection along rays, for the camera models with RAYS. Each Gaussian becomes an ellipse on the tangent plane of the
 // direction sphere at its mean, where perspective distorts it least. There is no pole and no seam.
 //
-// Owner: A work-item owns a Gaussian. Built with one lane; every shape gives the same bits.
+// Owner: A work-item owns a Gaussian. Built with one lane; LANES and ITEMS do not change its bits.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: As in project.cl, without NO_FRUSTUM_CULL -> splats (n, RAY_SIZE), directions in the camera's axes and
-//   distance in world units; tile_counts (n).
+// Buffers: The inputs of project.cl; NO_FRUSTUM_CULL is not supported -> splats (n, RAY_SIZE), directions in the
+//   camera's axes and distance in world units; tile_counts (n).
 // Equations: docs/cameras.md, (8) to (14), (18), (19), (30), (32); colour docs/gradients.md, (12).
 #include "shared/math.h"
 #define NEEDS_TANGENTS
@@ -29,7 +29,7 @@ static inline void store_box(const Box *t, int width, int height, int tiles_x, i
   if (!t->whole_rows) {
     float low = t->low_x - BOX_SLACK, high = t->high_x + BOX_SLACK;
 #ifdef WRAPS
-    // The shown part is one full turn from here; the picture may be narrower.
+    // Visible columns are those of one full turn from `begin` on; the picture may be narrower.
     const float turn = 2.0f * HALF_TURN * camera[CAMERA_FX], begin = 0.5f * ((float)width - turn);
     const float shift = turn * floor((low - begin) / turn);
     low -= shift;

@@ -2,9 +2,9 @@
 //
 // Owner: A work-item owns a Gaussian.
 // Launch: One work-item for each, in groups of 64; work-items past the end do nothing.
-// Buffers: cameras (views, CAMERA_SIZE), each as in project.cl, all of one projection; means (n, 3) -> least (n):
-//   natural log of the smallest standard deviation in world units; with `more` the minimum of this and the value
-//   already there. log_scales (n, 3): raised to `least` where smaller.
+// Buffers: cameras (views, CAMERA_SIZE), each as in project.cl, all of one camera model; means (n, 3) -> least (n):
+//   natural log of the smallest standard deviation in world units; with `more`, the minimum of this and the value
+//   already stored. log_scales (n, 3): raised to `least` where smaller.
 // Equations: docs/gradients.md, (88).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -20,8 +20,8 @@
   fma1(camera[CAMERA_R##row##0], x,                                                                                    \
        fma1(camera[CAMERA_R##row##1], y, fma1(camera[CAMERA_R##row##2], z, camera[CAMERA_T##row])))
 
-// A pixel's width at the mean (x, y, z), in world units, if the camera sees it; 1e30 if not. The camera sees it up to
-// 0.15 of the picture beyond the edges, which are also the Jacobian's bounds.
+// A pixel's width at the mean (x, y, z), in world units, if the camera sees it; 1e30 if not. It sees points up to 0.15
+// of the picture's size beyond the edges, which is also where the Jacobian is clamped.
 static inline float width_at(float x, float y, float z, __global const float *camera) {
   return pixel_width(ALONG(0), ALONG(1), ALONG(2), camera);
 }

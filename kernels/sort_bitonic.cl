@@ -1,5 +1,5 @@
 // Bitonic sort of a short array in a single launch, by one group in local memory. For short arrays, a radix sort's
-// dozen launches cost more. Ties go by value, so the sort is stable because values are positions.
+// dozen launches cost more. Equal keys are ordered by value; values are positions, so the sort is stable.
 //
 // Owner: The group owns the array, a work-item every ITEMS-th pair to compare.
 // Launch: One group of ITEMS work-items.

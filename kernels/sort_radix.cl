@@ -87,7 +87,7 @@ GROUP __kernel void radix_scatter(SCATTER) {
   scatter(begin, end, base, shift, digits, identity, keys, values, keys_out, values_out, places);
 }
 
-// keys (n) -> keys and positions, in the arrays 0 if the number of passes is odd, else in the arrays 1.
+// keys (n) -> sorted keys and positions: in keys0 and values0 after an odd number of passes, else in keys1 and values1.
 GROUP __kernel void radix_sort(ELEMENTS(n), const uint base, const uint digit_bits, const uint passes,
                                __global const uint *keys, __global uint *keys0, __global uint *values0,
                                __global uint *keys1, __global uint *values1, __local uint *places) {

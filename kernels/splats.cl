@@ -2,10 +2,10 @@
 //
 // Owner: A work-item owns LANES Gaussians. The common part runs in vectors, the rest one visible Gaussian at a time.
 // Launch: One work-item for each LANES Gaussians, in groups of 64; work-items past the end do nothing.
-// Buffers: radii (n, 2) in whole pixels, a 0 culls; means2d (n, 2) in pixels; conics (n, 3): a, b, c of the inverse
-//   covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three are the colour, missing ones
-//   are 0 -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where culled. With LISTED the caller has
-//   made the tile lists, so every splat is written; culled ones have an alpha of 0.
+// Buffers: radii (n, 2) in whole pixels, a Gaussian with a 0 is culled; means2d (n, 2) in pixels; conics (n, 3): a, b,
+//   c of the inverse covariance; opacities (n) in [0, 1]; depths (n); values (n, width): the first three are the
+//   colour, where missing ones count as 0 -> splats (n, SPLAT_SIZE), written where visible; tile_counts (n): 0 where
+//   culled. With LISTED the caller has made the tile lists, so every splat is written; culled ones have an alpha of 0.
 // Equations: docs/gradients.md, (170) to (172), with (44) to (47).
 #include "shared/math.h"
 #include "shared/lanes.h"
@@ -13,7 +13,7 @@
 #include "shared/splat.h"
 #include "shared/tile.h"
 
-// Limits within which float32 can represent a conic's determinant, and of a mean's position in pixels.
+// Limits within which float32 represents a conic's determinant; then the limit of a mean's position, in pixels.
 #define LEAST_CONIC 1e-15f
 #define LARGEST_CONIC 1e15f
 #define FARTHEST_PIXEL 1e9f

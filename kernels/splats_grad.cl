@@ -3,11 +3,11 @@
 //
 // Owner: A work-item owns one Gaussian.
 // Launch: One work-item for each Gaussian, in groups of 64; work-items past the end do nothing.
-// Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments, gradients by VALUES
-//   values, with ABSOLUTE_GRADIENTS absolute gradients by the mean; tile_counts, first_slots (n): its scan; splats of
-//   splats.cl -> d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit; d_values (n, width): up to
-//   VALUES columns, from `first` on; absolute (n, 2): by means2d. Rows of Gaussians without tiles are zero. add_values:
-//   slots (pairs, VALUES) -> d_values alone.
+// Buffers: slots (pairs, FIELDS) of blend_grad.cl or values_grad.cl: sums of g and its moments, gradients with respect
+//   to VALUES values, with ABSOLUTE_GRADIENTS absolute gradients with respect to the mean; tile_counts, first_slots
+//   (n): its scan; splats of splats.cl -> d_means2d (n, 2), d_conics (n, 3), d_opacities (n), in loss per unit;
+//   d_values (n, width): up to VALUES columns, from `first` on; absolute (n, 2): with respect to means2d. Rows of
+//   Gaussians without tiles are zero. add_values: slots (pairs, VALUES) -> d_values alone.
 // Equations: docs/gradients.md, (173) to (176).
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -1,4 +1,5 @@
-// Sums along an array's rows, in one order on every device: the Gaussians' gradients by the numbers of a camera.
+// Sums along an array's rows, in one order on every device: the Gaussians' gradients with respect to a camera's
+// numbers.
 //
 // Owner: A work-item owns SUM_ROWS neighbouring numbers of a row.
 // Launch: One work-item for each SUM_ROWS numbers of each row, in groups of 64; work-items past the end do nothing.

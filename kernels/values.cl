@@ -1,7 +1,7 @@
 // Blends any number of values per Gaussian with the image's weights, VALUES of them in a pass.
 //
-// Owner: A group owns a tile, as in blend.cl; transmittance takes the same values, to the bit.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Owner: A group owns a tile, as in blend.cl; transmittance has the same bits as there.
+// Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: blend's ranges, gaussian_from_sorted, splats and stops, with RECORD_CELLS its cells_from_sorted; values (n,
 //   depth), background (depth) -> pixels (height, width, depth): VALUES values of each pixel, from `first` on.
 // Equations: docs/gradients.md, (177), with (14) to (16).

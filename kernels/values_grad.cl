@@ -1,15 +1,15 @@
-// The gradient of blending any number of values, back to front: partial sums for each pair, for VALUES values in a
-// pass.
+// The gradient of blending any number of values, back to front: partial sums for each pair, of VALUES values per pass.
 //
 // Owner: A group owns a tile and writes one slot for each of its pairs, as in blend_grad.cl; in gradient_by_cell it
 //   owns a tile's pixels.
-// Launch: One group of ITEMS work-items for each tile, the first for first_tile, as in blend.cl.
+// Launch: One group of ITEMS work-items for each tile from first_tile on, as in blend.cl.
 // Buffers: gradient_by_cell: d_pixels (height, width, depth), background (depth), with ALPHA_GRADIENT d_alpha (height,
-//   width) -> by_cell (tiles, (depth + 1) * TILE * TILE): for each cell its gradients by all values, then by the final
-//   transmittance, background included; 0 in padding. values_grad: blend_grad's lists and planes, value_rows (n,
-//   depth), by_cell -> slots (pairs, FIELDS), all written: sums over the tile's pixels of the gradients by VALUES
-//   values, from `first` on. With GEOMETRY g and its moments come first, from all values; with ABSOLUTE_GRADIENTS the
-//   mean's absolute gradients come last.
+//   width) -> by_cell (tiles, (depth + 1) * TILE * TILE): for each cell, the gradients with respect to all values, then
+//   with respect to the final transmittance (including the part through the background); 0 in padding. values_grad:
+//   blend_grad's lists and planes, value_rows (n, depth), by_cell -> slots (pairs, FIELDS), all written: sums over the
+//   tile's pixels of the gradients with respect to VALUES values, from `first` on. With GEOMETRY, g and its moments,
+//   computed from all values, come before them; with ABSOLUTE_GRADIENTS, absolute gradients with respect to the mean
+//   come last.
 // Equations: docs/gradients.md, (178) to (180), with (22) to (26), (48) and (49).
 #include "shared/math.h"
 #include "shared/splat.h"

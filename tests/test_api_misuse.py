@@ -133,8 +133,8 @@ def test_a_run_that_is_there_is_not_trained_into_and_knows_its_settings(
     assert Run.open(run.path).config.iterations == 3  # and not what the run was made with
     metrics = run.metrics_path.read_bytes()
     for call, message in (
-        ({}, "has been trained already; resume=True goes on with it"),
-        ({"config": replace(FEW, iterations=1), "resume": True}, "is at step 3 already, expected more"),
+        ({}, "has been trained already; resume=True continues it"),
+        ({"config": replace(FEW, iterations=1), "resume": True}, "is already at step 3; expected more"),
         ({"config": replace(FEW, seed=9), "resume": True}, "seed is 0 there, a resumed run cannot change it to 9"),
     ):
         with pytest.raises(InputError) as caught:

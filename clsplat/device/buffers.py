@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arrays in device memory (a shape and a dtype over a buffer), and a workspace of named scratch arrays that grow.
 
-Debug mode: with CLSPLAT_POISON=1 every array is filled with NaN (2143289344 as an integer) when it is handed out.
-CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number. A kernel that reads memory that was
-never written then shows it in its results.
+Debug mode: with CLSPLAT_POISON=1 every array is filled with NaN (2143289344 as an integer) when it is allocated or
+taken from a workspace. CLSPLAT_POISON=0xff800000, or another 32-bit number, fills it with that number. A kernel that
+reads memory that was never written then shows it in its results.
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ class DeviceArray:
     def begin_get(self, into: NDArray[Any] | None = None) -> Callable[[], NDArray[Any]]:
         """Start a copy to the host, queued behind all work that is on the queue now.
 
-        into: host memory of that shape for the copy, such as `pinned`.
-        Returns a function that waits for this copy only, and returns it.
+        into: host memory of that shape for the copy, for example from `pinned`.
+        Returns a function that waits for this copy only, and then returns the host array.
         """
         host = np.empty(self.shape, self.dtype) if into is None else into
         copying = partial(cl.enqueue_copy, self.device.queue, host, self.buffer, is_blocking=False)
@@ -196,7 +196,7 @@ def allocate(device: Device, shape: tuple[int, ...], dtype: DTypeLike, capacity:
     limit = device.max_allocation
     if nbytes > limit:
         raise CapacityError(
-            f"a buffer of {amount(nbytes)} is needed and {device.name} allows {amount(limit)}: "
+            f"a buffer of {amount(nbytes)} is needed, but {device.name} allows at most {amount(limit)}: "
             "use a smaller resolution or fewer Gaussians (--density.max-gaussians)"
         )
     device.memory.check(nbytes)
@@ -245,8 +245,8 @@ def from_host(device: Device, values: NDArray[Any]) -> DeviceArray:
 
 @dataclass(frozen=True, eq=False)
 class Hosted:
-    """An array that kernels write, and the host memory that receives it: the same memory if the device shares the
-    host's."""
+    """An array that kernels write, and the host memory that receives it: the same memory if the device uses host
+    memory."""
 
     array: DeviceArray
     _host: NDArray[Any]
@@ -296,16 +296,16 @@ def pinned(device: Device, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[
 
 
 MAX_COMMAND_BUFFERS_PER_OBJECT = 256
-"""The most command buffers of one object: enough for photographs of a few sizes. At this number all of them are
-dropped."""
+"""Largest number of command buffers of one object: enough for photographs of a few sizes. At this number all of them
+are dropped."""
 
 
 class Workspace:
     """Scratch arrays by name.
 
-    A name's buffer is kept from call to call. A buffer that is too small is replaced by one half as large again; if
-    memory is `tight`, by one of the required size. The workspace also keeps command buffers of work on its arrays; they
-    are valid until one of these arrays gets another buffer.
+    The buffer of a name is reused from call to call. A buffer that is too small is replaced by a buffer of 1.5 times
+    the required size, or of just that size if memory is `tight`. The workspace also keeps command buffers of work on
+    its arrays; they are valid until one of these arrays gets another buffer.
     """
 
     def __init__(self, device: Device) -> None:
@@ -360,7 +360,7 @@ class Workspace:
     ) -> DeviceArray:
         """An array whose contents are undefined until they are written.
 
-        kept: the array must have been handed out before in this shape. It keeps its contents.
+        kept: True to keep the contents. The array must have been returned before in this shape.
         """
         latest = self._latest.get(name)
         if latest is not None and latest[0].shape == shape and latest[1] is dtype and self._poison is None:

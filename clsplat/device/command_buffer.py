@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded command buffers, which put work on a device's queue again without the Python code that made it.
+"""Recorded command buffers: they put work on a device's queue again, without running the Python code that made it.
 
 CLSPLAT_TAPES=0 disables replay. CLSPLAT_TAPES=check launches everything as usual, and compares each launch with the
 recorded one: an argument that differs is an error unless it was declared as `LaunchParameter`.
@@ -59,7 +59,7 @@ def described(value: Any) -> object:
 class CommandBuffer:
     """Launches, fills and copies to the host, in order.
 
-    entries: functions that put them on the queue, each with its kernel if it is a launch.
+    entries: functions that put these on the queue, each with its kernel if it is a launch.
     calls: the number of calls of each kind.
     anew: setter and argument index of each argument that a replay sets again.
     reads: the entries that copy to the host.

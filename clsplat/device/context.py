@@ -118,7 +118,7 @@ def limits(device: cl.Device) -> dict[str, object]:
 class Device:
     """A device with its context, in-order queue, kernel shape and built kernels.
 
-    why: warning that the shape is not the wanted one, which is shown when the device is first used; empty otherwise.
+    why: warning that the kernel shape is not the preferred one, shown when the device is first used; empty otherwise.
     only_tries: True if launches are only tried in the sandbox, and not made (`launch.only_tried`).
     waits: True if each launch waits for its kernel, as SYNC_VARIABLE requests.
     shares_memory: True if the device uses the host's memory.
@@ -176,7 +176,7 @@ class Device:
 
     def kernels(self, stem: str, defines: Mapping[str, object] = {}) -> Kernels:
         """The kernels of `stem`.cl in this device's shape with these defines, built at the first call."""
-        if self._why_another:  # only now: until it is used, the self-test may choose another shape
+        if self._why_another:  # only now: until its first use, the self-test may choose another shape
             tell_once(self._why_another)
         if self._switches:
             text = kernel_source(stem)
@@ -220,7 +220,7 @@ class Device:
 
     @property
     def is_another(self) -> bool:
-        """True if this shape was taken because the driver had failed in the wanted one."""
+        """True if this shape was chosen because the driver had failed in the preferred one."""
         return bool(self._why_another)
 
     def switched(self, *names: str) -> bool:
@@ -240,8 +240,8 @@ class Device:
 
     @property
     def row_alignment(self) -> int:
-        """Number of rows, of at least four bytes each, at whose multiples a part of an array must begin to be used in
-        place.
+        """A part of an array that is used in place must begin at a multiple of this many rows, of at least four bytes
+        each.
 
         OpenCL requires an alignment of sub-buffers, and kernels read whole vectors of lanes.
         """
@@ -308,7 +308,7 @@ class Device:
         while (status := event.command_execution_status) > cl.command_execution_status.COMPLETE:
             if time.monotonic() - start > seconds:
                 raise DriverError(
-                    self._trouble(kernel, f"does not come back within {seconds:g} s ({DRIVER_TIMEOUT_VARIABLE})")
+                    self._trouble(kernel, f"does not finish within {seconds:g} s ({DRIVER_TIMEOUT_VARIABLE})")
                 )
             time.sleep(pause)
             pause = min(2 * pause, 1e-2)
@@ -363,7 +363,7 @@ class Device:
                 self._subgroups.append(defines)  # in place: copies of a device share it
                 return defines
         raise DeviceError(
-            f"{title(self.cl_device)}: items of a sub-group do not exchange what they should; expected a shape without "
+            f"{title(self.cl_device)}: items of a sub-group do not exchange the right values; choose a shape without "
             f"sub-groups, such as CLSPLAT_SHAPE={self.shape.label.removesuffix('s')}"
         )
 
@@ -451,7 +451,7 @@ def _open(
         units = f"{device.max_compute_units} compute unit{'' if device.max_compute_units == 1 else 's'}"
         raise DeviceError(
             f"--device {index}/{part[0]}: {title(device)}, with {units}, cannot be divided into {part[1]} equal parts; "
-            f"expected a device with parts, or --device {index}, the whole"
+            f"expected a device that can be divided, or --device {index} for the whole"
         )
     chosen = divided[part[0]]
     shape = replace(shape, chunks=default_shape(chosen).chunks)
@@ -466,7 +466,7 @@ def open_devices(
     Without a limit, repeated calls return the same object for the same device. NAME/K is part K, counted from 0, of a
     device that OpenCL divides equally. The device is divided into as few parts as the largest K needs, at least two.
 
-    memory_limit: most bytes that all buffers of one returned object may take together.
+    memory_limit: largest number of bytes that all buffers of one returned object may take together.
     profile: make queues that record timings.
     Raises DeviceError if a device is named twice.
     """
@@ -488,5 +488,5 @@ def open_devices(
 def open_device(selector: str | None = None, memory_limit: int | None = None, *, profile: bool = False) -> Device:
     """Open the one device that `selector` names (see `open_devices`)."""
     if len(_names(selector)) > 1:
-        raise DeviceError(f"--device {selector}: expected one device here, only train and render take several")
+        raise DeviceError(f"--device {selector}: expected one device here; only train and render take several")
     return open_devices(selector, memory_limit, profile=profile)[0]

@@ -22,7 +22,7 @@ def check() -> None:
     """Raise DeviceError in a fork of a process that has used OpenCL."""
     if _owner and os.getpid() != _owner[0]:
         raise DeviceError(
-            f"process {os.getpid()} was forked from {_owner[0]}, which has used OpenCL, whose drivers do not work in a "
-            "fork; expected a process that begins anew: multiprocessing.get_context('spawn') or 'forkserver', "
-            "DataLoader(multiprocessing_context='spawn'), or clsplat's first call after the fork"
+            f"process {os.getpid()} was forked from {_owner[0]}, which has used OpenCL; OpenCL drivers do not work "
+            "in a fork. Use a process that starts anew: multiprocessing.get_context('spawn') or 'forkserver', "
+            "DataLoader(multiprocessing_context='spawn'), or make clsplat's first call after the fork"
         )

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 HOST_ALIGNMENT_BYTES = 4096
 """Alignment of the memory in bytes. With it drivers use the memory in place instead of copying it."""
 MIN_RECYCLED_BYTES = 1 << 18
-"""Size in bytes from which memory is kept for reuse; for less, reuse saves no time."""
+"""Smallest size, in bytes, of memory that is kept for reuse; below it, reuse saves no time."""
 MAX_IDLE_BYTES = 1 << 28
-"""The most bytes kept for reuse."""
+"""Largest number of bytes kept for reuse."""
 
 _lock = threading.Lock()
 _idle: list[NDArray[np.uint8]] = []
@@ -53,7 +53,7 @@ class _Block:
         self.__array_interface__: dict[str, Any] = raw.__array_interface__
 
     def __del__(self) -> None:
-        # An array may be deleted within any statement, also while the lock is held: then the memory is not kept.
+        # An array may be deleted within any statement, even while the lock is held: then its memory is not reused.
         if not _lock.acquire(blocking=False):
             return
         try:

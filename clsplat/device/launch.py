@@ -21,14 +21,14 @@ DEFAULT_GROUP_ITEMS = 64
 chunk."""
 _LOW_32_BITS = 0xFFFFFFFF
 _RECOMPILED_SIZE_ITEMS = 1 << 16
-"""Items along an axis from which PoCL compiles a kernel again."""
+"""Number of items along an axis from which PoCL compiles a kernel again."""
 
 
 @contextmanager
 def only_tried(device: Device) -> Iterator[None]:
-    """In the block, kernels are tried in the sandbox if necessary, but not launched on this device.
+    """Within the block, try kernels in the sandbox if necessary, but do not launch them on this device.
 
-    So if a driver fails, nothing has been changed yet.
+    If a driver fails in a trial, nothing has been changed yet.
     """
     device.only_tries = True
     try:
@@ -84,7 +84,7 @@ def _first(
         raise device.trials.fail(
             kernel.variant,
             kernel.name,
-            f"has {prod(local)} items in a group, where the driver allows it {most}",
+            f"has {prod(local)} items in a group, but the driver allows {most}",
         )
     typed = [value if kind is None else np.dtype(kind).type(value) for kind, value in zip(types, values, strict=True)]
     device.trials.launch(kernel, size, local, typed, form)

@@ -38,7 +38,7 @@ class StageRecord:
 
 @dataclass
 class Calls:
-    """Numbers of calls on a device's queue since it was opened.
+    """Numbers of calls on a device's queue since the device was opened.
 
     launches: kernels.
     fills, writes, reads: buffer operations for which the host does not wait.
@@ -101,7 +101,7 @@ class Recorder:
             self.on, self._stages, self._events = False, {}, []
 
     def add(self, name: str, event: Any, nbytes: int) -> None:
-        """Note a launch or transfer; only while `on`."""
+        """Record a launch or transfer. Call it only while `on`."""
         stage = self._stack[0] if self._stack else TRANSFERS_STAGE
         record = self._stages.setdefault(stage, StageRecord())
         record.launches += 1

@@ -62,7 +62,7 @@ def text_of(stem: str) -> str:
     stems = sorted(path.stem for path in kernel_root().glob("*.cl"))
     if where.strip() not in stems:
         raise InputError(
-            f"{BREAK_KERNEL_VARIABLE}={wanted}: {where.strip()} is no kernel, expected one of {examples(stems)}"
+            f"{BREAK_KERNEL_VARIABLE}={wanted}: {where.strip()} is not a kernel, expected one of {examples(stems)}"
         )
     if where.strip() != stem:
         return source
@@ -74,8 +74,8 @@ def text_of(stem: str) -> str:
 def build(context: cl.Context, device: cl.Device, variant: Variant) -> tuple[cl.Program, str]:
     """Compile a kernel file. Returns the program, and the salt of `Variant.anew` that it needed, or an empty string.
 
-    A failed build is repeated once with a text that is unique to this process. An aborted build leaves a program
-    without kernels in PoCL's cache, and another process that builds the same text may remove its files.
+    A failed build is repeated once, with a source text that is unique to this process. An aborted build leaves a
+    program without kernels in PoCL's cache, and another process that builds the same text may remove its files.
 
     Raises KernelBuildError with the device, the options, the log and the source, and DriverError for a program without
     kernels.

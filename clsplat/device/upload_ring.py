@@ -47,9 +47,9 @@ class UploadRing:
             self._queue = cl.CommandQueue(device.context, device.cl_device)
             hosts = [pinned(device, (nbytes,), np.uint8) for _ in range(UPLOAD_RING_SLOTS)]
         except cl.Error as error:
-            raise CapacityError(f"{device.name}: no second queue, or no pinned memory ({error})") from None
+            raise CapacityError(f"{device.name}: no room for a second queue or pinned memory ({error})") from None
         self._slots = [_Slot(*pair) for pair in zip(arrays, hosts, strict=True)]
-        """The slots, the least recently sent or taken first."""
+        """The slots, in order of their last use; the least recently used is first."""
 
     def begin(self, key: object, values: NDArray[Any]) -> None:
         """Start to upload an array for `take`, unless it is too large or its upload has already begun."""

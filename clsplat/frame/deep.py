@@ -30,7 +30,7 @@ from clsplat.stages.deep import DEEP_FLOATS
 from clsplat.stages.deep_merge import deep_merge, merge_bytes
 
 DrawDeep = Callable[[Camera], Float32]
-"""Function from a camera to its planes, which may be a view."""
+"""Function from a camera to the planes of its picture, which may be a view of another array."""
 Convert = Callable[[Float32, Float32], Float32]
 """Function from rgb (h, w, 3), and the alpha (h, w) that it is premultiplied by, to rgb in another space."""
 Weighted = tuple[Float32, Float32]
@@ -42,7 +42,7 @@ _WARP_BATCH_PIXELS = 1 << 14
 
 
 def render_deep(renderer: Renderer, gaussians: Gaussians, camera: Camera, bins: int) -> Float32:
-    """Slices (bins, H, W, 5) of a camera's picture, which may be any window."""
+    """Slices (bins, H, W, 5) of a camera's picture, which may be a window of its frame."""
     larger, rows, columns = on_tiles(camera)
     return renderer.render_deep(gaussians, larger, bins)[:, rows, columns]
 
@@ -92,7 +92,7 @@ def deep_converted(draw: DrawDeep, convert: Convert) -> DrawDeep:
 
 
 class Merge:
-    """Merges deep pictures by the weights of their pixels. Colours have to be linear."""
+    """Averages deep pictures with a weight for each pixel. Colours have to be linear."""
 
     def __init__(self, device: Device, bins: int) -> None:
         self.bins, self._device, self._work = bins, device, Workspace(device)
@@ -100,9 +100,9 @@ class Merge:
         self._pixels = max(limit // merge_bytes(DEEP_PICTURES, bins), TILE)
 
     def __call__(self, pictures: Iterable[Weighted]) -> Float32:
-        """The mean of at least one picture. The weights of a pixel add up to 1.
+        """The weighted mean of one or more pictures. The weights of a pixel add up to 1.
 
-        Pictures are merged in groups, and the results merged again, to limit the number of pictures held at once.
+        Pictures are merged in groups, and the results merged again, to limit the number of pictures in memory.
         """
         groups = list(self._groups(pictures))
         return groups[0][0] if len(groups) == 1 else self(groups)
@@ -144,7 +144,7 @@ def deep_warped(draw: DrawDeep, warp: Warp, merge: Merge) -> DrawDeep:
     """A DrawDeep of warped pictures. The camera that is passed to it gives only size and window.
 
     A pixel is the mean over `Warp.samples` by `Warp.samples` places, each a bilinear mix of the four pixels around. A
-    filter with negative weights cannot make slices. Where nothing is seen, there are no slices.
+    filter with negative weights would not give valid slices. Where nothing is seen, there are no slices.
     """
 
     def bent(camera: Camera) -> Float32:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deep EXR: a pixel's samples are slices of the scene by depth, each with its alpha and premultiplied colour.
 
-Composited front to back, they give the flat picture, since the slices hold the Gaussians that the pixel blends. Each
-pixel has its slices at the depths where its light is absorbed (docs/pictures.md).
+Composited front to back, the samples give the flat picture, since the slices contain the Gaussians that the pixel
+blends. Each pixel has its own slices, at the depths where its light is absorbed (docs/pictures.md).
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def write_deep(
     header: FrameFileHeader | None = None,
     convert: Convert | None = None,
 ) -> bool:
-    """Draw and write a deep scanline EXR, atomically, in strips of `rows` that bound the memory. Returns True if it is
-    empty.
+    """Draw and write a deep scanline EXR, atomically, in strips of `rows` that bound the memory. Returns True if the
+    picture is empty.
 
-    Channels are R, G, B, A, Z and ZBack. A pixel has a sample for each of its at most `bins` slices, each at a single
-    depth. Colours are half or float, by `encoding`, in the space that `convert` makes; depths are float. Raises
-    InputError and ClsplatError in the cases of `images.frame_files.write_channels`.
+    Channels are R, G, B, A, Z and ZBack. A pixel has at most `bins` slices, each stored as one sample at a single
+    depth. Colours are half or float, as `encoding` says, in the space to which `convert` converts; depths are float.
+    Raises InputError and ClsplatError in the cases of `images.frame_files.write_channels`.
     """
     encoding, header = encoding or Encoding(), header or FrameFileHeader()
     if path.suffix.lower() != ".exr":

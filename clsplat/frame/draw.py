@@ -20,8 +20,8 @@ from clsplat.rendering.renderer import OBJECTS_PER_COVERAGE_PASS, Renderer
 from clsplat.stages.channels import Features
 
 Planes = dict[str, NDArray[Any]]
-"""Channels by name, (height, width) or (height, width, floats). rgb is over the background; over black it is
-premultiplied by alpha."""
+"""Channels by name, (height, width) or (height, width, floats). rgb is composited over the background; over black, this
+is rgb premultiplied by alpha."""
 Draw = Callable[[Camera, Collection[str]], Planes]
 """Function from a camera and the names of channels to their planes."""
 
@@ -39,9 +39,9 @@ def drawn_by(
 ) -> Draw:
     """A Draw that renders with the kernels.
 
-    after, before: cameras of a whole frame that motion and backward motion lead to.
-    cut: cuts the surfaces of the frame's holdout; None without one.
-    moved, earlier: Gaussians that motion and backward motion lead to, None if they stand still.
+    after, before: cameras of whole frames to which motion and backward motion lead.
+    cut: function from a camera to its surfaces in the frame's holdout; None without a holdout.
+    moved, earlier: Gaussians to which motion and backward motion lead; None if they stand still.
     mattes: mattes by the names of their channels.
     Planes need not be contiguous: the encoder, which may run in another thread, makes them so.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame's holdout, resampled for the pictures that are rendered: windows, strips and supersampled ones."""
+"""A frame's holdout, resampled for the pictures that are rendered: windows, strips and supersampled pictures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clsplat.images.holdouts import Holdout, Surfaces
 class Cut:
     """Cuts the surfaces of a camera's picture out of its frame's holdout.
 
-    The last result is kept, as all samples of a shutter or a lens are of one picture.
+    The last result is cached, because all samples of a shutter or a lens show the same picture.
     """
 
     def __init__(self, holdout: Holdout) -> None:
@@ -21,7 +21,7 @@ class Cut:
         self._last: Surfaces | None = None
 
     def __call__(self, camera: Camera) -> Surfaces | None:
-        """Surfaces in the pixels of the picture, as depths in the kernels' terms; None if there are none.
+        """The surfaces in the picture's pixels, with depths as the kernels measure them; None if there are none.
 
         Each pixel takes the surfaces of the holdout's pixel that contains it.
         """

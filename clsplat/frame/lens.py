@@ -20,8 +20,8 @@ from clsplat.images.stmap import StMap
 from clsplat.scenes.dataset import Lens
 
 MAX_BEYOND_EDGE_FRAMES = 1.0
-"""Limit of places beyond each edge of the straight frame, in frames. Places farther out count as seeing nothing, as a
-map may have any value there."""
+"""Largest distance of places beyond an edge of the straight frame, in frame sizes. Places farther out count as seeing
+nothing, because a map may have any value there."""
 PLACE_STEP_PX = 2.0**-20
 """Places are rounded to multiples of this, in pixels, so that subtracting a window's corner causes no rounding
 error."""
@@ -32,7 +32,7 @@ PROBE_GRID_SIDE = 33
 MAX_SINGLE_SAMPLE_PX = 1.25
 """Size of a warped pixel, in straight pixels, up to which a single sample is taken."""
 MAX_WARP_SAMPLES = 16
-"""Largest number of a pixel's samples across, and down."""
+"""Largest number of samples across a pixel, and down."""
 _HALF_PIXEL_STEPS = ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5))
 
 
@@ -40,11 +40,11 @@ class Places(Protocol):
     """A source of places: positions of warped pixels in a straight picture."""
 
     def size(self, frame: Camera) -> tuple[int, int]:
-        """Width and height of the warped frame that belongs to a straight one."""
+        """Width and height of the warped frame that belongs to a straight frame."""
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Pixels (h, w, 2) of the straight frame that are seen at x (w,), y (h,) of the warped one; NaN where nothing
-        is."""
+        """Positions (h, w, 2) in the straight frame that are seen at x (w,), y (h,) of the warped frame; NaN where
+        nothing is seen. All are in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class ByMap:
 class ByLens:
     """Places from a photograph's lens. The warped picture has the photograph's pixels.
 
-    The straight frame is shown by the camera of `Lens.bare`, in any size.
+    The straight frame is that of `Lens.bare`'s camera, at any size.
     """
 
     lens: Lens
@@ -107,7 +107,7 @@ class Warp:
 
     @property
     def shown(self) -> Camera:
-        """A camera of the warped frame's size. Use only its pixels: its rays are not those of the warped pixels."""
+        """A camera of the warped frame's size. Use only its size and window: its rays are not those of the pixels."""
         width, height = self.source.size(self.frame)
         return replace(self.frame, width=width, height=height)
 
@@ -115,7 +115,7 @@ class Warp:
     def _grid(self) -> tuple[Float64, Float64]:
         """Places (33, 33, 2) spread over the frame, and the distance (33, 33) between adjacent pixels' places.
 
-        The distance is the larger of those across and down.
+        The distance is the larger of the distances across and down.
         """
         width, height = self.source.size(self.frame)
         x, y = ((np.arange(PROBE_GRID_SIDE) / (PROBE_GRID_SIDE - 1)) * (side - 1) + 0.5 for side in (width, height))
@@ -132,7 +132,7 @@ class Warp:
 
     @cached_property
     def samples(self) -> int:
-        """Samples across and down a pixel."""
+        """Number of samples across a pixel, and down."""
         most = np.nanmax(self._grid[1], initial=0.0)
         return 1 if most <= MAX_SINGLE_SAMPLE_PX else min(int(np.ceil(most - 1e-3)), MAX_WARP_SAMPLES)
 
@@ -167,7 +167,7 @@ class Warp:
 
 
 def distorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Pixels (height, width, 2) of the straight picture that are seen in the lens's own picture; NaN where none is."""
+    """Positions (height, width, 2), in the straight picture, of the pixels of the lens's picture; NaN where none."""
     grid = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     rays = lens.cam_from_img(np.stack([axis.ravel() for axis in grid], axis=1))
     places = rays * (straight.fx, straight.fy) + (straight.cx, straight.cy)
@@ -175,7 +175,7 @@ def distorted_places(lens: Lens, straight: Camera) -> Float64:
 
 
 def undistorted_places(lens: Lens, straight: Camera) -> Float64:
-    """Pixels (height, width, 2) of the lens's own picture that are seen in the straight one; NaN where none is."""
+    """Positions (height, width, 2), in the lens's picture, of the pixels of the straight picture; NaN where none."""
     x = (np.arange(straight.width) + 0.5 - straight.cx) / straight.fx
     y = (np.arange(straight.height) + 0.5 - straight.cy) / straight.fy
     across, down = np.meshgrid(x, y)

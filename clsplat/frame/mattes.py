@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 class Matte:
     """Objects of a matte.
 
-    names: one per object.
+    names: the name of each object.
     owners: (n,), for each Gaussian the index of its object.
     """
 

@@ -47,7 +47,7 @@ rounded."""
 
 
 DrawAt = Callable[[float], Draw]
-"""The Draw of a frame at a time in frames from the frame. The time is 0 if nothing moves."""
+"""Function from a time, in frames from the frame, to the Draw at that time. The time is 0 if nothing moves."""
 Pass = Callable[[DrawAt], DrawAt]
 """One step in making a frame. It takes the Draw of the step before and returns its own."""
 
@@ -56,13 +56,13 @@ Pass = Callable[[DrawAt], DrawAt]
 class FrameRequest:
     """A frame that a job's pipeline draws.
 
-    at: camera of the whole frame, in its final size, at a time in frames from the frame.
+    at: function from a time, in frames from this frame, to the camera of the whole frame in its final size.
     after, before: cameras of the next and the previous frame, for motion.
     lens: warps the picture.
-    sampling: of this frame, None for the job's.
-    cut: of the frame's holdout, for every sample of the frame.
-    models: the Gaussians at a time, None for the pipeline's own.
-    moved: Gaussians that motion and backward motion lead to, None if these stand still.
+    sampling: the sampling of this frame; None takes the job's.
+    cut: function from a camera to its surfaces in the frame's holdout, for every sample of the frame.
+    models: function from a time to the Gaussians; None takes the pipeline's own.
+    moved: Gaussians to which motion and backward motion lead; None if they stand still.
     """
 
     at: Callable[[float], Camera]
@@ -76,7 +76,7 @@ class FrameRequest:
 
 
 def at_each_time(apply: Callable[[Draw], Draw]) -> Pass:
-    """A pass that changes the picture of each time on its own."""
+    """A pass that applies a function to the Draw of each time."""
     return lambda draw: lambda time: apply(draw(time))
 
 
@@ -104,7 +104,7 @@ class FramePipeline:
         recorded: the model's colour space (`colour.recorded_space`).
         background: colour of the background in that space; black if alpha is written.
         mattes: mattes by the names of their channels.
-        Raises InputError for settings and colour spaces that do not fit together.
+        Raises InputError for settings and colour spaces that are not compatible.
         """
         self.config = config or PictureConfig()
         self.config.check()
@@ -138,7 +138,7 @@ class FramePipeline:
         return draw_at
 
     def _passes(self, frame: FrameRequest) -> list[Pass]:
-        """The passes of a frame, the first after the kernels first."""
+        """The passes of a frame in order, starting right after the kernels."""
         sampling, framing = self._sampling(frame), self.config.framing
         passes: list[Pass] = []
         if self._in_light(frame):
@@ -159,7 +159,7 @@ class FramePipeline:
         return lambda camera, names: converted(draw(camera, names), colours, colours.model, colours.light)
 
     def _in_strips(self, frame: FrameRequest, draw: Draw) -> Draw:
-        """The same picture in strips that leave memory for the rest."""
+        """The same picture in strips that leave memory for the model and its pairs."""
         device, framing = self._renderer.device, self.config.framing
 
         def drawn(camera: Camera, names: Collection[str]) -> Planes:
@@ -203,11 +203,11 @@ class FramePipeline:
         }
 
     def _sampling(self, frame: FrameRequest) -> SamplingConfig:
-        """Sampling of the frame, or of the job."""
+        """Sampling of the frame if it has its own, else of the job."""
         return frame.sampling or self.config.sampling
 
     def _in_light(self, frame: FrameRequest) -> bool:
-        """True if the frame's pixels are means of several, which are taken in linear light."""
+        """True if the frame's pixels are means of several values, which must be averaged in linear light."""
         return self._sampling(frame).on or self.config.framing.supersample > 1 or frame.lens is not None
 
     def is_blank(self, planes: Planes, frame: FrameRequest) -> bool | None:
@@ -226,7 +226,7 @@ class FramePipeline:
 def converted(planes: Planes, colours: Colours, source: str, target: str) -> Planes:
     """The same planes with rgb in another colour space.
 
-    rgb is divided by alpha for the conversion and multiplied again if alpha is present, else it is treated as opaque.
+    If alpha is present, rgb is divided by it for the conversion and multiplied again; without alpha, pixels are opaque.
     """
     if source == target or "rgb" not in planes:
         return planes

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples that a frame is the mean of: over a pixel (supersampling), the shutter's time and the lens's area.
 
-Samples have fixed places, and samples of shutter and lens have equal weights. So a repeated frame is bit-identical
-wherever a frame without samples is. Light is averaged in linear values only. Channels that have no mean come from one
-sample.
+Samples have fixed places, and samples of shutter and lens have equal weights. So rendering a frame again gives the same
+bits wherever it does so without samples. Light is averaged in linear values only. Channels that have no mean come from
+one sample.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def finer(camera: Camera, config: FramingConfig) -> Camera:
     if margin == 0:
         return camera.resized(camera.width * samples, camera.height * samples)
     if camera.model.wraps:
-        raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges, expected box")
+        raise InputError(f"--filter {config.filter}: needs pixels beyond a panorama's edges; use --filter box")
     padded = crop(camera, -margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
     return padded.resized(padded.width * samples, padded.height * samples)
 
@@ -109,7 +109,7 @@ def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
     without an image plane.
     """
     if not camera.is_pinhole:
-        raise InputError(f"depth of field is not defined for {camera.projection} cameras, expected a perspective one")
+        raise InputError(f"depth of field is not defined for {camera.projection} cameras; use a perspective camera")
     return replace(
         camera,
         translation=camera.translation - np.array([x, y, 0.0]),
@@ -119,10 +119,10 @@ def through_lens(camera: Camera, x: float, y: float, focus: float) -> Camera:
 
 
 def sample_cameras(at: Callable[[float], Camera], config: SamplingConfig) -> tuple[Camera, list[Camera]]:
-    """The camera in the middle of shutter and lens, and one camera per sample, all of whole frames.
+    """The camera at the middle of the shutter's time and of the lens, and one camera per sample, all of whole frames.
 
-    at: the camera at a time in frames from the frame, such as `Shot.at`.
-    A single sample is the middle itself.
+    at: function from a time, in frames from the frame, to the camera, such as `Shot.at`.
+    A single sample has the camera at the middle.
     """
     middle = at(config.middle)
     if not config.on or config.samples == 1:

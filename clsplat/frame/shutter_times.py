@@ -22,7 +22,8 @@ def sample_times(count: int) -> Float64:
 
 
 def sample_moments(config: SamplingConfig) -> list[float]:
-    """The time of each sample, in frames from the frame: spread over an open shutter, else the shutter's middle."""
+    """The time of each sample, in frames from the frame: spread over the open shutter, or its middle without motion
+    blur."""
     if not config.on or config.samples == 1:
         return [config.middle]
     if not config.moves:

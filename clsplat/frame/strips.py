@@ -28,10 +28,10 @@ def strip_rows(
     config: FramingConfig | None = None,
     planes: int = 0,
 ) -> int:
-    """Rows of a strip that leaves memory for the rest, in whole tiles; the picture's height if it needs no strips.
+    """Rows of a strip, in whole tiles, that leaves room for the model and pairs; the picture's height if one is enough.
 
     names: names of the wanted channels.
-    config: its supersampling makes rendered strips larger than written ones.
+    config: the framing; with supersampling, rendered strips are larger than written strips.
     planes: bytes per pixel in further planes.
     """
     samples = config.supersample if config else 1
@@ -44,7 +44,7 @@ def strip_rows(
 
 
 def strips(camera: Camera, rows: int) -> Iterator[Camera]:
-    """The picture in strips of at most `rows`, from the top. Several strips end at the frame's tile borders."""
+    """The picture in strips of at most `rows`, from the top. All but the last end at the frame's tile borders."""
     if rows >= camera.height:
         yield camera
         return
@@ -67,7 +67,7 @@ def in_strips(draw: Draw, rows: int) -> Draw:
 
 
 def check_parts(camera: Camera, encoding: Encoding, views: int = 1) -> None:
-    """Raise InputError for a file in several parts or views, which it stores one after the other.
+    """Raise InputError for several parts or views: a file stores them one after the other, which strips cannot fill.
 
     views: number of views of a stereo pair in the file.
     """
@@ -94,8 +94,8 @@ def write_in_strips(
     """Draw and write a picture strip by strip, atomically.
 
     The bytes are the same as `write_channels` writes for the whole picture, except in formats whose layout depends on
-    how rows arrive. Raises InputError for channels that the format cannot hold, and for several parts, which a file
-    stores one after the other. Raises ClsplatError if writing fails.
+    how rows arrive. Raises InputError for channels that the format cannot hold, and for several parts (see
+    `check_parts`). Raises ClsplatError if writing fails.
     """
     encoding, header, extension = encoding or Encoding(), header or FrameFileHeader(), path.suffix.lower()
     check_target(path, names)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Warped pictures, sampled from straight ones at the places of their pixels (docs/pictures.md).
 
-A window of a warped picture has the same pixels as the whole picture there.
+A window of a warped picture has the same pixels as the whole picture has there.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def cubic(plane: NDArray[Any], places: Float64) -> NDArray[Any]:
 
 
 def _catmull_rom(t: Float32) -> tuple[Float32, Float32, Float32, Float32]:
-    """Weights of the four pixels around a place, at the distance t after the second one."""
+    """Weights of the four pixels around a place at the distance t after the second pixel."""
     return (
         0.5 * t * (t * (2 - t) - 1),
         0.5 * (t * t * (3 * t - 5) + 2),

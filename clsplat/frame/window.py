@@ -24,7 +24,7 @@ def framed(camera: Camera, config: FramingConfig) -> Camera:
         x, y, width, height = parse_region(config.region)
         if x + width > camera.width or y + height > camera.height:
             raise InputError(
-                f"--region {config.region}: ends at {x + width},{y + height}, expected at most the frame's "
+                f"--region {config.region}: ends at {x + width},{y + height}, beyond the frame's size "
                 f"{camera.width},{camera.height}"
             )
         return crop(camera, x, y, width, height)

@@ -32,8 +32,8 @@ class StepMemory:
     """Memory of a training step in addition to a frame's, by its settings.
 
     fields: the columns of a slot.
-    photographs: pixels of all photographs that may stay on the device.
-    turns: the `turns` of `stages.loss`.
+    photographs: number of pixels of all photographs that may stay on the device.
+    turns: number of arrays for the partial sums of the loss (`stages.loss.loss`).
     masks: True if photographs have masks, or there is an alpha loss.
     row_bytes: bytes per Gaussian of the training's components.
     pixel_bytes: bytes per pixel of the training's components.

@@ -47,12 +47,12 @@ class Need:
 
     @property
     def total(self) -> int:
-        """Bytes if everything except photographs is on the device at once."""
+        """Bytes needed if everything except photographs is on the device at once."""
         return self.planes + self.scratch + self.gaussians * (self.row + self.model) + self.pairs * self.pair
 
     @property
     def moving(self) -> int:
-        """Bytes of a second copy of parameters and moments, while rows move."""
+        """Bytes of a second copy of parameters and moments, which exists while rows are moved."""
         return self.gaussians * self.model
 
 
@@ -98,13 +98,13 @@ class Plan:
         if self.streamed:
             how.append(f"parameters are streamed, {self.rows:,} Gaussians at a time")
         if self.bands > 1:
-            how.append(f"the image is done in about {self.bands} bands of tiles")
+            how.append(f"the image is rendered in about {self.bands} bands of tiles")
         needed, allowed = mebibytes(self.need.total), mebibytes(self.allowed)
         return f"about {needed} of device memory needed, {allowed} allowed: " + (", ".join(how) or "all at once")
 
 
 def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
-    """Divide the work, going by the estimated number of pairs.
+    """Divide the work according to the estimated number of pairs.
 
     If not everything fits at once, the tiles are divided into bands. If that would make many bands, the parameters are
     also streamed in parts. Bands come first because they repeat little work, while parts cross the bus in every step.
@@ -133,6 +133,6 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
         least = budget - room + alignment * need.model + max(need.gaussians // 8, 1) * need.pair
         raise CapacityError(
             f"{need.gaussians:,} Gaussians at this size of image need at least about {mebibytes(least)} of device "
-            f"memory, or {mebibytes(need.total)} to be done at once, and {mebibytes(budget)} are allowed"
+            f"memory, or {mebibytes(need.total)} to be processed at once, but {mebibytes(budget)} are allowed"
         )
     return streamed

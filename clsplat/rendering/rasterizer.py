@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The forward pass and its gradient, each on one screen."""
+"""The forward pass and its gradient, as sequences of the stages."""
 
 from __future__ import annotations
 
@@ -53,15 +53,15 @@ class ListedBand:
 
 
 MAX_COUNTED_PASSES = 3
-"""Number of passes by capacity whose counts are kept: the current one, the one before, and one that is repeated."""
+"""Number of passes by capacity whose counts are retained: the current pass, the one before, and a repeated pass."""
 
 
 @dataclass(frozen=True)
 class PairCapacity:
-    """Capacity of a pass that is launched before its number of pairs is known.
+    """Capacity of a pass that is launched before its number of pairs is known: "a pass by capacity".
 
     pairs: number of pairs that fit in its arrays.
-    turn: place of its counts, below MAX_COUNTED_PASSES.
+    turn: index of the array for its counts, below MAX_COUNTED_PASSES.
     """
 
     pairs: int

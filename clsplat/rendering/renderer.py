@@ -66,7 +66,7 @@ Others, if they were asked for: (H, W) or (H, W, floats) float32, as docs/channe
 
 
 def held_sh(gaussians: Gaussians, config: RasterizerConfig) -> ShStorage:
-    """The SH coefficients of a model that the settings keep for rendering, and their storage.
+    """Which SH coefficients of a model the settings keep for rendering, and their storage.
 
     Raises InputError if a coefficient is too large for float16.
     """
@@ -275,7 +275,7 @@ class Renderer:
     def _motion(
         self, gaussians: Gaussians | AnyGaussians, on_device: AnyGaussians, ahead: _MotionEnd, back: _MotionEnd
     ) -> Motion:
-        """Both ends of motion, their means stored on the same side as the model."""
+        """Both ends of motion, with means on the device or on the host, like the model."""
         cameras = self._sent(ahead, gaussians), self._sent(back, gaussians)
         return Motion(*cameras, self._moved(on_device, ahead), self._moved(on_device, back))
 
@@ -293,7 +293,7 @@ class Renderer:
         if moved is None:
             return None
         if len(moved) != gaussians.count:
-            raise ValueError(f"{len(moved)} Gaussians to move to, expected {gaussians.count}")
+            raise ValueError(f"{len(moved)} moved Gaussians, expected {gaussians.count} as in the model")
         if isinstance(gaussians, HostGaussians):
             return HostGaussians(len(moved), gaussians.coefficients, {"means": HostArray(moved.means)}, gaussians.rows)
         return DeviceGaussians(len(moved), gaussians.coefficients, {"means": upload(self.device, moved.means)})
@@ -356,7 +356,7 @@ def _motion_end(
     if asked and camera.model.without_motion:
         raise InputError(f"{name} is not defined for {camera.model.without_motion}")
     if asked and other.projection != camera.projection:
-        raise InputError(f"{name} goes from a camera to one that is {other.projection}, expected {camera.projection}")
+        raise InputError(f"{name} leads to a camera that is {other.projection}, expected {camera.projection}")
     return _MotionEnd(other, gaussians if asked else None)
 
 
@@ -393,13 +393,13 @@ def render(
     gaussians : Gaussians
         The model.
     camera : Camera
-        In world coordinates. Its near plane is the model's unless it has its own.
+        In world coordinates. If it specifies no near plane, the model's is used.
     background : sequence of 3 float
         Red, green, blue, any finite numbers.
     device : str, optional
         A device as `clsplat devices` lists it. None means the default device (docs/drivers.md).
     max_device_mem : str or int, optional
-        Largest amount of its memory to use, in bytes or such as "256MiB".
+        Largest amount of its memory to use, in bytes or as text such as "256MiB".
 
     Returns
     -------

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from clsplat.errors import InputError
 
 MIN_DROPPED_SH_FRACTION = 0.5
-"""Fraction of the coefficients above band 0 that can be left out, from which each Gaussian stores its own degree.
+"""Each Gaussian stores its own degree if at least this fraction of the coefficients above band 0 can be left out.
 
 From this fraction on, a frame takes no longer with the degrees than without them (docs/performance.md).
 """
@@ -52,7 +52,7 @@ def needed_degrees(sh: NDArray[np.float32], tolerance: float) -> NDArray[np.uint
 
 
 def coefficients_in_use(degrees: NDArray[np.uint8]) -> tuple[int, bool]:
-    """Coefficients per channel of the Gaussian with the most, and True if a degree for each Gaussian saves enough."""
+    """Largest number of coefficients per channel in use, and True if a degree for each Gaussian saves enough."""
     coefficients = (int(degrees.max(initial=0)) + 1) ** 2
     if coefficients == 1:
         return 1, False

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches adam.cl for every parameter group. In a step of one view, `stages.project.project_step` does Adam
+"""Launches adam.cl for every parameter group. In a step of one view, `stages.project.project_step` takes Adam's step
 instead."""
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from clsplat.stages.device_gaussians import DeviceGaussians
 
 @dataclass(frozen=True, eq=False)
 class AdamStep:
-    """A step of Adam: its constants, its number from 1, and the learning rate of each group."""
+    """A step of Adam: its constants, its number (from 1), and the learning rate of each group."""
 
     config: OptimiserConfig
     number: int
@@ -50,14 +50,14 @@ def adam(
     tile_counts: DeviceArray,
     readback: DeviceArray | None = None,
 ) -> None:
-    """Take a step along the gradients, and leave them zero.
+    """Take a step along the gradients, and set the gradients to zero.
 
     tile_counts: (n,) uint32, 0 where the view does not show a Gaussian, for `OptimiserConfig.sparse`.
-    readback: (READBACK_SIZE,) uint32. Its last four count the elements whose step was refused, by reason
+    readback: (READBACK_SIZE,) uint32. Its last four entries count the elements whose step was refused, by reason
     (`columns.REFUSED`).
     """
     readback = readback or allocate(device, (len(READBACK),), np.uint32)
-    counts = readback.buffer  # not the array: its bytes are no traffic, as it is written only on a fault
+    counts = readback.buffer  # an array would count as traffic, but this is written only on a fault
     config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
     lanes = device.shape.lanes

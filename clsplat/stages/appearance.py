@@ -27,9 +27,9 @@ APPEARANCE_BETA1, APPEARANCE_BETA2, APPEARANCE_EPSILON = 0.9, 0.999, 1e-15
 class GainEntries:
     """Entries of gains, and how they learn.
 
-    first_row: of the entries in column sums.
-    mix_rate: fraction of the rate for mixes.
-    centred: the mean of each entry is subtracted after a step.
+    first_row: row of the first entry in the column sums.
+    mix_rate: learning rate of mixes, as a fraction of the rate of gains.
+    centred: True if the mean of each entry over all rows is subtracted after a step.
     """
 
     first_row: int = 0
@@ -89,7 +89,7 @@ def rows_on(device: Device, photographs: int, pull: csr_array | None) -> dict[st
 
 @stage("appearance", remove_gains=1)
 def remove_gains(device: Device, gains: Gains, photograph: int, target: DeviceArray) -> None:
-    """Divide the first three planes, the colours, of (3 or more, rows, stride) by the photograph's gains."""
+    """Divide the colours, the first three planes of `target` (3 or more, rows, stride), by the photograph's gains."""
     _, rows, stride = target.shape
     kernel = device.kernels("appearance", {"LANES": 1}).remove_gains
     launch_grid(device, kernel, (stride, rows), photograph, stride, rows * stride, gains.gains, target)
@@ -104,9 +104,10 @@ def gain_gradient(
     height: int,
     place: int = 0,
 ) -> DeviceArray:
-    """Column sums (3, stride) of the image times the loss's gradient by it.
+    """Column sums (3, stride) of the image times the loss's gradient with respect to it.
 
-    ln 2 times their sum over x is the gradient by the photograph's logs. Each `place` in a batch has its own array.
+    ln 2 times their sum over x is the gradient with respect to the photograph's logs. Each `place` in a batch has its
+    own array.
     """
     _, rows, stride = image.shape
     down = rows // TILE
@@ -134,7 +135,7 @@ def step_gains(
 ) -> None:
     """Adam's step number `step` (from 1) along the column sums of the entries.
 
-    If the step's pass by capacity has stopped, nothing changes.
+    If the step's pass has stopped (kernels/duplicate.cl), nothing changes.
     """
     kernels, (photographs, width) = device.kernels("appearance", {"LANES": 1}), gains.logs.shape
     count = photographs * width

@@ -91,7 +91,7 @@ def launch_tiles(
 ) -> None:
     """Launch a kernel of `stem`.cl, with one group per tile of the lists.
 
-    kernel: its name, if different from the file's.
+    kernel: the kernel's name, if it is not `stem`.
 
     The kernel's arguments are the first tile, the number of tiles in a row of the image, and `arguments`.
     """
@@ -141,8 +141,8 @@ def count_pairs(
 ) -> tuple[int, int]:
     """Count pairs of a Gaussian and a pixel, by a build of blend.cl that counts them: (contributing, evaluated).
 
-    A pair contributes if its colour is added to the pixel. It is evaluated if its alpha is computed, which a vector
-    does for all its lanes.
+    A pair contributes if its colour is added to the pixel. It is evaluated if its alpha is computed; a vector computes
+    the alpha of all its lanes.
     """
     width, height = camera.width, camera.height
     planes = _planes(work, width, height, kept=True)  # the planes that `blend` wrote, which get the same values again
@@ -166,8 +166,8 @@ def blend_grad(
 ) -> DeviceArray:
     """Partial gradients of every pair of the lists at its slot, (pairs, fields.floats).
 
-    image_gradient: (3, rows, stride). A fourth plane is the loss's gradient by the transmittance. A last plane is the
-    gradient by nearness, if the fields include it.
+    image_gradient: (3, rows, stride). A fourth plane is the loss's gradient with respect to the transmittance. A last
+    plane is the gradient with respect to nearness, if the fields include it.
     """
     rows, stride = blended.transmittance.shape
     pairs = lists.gaussian_from_sorted.shape[0]

@@ -83,8 +83,8 @@ class Floats:
 class Channels:
     """Planes padded to whole tiles; `Features.named` splits them.
 
-    means: (floats + 2, rows, stride), the features and then DEPTH_PLANES.
-    whole: (2, rows, stride), WHOLE_NUMBER_PLANES.
+    means: (floats + 2, rows, stride), the features, then the planes of DEPTH_PLANES.
+    whole: (2, rows, stride), the planes of WHOLE_NUMBER_PLANES.
     """
 
     means: DeviceArray
@@ -156,7 +156,7 @@ def channels(
     blended: Blended,
     held: Held | None = None,
 ) -> Channels:
-    """Blend the features with the weights of `blended`, which must be of the same lists.
+    """Blend the features with the weights of `blended`, which must come from the same lists.
 
     held: surfaces of the holdout, if there is one.
     """

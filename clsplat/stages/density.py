@@ -24,7 +24,7 @@ from clsplat.stages.scan import scan
 
 
 def gaussian_bytes(*, contributions: bool) -> int:
-    """Bytes of each Gaussian's statistics: sums, views, radii; two epochs of two contributions."""
+    """Bytes of each Gaussian's statistics: sum, views, radius; with contributions, two for each of two epochs."""
     return 4 * (3 + 4 * contributions)
 
 
@@ -44,8 +44,8 @@ class DensityStatistics:
 
     CONTRIBUTION_STATISTICS are contributions to the images of the training views, in pixels. They are counted per
     epoch, whether or not Gaussians are densified. There is the total over the views and the largest in one view, each
-    for the current epoch and for the last whole one. They are infinite for Gaussians that did not exist, or were not
-    measured, in some view of the epoch. They are None if no rule uses them.
+    for the current epoch and for the last complete epoch. They are infinite for Gaussians that did not exist, or were
+    not measured, in some view of the epoch. They are None if no rule uses them.
     """
 
     gradient_sums: DeviceArray
@@ -73,13 +73,13 @@ class DensityStatistics:
                 array.set(values[name])
 
     def forget_contributions(self) -> None:
-        """Forget the Gaussians' contributions until the next epoch is over."""
+        """Set all contributions to infinity, so that none counts as small until an epoch is complete."""
         for name, array in self.named().items():
             if name in CONTRIBUTION_STATISTICS:
                 array.fill(np.inf)
 
     def next_epoch(self) -> DensityStatistics:
-        """Statistics in which the current epoch becomes the last whole one, and a new epoch begins."""
+        """Statistics in which the current epoch becomes the last complete epoch, and a new epoch begins."""
         if self.whole_totals is None or self.whole_largest is None:
             return self
         self.whole_totals.fill(0.0)
@@ -110,7 +110,7 @@ def add_statistics(
     projected: Projected,
     screen: Screen,
 ) -> None:
-    """Add one view: the norm of the gradient by each visible mean, in NDC, the unit of the paper's threshold."""
+    """Add one view: the norm of the gradient with respect to each visible mean in NDC, as for the paper's threshold."""
     n = projected.tile_counts.shape[0]
     rays = camera.model.along_rays
     kernels = device.kernels("density", {"RAYS": True} if rays else {})

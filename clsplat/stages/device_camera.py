@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera layout in the form that the kernels read."""
+"""Cameras in the layout that the kernels read."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ assert CAMERA[len(_CAMERA_FIELDS) :] == tuple(
     f"{name}_LOW" for name in _CAMERA_FIELDS[: len(CAMERA) - len(_CAMERA_FIELDS)]
 )
 FARTHEST_PLANE = float(np.finfo(np.float32).max)
-"""Far plane of a camera without one, world units. It is finite because infinity, split into two floats, would give
-NaN."""
+"""Far plane, in world units, of a camera that has none. It is finite because infinity, split into two floats, would
+give NaN."""
 _TRANSLATION_FIELDS, _POSITION_FIELDS = ("T0", "T1", "T2"), ("PX", "PY", "PZ")
 _ROTATION_FIELDS = tuple(tuple(f"R{row}{column}" for column in range(3)) for row in range(3))
 
 
 def pack_camera(camera: Camera) -> NDArray[np.float32]:
     """Pack a camera in the order of `columns.CAMERA`: its values as float32, and their rounding errors in the fields
-    _LOW.
+    whose names end in _LOW.
 
     Raises InputError for a panorama of more than a full turn.
     """
     if camera.width > (turn := camera.model.turn(camera)) * (1 + 1e-6):
-        wide = f"{camera.width} pixels wide, of which {turn:.1f} are a whole turn"
-        raise InputError(f"{camera.model.named} camera is {wide}: expected no more")
+        wide = f"{camera.width} pixels wide, but a full turn has {turn:.1f} pixels"
+        raise InputError(f"{camera.model.named} camera is {wide}: expected at most a full turn")
     window = camera.window or Window(0, 0, camera.width, camera.height)
     half_w, half_h = 0.5 * window.width / camera.fx, 0.5 * window.height / camera.fy
     values = {

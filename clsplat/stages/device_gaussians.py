@@ -52,7 +52,7 @@ class _ByGroup(Generic[A]):
         return self.arrays[group]
 
     def only(self, *groups: str) -> Self:
-        """The same with only these arrays."""
+        """An object with only the arrays of these groups."""
         return replace(self, arrays={group: self.arrays[group] for group in groups})
 
 
@@ -108,7 +108,7 @@ AnyGaussians = DeviceGaussians | HostGaussians
 def parts(
     work: Workspace, *models: AnyGaussians, keep: bool = False
 ) -> Iterator[tuple[int, int, tuple[DeviceGaussians, ...]]]:
-    """Yield (start, stop, the models' rows [start, stop) on the device) for one part of the rows after the other.
+    """Yield (start, stop, the models' rows [start, stop) on the device) for each part of the rows in turn.
 
     Models on the device have a single part. A part of a host model is valid until the next part is requested.
 

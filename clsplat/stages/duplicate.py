@@ -28,14 +28,14 @@ DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
 """Bytes per Gaussian: first slots, the visible Gaussians with their keys, and the same sorted, with counts and
 offsets."""
 BAND_GAUSSIAN_BYTES = 4
-"""Additional bytes per Gaussian if there are several bands: its number of tiles in one of them."""
+"""Additional bytes per Gaussian if there are several bands: its number of tiles in the current band."""
 BAND_TILE_BYTES = 4
 """Bytes per tile if there are several bands: its number of pairs."""
 
 
 def pair_bytes(*, sorts_pairs: bool) -> int:
-    """Bytes per pair: tile, slot and Gaussian. If pairs are sorted by depth, tile, Gaussian and depth by slot, and the
-    sort, are added."""
+    """Bytes per pair: tile, slot and Gaussian. If pairs are sorted by depth, this includes the tile, Gaussian and depth
+    of each slot, and the sort."""
     return 12 + (12 + SORT_KEY_BYTES if sorts_pairs else 0)
 
 
@@ -63,7 +63,7 @@ class Counted:
     key_bits: the number of low bits that can be set in a key minus least_key.
     refused: the counts of `adam`.
 
-    In a pass by capacity, `visible` and `pairs` are upper bounds, and these fields are set:
+    In a pass launched by capacity (`PairCapacity`), `visible` and `pairs` are upper bounds, and these fields are set:
 
     on_device: the READBACK array in which its kernels find the totals.
     arriving: function that waits for the host's copy of that array, and returns it.
@@ -82,9 +82,9 @@ class Counted:
     arriving: Callable[[], NDArray[Any]] | None = None
 
     def elements(self, most: int, name: str) -> Elements:
-        """The number of elements for kernels, by its name in READBACK.
+        """The number that READBACK calls `name`, as a count of elements for kernels.
 
-        most: the number itself, or in a pass by capacity its upper bound.
+        most: the number itself, or its upper bound in a pass by capacity.
         """
         return Elements(most, self.on_device, READBACK.index(name))
 
@@ -212,8 +212,8 @@ def plan_bands(
     by_tile = counts.get()
     if (most := int(by_tile.max(initial=0))) > capacity:
         raise CapacityError(
-            f"one tile of {TILE}x{TILE} pixels has {most:,} Gaussians, and of the {amount(device.budget)} on "
-            f"{device.name} enough is left for {capacity:,}: allow more (--max-device-mem)"
+            f"one tile of {TILE}x{TILE} pixels has {most:,} Gaussians, but in the {amount(device.budget)} on "
+            f"{device.name} there is room for only {capacity:,}: allow more memory (--max-device-mem)"
         )
     ends = np.cumsum(by_tile, dtype=np.uint64)
     bands, first, done = [], 0, 0

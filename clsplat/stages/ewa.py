@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launches ewa.cl and ewa_grad.cl: Gaussians to means, conics, depths and radii on the image, and the gradient back.
 
-The kernels follow gsplat's conventions. They can also compute the gradient by the camera.
+The kernels follow gsplat's conventions. They can also compute the gradient with respect to the camera.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class EwaCamera:
     viewmat: (4, 4), camera from world. Its first three rows need not be a rotation and a translation.
     intrinsics: (3, 3), fx, fy, cx and cy in pixels; a skew is ignored.
     width, height: pixels.
-    near, far: Gaussians whose depth is not strictly between these are culled, world units.
+    near, far: world units; Gaussians whose depth is not strictly between these are culled.
     eps2d: px^2, added to the diagonal of the projected covariance.
     radius_clip: pixels; Gaussians with no larger radius are culled.
     model: one of EWA_CAMERA_MODELS.
@@ -72,8 +72,8 @@ class EwaCamera:
         return np.asarray(inverse[:3, 3], np.float64)
 
     def position_gradient(self, by_position: Float64) -> Float64:
-        """The gradient (4, 4) by the view matrix from the gradient (3,) by the centre. All sixteen numbers count as
-        variables."""
+        """The gradient (4, 4) with respect to the view matrix, whose sixteen numbers all count as variables, from the
+        gradient (3,) with respect to the centre."""
         inverse = np.linalg.inv(self.viewmat)
         by_inverse = np.zeros((4, 4))
         by_inverse[:3, 3] = by_position
@@ -173,7 +173,7 @@ class Ewa:
 
 @dataclass(frozen=True, eq=False)
 class EwaImageGradients:
-    """Gradients by the arrays of `Ewa`, with their shapes. None counts as 0.
+    """Gradients with respect to the arrays of `Ewa`, with the same shapes. None counts as 0.
 
     The b of a conic stands for two entries of a symmetric matrix, but counts as one variable.
     """
@@ -186,9 +186,9 @@ class EwaImageGradients:
 
 @dataclass(frozen=True, eq=False)
 class EwaGradients:
-    """Gradients by the arrays of EwaInputs, with their shapes.
+    """Gradients with respect to the arrays of EwaInputs, with the same shapes.
 
-    The gradient by an off-diagonal entry of a covariance is the sum over both of its places in the matrix.
+    The gradient with respect to an off-diagonal entry of a covariance is the sum over its two places in the matrix.
     """
 
     means: DeviceArray
@@ -240,11 +240,11 @@ def ewa_grad(
     add: bool = False,
     by_camera: bool = False,
 ) -> DeviceArray | None:
-    """Fill `gradients` from the `given` gradients by the image's quantities. Equations (159) to (166).
+    """Fill `gradients` from the `given` gradients with respect to the projected arrays. Equations (159) to (166).
 
-    add: add to the existing gradients, such as the ones of earlier cameras.
-    by_camera: return the gradient by the camera (16,), in the order of `columns.EWA_GRADIENT`; `camera_gradients` turns
-    it into matrices.
+    add: add to the existing gradients, such as those of earlier cameras.
+    by_camera: return the gradient (16,) with respect to the camera, in the order of `columns.EWA_GRADIENT`;
+    `camera_gradients` turns it into matrices.
 
     Culled Gaussians have no gradient.
     """
@@ -274,7 +274,7 @@ def ewa_grad(
 
 
 def camera_gradients(by_camera: NDArray[np.floating]) -> tuple[Float64, Float64]:
-    """Split the camera gradient (16,) of `ewa_grad` into gradients by the view matrix (4, 4) and the intrinsics (3, 3).
+    """Split the gradient (16,) of `ewa_grad` into gradients for the view matrix (4, 4) and the intrinsics (3, 3).
 
     The last row of the view matrix has no gradient.
     """

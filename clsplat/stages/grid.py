@@ -54,7 +54,7 @@ def device_bytes(photographs: int, sizes: Sequence[tuple[int, int]]) -> int:
 def apply_grid(
     device: Device, work: Workspace, grids: Grids, photograph: int, image: DeviceArray, width: int, height: int
 ) -> DeviceArray:
-    """The image, width x height pixels, with the photograph's colours: planes (3, rows, stride)."""
+    """The image, of width x height pixels, with the colours of the photograph: planes (3, rows, stride)."""
     _, rows, stride = image.shape
     seen = work.array("appearance_seen", image.shape)
     sizes = (photograph, stride, rows * stride, *_spans(width, height))
@@ -76,10 +76,10 @@ def grid_gradient(
     weight: float,
     place: int = 0,
 ) -> DeviceArray:
-    """Convert the gradient by the transformed image to the gradient by the image, in place.
+    """Convert, in place, the gradient with respect to the transformed image to that with respect to the image.
 
-    Returns the gradient by the photograph's grid, plus `weight` times the gradient of its variation. Each `place` in a
-    batch has its own array.
+    Returns the gradient with respect to the photograph's grid, plus `weight` times the gradient of its variation. Each
+    `place` in a batch has its own array.
     """
     _, rows, stride = image.shape
     plane, (across, down) = rows * stride, _spans(width, height)
@@ -106,9 +106,9 @@ def step_grid(
     rate: float,
     readback: DeviceArray,
 ) -> None:
-    """Adam's step for the photograph's grid, at its visit number `visit` (from 1).
+    """Take Adam's step number `visit` (from 1) for the photograph's grid.
 
-    If the step's pass by capacity has stopped, nothing changes.
+    If the step's pass has stopped (kernels/duplicate.cl), nothing changes.
     """
     kernel = device.kernels("grid", {"LANES": 1}).move_grid
     constants = (
@@ -124,6 +124,6 @@ def step_grid(
 
 @stage("appearance")
 def centre_grids(device: Device, grids: Grids, readback: DeviceArray) -> None:
-    """Make the mean of all grids the identity. If the step's pass by capacity has stopped, nothing changes."""
+    """Make the mean of all grids the identity. If the step's pass has stopped, nothing changes."""
     kernel = device.kernels("grid", {"LANES": 1}).centre_grids
     launch_items(device, kernel, GRID_FLOATS, grids.grids.shape[0], readback, grids.grids)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launches harmonics.cl and harmonics_grad.cl: colours from spherical harmonics, and the gradient back.
 
-The directions are given, or point from a camera to the means.
+The directions are an input, or point from a camera to the means.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class HarmonicsGradients:
-    """Gradients by the arrays of `Harmonics`: sh (n, K, 3) and, if requested, directions (n, 3)."""
+    """Gradients with respect to the arrays of `Harmonics`: sh (n, K, 3) and, if requested, directions (n, 3)."""
 
     sh: DeviceArray
     directions: DeviceArray | None = None
@@ -109,8 +109,8 @@ def harmonics_grad(
 ) -> DeviceArray | None:
     """Fill `gradients` from d_colours (n, 3) and the colours of `harmonics`.
 
-    add, add_directions: add to existing gradients, of earlier cameras or by the means, instead of replacing them.
-    by_centre: return the gradient (3,) by the camera's centre.
+    add, add_directions: add to existing gradients (of earlier cameras, or of the means) instead of replacing them.
+    by_centre: return the gradient (3,) with respect to the camera's centre.
 
     Equations (38) to (40) and (168).
     """

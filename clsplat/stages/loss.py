@@ -22,8 +22,7 @@ LOSS_PIXEL_BYTES = 12
 """Bytes of the image's gradient, per pixel with padding."""
 
 _MIN_BLOCK_ROWS = 32
-"""The fewest rows of a block. Blocks should not be smaller, as each computes ten further rows of its neighbours
-again."""
+"""The fewest rows of a block. Blocks should not be smaller, because each computes ten rows of its neighbours again."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class _Blocks:
 
     rows, columns: size of a block, pixels.
     groups: number of blocks.
-    field: floats from one derivative of a row to the next, in groups that keep derivatives.
+    field: floats between two derivatives of a row, in groups that keep derivatives.
     partials, sums: floats of these arrays.
 
     The order of the sums depends only on the number of columns; no other result depends on the blocks.
@@ -62,7 +61,7 @@ def _blocks(device: Device, height: int, stride: int) -> _Blocks:
 
 
 def scratch_bytes(device: Device, height: int, stride: int, turns: int = 1) -> int:
-    """Bytes of the partial derivatives, and of the partial sums, of which each turn has its own."""
+    """Bytes of the partial derivatives, and of `turns` arrays of partial sums."""
     blocks = _blocks(device, height, stride)
     return 4 * (blocks.partials + turns * blocks.sums)
 
@@ -72,8 +71,8 @@ class Loss:
     """A loss and its gradient.
 
     gradient: (3, rows, stride), with an additional plane for each of the alpha and depth terms.
-    sums: (3, ...), partial sums of SSIM, of |x - y| and of its square. With further terms they are in one row, followed
-    by the sums of these.
+    sums: (3, ...), partial sums of SSIM, of |x - y| and of its square. With further terms the array has one axis, and
+    the sums of these terms follow.
     samples: the number of samples that count.
     masked: the number of masked samples, whose windows still count in SSIM.
     copy: function that returns the sums, if a copy to the host has been started.

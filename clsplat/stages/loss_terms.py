@@ -25,8 +25,8 @@ class Compared:
     """A render and its photograph, as `stages.loss.loss` hands them to a term.
 
     target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha.
-    gradient: planes (3 + terms, rows, stride), of which the term writes its own.
-    sums: all partial sums of the loss, of which the term writes `rows / TILE * stride`.
+    gradient: planes (3 + terms, rows, stride); each term writes its own plane.
+    sums: all partial sums of the loss; each term writes `rows / TILE * stride` of them.
     pixels: number of pixels that count.
     """
 
@@ -40,7 +40,7 @@ class Compared:
 
 
 class LossTerm:
-    """A loss term. Its value is weight * (sum of its partial sums) / divisor, by `scale`."""
+    """A loss term. Its value is weight * (sum of its partial sums) / divisor; `scale` returns weight and divisor."""
 
     wants_alpha = False
     """True if the term reads the photograph's alpha, the fourth plane of the target."""
@@ -97,7 +97,7 @@ class DepthTerm(LossTerm):
     factor: float
 
     def scale(self, pixels: float) -> tuple[float, float]:  # noqa: ARG002
-        """The factor, and 1: the weights of the pixels already contain their number."""
+        """The factor, and 1: the factor already contains the division."""
         return self.factor, 1.0
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:

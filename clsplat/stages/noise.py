@@ -16,7 +16,7 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.stages.device_gaussians import DeviceGaussians
 
 NOISE_OPACITY_RANGE = 0.16
-"""No noise is added to opacities over `dead` by more than this: it would be less than 1.2e-7 of a dead Gaussian's."""
+"""No noise for opacities that exceed `dead` by more than this: it would be under 1.2e-7 of a dead Gaussian's noise."""
 
 
 def highest_logit(dead: float) -> float:
@@ -40,7 +40,7 @@ def noise(
 def _add_noise(
     device: Device, explore: Exploration, gaussians: DeviceGaussians, first_row: int, readback: DeviceArray
 ) -> None:
-    """Launch add_noise: a stage of its own, so that a step without noise records none."""
+    """Launch add_noise. This is a separate stage, so that a step without noise does not record one."""
     highest, limit2 = min(highest_logit(explore.dead), 1e30), PARAMETER_GROUPS["means"].limit ** 2
     launch_items(
         device,

@@ -41,9 +41,9 @@ class Limits:
 def measure_limits(
     device: Device, *, seconds: float = 0.1, repeat: int = 5, copy_bytes: int = _COPY_BYTES, widened: bool = True
 ) -> Limits:
-    """Measure the best of `repeat` runs each; arithmetic runs last about `seconds`.
+    """Measure each rate as the best of `repeat` runs; runs of arithmetic last about `seconds`.
 
-    widened: use vectors of 16 if blending does; otherwise of the kernel shape's lanes.
+    widened: use vectors of 16 lanes if blending does. False always uses the kernel shape's lanes.
     """
     items = tile_items(device)
     defines = {} if widened else {"NARROW": True}

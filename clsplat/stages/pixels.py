@@ -13,7 +13,7 @@ from clsplat.stages.device_camera import padded_size
 
 @stage("pixels")
 def pixels_from_planes(device: Device, blended: Blended, pixels: DeviceArray, alpha: DeviceArray) -> None:
-    """Fill up to three leading values of pixels (height, width, depth), and alpha (height, width)."""
+    """Fill the first values, at most three, of pixels (height, width, depth), and alpha (height, width)."""
     height, width, depth = pixels.shape
     kernel, stride = device.kernels("pixels").pixels_from_planes, blended.transmittance.shape[1]
     planes = (blended.image, blended.transmittance)
@@ -26,7 +26,7 @@ def planes_from_pixels(
 ) -> DeviceArray:
     """The image gradient (3, rows, stride) of `blend_grad` from d_pixels (height, width, depth), depth 1 to 3.
 
-    d_alpha: (height, width), gives a fourth plane, the gradient by the transmittance.
+    d_alpha: (height, width), gives a fourth plane, the gradient with respect to the transmittance.
     The padding is not written.
     """
     height, width, depth = d_pixels.shape

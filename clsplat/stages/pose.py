@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches pose.cl: the gradient by the pose and the lens of a training view's camera."""
+"""Launches pose.cl: the gradient with respect to the pose and the lens of a training view's camera."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ point."""
 
 
 def sums_of(work: Workspace, count: int, numbers: int = POSE_NUMBERS) -> DeviceArray:
-    """Allocate the partial sums of `count` Gaussians by a pose or a lens, one row for each POSE_ROWS Gaussians.
+    """Allocate partial sums for the gradient of a pose or a lens: one row for each POSE_ROWS of `count` Gaussians.
 
     `pose_rows` or `lens_rows` fills them.
     """
@@ -36,7 +36,7 @@ def pose_rows(
     """Sum the pose gradient of these Gaussians into `sums` (ceil(n / POSE_ROWS), 6).
 
     device: the device with the switches of the camera's projection.
-    first_row: row of the first of them in the model, a multiple of POSE_ROWS.
+    first_row: row in the model of the first of these Gaussians, a multiple of POSE_ROWS.
     """
     launch_items(
         device,
@@ -67,7 +67,7 @@ def lens_rows(
 def sum_of(device: Device, work: Workspace, sums: DeviceArray) -> DeviceArray:
     """The total (1, numbers) of the partial sums (m, numbers).
 
-    It is by the rotation and translation of `Camera.moved`, or by ln fx, ln fy, cx and cy.
+    It is the gradient with respect to the rotation and translation of `Camera.moved`, or to ln fx, ln fy, cx and cy.
     """
     kernel, numbers, level = device.kernels("pose", {"LANES": 1}).pose_sums, sums.shape[1], 0
     while sums.shape[0] > 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches ppisp.cl: a photograph's gains and colour mixes, its lens's vignette, and the gradient by them."""
+"""Launches ppisp.cl: a photograph's gains and colour mixes, its lens's vignette, and the gradient of all these."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clsplat.stages.appearance import GainEntries, Gains
 COLOUR_ENTRIES, VIGNETTE_ENTRIES = 9, 3
 """Entries of a photograph, three gains and six mixes; entries of a lens."""
 VIGNETTE_GAINS = GainEntries(first_row=COLOUR_ENTRIES, centred=False)
-"""Entries of a lens, behind the photograph's in column sums."""
+"""Entries of a lens, which follow the photograph's in column sums."""
 PPISP_PIXEL_BYTES = 8
 """Bytes of the partial sums, per pixel with padding."""
 
@@ -24,7 +24,7 @@ PPISP_PIXEL_BYTES = 8
 class PhotoLens:
     """Photograph and lens of a view, as the kernels need them.
 
-    photograph, lens: rows of their entries.
+    photograph, lens: rows in the arrays of their entries.
     centre: the principal point, as fractions of the image's width and height.
     flat: False for a panorama, which has no vignette.
     """
@@ -80,7 +80,7 @@ def camera_gradient(
     """Column sums (COLOUR_ENTRIES + VIGNETTE_ENTRIES, stride) of the gradient; each `place` in a batch has its own
     array.
 
-    Their sums over x are the gradients by the entries, divided by ln 2 except for the mixes.
+    Their sums over x are the gradients with respect to the entries, divided by ln 2 except for the mixes.
     """
     _, rows, stride = image.shape
     down, sums = rows // TILE, COLOUR_ENTRIES + VIGNETTE_ENTRIES

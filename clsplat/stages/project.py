@@ -41,7 +41,7 @@ class Projected:
 
     splats: (n, SPLAT).
     tile_counts: (n), 0 where culled.
-    shown: (n), 0 where there is no splat. None unless culling is switched off, as otherwise tile_counts says the same.
+    shown: (n), 0 where there is no splat. None unless culling is switched off: otherwise tile_counts shows the same.
     """
 
     splats: DeviceArray
@@ -72,7 +72,7 @@ def project(
     camera_array: DeviceArray,
     thinning: Thinning | None = None,
 ) -> Projected:
-    """Project all Gaussians (Kerbl et al. 2023, section 4), except the ones that thinning drops.
+    """Project all Gaussians (Kerbl et al. 2023, section 4), except those that thinning drops.
 
     It also counts the tiles that each Gaussian reaches.
     """
@@ -136,7 +136,7 @@ class Slots:
 class Screen:
     """Screen-space results of one view; only rows of visible Gaussians are written.
 
-    gradients: (n, 2), by the means on the image, in pixels.
+    gradients: (n, 2), with respect to the means on the image, in pixels.
     contributions: (n,), sums of the blending weights over the image's pixels, or None.
     """
 
@@ -181,7 +181,7 @@ def project_grad(
 
     sh_rest: also compute the higher SH bands.
     explore: its penalties are added.
-    by_lens: (n, 4), receives each Gaussian's gradient by the lens of a flat camera.
+    by_lens: (n, 4), receives each Gaussian's gradient with respect to the lens of a flat camera.
     """
     weights, build = explore.weights, _build(device)
     defines = {**_defines(gaussians, slots, sh_rest=sh_rest), **build.defines}
@@ -245,7 +245,7 @@ def project_step(
         *(config.beta1, config.beta2, config.epsilon),
         *numbers[weights:],
         *(PARAMETER_GROUPS["means"].limit ** 2, PARAMETER_GROUPS["sh_dc"].limit ** 2),
-        readback.buffer,  # a raw buffer, not an array that each step processes: it is touched only on a fault
+        readback.buffer,  # an array would count as traffic, but this is written only on a fault
         *(arrays[group] for arrays in model for group in PARAMETER_GROUPS),
     )
     build = _build(device)

@@ -122,7 +122,7 @@ def sort(
 ) -> tuple[DeviceArray, DeviceArray]:
     """Sort by the faster of the two sorts for this number of keys.
 
-    bits: number of low bits that can be set in a key less `base`.
+    bits: number of low bits that can be set in a key minus `base`.
     base: not larger than any key.
     elements: the number of keys that count, if not all do.
     """

@@ -17,14 +17,14 @@ from clsplat.stages.project import Projected, Slots
 SPLAT_VALUES = 3
 """Values in a splat, which blend.cl blends."""
 SLOT_MOMENT_FIELDS = SLOT.index("RED")
-"""Fields of a slot before the gradients by values."""
+"""Number of fields in a slot before the gradients with respect to values."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScreenGaussians:
     """Projected Gaussians as arrays.
 
-    radii: (n, 2) int32 in pixels; one of them is 0 if a Gaussian is culled.
+    radii: (n, 2) int32 in pixels; a Gaussian with a radius of 0 is culled.
     means2d: (n, 2) in pixels.
     conics: (n, 3), a, b and c of the inverse covariance.
     opacities: (n,) in [0, 1].
@@ -52,9 +52,9 @@ class ScreenGaussians:
 
 @dataclass(frozen=True, eq=False)
 class ScreenGradients:
-    """Gradients by the arrays of `ScreenGaussians`: means2d (n, 2), conics (n, 3), opacities (n,), values (n, width).
+    """Gradients for the arrays of `ScreenGaussians`: means2d (n, 2), conics (n, 3), opacities (n,), values (n, width).
 
-    absolute: (n, 2), the absolute gradients by means2d, or None if not requested.
+    absolute: (n, 2), the absolute gradients with respect to means2d, or None if not requested.
     """
 
     means2d: DeviceArray
@@ -70,7 +70,7 @@ def splats(
 ) -> Projected:
     """Compute splats and tile counts for an image of width x height pixels.
 
-    listed: make a splat for every Gaussian, also for culled ones, as the caller's tile lists may contain any.
+    listed: make a splat for every Gaussian, even if it is culled, because the caller's tile lists may contain any.
     """
     n = gaussians.count
     projected = Projected(work.array("splats", (n, len(SPLAT))), work.array("tile_counts", (n,), np.uint32))

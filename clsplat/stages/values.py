@@ -43,7 +43,7 @@ def most_gradients(device: Device) -> int:
 
 @dataclass(frozen=True, eq=False)
 class ValuePass:
-    """Values (n, depth) of all Gaussians in an image, its lists, splats and blending, and the background (depth,)."""
+    """Values (n, depth) of all Gaussians; an image's lists, splats and blending; the values' background (depth,)."""
 
     lists: TileLists
     projected: Projected

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of several views, on one device or several: gradients are summed in the order of the views, then Adam.
+"""A step of several views, on one device or several: gradients are summed in the order of the views, then Adam's step.
 
 The first device has the model. Each further device has a thread and a copy of the parameters, and returns the results
 of its views. Neither the speed nor the number of devices changes a bit of the result.
@@ -68,7 +68,7 @@ def scaled_rates(rates: Mapping[str, float], batch: int) -> dict[str, float]:
 
 
 def shares(count: int, devices: int) -> list[range]:
-    """The views of a step that each device takes: consecutive ones."""
+    """The consecutive views of a step that each device takes."""
     size = -(-count // devices)
     return [range(min(k * size, count), min((k + 1) * size, count)) for k in range(devices)]
 
@@ -90,15 +90,14 @@ class _AddedView(GradientStep):
     """A view whose gradients are added to the sums over the views. The sums are the second member of its model.
 
     shown: (n,), nonzero for Gaussians that any view shows; None if Adam does not need it.
-    own: gradients by the parameters of the views' parts, by the views' places.
+    own: for the place of each view, the gradients with respect to the parameters of its parts.
     """
 
     shown: DeviceArray | None
     own: dict[int, Sequence[DeviceArray | None]]
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Keep the gradients instead of taking a step: all views of the batch use the components' state from before
-        it."""
+        """Keep the gradients instead of taking a step: all views use the components' state before the batch."""
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
@@ -120,7 +119,7 @@ class ViewOutcome:
 
     arrays: arrays of its rows, by name.
     gradients: gradients of its rows, by parameter group.
-    own: gradients by the parameters of its parts.
+    own: gradients with respect to the parameters of its parts.
     """
 
     arrays: dict[str, NDArray[Any]]
@@ -131,7 +130,7 @@ class ViewOutcome:
 
 @dataclass(frozen=True, eq=False)
 class _RemoteView(GradientStep):
-    """A view on another device than the model's. Its results go to the host."""
+    """A view on a device other than the model's. Its results go to the host."""
 
     arrays: dict[str, NDArray[Any]]
     outcome: dict[str, NDArray[np.float32]]
@@ -179,7 +178,7 @@ class Replica:
         self.photographs.follow(plan.photographs)
 
     def take(self, values: Mapping[str, NDArray[np.float32]], coefficients: int) -> None:
-        """Take the parameters of these groups, of `coefficients` SH coefficients, from the host."""
+        """Upload the parameters of these groups, with `coefficients` SH coefficients, from the host."""
         assert self.plan is not None, "planned before the first step"
         count = self.plan.need.gaussians
         if self.parameters is None or self.parameters.coefficients != coefficients:
@@ -203,7 +202,7 @@ class Replica:
     ) -> ViewOutcome:
         """Forward, loss and backward of a view.
 
-        place: its number among this device's views.
+        place: the view's number among this device's views.
         factor: divisor of the photographs' resolution.
         values: values of its parts, for this device.
         splats: True if density control uses its gradients.
@@ -236,7 +235,7 @@ class Replica:
 
 
 class Batch:
-    """The gradients of several views, and Adam along their sum.
+    """The gradients of several views, and Adam's step along their sum.
 
     rasterizer, photographs: rasterizer and image cache of the device that has the model.
     further: the other devices.
@@ -250,7 +249,7 @@ class Batch:
         if len({device.queue.int_ptr for device in devices}) < len(devices):
             raise InputError(
                 f"several devices to train on: got {', '.join(device.name for device in devices)}, of which two "
-                "share a queue and kernels; expected each opened on its own, as each gets a thread"
+                "share a queue and kernels; open each device on its own, because each gets a thread"
             )
         self.rasterizer, self.photographs, self.config = rasterizer, photographs, config
         self.replicas = [Replica(device, config, photographs) for device in further]
@@ -284,11 +283,11 @@ class Batch:
         *,
         statistics: bool,
     ) -> Losses:
-        """Update the model (parameters, first and second moments) by the views.
+        """Update the model (parameters, first and second moments) with the views of a step.
 
         step: the template of a single view's step; its number counts views.
         factor: divisor of the photographs' resolution.
-        probes: makes a view's probe.
+        probes: function that makes a view's probe.
         statistics: True if density control uses the views' gradients.
         """
         batch, work, device = self.config.batch, self.rasterizer.work, step.device
@@ -330,7 +329,7 @@ class Batch:
         return Losses(tuple(losses))
 
     def _room_for(self, device: Device, parameters: AnyGaussians) -> tuple[AnyGaussians, DeviceArray | None]:
-        """Arrays for the sums and for the mark of shown Gaussians, or None if Adam does not need the mark.
+        """Arrays for the sums and for the marks of visible Gaussians. The second is None if Adam needs no marks.
 
         The sums are zero, as `adam` leaves them; the marks are cleared.
         """
@@ -402,7 +401,7 @@ class Batch:
 
 
 def _brought(work: Workspace, device: Device, name: str, values: NDArray[Any]) -> DeviceArray:
-    """Copy an array of another device to this one. The host's copy must stay until the next step."""
+    """Copy an array of another device to this one. The host's copy must stay unchanged until the next step."""
     if device.shares_memory and values.size:
         return shared(device, values)
     array = work.array(name, values.shape, values.dtype.type)

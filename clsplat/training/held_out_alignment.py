@@ -20,7 +20,7 @@ from clsplat.training.supervision.image_cache import kept_pixels
 from clsplat.training.trainer import Trainer
 
 ALIGNMENT_STEPS, ALIGNMENT_REACH_DEGREES = 40, 1.0
-"""Steps to find the pose of a held-out view, and the approximate limit of its rotation in degrees."""
+"""Number of steps that find the pose of a held-out view, and the approximate limit of its rotation in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class _FixedModel(GradientStep):
 def aligned(trainer: Trainer, view: View, look: Look) -> Camera:
     """Camera of a held-out view, moved so that the model fits the view's photograph best. The model does not change.
 
-    look: function that gives the view's appearance, which is removed from the photograph.
+    look: function from the view to its appearance, which is removed from the photograph.
     """
     config, rasterizer, model = replace(trainer.config, thinning=0.0), trainer.rasterizer, trainer.parameters
     photograph = np.ascontiguousarray(view.load_masked())

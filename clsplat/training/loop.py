@@ -50,15 +50,15 @@ GROWTH_LIMIT_FRACTION = 0.97
 """Fraction of --density.max-gaussians from which growth counts as limited. It is below 1 because some Gaussians are
 pruned after the limit was reached."""
 OVERFITTING_DB = 0.2
-"""Fall of the held-out views' mean PSNR, dB, from which a warning tells of overfitting.
+"""Fall of the held-out views' mean PSNR, in dB, from which a warning reports overfitting.
 
 Trainings that differ only in the seed differ by as much (docs/quality.md).
 """
 
 
 Between = Callable[[Trainer, Callable[[], bool]], None]
-"""A function called before each step, with the trainer and a predicate that is True after Ctrl-C, when it should
-return."""
+"""Function called before each step, with the trainer and a predicate. It should return once the predicate is True,
+after Ctrl-C."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def _interruption() -> Iterator[Callable[[], int]]:
 
     def asked() -> int:
         if not first:
-            for number in before:  # installed again, as kernel compilers have installed handlers of their own
+            for number in before:  # again, because kernel compilers have installed their own handlers
                 signal.signal(number, ask)
         return first
 
@@ -156,7 +156,7 @@ class TrainingSession:
         if not 0 < self.trainer.step <= self.saved:
             return ""
         resume = f"clsplat train -o {self.run.path} --resume"
-        return f"; the checkpoint of step {self.trainer.step} is written: {resume} goes on from it"
+        return f"; a checkpoint of step {self.trainer.step} is written: {resume} continues from it"
 
     def go_back(self) -> bool:
         """Report non-finite values. After too many troubled steps, go back to the last checkpoint with smaller learning
@@ -182,9 +182,9 @@ class TrainingSession:
             self.saved = -1
             self.save()  # the smaller learning rates must survive a crash
         warnings.warn(
-            f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had trouble: back to "
-            "step "
-            f"{trainer.step}, with learning rates multiplied by {trainer.monitor.retries.rate_factor:g}"
+            f"step {stopped}: {len(retries.troubled)} of the last {TROUBLE_WINDOW_STEPS} steps had trouble: "
+            f"training returns to step {trainer.step}, with learning rates multiplied "
+            f"by {trainer.monitor.retries.rate_factor:g}"
         )
         return True
 
@@ -244,7 +244,7 @@ class TrainingSession:
     def evaluate(self, *, keep: bool) -> Evaluation:
         """Evaluate the held-out views.
 
-        keep: keep their renders in the run's test/.
+        keep: save their renders in the run's folder test/.
         """
         trainer = self.trainer
         trainer.settle()
@@ -395,7 +395,7 @@ def _tell_of_limit(trainer: Trainer) -> None:
     if not density.fills and began < most <= trainer.parameters.count:
         warnings.warn(
             f"--density.max-gaussians {density.max_gaussians:,} has limited the growth: --density.growth mcmc, or "
-            "budget with --density.long-axis, shows more with as many Gaussians"
+            "budget with --density.long-axis, gives more detail with as many Gaussians"
         )
 
 
@@ -429,5 +429,5 @@ def _tell_idle_settings(trainer: Trainer) -> None:
     if trainer.step == 0 and config.density.every and count > config.density.max_gaussians:
         warnings.warn(
             f"training begins with {count:,} Gaussians, more than --density.max-gaussians "
-            f"{config.density.max_gaussians:,}, which stops new ones only: give the scene fewer points"
+            f"{config.density.max_gaussians:,}, which only prevents new Gaussians: give the scene fewer points"
         )

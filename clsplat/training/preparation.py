@@ -24,7 +24,7 @@ from clsplat.training.cameras.refinement import Cameras
 def prepared(scene: Scene, config: TrainConfig) -> Scene:
     """Scene with its start points and known depths; `scene` itself if it has them already.
 
-    Raises InputError for points, depths or cameras to refine on which training would fail.
+    Raises InputError for points, depths or cameras to refine with which training would fail.
     """
     scene = with_depths(with_points(scene, config.start_points), config.depth_use)
     scene.require_training_views()
@@ -36,7 +36,7 @@ def prepared(scene: Scene, config: TrainConfig) -> Scene:
 def check_steps_left(run: Run, config: TrainConfig, name: str) -> None:
     """Raise InputError, with the setting's `name`, if a run is past its last step."""
     if (done := max((step for step, _ in run.checkpoints()), default=0)) > config.iterations:
-        raise InputError(f"{name} {config.iterations}: {run.path} is at step {done} already, expected more")
+        raise InputError(f"{name} {config.iterations}: {run.path} is already at step {done}; expected more")
 
 
 def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -> Scene:
@@ -48,8 +48,8 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
     if run is not None:
         if not resume and (run.checkpoints() or run.read_metrics()):
             raise InputError(
-                f"{run.path}: has been trained already; resume=True goes on with it, Run.create(..., overwrite=True) "
-                "starts again"
+                f"{run.path}: has been trained already; resume=True continues it, Run.create(..., overwrite=True) "
+                "starts anew"
             )
         run.keep_config(config)
         if resume:
@@ -60,7 +60,7 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
     for text in sanity_checks.of_scene(scene, config.background):
         warnings.warn(text)
     if is_colourless(scene):
-        warnings.warn(f"{scene.name}: the points have no colours, and get those of the photographs")
+        warnings.warn(f"{scene.name}: the points have no colours, and get their colours from the photographs")
         scene = replace(scene, point_colors=photographed(scene, background_colour(config.background)))
     return scene
 
@@ -75,7 +75,7 @@ def checked(scene: Scene, config: TrainConfig | None, run: Run | None, *, resume
         if not isinstance(value, kind):
             raise InputError(f"{name} is {value!r:.100}, expected {meant}")
     if resume and run is None:
-        raise InputError("resume=True: expected run=..., the run to go on with")
+        raise InputError("resume=True: expected run=..., the run to continue")
     if config is None:
         config = run.config if run is not None else TrainConfig()
     config.check()
@@ -100,12 +100,12 @@ def late_settings(config: TrainConfig) -> Iterator[str]:
     if optimiser.cooldown > last:
         part = optimiser.cooldown_to ** (1 - last / optimiser.cooldown)
         yield (
-            f"--optimiser.cooldown {optimiser.cooldown}: the learning rates begin at {part:.2g} of their values, "
-            f"training has {last} steps; {expected}"
+            f"--optimiser.cooldown {optimiser.cooldown}: the learning rates begin at {part:.2g} of their values, as "
+            f"training has only {last} steps; {expected}"
         )
     late = [step for step in config.warmup if step >= max(last, 2)]
     if late and tuple(config.warmup) != TrainConfig.warmup:
         yield (
-            f"--warmup {','.join(map(str, late))}: the training resolution does not double then, {ends} at "
+            f"--warmup {','.join(map(str, late))}: the training resolution does not double then, because {ends} at "
             f"1/{2 ** len(late)} of the size; expected less than --iterations {last}"
         )

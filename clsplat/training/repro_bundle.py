@@ -81,8 +81,8 @@ class StepRecord(TypedDict):
     settings: text of config.toml.
     versions, device: of the machine that trained.
     depth_factor: factor of the known depths, if they are compared.
-    of: number of the bundle's Gaussians, and of the training's.
-    reproduced: True if the bundle has the trouble.
+    of: numbers of Gaussians in the bundle and in the training.
+    reproduced: True if the bundle reproduces the trouble.
     """
 
     step: int
@@ -214,7 +214,7 @@ def _bundle_of(saved: Checkpoint, path: Path) -> Bundle:
         by_rays=bool(lens["by_rays"]),
     )
     if photograph.dtype not in (np.uint8, np.float32) or channels not in (3, 4, 5):
-        raise ValueError(f"a photograph {photograph.shape} of {photograph.dtype}")
+        raise ValueError(f"the photograph has shape {photograph.shape} of {photograph.dtype}")
     camera.check()
     aims = None
     if "depth" in arrays:

@@ -68,8 +68,9 @@ def timed(device: Device, work: Callable[[], T]) -> tuple[T, dict[str, float]]:
 def contributions(trainer: Trainer, seconds: float = CONTRIBUTION_SECONDS) -> dict[str, Any] | None:
     """Histogram of `largest_contributions`.
 
-    `none` is the number of Gaussians that no view shows. `counts` are the numbers of the others between `edges`, which
-    are powers of ten of pixels. The first and last bin include all values beyond their outer edge.
+    `none` is the number of Gaussians that no view shows. `counts` are the numbers of other Gaussians in the bins
+    between `edges`, which are powers of ten of pixels. The first and last bin include all values beyond their outer
+    edge.
     Returns None if memory is limited, as the plan covers training alone.
     """
     if trainer.device.memory.limit is not None or isinstance(trainer.parameters, HostGaussians):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model in training: the step on one screen, and the state that a checkpoint holds."""
+"""The model in training: its step, and the state that a checkpoint contains."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Mark:
-    """A point of the work at which a checkpoint is possible.
+    """A point in the training at which a checkpoint is possible.
 
     step: number of steps done.
     rng: state of the random generator.
-    queue: views that the epoch has left.
+    queue: views that are left in the epoch.
     controlled: True if the density control before the next step has been done.
     """
 
@@ -108,7 +108,7 @@ class Trainer:
         self.given = initial
         self.monitor = NonFiniteMonitor(self.rasterizer.readback, [view.name for view in self.views])
         self.pending = SpeculativeSteps(device, self.monitor, self._begin_again)
-        self.pending.on &= self.batch is None and not config.refines  # a batch reads its losses; cameras, gradients
+        self.pending.on &= self.batch is None and not config.refines  # a batch reads losses, and refinement gradients
         self._start()
 
     def _start(self) -> None:
@@ -226,7 +226,7 @@ class Trainer:
         if self.batch is None:
             run = partial(self._run, step, inputs[0], reads_loss)
             result = self.pending.launch(run, self._room(factor), reads_loss=reads_loss)
-            if self.queue:  # the next step's photograph, unless the resolution rises
+            if self.queue:  # upload the next step's photograph, at this resolution
                 self.photographs.ahead(self.queue[-1], factor)
         else:
             gathers, model = self.strategy.needs(self.step).gradients, (self.parameters, self.first, self.second)
@@ -276,7 +276,7 @@ class Trainer:
         return result
 
     def _room(self, factor: float) -> int:
-        """Number of pairs that the next step is launched for.
+        """Capacity, in pairs, with which the next step is launched.
 
         0 if the pairs have to be counted first, for example if the strategy inspects the model after each step.
         """
@@ -285,7 +285,7 @@ class Trainer:
         return self.pending.room(self.rasterizer, (factor, self.rasterizer), self.parameters.count)
 
     def _begin_again(self) -> None:
-        """Prepare for repeating a step. `mark` is lost."""
+        """Prepare for repeating a step. This invalidates `mark`."""
         self.mark = None
         self.mend()
 
@@ -349,7 +349,7 @@ class Trainer:
         return self.renderer.render(self.parameters, self.local(camera), background)
 
     def validate(self) -> bool:
-        """Validate the refined cameras, if that is due. True if they were measured."""
+        """Validate the refined cameras, if that is due. Returns True if they were measured."""
         if not self.cameras.gate.is_due(self.step):
             return False
         self.settle()
@@ -536,15 +536,15 @@ class Trainer:
             self.rng.bit_generator.state = checkpoint.state["rng"]
             queue = list(checkpoint.state["queue"])
             if not all(type(index) is int and index >= 0 for index in queue):
-                raise ValueError(f"a queue of {queue[:3]}")
+                raise ValueError(f"the queue of views begins with {queue[:3]}")
             retries = RetryBudget(**checkpoint.state.get("patience", {}))
             last_views = checkpoint.state.get("views", 1)
             if type(last_views) is not int or not 1 <= last_views <= max(checkpoint.step, 1):
-                raise ValueError(f"a step of {last_views!r:.20} views")
+                raise ValueError(f"the last step had {last_views!r:.20} views")
         except (KeyError, TypeError, ValueError, IndexError) as error:
             why = f"{type(error).__name__}: {error}"
             raise unusable(checkpoint, f"its state is not as this version writes it ({why})") from None
-        self.queue = queue if max(queue, default=0) < len(self.views) else []  # a scene that had more views
+        self.queue = queue if max(queue, default=0) < len(self.views) else []  # the scene had more views before
         self.controlled, self.mark = bool(checkpoint.state.get("controlled", False)), None
         self.last_views = last_views
         self.monitor.retries = retries

@@ -1,11 +1,11 @@
 // Adam's step, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for LANES consecutive
 // elements.
 //
-// No parameter and no moment becomes NaN or infinite here. An element stays as it is if its new values would be, or if
-// the square of its new parameter would reach `limit2`. Such refusals are counted in the last four entries of
-// `readback` (the first four belong to compact_visible). They count by cause: the old parameter, the gradient, the
-// moments, or only the step itself. Broken moments restart from zero. In the other cases the second moment becomes
-// infinite and the first 0: every step is then refused until the host has repaired the row
+// No parameter and no moment becomes NaN or infinite here. An element stays unchanged if its new values would be NaN or
+// infinite, or if the square of its new parameter would reach `limit2`. Such refusals are counted in the last four
+// entries of `readback` (the first four belong to compact_visible). They count by cause: the old parameter, the
+// gradient, the moments, or only the step itself. Broken moments restart from zero. In the other cases the second
+// moment becomes infinite and the first 0: every step is then refused until the host has repaired the row
 // (docs/decisions/0016-never-a-nan.md).
 
 // Constants of a step, and the counters of refused elements. rate: the learning rate / (1 - beta1^t); root: 1 / sqrt(1
@@ -41,8 +41,8 @@ static inline void refuse(size_t i, Step s, float p, float g, float m, float v, 
                                        : READBACK_REFUSED_STEPS));
 }
 
-// With vectors, single elements are stepped only where one is refused. That is rare, and inlining it everywhere made
-// one compiler take half a minute.
+// With vectors, single elements are stepped only where one is refused. That is rare, and inlining this function
+// everywhere made one compiler take half a minute.
 #if LANES > 1
 #define RARE __attribute__((noinline)) static
 #else
@@ -66,7 +66,7 @@ RARE void step_element(size_t i, float g, Step s, Stepped model) {
   model.parameters[i] = p;
 }
 
-// The step of the `taken` elements from i on. Returns 0 and stores nothing if one has to be refused. The second moment
+// The step of the `taken` elements from i on. Returns 0 and stores nothing if any has to be refused. The second moment
 // is a square like p * p, so one test of their sum checks both.
 static inline int step_vector(size_t i, floatL g, intL taken, Step s, Stepped model) {
   const floatL before = LOADL(model.parameters + i), m_before = LOADL(model.first + i);

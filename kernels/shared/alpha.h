@@ -1,5 +1,5 @@
 // A Gaussian's alpha in a tile's pixels. blend and blend_grad must agree to the last bit: otherwise the gradient, which
-// recovers the transmittance by division, would use another one than the image.
+// recovers the transmittance by division, would not use the transmittance of the image.
 
 // A Gaussian's nearness, 1 / depth, which is blended like a colour (docs/gradients.md, (120)).
 #ifdef NEARNESS
@@ -12,7 +12,7 @@
 #define NEAR_HERE(nearness)
 #endif
 
-// u of a pixel; (dx, dy) is the mean minus the pixel.
+// The whitened coordinate u of a pixel; (dx, dy) is the mean minus the pixel.
 static inline floatL whitened_u(float l11, float l12, floatL dx, floatL dy) {
   return fmaL((floatL)(l12), dy, l11 * dx);
 }
@@ -58,7 +58,7 @@ static inline void add_moments(floatS g, floatS u, floatS v, floatS *sums) {
 // log2 of the uncapped alpha from the mean's offset in (u, v).
 static inline floatL log2_alpha(floatL u, floatL v, float log2o) { return fmaL(-u, u, fmaL(-v, v, (floatL)(log2o))); }
 
-// Alpha from its uncapped log2; 0 in the lanes that do not take the Gaussian.
+// Alpha from the log2 of the uncapped alpha; 0 in the lanes that do not take the Gaussian.
 static inline floatL alpha_where(intL taken, floatL power) {
   floatL alpha = exp2L(power);
   alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);

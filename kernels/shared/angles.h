@@ -33,7 +33,7 @@ static inline float half_atan(float y, float x) {
   return x < 0.0f ? HALF_TURN - quarter_atan(y, -x) : quarter_atan(y, x);
 }
 
-// The same for any y; 0 for (0, 0).
+// The angle of (x, y) from the x axis for any y, with the sign of y; 0 for (0, 0).
 static inline float signed_atan(float y, float x) {
   if (!(x != 0.0f || y != 0.0f)) return 0.0f;
   return y < 0.0f ? -half_atan(-y, x) : half_atan(y, x);

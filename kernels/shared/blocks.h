@@ -53,8 +53,8 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
 static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 #else
-// The right edge of an ellipse, from its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). It may be
-// slightly too large, as the square root is up to 0.2 % too large.
+// The right edge of an ellipse, relative to its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). It may
+// be slightly too large, as the square root is up to 0.2 % too large.
 static inline float block_edge(float d0, float d1, float tangent, float half_w, float l12, float l22, float inverse_l11,
                                float budget) {
   const float dy = tangent < d0 ? d0 : d1, v = l22 * dy;
@@ -99,7 +99,7 @@ static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y
 #endif
 
 // A batch: splats that the group's items fetch together and all read. Every item fetches the same number, repeating the
-// last splat at the list's end: a compiler that vectorises across items may read for idle ones too.
+// last splat at the list's end: a compiler that vectorises across items may read memory for idle items too.
 #define BATCH (ITEMS < 64 ? 64 : ITEMS)
 typedef struct {
   float mx, my, l11, l12; // mx, my: from the tile's first pixel to the mean

@@ -1,14 +1,14 @@
 // The camera model of this build: the one place that chooses a header of shared/camera/. All have the same functions
 // and macros, which docs/cameras.md (Adding a camera model) lists. Needs math.h and lanes.h.
 //
-// A kernel defines the parts that it needs before the first include:
-//   NEEDS_PROJECTION   a Gaussian's place on the image plane; gaussian.h defines it
-//   NEEDS_GRADIENT     the gradient by the mean, through that place
+// Before the first include, a kernel defines the macros of the parts that it needs:
+//   NEEDS_PROJECTION   a Gaussian's place on the image plane; gaussian.h and ewa.h define this macro
+//   NEEDS_GRADIENT     the gradient with respect to the mean, through that place
 //   NEEDS_TANGENTS     with RAYS, a pixel on the plane that touches the sphere of directions; one lane
 //   NEEDS_BOXES        with RAYS, the box of pixels around a direction; one lane
 //   NEEDS_MOTION       the motion of a mean, in pixels; one lane
 //   NEEDS_PIXEL_WIDTH  the width of a pixel in the world; one lane
-// With RAYS, the direction of a pixel is always there.
+// With RAYS, ray_of, the direction of a pixel, is always defined.
 #include "shared/elementary.h"
 #include "shared/angles.h"
 
@@ -36,7 +36,7 @@ typedef struct {
 #include "shared/camera/orthographic.h"
 #elif defined(EQUIRECTANGULAR)
 #include "shared/camera/equirectangular.h"
-#elif defined(FISHEYE_RAYS) // with BENT_FISHEYE, its series of the angle
+#elif defined(FISHEYE_RAYS) // BENT_FISHEYE adds its coefficients
 #include "shared/camera/fisheye.h"
 #elif defined(PERSPECTIVE_RAYS)
 #include "shared/camera/perspective_rays.h"

@@ -1,6 +1,7 @@
-// The pixels of a tile as cells, and the cells that a Gaussian reaches. A group that shares a tile uses blocks.h.
-// Otherwise one work-item walks the tile, and a cell is a block of CELL_W x CELL_H pixels in a vector, row by row: an
-// ellipse's edge cuts fewer blocks than rows of as many pixels. Cell c is at column c % COLUMNS and row c / COLUMNS.
+// The pixels of a tile as cells, and the cells that a Gaussian reaches. Where several work-items share a tile, blocks.h
+// is used. Otherwise one work-item walks the tile, and a cell is a block of CELL_W x CELL_H pixels in a vector, row by
+// row: an ellipse's edge cuts fewer blocks than rows of as many pixels. Cell c is at column c % COLUMNS and row c /
+// COLUMNS.
 #if ITEMS > 1
 #include "shared/blocks.h"
 #else
@@ -55,8 +56,8 @@ typedef int4 int4U __attribute__((aligned(4)));
 #endif
 #endif
 
-// The cells that a Gaussian reaches. In a tile of at most 32 cells they are bits, of the cells with a pixel in the
-// ellipse. Otherwise they are the cells that its box reaches.
+// The cells that a Gaussian reaches. In a tile of at most 32 cells, this is a bit for each cell with a pixel in the
+// ellipse. In larger tiles it is the range of cells that the ellipse's box reaches.
 #if LANES >= 8
 #ifndef RAYS // with RAYS every cell of a tile is visited
 #define CELLS_BY_ELLIPSE
@@ -80,7 +81,7 @@ static inline float8 over_sqrt(float8 x) {
 }
 
 // The ellipse's chord in eight rows of pixels, from *low to *end, in pixels and not clamped: |l11 (mx - x) + l12 (my -
-// y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2. It is a point where rest < 0.
+// y)| <= sqrt(rest), rest = budget - (l22 (my - y))^2. The chord is a single point where rest < 0.
 static inline float8 chord(float8 dy, float mx, float l12, float l22, float inverse_l11, float budget, float8 *low,
                            float8 *end) {
   const float8 v = l22 * dy, shift = l12 * dy;
@@ -139,8 +140,8 @@ static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y
 #endif
 }
 
-// Tables of the pixels' coordinates: in some compilers, integer conversions in the inner loop became a dependency chain
-// through it. A cell has the same index in every table and array, because address arithmetic is much of a loop's
+// Tables of the pixels' coordinates: in some compilers, integer conversions in the inner loop became one long
+// dependency chain. A cell has the same index in every table and array, because address arithmetic is much of a loop's
 // instructions.
 #define PIXEL_TABLES                                                                                                   \
   floatL table_x[CELLS], table_y[CELLS];                                                                               \
@@ -163,9 +164,9 @@ typedef uint Open;
 
 #define FOR_CELLS(cell, reach) for (uint left = (reach), cell = 0; left && ((cell = LOWEST(left)), 1); left &= left - 1)
 
-// Recorded cells are bits of cells in the shape's own vectors. RECORDED(mask) << FIRST_RECORDED(cell): those with a
-// lane set in a cell's mask. CELLS_OF(recorded): the cells that contain them. PLACE_OF(each): the index in an array of
-// cells, seen as an array of floatS.
+// A record has one bit for each vector of the shape's own width, of which a cell has VECTORS. RECORDED(mask) <<
+// FIRST_RECORDED(cell): the bits of a cell's vectors with a lane set in `mask`. CELLS_OF(recorded): the cells that
+// contain recorded vectors. PLACE_OF(each): a recorded vector's index in an array of cells, read as an array of floatS.
 #if VECTORS == 1
 #define FIRST_RECORDED(cell) (cell)
 #define RECORDED(mask) ((uint)(ANYL(mask) != 0))

@@ -74,7 +74,7 @@ static inline Double twice2(Double a) {
   return result;
 }
 
-// The product is exact.
+// a * b, exactly.
 static inline Double product2(floatL a, floatL b) {
   const floatL high = a * b;
   const Double product = {high, fmaL(a, b, -high)};

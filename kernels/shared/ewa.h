@@ -1,7 +1,8 @@
 // From LANES Gaussians to their ellipses on the image, with gsplat's conventions; shared by ewa.cl and its gradient.
-// Equation numbers refer to docs/gradients.md. The view matrix may be any matrix, so that its gradient is by its twelve
-// numbers: (154) uses cofactors of the rows instead of the rows. With ORTHOGRAPHIC the image is linear in x and y, with
-// FISHEYE in the angle from the axis. With COVARIANCES these are given instead of quaternions and scales.
+// Equation numbers refer to docs/gradients.md. The view matrix may be any matrix, and has a gradient with respect to
+// each of its twelve numbers: (154) uses cofactors of its rows instead of the rows. With ORTHOGRAPHIC the image is
+// linear in x and y, with FISHEYE in the angle from the axis. With COVARIANCES, covariances replace quaternions and
+// scales.
 #include "shared/place.h"
 #define NEEDS_PROJECTION
 #include "shared/camera.h"
@@ -274,7 +275,7 @@ static inline int project_ellipses(const uint *row, __global const float *means,
     p->c[k] = fmaL(p->n[0], p->r[k], fmaL(p->n[1], p->r[3 + k], p->n[2] * p->r[6 + k]));
   }
   covariance2(camera[EWA_EPS], p);
-#ifndef FISHEYE // as in gaussian.h: rounding must move a long axis by little against the short one
+#ifndef FISHEYE // as in gaussian.h: rounding must move a long axis little compared with the short axis
   floatL longest2 = p->s[0] * p->s[0];
   longest2 = p->s[1] * p->s[1] > longest2 ? p->s[1] * p->s[1] : longest2;
   longest2 = p->s[2] * p->s[2] > longest2 ? p->s[2] * p->s[2] : longest2;

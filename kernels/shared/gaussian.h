@@ -1,5 +1,5 @@
 // From LANES Gaussians' parameters to their ellipses on the image, shared by projection and its gradient. Equation
-// numbers refer to docs/gradients.md. With RAYS tangent.h has its own projection, which shares what is outside of
+// numbers refer to docs/gradients.md. With RAYS, tangent.h has its own projection, which uses only the code outside of
 // #ifndef RAYS here.
 
 #include "shared/place.h"

@@ -60,8 +60,8 @@ static inline uint group_exclusive_scan(uint value, __local uint *scratch, uint 
 #endif
 }
 
-// A group's tile, from the kernel's first_tile, tiles_x, height and ranges: its first pixel, its list of pairs [begin,
-// end), and the strides in floats between rows and between planes.
+// Defines a group's tile from the kernel's first_tile, tiles_x, height and ranges: its first pixel, its list of pairs
+// [begin, end), and the strides in floats between rows and between planes.
 #define TILE_OF_GROUP                                                                                                  \
   const int tile = first_tile + get_group_id(0);                                                                       \
   const int tile_x = (tile % tiles_x) * TILE, tile_y = (tile / tiles_x) * TILE;                                        \

@@ -1,4 +1,5 @@
-// A holdout: surfaces of other elements in the pixels, which let a fraction of the light behind them through.
+// A holdout: in each pixel, the surfaces of other elements, each of which lets a fraction of the light behind it
+// through.
 //
 // held_starts (pixels of a plane + 1): the first surface of each pixel, then the end. held_surfaces (surfaces,
 // HELD_SIZE): the depths of front and back, the transmitted fraction, and its binary logarithm over the thickness. Each

@@ -3,7 +3,7 @@
 #ifndef LANES
 #error "LANES must be defined: pixels per vector, 1, 4, 8 or 16"
 #endif
-#ifndef VECTORS // shape vectors in one of these: widened.h
+#ifndef VECTORS // number of the shape's own vectors in one floatL: widened.h
 #define VECTORS 1
 #endif
 #define CAT_(a, b) a##b

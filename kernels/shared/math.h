@@ -5,10 +5,10 @@
 
 #define LOG2E 1.44269504088896341f
 #define LN2 0.693147180559945f
-#ifndef ALPHA_MAX // the library can set another cap
+#ifndef ALPHA_MAX // clsplat can set another cap for a build
 #define ALPHA_MAX 0.99f
 #endif
-#ifndef ALPHA_MIN // these two can be set by RasterizerConfig
+#ifndef ALPHA_MIN // RasterizerConfig can set ALPHA_MIN, LOG2_ALPHA_MIN and, below, TRANSMITTANCE_MIN
 #define ALPHA_MIN (1.0f / 255.0f)
 #define LOG2_ALPHA_MIN -7.99435344f // log2(1/255)
 #endif

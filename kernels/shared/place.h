@@ -22,7 +22,7 @@ static inline void rotation_of(const floatL *q, floatL *r) {
   r[8] = 1.0f - 2.0f * (x * x + y * y);
 }
 
-// (57): the same in two floats, times the square of the returned length. `length` is the raw quaternion's.
+// (57): the rotation matrix in two floats, times the square of the returned length. `length`: of the raw quaternion.
 static inline floatL rotation2_of(const uint *row, __global const float *quaternions, floatL length, Double *r) {
   // Scales by a power of two, which is exact, to keep the low parts of products out of the denormals.
   const floatL size = AS_FLOATL(AS_INTL(length) & 0x7f800000);

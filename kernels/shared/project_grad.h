@@ -18,7 +18,7 @@
 #define FOR_HIGHER(k, used) for (int k = 1; k < (used); ++k)
 #endif
 
-// Weights of the penalties as parameters and as arguments, after a comma each. `Exploration.weights` has their order.
+// Weights of the penalties as parameters and as arguments, each after a comma. `Exploration.weights` has their order.
 #ifdef PENALTIES
 #define PENALTY_PARAMETERS , const float opacity_weight, const float scale_weight
 #define PENALTY_WEIGHTS , opacity_weight, scale_weight
@@ -27,8 +27,8 @@
 #define PENALTY_WEIGHTS
 #endif
 
-// Gradients of LANES Gaussians by their parameters. The gradient by an SH coefficient is its basis value times the one
-// by colour. `colour` is red, green and blue, each zero where clamped.
+// Gradients with respect to the parameters of LANES Gaussians. The gradient with respect to an SH coefficient is its
+// basis value times the gradient with respect to the colour. `colour` is red, green and blue, each zero where clamped.
 typedef struct {
   Lanes mean[3], quaternion[4], scale[3], opacity, colour[3], basis[16];
 } Gradients;
@@ -117,7 +117,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d_screen[1].all = side_y * d_my;
 #endif
 #else
-  // (50): the mean on the image, -W^T (sum of g w).
+  // (50): the gradient with respect to the mean's image position, -W^T (sum of g w).
   const floatL d_mx = -INVERSE_WHITEN2 * (l11 * m_gu);
   const floatL d_my = -INVERSE_WHITEN2 * fmaL(l12, m_gu, l22 * m_gv);
 #ifdef ABSOLUTE_GRADIENTS
@@ -163,14 +163,15 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
   }
 
-  // (122): the gradient of nearness by depth; along the axis it points towards the camera.
+  // (122): the gradient through nearness, 1 / depth. Along the axis it points towards the camera.
 #ifndef NEARNESS
 #define LESS_NEAR(z)
 #else
 #define LESS_NEAR(z) -m[SLOT_NEAR].all / ((z) * (z))
 #endif
 
-  // (59) to (61): log scales, the rotation in the Gaussian's own frame, and the gradient through the Jacobian.
+  // (59) to (61): the gradients with respect to the log scales and to the rotation in the Gaussian's frame, and the
+  // gradient through the Jacobian.
   floatL d_size = (floatL)(0.0f), along_u = d_size, along_v = d_size, turned[3];
 #ifdef LENS
   Lanes lens[4];

@@ -12,7 +12,7 @@ static inline uint random_word(const uint row, const uint key0, const uint key1)
   return mixed(mixed(row ^ key0) + key1);
 }
 
-// The opacity factor of a model row in a thinning step: 0, left out, if the row's word is under the threshold.
+// The opacity factor of a model row in a thinning step: 0 leaves it out, if the row's word is under the threshold.
 static inline float thinning(const uint row, const uint key0, const uint key1, const uint threshold,
                              const float factor) {
   return random_word(row, key0, key1) < threshold ? 0.0f : factor;

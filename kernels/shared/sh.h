@@ -34,7 +34,7 @@ static inline void sh_basis(int coefficients, floatL x, floatL y, floatL z, floa
   basis[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
 }
 
-// d[3]: the sum over k of weight[k] times the gradient of basis[k] by (x, y, z).
+// d[3]: the sum over k of weight[k] times the gradient of basis[k] with respect to (x, y, z).
 static inline void sh_direction_gradient(int coefficients, floatL x, floatL y, floatL z, const floatL *weight,
                                          floatL *d) {
   d[0] = d[1] = d[2] = (floatL)(0.0f);
@@ -70,8 +70,8 @@ static inline float4 float_from_half(int4 bits) {
   return as_float4(as_int4(positive) | (bits & 0x8000) << 16);
 }
 
-// The three channels of a coefficient; a load of four would read past the end of the row's last one. shT: storage type
-// of the bands above 0 (RasterizerConfig.sh_storage).
+// The three channels of a coefficient; a load of four floats would read past the row's end at its last coefficient.
+// shT: storage type of the bands above 0 (RasterizerConfig.sh_storage).
 #ifdef SH_HALF
 typedef ushort shT;
 static inline float4 sh_channels(__global const shT *f, int last) {

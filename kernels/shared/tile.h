@@ -24,15 +24,15 @@ static inline int first_cell(float low, float size, int count) {
   return whole + ((float)whole < cell);
 }
 
-// One past the last index of those whose first pixel centre is at or before `high`, within [0, count].
+// One past the last index of the tiles (or rows) whose first pixel centre is at or before `high`, within [0, count].
 static inline int end_cell(float high, float size, int count) {
   float cell = (high + TILE_SLACK - 0.5f) * (1.0f / size) + 1.0f;
   cell = cell > 0.0f ? cell : 0.0f;
   return (int)(cell < (float)count ? cell : (float)count);
 }
 
-// The largest box, in tiles, that is listed whole: testing which tiles the ellipse reaches takes longer than blending
-// needs to find a tile's pixels unreached.
+// The largest box, in tiles, that is listed whole: for so few tiles, testing which of them the ellipse reaches takes
+// longer than blending takes to find no pixel reached.
 #ifdef BOX_TILE_TEST // RasterizerConfig.tile_test
 #define SMALL_BOX 0x7fffffff
 #elif !defined(SMALL_BOX)
@@ -52,7 +52,7 @@ static inline Ellipse ellipse_of(__global const float *splat, int tiles_x, int t
   return e;
 }
 
-// The tiles [*x0, *x1) of the box in a tile row, in two parts.
+// The tiles [*x0, *x1) of the box in a tile row; a box that wraps has two parts.
 #define SPANS 2
 static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
   const int wraps = e->tile_x0 > e->tile_x1;
@@ -71,8 +71,8 @@ typedef struct {
 } Ellipse;
 
 #ifdef SQUARE_TILE_TEST
-// The longer half axis in pixels, as in Kerbl et al.'s code, from the larger eigenvalue of the covariance. That is
-// recovered from the whitening.
+// The longer half axis in pixels, as in Kerbl et al.'s code, from the larger eigenvalue of the covariance. The
+// covariance is recovered from the whitening.
 static inline float longest_half_axis(__global const float *splat) {
   const float larger = larger_eigenvalue(splat[SPLAT_L11], splat[SPLAT_L12], splat[SPLAT_L22]);
   return sqrt(EXTENT(splat[SPLAT_LOG2O]) * larger);

@@ -1,4 +1,4 @@
-// Code that the kernels for any number of values per Gaussian share. Needs cells.h.
+// Code shared by the kernels that blend any number of values per Gaussian. Needs cells.h.
 #ifndef VALUES
 #error "VALUES must be defined: values of a Gaussian that a pass has, 1 to 32"
 #endif
@@ -15,7 +15,7 @@
 // A short loop over the pass's values, unrolled if a lane is an item (lanes.h).
 #define FOR_VALUES(k) UNROLL for (int k = 0; k < VALUES; ++k)
 
-// Cells of the i-th pair with a pixel that takes it, or may take it.
+// The cells with a pixel that takes the i-th pair, or may take it.
 #ifdef RECORD_CELLS // blend has recorded them
 #define CELLS_OF_PAIR(i, splat) cells_from_sorted[i]
 #else

@@ -1,5 +1,5 @@
 // The gradient of blending with one Gaussian per item, BY_GAUSSIAN. A group's items walk the pixels of a tile one
-// behind another. Each has a Gaussian and its sums in registers, and passes the pixels' state on in local memory.
+// behind another. Each item has a Gaussian and its sums in registers, and passes the pixels' state on in local memory.
 //
 // The pixels are in ITEMS chunks, each a piece of a row. In round r of a turn item j is at chunk (r - j) % ITEMS. So a
 // chunk meets the Gaussians in their order, an item starts its next Gaussian right after its last chunk, and one
@@ -29,7 +29,7 @@ typedef struct {
 #endif
 } Walker;
 
-// The gradient by nearness of a tile's pixels, in the order of their state.
+// The gradient with respect to the nearness of a tile's pixels, in the order of Passing and Fixed.
 #ifdef NEARNESS
 #define NEAR_OF_STAGED , s.near
 #define NEAR_PIXELS , near
@@ -41,7 +41,7 @@ typedef struct {
 #endif
 
 // Removes the walker's pair from a chunk's pixels, and adds their gradients to its sums (SLOT_STRIDE). Pixels that do
-// not take it are processed with alpha 0: among 32 items some nearly always have one that does, and branches would
+// not take it are processed with alpha 0: among 32 items some nearly always have a pixel that does, and branches would
 // serialise a chunk's pixels.
 static inline void take_chunk(const Walker *w, int chunk, __local Passing *passing, __local const Fixed *fixed,
                               float *sums NEAR_PIXELS_PARAMETER) {

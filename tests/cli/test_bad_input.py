@@ -259,7 +259,7 @@ def test_several_devices(words: list[str], line: str, scene: Path, tmp_path: Pat
 
 def test_one_device_where_one_is_expected(scene: Path, trained: Path, capfd: Capture) -> None:
     assert main(["eval", str(trained / "model.ply"), "--scene", str(scene), "--device", "0,1"]) == 2
-    assert "--device 0,1: expected one device here, only train and render take several" in one_error(capfd)
+    assert "--device 0,1: expected one device here; only train and render take several" in one_error(capfd)
 
 
 def test_overwriting_with_what_cannot_be_trained_keeps_the_run(scene: Path, tmp_path: Path, capfd: Capture) -> None:
@@ -272,4 +272,4 @@ def test_overwriting_with_what_cannot_be_trained_keeps_the_run(scene: Path, tmp_
         assert len(capfd.readouterr().err.splitlines()) == 1
         assert (run / "model.ply").read_bytes() == model
     assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 2
-    assert "is at step 40 already" in capfd.readouterr().err
+    assert "is already at step 40" in capfd.readouterr().err

@@ -76,7 +76,7 @@ def test_nothing_is_lost(
             train_on(loaded, WITHOUT, device=default_device, run=run)
     assert [number for number, _ in run.checkpoints()] == ([step] if step else [])
     if step and isinstance(error, DriverError):
-        assert str(raised.value).startswith(f"it failed; the checkpoint of step {step} is written: clsplat train -o ")
+        assert str(raised.value).startswith(f"it failed; a checkpoint of step {step} is written: clsplat train -o ")
     resumed = train_on(loaded, WITHOUT, device=default_device, run=Run.open(run.path), resume=True)
     for group in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
         assert np.array_equal(getattr(whole, group), getattr(resumed, group)), group
@@ -139,7 +139,7 @@ def test_the_checkpoint_of_a_late_failure_gives_the_same_bytes(
     driver_records.memory_path().unlink()
     standing(how, latest, latest)
     assert train(scene, tmp_path / "run", WITHOUT) == 1
-    assert f"; the checkpoint of step {step} is written: " in error_of(capsys)
+    assert f"; a checkpoint of step {step} is written: " in error_of(capsys)
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == [f"step-{step:07}.npz"]
     driver_records.memory_path().unlink()  # else it would go on in another shape
     monkeypatch.delenv("CLSPLAT_STAND_IN")

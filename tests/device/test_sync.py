@@ -36,7 +36,7 @@ class Event:
 
 @pytest.mark.parametrize(
     ("status", "text"),
-    [(1, "scan.cl, scan_top, does not come back within 0.05 s (CLSPLAT_DRIVER_TIMEOUT)"),
+    [(1, "scan.cl, scan_top, does not finish within 0.05 s (CLSPLAT_DRIVER_TIMEOUT)"),
      (-14, "scan.cl, scan_top, failed with OpenCL's status -14")],
 )  # fmt: skip
 def test_the_kernel_is_named(waiting: Device, monkeypatch: pytest.MonkeyPatch, status: int, text: str) -> None:

@@ -188,7 +188,7 @@ def test_settings_that_make_no_sense(config: FramingConfig, message: str) -> Non
 
 def test_what_the_camera_cannot(default_device: Device) -> None:
     camera = PERSPECTIVE[1]
-    with pytest.raises(InputError, match=r"--region 100,0,51,10: ends at 151,10, expected at most the frame's 150,100"):
+    with pytest.raises(InputError, match=r"--region 100,0,51,10: ends at 151,10, beyond the frame's size 150,100"):
         framed(camera, FramingConfig(region="100,0,51,10"))
     panorama = camera_of("equirectangular")
     config = FramingConfig(supersample=2, filter="blackman-harris")

@@ -265,12 +265,12 @@ def planned(mebibytes: float, need: Need = STEP, largest: int = 2**31) -> str:
 
 def test_the_plan_in_words() -> None:
     assert planned(1000) == "about 211.6 MiB of device memory needed, 1,000.0 MiB allowed: all at once"
-    assert planned(190).endswith("190.0 MiB allowed: the image is done in about 2 bands of tiles")
+    assert planned(190).endswith("190.0 MiB allowed: the image is rendered in about 2 bands of tiles")
     assert "allowed: parameters are streamed, 20,128 Gaussians at a time, the image" in planned(140)
     with pytest.raises(CapacityError, match=r"need at least about 68.3 MiB of device memory, or 211.6 MiB to be done"):
         planned(65)
     small = Need(gaussians=40, **ROW, planes=50_000, scratch=1024)
-    with pytest.raises(CapacityError, match=r"about [0-9]+ KiB .* [0-9]+ KiB to be done at once, and 4,000 bytes are"):
+    with pytest.raises(CapacityError, match=r"about [0-9]+ KiB .* KiB to be processed at once, but 4,000 bytes are"):
         plan(small, 4000, 2**31, 32)
 
 
@@ -315,7 +315,7 @@ def test_from_python(scene: Scene) -> None:
     gaussians, camera = random_cloud(500, 3, 60, 40)
     wanted = clsplat.render(gaussians, camera).image
     assert_same_bits(clsplat.render(gaussians, camera, max_device_mem="400KiB").image, wanted)
-    with pytest.raises(CapacityError, match=r"[1-9][0-9]+ KiB to be done at once, and 98 KiB are allowed"):
+    with pytest.raises(CapacityError, match=r"[1-9][0-9]+ KiB to be processed at once, but 98 KiB are allowed"):
         clsplat.render(gaussians, camera, max_device_mem=100_000)
     config, plans = short(iterations=2), []
     clsplat.train(scene, config, max_device_mem="64MiB", on_plan=plans.append)

@@ -51,7 +51,7 @@ def test_the_picture_is_that_of_render() -> None:
     plain = renderer.render(*SCENE)
     assert_same_bits(image.image, plain.image)
     assert_same_bits(image.alpha, plain.alpha)
-    with pytest.raises(ValueError, match="3 Gaussians to move to, expected 20000"):
+    with pytest.raises(ValueError, match="3 moved Gaussians, expected 20000"):
         renderer.render_channels(*SCENE, ("motion",), moved=take(SCENE[0], slice(3)))
     still = renderer.render_channels(*SCENE, ("motion",))[1]
     assert not still["motion"].any()
@@ -84,5 +84,5 @@ def test_backward_motion_is_forward_motion_of_the_frame_before(projection: Proje
 def test_backward_motion_of_another_projection_is_refused() -> None:
     gaussians, camera = scenes.one()
     other = replace(camera, projection="orthographic")
-    with pytest.raises(InputError, match="backward goes from a camera to one that is orthographic, expected perspec"):
+    with pytest.raises(InputError, match="backward leads to a camera that is orthographic, expected perspective"):
         Renderer(open_device()).render_channels(gaussians, camera, ("backward",), before=other)

@@ -185,7 +185,7 @@ def test_a_cloud_without_colours_takes_the_photographs(scene: Path, default_devi
     found = photographed(bare, (0.0, 0.0, 0.0))
     assert np.corrcoef(found.ravel(), loaded.point_colors.ravel())[0, 1] > 0.5
     texts = told(bare, default_device, iterations=2)
-    assert texts == [f"{loaded.name}: the points have no colours, and get those of the photographs"]
+    assert texts == [f"{loaded.name}: the points have no colours, and get their colours from the photographs"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = train(bare, short(iterations=2), device=default_device)

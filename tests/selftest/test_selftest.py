@@ -225,7 +225,7 @@ def test_a_change_of_words_that_are_not_there(default_device: Device, monkeypatc
 
 def test_a_change_of_a_kernel_that_is_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blender: alpha => beta")
-    known = r"blender is no kernel, expected one of adam, alpha_loss, appearance and \d+ more$"
+    known = r"blender is not a kernel, expected one of adam, alpha_loss, appearance and \d+ more$"
     with pytest.raises(InputError, match=known):
         default_device.with_shape().kernels("scan")
 

@@ -244,7 +244,7 @@ RENDER = """def RenderSettings "Render"
     ("flags", "settings", "message"),
     [
         ("--width 64", "", "--stereo: frame 1 is 64x48 for the left eye and 64x32 for the right; "),
-        ("--width 64 --region 0,30,8,8", "", "--region 0,30,8,8: ends at 8,38, expected at most the frame's 64,32"),
+        ("--width 64 --region 0,30,8,8", "", "--region 0,30,8,8: ends at 8,38, beyond the frame's size 64,32"),
         ("", RENDER, "--stereo: frame 1 has pixels of the aspect ratio 1.0 for the left eye and 1.5 for the right; "),
     ],
 )

@@ -106,7 +106,7 @@ def test_a_pixel_that_the_first_gaussian_of_a_band_ends(default_device: Device) 
 
 
 def test_one_tile_too_full_says_so(default_device: Device) -> None:
-    with pytest.raises(CapacityError, match=r"one tile of 16x16 pixels has \d+ Gaussians, .* enough is left for 3: "):
+    with pytest.raises(CapacityError, match=r"one tile of 16x16 pixels has \d+ Gaussians, but .* room for only 3: "):
         in_bands(default_device, "many_per_tile", 3)
 
 

@@ -85,7 +85,7 @@ def test_bad_poses_are_gone_back_from(
     assert ended < 54
     assert figures[60] > last + 0.5  # what is left of the training makes good use of them
     assert len(told) == 1
-    assert f"the cameras are again those of step {gate['best']}" in told[0]
+    assert f"the cameras of step {gate['best']} are restored" in told[0]
     assert any(f"ended at step {ended}" in note for note in read_run_numbers(run).notes)
     assert run.model_path.read_bytes() != undisturbed
 

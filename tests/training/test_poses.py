@@ -153,7 +153,7 @@ def test_a_call_that_is_refused_leaves_the_run_as_it_is(folder: Path, tmp_path: 
 
 
 def test_a_model_that_has_moved_away_is_told_of() -> None:
-    with pytest.warns(UserWarning, match=r"20\.00 dB where they were given and 21\.50 dB where they fit"):
+    with pytest.warns(UserWarning, match=r"20\.00 dB at their given poses and 21\.50 dB at the poses that"):
         doubt_poses({"psnr": 20.0, "psnr_aligned": 21.5}, 1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -194,10 +194,10 @@ def test_repeated_trouble_goes_back_with_smaller_steps(scene: Scene, default_dev
 
     with heard() as lines, spoilt(due):
         train(scene, CHECKED, device=default_device, run=run)
-    back = next(line for line in lines if "back to" in line)
+    back = next(line for line in lines if "returns to" in line)
     match = re.fullmatch(
-        r"step (\d+): 5 of the last 100 steps had trouble: back to step (\d+), with learning rates multiplied "
-        r"by 0\.5",
+        r"step (\d+): 5 of the last 100 steps had trouble: training returns to step (\d+), with learning rates "
+        r"multiplied by 0\.5",
         back,
     )
     assert match is not None
@@ -229,7 +229,7 @@ def test_a_model_that_is_mostly_broken_is_not_mended(scene: Scene, default_devic
         patch.setattr(Trainer, "train_step", step)
         result = train(scene, CHECKED, device=default_device, run=run)
     assert re.search(r"parameters of (\d+) Gaussians .*; \1 of \1 are too many to remove", lines[0])
-    assert re.match(r"step (19|20): 1 of the last 100 steps had trouble: back to step 15", lines[1])
+    assert re.match(r"step (19|20): 1 of the last 100 steps had trouble: training returns to step 15", lines[1])
     assert np.isfinite(result.sh).all()
 
 
@@ -237,7 +237,7 @@ def test_without_a_checkpoint_it_starts_again(scene: Scene, default_device: Devi
     for run in (None, Run.create(tmp_path / "run", CONFIG)):
         with heard() as lines, spoilt(lambda trainer: trainer.monitor.retries.rate_factor == 1.0):
             train(scene, CONFIG, device=default_device, run=run)
-        assert any("back to step 0, with learning rates multiplied by 0.5" in line for line in lines)
+        assert any("returns to step 0, with learning rates multiplied by 0.5" in line for line in lines)
 
 
 # Training gives up
@@ -256,7 +256,7 @@ def test_what_cannot_be_helped_stops_with_a_bundle(scene: Scene, default_device:
         str(caught.value),
     )
     assert message is not None
-    assert len([line for line in lines if "back to" in line]) == MAX_CHECKPOINT_RETURNS
+    assert len([line for line in lines if "returns to" in line]) == MAX_CHECKPOINT_RETURNS
     bundle = repro_bundle.read_bundle(Path(message[3]))
     assert bundle.record["reproduced"]
     assert bundle.config == config

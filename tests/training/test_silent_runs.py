@@ -189,8 +189,8 @@ LATE = {
     "cooldown": (
         {"optimiser": OptimiserConfig(cooldown=6, cooldown_to=0.25)},
         (
-            "--optimiser.cooldown 6: the learning rates begin at 0.5 of their values, training has 3 steps; expected "
-            "at most --iterations 3"
+            "--optimiser.cooldown 6: the learning rates begin at 0.5 of their values, as training has only 3 steps; "
+            "expected at most --iterations 3"
         ),
     ),
     "growth": (
@@ -203,8 +203,8 @@ LATE = {
     "warmup": (
         {"warmup": (1, 3, 9)},
         (
-            "--warmup 3,9: the training resolution does not double then, training ends at step 3 at 1/4 of the size; "
-            "expected less than --iterations 3"
+            "--warmup 3,9: the training resolution does not double then, because training ends at step 3 at 1/4 of the "
+            "size; expected less than --iterations 3"
         ),
     ),
 }

@@ -25,7 +25,7 @@ class Appearance(Component):
         return ()
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Views with their appearances."""
+        """The views, each with its appearance as a part."""
         shares = self.of_views([each.view for each in inputs], step)
         if not shares:
             return inputs
@@ -44,7 +44,7 @@ class Appearance(Component):
         self.take(named("appearance/"))
 
     def take(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint, by name without the prefix."""
+        """Load the arrays of a checkpoint. Their names come without the prefix."""
 
     def write(self, run: Run) -> None:
         """Write appearance.json and appearance.npz."""

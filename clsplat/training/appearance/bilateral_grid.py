@@ -34,7 +34,7 @@ class ViewGrid(ViewPart):
     """Grid of one view in one step.
 
     visit: number of this visit to the view, from 1.
-    ends: True if a pass through all views ends with it.
+    ends: True if a pass through all views ends with this visit.
     place: the view's place in a batch.
     """
 
@@ -63,15 +63,15 @@ class ViewGrid(ViewPart):
         width: int,
         height: int,
     ) -> DeviceArray:
-        """Image with the photograph's colours."""
+        """The image with the photograph's grid applied."""
         return apply_grid(self.device, work, self.grids, self.view, image, width, height)
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
     ) -> DeviceArray:
-        """Turn `gradient` into the gradient by the image, in place, and return the gradient by the grid for `update`.
+        """Convert `gradient`, in place, to the gradient with respect to the image. Return the gradient of the grid.
 
-        The kernels of `update` are tried here in the sandbox, before anything changes.
+        `update` uses the result; its kernels are tried here in the sandbox, before anything changes.
         """
         of_view, size = (self.grids, self.view, image, gradient), (width, height)
         by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
@@ -81,7 +81,7 @@ class ViewGrid(ViewPart):
         return by_grid
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step. After a pass through all views the mean of all grids is made the identity.
+        """Take Adam's step. After a pass through all views, centre all grids so that their mean is the identity.
 
         The part that all grids have in common belongs to the model.
         """

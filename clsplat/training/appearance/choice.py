@@ -22,11 +22,11 @@ APPEARANCE_MODELS: dict[str, Callable[[TrainConfig, Device, Scene], Appearance]]
     "ppisp": PpispOfAll,
     "grid": GridsOfAll,
 }
-"""Appearance models by the setting `appearance`."""
+"""Appearance models by value of the setting `appearance`."""
 
 
 def appearance_of(config: TrainConfig, device: Device, scene: Scene) -> Appearance:
-    """Appearances of a training by its settings."""
+    """The appearance model that the settings ask for."""
     if config.appearance == "none":
         return Appearance()
     return APPEARANCE_MODELS[config.appearance](config, device, scene)

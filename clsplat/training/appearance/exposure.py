@@ -31,29 +31,30 @@ if TYPE_CHECKING:
 CODED_OCTAVES_PER_LIGHT_OCTAVE = 1 / 2.2
 """Approximate octaves of a coded colour value per octave of light.
 
-Initial gains come from the colours of points. If points give none, they come from EXIF exposures by this factor.
+Initial gains come from the colours of points. If points give none, they come from EXIF exposures in octaves, multiplied
+by this number.
 """
 
 START_GAIN_STEP_OCTAVES = 2.0**-10
-"""Octaves to which gains from points are rounded, so that processors that sum in different orders start equally."""
+"""Gains from points are rounded to multiples of this, in octaves, to be equal in spite of different orders of sums."""
 
 VIEW_PULL_WEIGHT, NEIGHBOUR_PULL_WEIGHT = 0.02, 0.7
 """Weights of the pulls towards the gains from points, as fractions of the distance in octaves, in the loss's gradient.
 
-The first pulls the gains of each photograph. The second pulls the part of them that it has in common with its
-neighbours: neighbouring views may all become slightly too bright if what only they show is dark, and there the points
-know better. Gains without points are not pulled, as the pull would hold them at the mean.
+The first pulls the gains of each photograph. The second pulls the part of them that neighbouring photographs have in
+common: neighbours may all become slightly too bright where they alone show a dark surface, but gains from points do
+not. Gains that are not from points are not pulled, as the pull would hold them at the mean.
 """
 
 GAIN_RATE_END_FRACTION = 0.001
 """Fraction of the learning rate that is left at the last step.
 
-Adam's steps are as large as the rate even at the optimum. With ten times this fraction, the last steps of one of 127
-photographs change its gain by 0.25 %.
+Adam's steps are as large as the rate even at the optimum. With ten times this fraction and 127 photographs, the last
+steps change a photograph's gain by 0.25 %.
 """
 
 GAIN_CHECKPOINT_ARRAYS = ("logs", "start", "first", "second", "gains")
-"""Arrays of `Gains` in a checkpoint. Its array `told` is 1 for photographs with gains from points, else 0."""
+"""Arrays of `Gains` in a checkpoint. A further array, `told`, is 1 for photographs with gains from points, else 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ class ViewGains(ViewPart):
         width: int,  # noqa: ARG002
         height: int,  # noqa: ARG002
     ) -> DeviceArray:
-        """The unchanged image; the photograph in `target` is divided by its gains."""
+        """Divide the photograph in `target` by its gains. Returns the unchanged image."""
         remove_gains(self.device, self.gains, self.view, target)
         return image
 
@@ -99,7 +100,7 @@ class ViewGains(ViewPart):
         width: int,  # noqa: ARG002
         height: int,
     ) -> DeviceArray:
-        """Sums for `update`, which is tried here, before anything changes."""
+        """Sums for `update`, whose kernels are tried here in the sandbox, before anything changes."""
         columns = gain_gradient(self.device, work, image, gradient, height, self.place)
         if self.step == 1:
             with only_tried(self.device):
@@ -113,7 +114,7 @@ class ViewGains(ViewPart):
 
 
 def _from_mean(told: Sequence[float | None], of: Sequence[float | None]) -> NDArray[np.float64]:
-    """Exposures `told`, from EXIF, relative to the mean of the known ones in `of`; NaN for unknown ones."""
+    """Exposures `told` from EXIF, relative to the mean of the known exposures in `of`; NaN where unknown."""
     known = [value for value in of if value is not None]
     return np.array([np.nan if value is None or not known else value - np.mean(known) for value in told], np.float64)
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene, View
 
 MIX_RATE_FRACTION = 0.3
-"""Fraction of the gains' rate that mixes use. At the full rate they absorb colours of the scene."""
+"""Learning rate of mixes, as a fraction of the gains' rate. At the full rate they absorb colours of the scene."""
 _COLOUR_GAINS = GainEntries(mix_rate=MIX_RATE_FRACTION)
 
 VIGNETTE_CHECKPOINT_ARRAYS = ("logs", "first", "second")
@@ -76,14 +76,14 @@ class ViewColours(ViewPart):
         width: int,
         height: int,
     ) -> DeviceArray:
-        """The unchanged image; gains, mixes and vignette are removed from the photograph in `target`."""
+        """Remove gains, mixes and vignette from the photograph in `target`. Returns the unchanged image."""
         develop(self.device, self.colours, self.vignettes, self.taken, target, width, height)
         return image
 
     def gradient(
         self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
     ) -> DeviceArray:
-        """Sums for `update`, which is tried here, before anything changes."""
+        """Sums for `update`, whose kernels are tried here in the sandbox, before anything changes."""
         columns = camera_gradient(self.device, work, self.taken, image, gradient, width, height, self.place)
         if self.step == 1:
             with only_tried(self.device):
@@ -91,7 +91,7 @@ class ViewColours(ViewPart):
         return columns
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step of the photograph's entries and its lens's entries."""
+        """Take Adam's step for the entries of the photograph and of its lens."""
         assert own is not None, "made by `gradient`"
         row, lens, step = self.taken.photograph, self.taken.lens, self.step
         step_gains(self.device, self.colours, row, own, step, self.rate, readback, _COLOUR_GAINS)
@@ -155,8 +155,8 @@ class PpispOfAll(GainsOfAll):
     def record(self) -> dict[str, Any]:
         """Content of appearance.json, by the names of the views.
 
-        Held-out photographs have the vignette of their lens, or the mean of all lenses if no training photograph has
-        it. Centres are fractions of the picture's size.
+        Held-out photographs have the vignette of their lens, or the mean of all vignettes if no training photograph has
+        their lens. Centres are fractions of the picture's size.
         """
         record, colours = super().record(), self._gains.logs.get().astype(np.float64)
         vignettes = self._vignettes.logs.get().astype(np.float64)

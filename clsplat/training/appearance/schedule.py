@@ -14,7 +14,7 @@ from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.context import Device
 
 APPEARANCE_WARM_UP_STEPS, WARM_UP_START_FRACTION = 500, 0.01
-"""Steps of the warm-up, unless a tenth of all steps is less, and the fraction of the rate at its start."""
+"""Length of the warm-up in steps, or a tenth of all steps if that is less; fraction of the rate at its start."""
 FULL_LENGTH_STEPS = 10_000
 """Number of steps below which a training counts as short. In this many steps, and at the rate of the settings, a gain
 can change by about 2 octaves."""
@@ -23,8 +23,8 @@ can change by about 2 octaves."""
 def rate_at(config: TrainConfig, step: int, views: int, *, ends: float, hastens: bool = True) -> float:
     """Learning rate of step number `step`.
 
-    views: number of photographs. Each has a gradient in one of so many steps, so its Adam steps shrink by the root of
-    it.
+    views: number of photographs. Each has a gradient in only one of this many steps, so its Adam steps shrink by the
+    root of this number.
     ends: fraction of the rate that is left at the last step.
     hastens: True to raise the rate in a short training, so that gains can change by as much as in a long one.
     """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photographs with nearby cameras, and the part of their gains that they have in common.
 
-The pictures hardly determine that part, so that `exposure` pulls it to its start.
+The pictures hardly determine that part, so `exposure` pulls it to its initial value.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from clsplat.camera import Camera
 NEIGHBOUR_DISTANCE_LIMIT = 2.5
 """Distance at which cameras stop being neighbours.
 
-It combines two distances: between centres, relative to the median distance from the middle, and between unit viewing
+It combines two distances: between centres, relative to their median distance from the middle, and between unit viewing
 directions. At a quarter of the limit about half of the weight is left. Over about that distance a colour of SH degree 3
 can vary with the direction.
 """
 MAX_MEAN_NEIGHBOURS = 256
-"""Maximum mean number of neighbours of a camera, including itself. The distance limit is reduced so far if
-necessary."""
+"""Maximum mean number of neighbours of a camera, including itself. The distance limit is reduced if there would be
+more."""
 NEIGHBOUR_WEIGHT_STEP = 2.0**-20
 """Step to which weights are rounded, so that they are equal on processors that round differently."""
 
@@ -46,11 +46,11 @@ def common(cameras: Sequence[Camera], told: NDArray[np.bool_]) -> csr_array:
 
     told: (n,), True for photographs that count; rows and columns of the others are 0.
 
-    For a photograph with many neighbours the matrix keeps nearly all of the common part. For one without neighbours it
-    keeps half of its value. Its entries are w / sqrt(t t'), where w is (1 - r)^6 (6 r + 1) at a distance of r
-    NEIGHBOUR_DISTANCE_LIMIT. t and t' are 1 more than the sums of their w. These w are positive definite in six
-    dimensions (Wendland, Advances in Computational Mathematics 4, 1995). So the matrix is positive semidefinite, except
-    for rounding to `NEIGHBOUR_WEIGHT_STEP`.
+    For a photograph with many neighbours the matrix keeps nearly all of the common part. For a photograph without
+    neighbours it keeps half of the value. Its entries are w / sqrt(t t'), where w is (1 - r)^6 (6 r + 1) at a distance
+    of r times NEIGHBOUR_DISTANCE_LIMIT. t and t' are 1 plus the sum of w over a photograph's neighbours, itself
+    included. These w are positive definite in six dimensions (Wendland, Advances in Computational Mathematics 4, 1995).
+    So the matrix is positive semidefinite, except for rounding to `NEIGHBOUR_WEIGHT_STEP`.
     """
     numbers = np.flatnonzero(told)
     if not len(numbers):

@@ -48,11 +48,11 @@ def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, al
 
 
 def doubt_poses(mean: Mapping[str, float], most: float) -> None:
-    """Warn if the model's world has moved away from the given cameras: if aligned poses score over `most` dB better."""
+    """Warn if aligned poses score over `most` dB better: the model's world has moved away from the given cameras."""
     lost = mean.get("psnr_aligned", 0.0) - mean["psnr"]
     if 0 < most < lost:
         warnings.warn(
-            f"--refine-poses: held-out views have {mean['psnr']:.2f} dB where they were given and "
-            f"{mean['psnr_aligned']:.2f} dB where they fit the model best: it has moved with the refined cameras. Use "
-            "those of refined/ with it; where the given ones are good, train without --refine-poses"
+            f"--refine-poses: held-out views have {mean['psnr']:.2f} dB at their given poses and "
+            f"{mean['psnr_aligned']:.2f} dB at the poses that fit best: the model has moved with the refined cameras. "
+            "Use the cameras of refined/ with it; if the given cameras are good, train without --refine-poses"
         )

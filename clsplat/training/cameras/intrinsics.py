@@ -36,7 +36,7 @@ class RefinedLenses:
         for view in views:
             if not view.lens.is_pinhole or not view.camera.model.flat:
                 raise InputError(
-                    f"--refine-lenses: {view.name} was taken through {view.lens.model}, which bends pictures; expected "
+                    f"--refine-lenses: the lens of {view.name} is {view.lens.model}, with distortion; expected "
                     "photographs without distortion, as `clsplat sfm` and COLMAP's image_undistorter write them"
                 )
         self._rows = {lens: row for row, lens in enumerate(dict.fromkeys(view.lens for view in views))}
@@ -53,7 +53,7 @@ class RefinedLenses:
         return self.on and step > self._start
 
     def move(self, view: int, step: int, camera: Camera, gradient: Float64) -> None:
-        """Take Adam's step of a view's lens. A gradient that is not finite causes no step.
+        """Take Adam's step for a view's lens. A gradient that is not finite causes no step.
 
         camera: the camera with which the gradient was computed.
         gradient: (4,), with respect to ln fx, ln fy, cx and cy.

@@ -18,7 +18,7 @@ from clsplat.scenes.scene import View
 
 POSE_BETA1, POSE_BETA2 = 0.9, 0.99
 MIN_AXIS_MOMENT_RATIO, MIN_AXIS_MOMENT = 1e-2, 1e-30
-"""Lower bounds of the second moment along an axis: relative to the largest one, and absolute."""
+"""Lower bounds of the second moment along an axis: relative to the largest second moment, and absolute."""
 JACOBI_PAIRS = [
     np.array(pairs)
     for pairs in (
@@ -29,11 +29,11 @@ JACOBI_PAIRS = [
         ((0, 1, 3), (5, 2, 4)),
     )
 ]
-"""The 15 pairs of six motions, three at a time."""
+"""The 15 pairs of six axes, as five sets of three disjoint pairs."""
 JACOBI_SWEEPS, JACOBI_TOLERANCE = 6, 1e-16
-"""Jacobi rotations: passes over all pairs, and relative tolerance of off-diagonal zeros."""
+"""Number of passes of Jacobi rotations over all pairs, and relative size of off-diagonals that counts as zero."""
 CAMERA_RATE_END_FRACTION = 0.01
-"""Fraction of the rate that is left at the last step."""
+"""Fraction of the learning rate that is left at the last step."""
 
 
 def fallen(reach: float, part: float, visits: float) -> float:
@@ -102,8 +102,8 @@ def descend(first: Float64, second: Float64, by: Float64, visit: int) -> Float64
 class Poses:
     """Cameras of the training views, which move if poses are refined.
 
-    Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first one,
-    and the one farthest from it. Outlier cameras are not chosen.
+    Adam has moments for each view. Two views do not move, so that the model keeps its place and size: the first view,
+    and the view farthest from it. Outlier cameras are not chosen.
     """
 
     def __init__(self, config: TrainConfig, views: Sequence[View], extent: float) -> None:
@@ -114,7 +114,7 @@ class Poses:
         if not self.on:
             return
         if len(views) < 3:
-            raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two do not move")
+            raise InputError(f"--refine-poses: {len(views)} training views, expected 3 or more, as two are not refined")
         places = np.array([camera.position for camera in self.cameras])
         near = ~stray_cameras(self.cameras)
         first = int(near.argmax())
@@ -129,13 +129,13 @@ class Poses:
         return self.on and step > self._start and view not in self.held
 
     def rate(self, step: int) -> float:
-        """Rate of a step in radians. It falls exponentially, and all visits of a view sum to about `pose_reach`."""
+        """Learning rate of a step, in radians. It falls exponentially; over a view's visits it sums to `pose_reach`."""
         steps = self._config.iterations - self._start
         reach, part = np.radians(self._config.pose_reach), (step - self._start) / steps
         return fallen(reach, part, steps / len(self.cameras))
 
     def move(self, view: int, step: int, gradient: Float64) -> None:
-        """Take Adam's step of a view's pose. A gradient that is not finite causes no step."""
+        """Take Adam's step for a view's pose. A gradient that is not finite causes no step."""
         by = gradient * self._scale  # translations relative to the extent
         if not np.isfinite(by).all():
             return

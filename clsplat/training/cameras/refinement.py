@@ -33,7 +33,7 @@ REFINEMENT_ARRAYS_PER_PARAMETER = 4
 
 @dataclass(eq=False)
 class CameraSums(ViewPart):
-    """Gradients with respect to the pose and the lens of a step's view, of a model of `count` rows.
+    """Gradients with respect to the pose and the lens of a step's view, summed over the `count` rows of the model.
 
     `add_rows` receives all rows, in order.
     pose, lens: True for each gradient to sum.
@@ -74,7 +74,7 @@ class CameraSums(ViewPart):
             lens_rows(rows.device, counts, rows.by_lens, self._sums[LENS_NUMBERS], rows.start)
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:  # noqa: ARG002
-        """Move the camera; waits for the device."""
+        """Take the optimiser's step for the camera (`move`). Waits for the device."""
         if self.move is not None:
             self.move(self)
 
@@ -93,10 +93,10 @@ class CameraSums(ViewPart):
 
 
 class Cameras(Component):
-    """Cameras of the training views. Refined poses and lenses change until the gate ends the refinement.
+    """Cameras of the training views. Refined poses and lenses change until the validation gate ends the refinement.
 
     work: memory for sums over the model's rows.
-    held_out: number of held-out views with which the gate validates the cameras.
+    held_out: number of held-out views with which the gate (`CameraGate`) validates the cameras.
     """
 
     def __init__(self, config: TrainConfig, scene: Scene, work: Workspace | None = None, held_out: int = 0) -> None:
@@ -131,7 +131,7 @@ class Cameras(Component):
         return replace(inputs, parts=(*inputs.parts, sums))
 
     def _move(self, inputs: ViewInputs, step: int, sums: CameraSums) -> None:
-        """Change the view's camera along the gradients; waits for the device."""
+        """Take the optimiser's step for the view's pose and lens. Waits for the device."""
         if sums.pose:
             self.poses.move(inputs.view, step, sums.by_pose())
         if sums.lens:

@@ -41,7 +41,7 @@ class ValidationViews:
         A photograph counts if its mask keeps a pixel. If appearance is learnt, colours are fitted before the
         comparison.
 
-        look: function that gives a view's appearance, as far as it is known.
+        look: function from a view to its appearance, as far as it is known.
         """
         found = []
         for index, camera in enumerate(cameras):
@@ -57,11 +57,11 @@ class ValidationViews:
 
 def validate(cameras: Cameras, validation_views: ValidationViews, step: int, draw: Draw, look: Look) -> None:
     """Measure the held-out views with the refined cameras. If the gate rejects the cameras, warn and go back to earlier
-    ones.
+    cameras.
 
-    Held-out views are measured twice, with their given poses and with these moved by the drift of the refined poses.
-    The better result counts. The given poses are right if only some training poses were wrong, and the moved ones if
-    the whole world has drifted.
+    Held-out views are measured twice, with their given poses, and with these poses moved by the drift of the refined
+    poses. The better result counts. The given poses are right if only some training poses were wrong, and the moved
+    ones if the whole world has drifted.
     """
     seen = [cameras.lenses.seen(view.lens, view.camera) for view in validation_views.views]
     psnr = validation_views.psnr(draw, look, seen)

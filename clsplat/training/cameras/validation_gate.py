@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gate of refined cameras: it returns to earlier cameras if held-out photographs get worse. Policy only, no OpenCL."""
+"""Validation gate: returns to earlier cameras if refinement makes held-out views worse. Policy only, no OpenCL."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from clsplat.training.density.adaptive import is_due, is_reset_due
 MAX_GATE_VIEWS = 8
 """Maximum number of held-out views that are measured."""
 GATE_MEASUREMENTS = 10
-"""Measurements in a training, in addition to the one when refinement begins."""
+"""Number of measurements in a training, after the measurement at the beginning of refinement."""
 LOW_MEASUREMENTS_IN_A_ROW = 2
-"""Number of consecutive low measurements that end refinement. A single one may be low because of a densification."""
+"""Number of consecutive low measurements that end refinement. Just one may be low because of a densification."""
 RESET_SETTLING_DIVISOR = 3
 """Divisor of the interval between opacity resets. The quotient is the number of steps in which a model recovers from a
 reset; until then its cameras cannot be validated."""
 DRIFT_ITERATIONS, MIN_DRIFT_RESIDUAL = 10, 1e-12
-"""Number of reweighted fits of a drift, and the residual and spread below which they count as zero."""
+"""Number of reweighted fits of a drift, and the limit below which a residual or spread counts as zero."""
 
 
 def steps_of(config: TrainConfig) -> tuple[int, ...]:
     """Steps after which cameras are validated, rising: when refinement begins, and at every tenth of the training.
 
-    Just after a densification, and for long after an opacity reset, the model is too bad to validate cameras with. The
-    measurement then moves to the last step before, where it comes before the change of the model.
+    Just after a densification, and for long after an opacity reset, the model is too bad to validate cameras with. A
+    measurement due then is made at the last step before, ahead of that change of the model.
     """
     density, first = config.density, first_step(config)
     settling = (density.opacity_reset_every or DensityConfig.opacity_reset_every) // RESET_SETTLING_DIVISOR
@@ -65,23 +65,23 @@ class Drift:
     shift: Float64
 
     def taken_along(self, camera: Camera) -> Camera:
-        """Camera that sees in the drifted world what this one sees in the original world."""
+        """Camera that sees in the drifted world what `camera` sees in the original world."""
         rotation = camera.rotation @ self.rotation.T
         position = self.scale * self.rotation @ camera.position + self.shift
         return camera.posed(rotation, -rotation @ position)
 
     def points(self, points: Float64) -> Float64:
-        """Points (N, 3) of the original world, moved to the drifted one."""
+        """Points (N, 3) of the original world, moved to the drifted world."""
         moved: Float64 = self.scale * points @ self.rotation.T + self.shift
         return moved
 
 
 def drift(given: Sequence[Camera], refined: Sequence[Camera], extent: float) -> Drift:
-    """Similarity that best maps the given poses to the refined ones, n each.
+    """Similarity transform that best maps the n given poses to the n refined poses.
 
-    A camera's residual is the root of (angle^2 + (distance/extent)^2), angles in radians. Squared residuals have Huber
-    weights with the median residual as the bound, so that a few outliers have little influence. The rotation fits
-    positions and axes together (Kabsch 1976), as cameras may lie on a line or in one point. The scale is Umeyama's
+    A camera's residual is the root of (angle^2 + (distance/extent)^2), with the angle in radians. Squared residuals
+    have Huber weights with the median residual as the bound, so that a few outliers have little influence. The rotation
+    fits positions and axes together (Kabsch 1976), as cameras may lie on a line or in one point. The scale is Umeyama's
     (1991), from the positions.
     """
     old, new = (np.array([camera.rotation for camera in cameras]) for cameras in (given, refined))
@@ -118,13 +118,13 @@ class CameraGate:
         self._best: dict[str, NDArray[Any]] = {}
 
     def is_due(self, step: int) -> bool:
-        """True if the cameras have to be validated after this step, or if a due step has passed without it."""
+        """True if the cameras have to be validated after this step, or should have been after an earlier step."""
         last = self.measured[-1][0] if self.measured else -1
         return any(last < due <= step for due in self._steps)
 
     @property
     def best(self) -> tuple[int, float]:
-        """Step and dB of the best measurement before refinement ended; of equal ones, the first."""
+        """Step and dB of the best measurement before refinement ended; the first of equals."""
         known = [each for each in self.measured if self.ended is None or each[0] <= self.ended]
         return max(known, key=lambda each: each[1])
 
@@ -134,7 +134,7 @@ class CameraGate:
         """Record a measurement in dB.
 
         cameras: the cameras' arrays of a checkpoint.
-        Returns the arrays of the cameras to go back to, or None to keep these, and the text of a warning, or "".
+        Returns the arrays of the cameras to go back to, or None to keep the current ones, and a warning, or "".
         """
         self.measured.append((step, psnr))
         if self.ended is not None:
@@ -154,9 +154,9 @@ class CameraGate:
         found = f"{flag}: held-out views had {best:.2f} dB at step {at}, {figures} dB at steps {steps}"
         advice = f"try a smaller {reach}, or train without {flag}"
         if step >= self._config.iterations:
-            return None, f"{found}: no step is left to go back; {advice}"
+            return None, f"{found}: no step is left in which to go back; {advice}"
         self.ended = step
-        return self._best, f"{found}: the cameras are again those of step {at}, and stay; {advice}"
+        return self._best, f"{found}: the cameras of step {at} are restored, and refinement ends; {advice}"
 
     def record(self) -> dict[str, Any]:
         """Measurements so far, for metrics.jsonl. Requires at least one."""
@@ -172,9 +172,9 @@ class CameraGate:
         return {f"gate/{name}": array for name, array in own.items()}
 
     def load(self, arrays: Mapping[str, NDArray[Any]], cameras: Mapping[str, NDArray[Any]]) -> None:
-        """Load the arrays of a checkpoint, by name without the prefix. They are empty before the first measurement.
+        """Load the arrays of a checkpoint, by name without the prefix. There are none before the first measurement.
 
-        cameras: arrays of the cameras now, whose shapes the stored ones must have.
+        cameras: arrays of the current cameras; the loaded arrays must have the same shapes.
         Raises ValueError for arrays of other views.
         """
         self.measured, self.ended, self._best = [], None, {}

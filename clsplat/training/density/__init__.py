@@ -50,7 +50,7 @@ class Marker(Protocol):
         """Mean gradients (n,) of the Gaussians that may be densified; negative for the rest."""
 
     def rows(self, rules: MarkRules) -> RowList:
-        """List the rows that the rules produce: kept ones, clones, first and second halves."""
+        """List the rows that the rules produce: retained rows, clones, first halves, second halves."""
 
 
 class HostCopy(Protocol):
@@ -90,7 +90,7 @@ class RowPlan:
     rows: (m,) uint32, the source row of each new row; None if all rows stay.
     fresh: (m,) bool, True for rows whose moments start at zero and whose contributions are unknown.
     listed: list from the model's marker, which takes the place of `rows` and `fresh`.
-    values: by parameter group, indices of the new rows that change, and their values (k, ...).
+    values: by parameter group, the indices (k,) of new rows whose values change, and these values (k, ...).
     halves: function that computes the values of the halves from the groups `halved` of the split Gaussians.
     changes: by group, function that computes new values for all rows.
     restarted: groups whose moments start at zero in every row.

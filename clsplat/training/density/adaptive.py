@@ -47,7 +47,7 @@ class Adaptive(Strategy):
         return rows_change or is_reset_due(self.config, step, white=self.white)
 
     def before_step(self, model: ModelState) -> RowPlan:
-        """Densify or prune, then reset opacities, whichever is due."""
+        """Densify or prune, then reset opacities, each only if it is due."""
         config, step, made = self.config, model.step, RowPlan()
         if (densifies := is_due(config, step)) or is_pruning_due(config, step):
             made = plan(config, model) if densifies else plan_pruning(config, model)
@@ -86,7 +86,7 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
     """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
     or contribute little.
 
-    Kept Gaussians come first and in order. Clones and halves are fresh.
+    Retained Gaussians come first, in order. Clones and halves are fresh.
     """
     # Each rule compares like NumPy: a float32 array with a Python number, in float32.
     too_large, dense = config.max_world_fraction * model.extent, config.dense_fraction * model.extent
@@ -119,7 +119,7 @@ def _pruning(config: DensityConfig, model: ModelState) -> MarkRules:
     """Rules for pruning transparent Gaussians and Gaussians that no view needs.
 
     Contributions are in pixels, and infinite while unknown. The largest contribution is the maximum over the views of
-    the last whole epoch and of the current one.
+    the last complete epoch and of the current epoch.
     """
     opaque = np.log(config.min_opacity / (1 - config.min_opacity))
     rules = MarkRules(transparent=edge(lambda logit: logit >= opaque))
@@ -163,15 +163,15 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
 
 
 def draw_halves(config: DensityConfig, split: Mapping[str, Float32], *, rng: np.random.Generator) -> dict[str, Float32]:
-    """New means and log scales of all first halves and then all second ones, from the groups SPLIT_GROUPS of the split
-    Gaussians."""
+    """New means and log scales of all first halves, then of all second halves, from the groups SPLIT_GROUPS of the
+    split Gaussians."""
     means, log_scales = split_halves(config, **{name: np.tile(split[name], (2, 1)) for name in SPLIT_GROUPS}, rng=rng)
     return {"means": means, "log_scales": log_scales}
 
 
 def long_halves(split: Mapping[str, Float32]) -> dict[str, Float32]:
-    """New means, log scales and opacities of first halves and then second ones, on both sides of the mean along the
-    longest axis.
+    """New means, log scales and opacities of all first halves, then of all second halves, on both sides of the mean
+    along the longest axis.
 
     docs/gradients.md, (102). split: the groups SPLIT_GROUPS and opacity_logits of the split Gaussians.
     """
@@ -210,7 +210,7 @@ def draw_offsets(quaternions: Float32 | Float64, log_scales: Float32 | Float64, 
 def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
     """Offsets (m, 3) along the axes of Gaussians, rotated by their quaternions (m, 4)."""
     q = quaternions.astype(np.float64)
-    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # length 0 is not drawn: no rotation
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-300)  # a zero quaternion is not drawn
     w, axis = q[:, :1], q[:, 1:]
     twice = 2 * np.cross(axis, offsets)
     turned: Float64 = offsets + w * twice + np.cross(axis, twice)
@@ -218,6 +218,6 @@ def rotated(quaternions: Float32 | Float64, offsets: Float64) -> Float64:
 
 
 def reset_opacities(config: DensityConfig, opacity_logits: Float32) -> Float32:
-    """Opacity logits of opacities that are at most `opacity_reset_to`."""
+    """Opacity logits, lowered where the opacity is over `opacity_reset_to`."""
     ceiling = np.log(config.opacity_reset_to / (1 - config.opacity_reset_to))
     return np.minimum(opacity_logits, np.float32(ceiling))

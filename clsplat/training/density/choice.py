@@ -16,7 +16,7 @@ def strategy_of(config: TrainConfig) -> Strategy:
     """New strategy for one training."""
     if config.density.growth == "mcmc":
         return Mcmc(config)
-    if config.sky:  # otherwise the sky's Gaussians would all be pruned as oversized
+    if config.sky:  # without a larger limit, the whole sky would be pruned as oversized
         size = config.density.max_world_fraction * SKY_RADIUS_RATIO
         config = replace(config, density=replace(config.density, max_world_fraction=size))
     return Adaptive(config)

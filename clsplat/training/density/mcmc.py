@@ -23,7 +23,7 @@ from clsplat.training.density import SPLIT_GROUPS, ModelState, RowPlan, Statisti
 from clsplat.training.density.adaptive import draw_offsets, is_due, long_halves
 
 MAX_GAUSSIANS_PER_PLACE = 51
-"""Maximum number of Gaussians that together replace one."""
+"""Maximum number of Gaussians that together replace one Gaussian."""
 MAX_SHARED_OPACITY = 1 - 1e-7
 """Upper limit of opacities in computations, as above it a float32 logit has no precision left."""
 MIN_DRAWN_OPACITY = 1 / 255
@@ -42,18 +42,18 @@ class Mcmc(Strategy):
         self.config = config.density
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
-        """Gradients while the model grows or Gaussians move."""
+        """Gradients while the model grows or dead Gaussians are relocated."""
         config = self.config
         return StatisticsNeeds(gradients=step < config.stop, absolute=config.absolute_gradients)
 
     def is_due(self, step: int) -> bool:
-        """True if Gaussians move."""
+        """True if relocation and growth are due after this step."""
         return is_due(self.config, step)
 
     def before_step(self, model: ModelState) -> RowPlan:
-        """Halve the Gaussians with the largest gradients. Second halves take the rows of the dead, then new ones.
+        """Halve the Gaussians with the largest gradients. Second halves take the rows of dead Gaussians, then new rows.
 
-        A Gaussian is dead if nearly transparent, without a rotation, or too large on the screen.
+        A Gaussian is dead if it is nearly transparent, has no valid rotation, or is too large on the screen.
         """
         config = self.config
         stored = model.parameters["opacity_logits"].get()
@@ -64,7 +64,7 @@ class Mcmc(Strategy):
             dead |= model.statistics["radii"].get() > config.max_screen_radius
         if dead.all():
             raise ClsplatError(
-                f"step {model.step}: every Gaussian is under --density.min-opacity {config.min_opacity}; lower that or "
+                f"step {model.step}: every Gaussian is under --density.min-opacity {config.min_opacity}; lower it or "
                 "--density.opacity-weight"
             )
         more, places = wanted(config, model.step, model.count) - model.count, np.flatnonzero(dead)
@@ -91,7 +91,7 @@ class Mcmc(Strategy):
     def _moved(
         self, groups: dict[str, Float32], rows: NDArray[np.int64], left: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Move the remaining dead Gaussians as published: to the places of live ones, drawn by their opacities.
+        """Move the remaining dead Gaussians as published: to live ones, drawn in proportion to opacity.
 
         groups, rows: updated in place.
         Returns the rows that change.
@@ -148,19 +148,17 @@ def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
     """Indices (count,) drawn with replacement, with probabilities proportional to the weights."""
     sums = np.cumsum(weights)
     found: NDArray[np.int64] = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
-    last = int(
-        np.flatnonzero(weights)[-1]
-    )  # a drawn number that was rounded up to the sum of the weights selects this one
+    last = int(np.flatnonzero(weights)[-1])  # selected by a random number that was rounded up to the sum of the weights
     found[found > last] = last
     return found
 
 
 def shared(opacities: Float64, numbers: NDArray[np.int64], least: float) -> tuple[Float64, Float64]:
-    """Opacities of Gaussians that together replace one, and the increments of their log scales: docs/gradients.md,
-    (94).
+    """Opacities of the Gaussians that together replace one Gaussian, and the increments of their log scales. Equation
+    (94) of docs/gradients.md, (9) of Kheradmand et al. 2024.
 
     opacities: opacities of the replaced Gaussians.
-    numbers: number of Gaussians that replace each.
+    numbers: for each of these, the number of Gaussians that replace it.
     least: lower limit of the new opacities.
     All arrays are (n,).
     """

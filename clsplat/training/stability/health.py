@@ -100,7 +100,7 @@ class RetryBudget:
     def note(self, step: int, *, lost: bool = False) -> None:
         """Record trouble in a step.
 
-        lost: too much of the model is broken to continue with it.
+        lost: True if too much of the model is broken to continue with it.
         """
         self.troubled = [*(earlier for earlier in self.troubled if step - TROUBLE_WINDOW_STEPS < earlier < step), step]
         self.lost = self.lost or lost
@@ -112,7 +112,7 @@ class RetryBudget:
 
     @property
     def spent(self) -> bool:
-        """True if there is no return left."""
+        """True if no return to a checkpoint is left."""
         return self.returns >= MAX_CHECKPOINT_RETURNS
 
     def after_return(self) -> RetryBudget:

@@ -78,7 +78,7 @@ class NonFiniteMonitor:
         self.last = replace(last, others=(*last.others, view)) if last is not None and same else view
 
     def notice(self, refused: Sequence[int]) -> None:
-        """Take `adam`'s counts (`REFUSED`) of the last step, whose loss must still be available."""
+        """Record `adam`'s counts (`REFUSED`) of the last step, whose loss must still be available."""
         if not any(refused) or self._noticed is not None or self.last is None:
             return
         counts = dict(zip(REFUSED, refused, strict=True))
@@ -155,4 +155,4 @@ def _done(stage: str, lost: int, count: int, *, hopeless: bool) -> str:
         return f"{lost:,} of {count:,} are too many to remove"
     if lost:
         return f"{lost:,} removed"
-    return "nothing is learnt where it shows" if stage == "loss" else "moments begin again from zero"
+    return "the Gaussians concerned learn nothing" if stage == "loss" else "moments begin again from zero"

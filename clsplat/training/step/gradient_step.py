@@ -71,7 +71,7 @@ class GradientStep:
 
     @property
     def adam_step(self) -> AdamStep:
-        """Adam's step of this number."""
+        """Adam's step with this step's number."""
         return AdamStep(self.config.optimiser, self.step, self.rates)
 
     def run(
@@ -83,10 +83,10 @@ class GradientStep:
         *,
         reads_loss: bool = False,
     ) -> Loss:
-        """Update the model (parameters, first and second moments) by a view.
+        """Update the model (parameters, first and second moments) with a view.
 
         gradients: arrays for the gradients of the rows on the device at once, if a probe or a part reads them. They are
-        zero before and after. The model has the same bits without them.
+        zero before and after, and do not change the bits of the model.
         reads_loss: True if the loss will be read.
         """
         rasterizer, work, camera = self.rasterizer, self.rasterizer.work, inputs.camera
@@ -171,7 +171,7 @@ class GradientStep:
         )
 
     def _change(self, rows: StepRows, inputs: ViewInputs, probe: StepProbe) -> None:
-        """Take Adam's step of some rows."""
+        """Take Adam's step for some rows."""
         if rows.gradients is not None:
             project_grad(
                 rows.device,
@@ -194,7 +194,7 @@ class GradientStep:
     def replayed(
         self, of: object, key: tuple[object, ...], make: Callable[[], R], numbers: tuple[float, ...] = ()
     ) -> R:
-        """`Workspace.replayed` if the step is by capacity.
+        """The result of `make`, through `Workspace.replayed` if the step is launched by capacity.
 
         A step with exact counts has new arrays each time, so its command buffer would never be reused.
         """
@@ -203,12 +203,12 @@ class GradientStep:
         return self.rasterizer.work.replayed(of, key, make, numbers)
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
-        """Take Adam's step of the view's parts, along their own gradients."""
+        """Take Adam's step for the view's parts, along the gradients `own`."""
         for part, gradient in zip(inputs.parts, own, strict=True):
             part.update(gradient, self.rasterizer.readback)
 
     def update(self, rows: StepRows) -> None:
-        """Take Adam's step of some rows, with the gradient of projection if it is not computed yet."""
+        """Take Adam's step for some rows; compute the gradient of projection if that is not done yet."""
         step, readback = self.adam_step, self.rasterizer.readback
         if rows.gradients is not None:
             parameters, first, second = rows.model
@@ -231,7 +231,7 @@ class GradientStep:
 def view_gradients(work: Workspace, parameters: AnyGaussians, *, zero: bool = False) -> DeviceGaussians:
     """Arrays for a view's gradients of the rows that are on the device at once.
 
-    zero: fill it with zeros, as `GradientStep.run` requires.
+    zero: fill them with zeros, as `GradientStep.run` requires.
     """
     rows = min(parameters.rows, parameters.count) if isinstance(parameters, HostGaussians) else parameters.count
     shapes = group_shapes(rows, parameters.coefficients)

@@ -21,14 +21,14 @@ from clsplat.stages.project import Projected, Screen, Slots
 class ViewInputs:
     """A view of a step.
 
-    view: its index among the training views.
+    view: the view's index among the training views.
     photograph: (H, W, 3 to 5): colours, then alpha and mask.
-    camera: its camera, of the photograph's size.
+    camera: the view's camera, of the photograph's size.
     begins: True if an epoch begins with it.
     kept: number of pixels that its mask keeps, None without a mask.
     depth: known depths, if they are compared.
     area: number of full-resolution pixels per pixel.
-    place: its number in the step.
+    place: the view's number in the step.
     parts: the components' parts in it.
     """
 
@@ -65,7 +65,7 @@ class StepRows(ViewRows):
     model: their parameters, then the arrays that the step changes with these: moments, or sums of gradients.
     device: the device with the switches of the view's projection.
     camera_array, slots: the step's camera, and the gradients of the rows' pairs.
-    gradients: gradients by the rows' parameters, if requested.
+    gradients: gradients with respect to the rows' parameters, if requested.
     by_lens: (rows, 4), gradients with respect to the view's lens.
     """
 
@@ -94,7 +94,7 @@ class ViewPart:
     """True if `add_rows` reads the rows' gradients."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
-        """The same part on another device, made from `values`, to compare and to compute its gradient there."""
+        """The same part on another device, made from `values`, for `compare` and `gradient` there."""
         return self
 
     def values(self) -> NDArray[np.float32]:
@@ -123,7 +123,7 @@ class ViewPart:
         width: int,  # noqa: ARG002
         height: int,  # noqa: ARG002
     ) -> DeviceArray | None:
-        """Turn dL/d(compared image) into dL/d(image), in place. Returns the gradient by the part's own parameters."""
+        """Convert dL/d(compared image) to dL/d(image), in place. Returns the gradient for the part's own parameters."""
         return None
 
     def lens_gradients(self, rows: int) -> DeviceArray | None:  # noqa: ARG002
@@ -134,4 +134,4 @@ class ViewPart:
         """Sum the gradients of these rows, before the rows change."""
 
     def update(self, own: DeviceArray | None, readback: DeviceArray) -> None:
-        """Take Adam's step along the part's own gradient. It changes nothing if a step by capacity has stopped."""
+        """Take Adam's step along the part's own gradient. It changes nothing if the step's pass has stopped."""

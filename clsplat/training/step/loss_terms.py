@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss terms of a training, by its settings: a new one is a row of `LOSS_TERMS`."""
+"""The loss terms that a training's settings ask for: a new term is a row of `LOSS_TERMS`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from clsplat.training.step.inputs import ViewInputs
 
 
 def alpha_term(config: TrainConfig, inputs: ViewInputs) -> LossTerm | None:
-    """The alpha loss, for photographs with alpha or masks if these mean transparency."""
+    """The alpha loss, for photographs with alpha, or with masks if masks mean transparency."""
     wanted = config.alpha_loss > 0 and inputs.photograph.shape[2] > 3
     return AlphaTerm(config.alpha_loss) if wanted else None
 

@@ -38,7 +38,7 @@ class StepMonitor(StepProbe):
     changes: Callable[[], None]
 
     def forward(self, frame: ForwardPass) -> None:
-        """Take the counts of the step before, which this pass has read back."""
+        """Record the counts of the previous step, which this pass has read back."""
         self.monitor.notice(frame.refused)
         self.pending.seen(frame)
 
@@ -49,7 +49,7 @@ class StepMonitor(StepProbe):
 
     def before_rows(self, rows: StepRows) -> None:
         """Try every kernel that changes the state in the sandbox, before the first row changes: a driver may fail in
-        any."""
+        any of them."""
         step, parameters = self.step, rows.parameters
         size = (parameters.count, parameters.coefficients)
         build = (step.adam_step.updates_sh_rest, step.fields, rows.slots.first_slots is None, self.needs.gradients)
@@ -66,7 +66,7 @@ class StepMonitor(StepProbe):
         self.add_statistics(self.statistics.rows(rows.start, rows.stop), rows)
 
     def add_statistics(self, statistics: DensityStatistics, rows: ViewRows) -> None:
-        """Add the view to those statistics of some rows that density control needs."""
+        """Add the view to the statistics that density control needs of these rows."""
         device, camera, screen = self.step.device, self.inputs.camera, rows.screen
         if self.needs.gradients:
             size = (camera.width, camera.height, camera.fx)

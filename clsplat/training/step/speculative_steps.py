@@ -22,7 +22,7 @@ from clsplat.stages.loss import Loss
 from clsplat.training.stability.non_finite import LastStep, NonFiniteMonitor
 
 BY_CAPACITY_VARIABLE = "CLSPLAT_BY_CAPACITY"
-"""Variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
+"""Environment variable that decides if steps are launched by capacity. By default they are, except on CPUs."""
 
 Run = Callable[[int, PairCapacity | None], Loss]
 """A function that runs one step. It takes the step's turn, and a capacity, or None to count the pairs first."""
@@ -54,8 +54,7 @@ def by_capacity(device: Device) -> bool:
 class SpeculativeSteps:
     """A training's steps launched by capacity, at most two at a time, and the capacity of the next one.
 
-    begin: function that is called before a step is repeated, which begins by repairing the trouble that `monitor` has
-    noticed.
+    begin: function that is called before a step is repeated. It first repairs the trouble that `monitor` has noticed.
     redone: number of repeated steps.
     """
 
@@ -81,7 +80,7 @@ class SpeculativeSteps:
         self._most = None
 
     def seen(self, frame: ForwardPass) -> None:
-        """Note a step's frame, right after its launch."""
+        """Record a step's frame, right after the step's launch."""
         self._frame = frame
         if frame.listed.counted.arriving is None:
             self._count(frame.listed.counted.pairs if len(frame.bands) == 1 else None)
@@ -102,7 +101,7 @@ class SpeculativeSteps:
         if self._most is None:
             return 0
         wanted = max(self._most + self._most // 4, 1024)
-        step = 1 << (wanted.bit_length() - 4)  # rounded to few sizes, so that arrays seldom change theirs
+        step = 1 << (wanted.bit_length() - 4)  # rounded to few sizes, so that arrays are seldom resized
         wanted = -(-wanted // step) * step
         return wanted if wanted <= rasterizer.capacity else 0
 

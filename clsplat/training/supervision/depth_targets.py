@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known depths of the training views, which a step compares with the render's."""
+"""Known depths of the training views, which a step compares with rendered depths."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class DepthTargets(Component):
         return DEPTH_PIXEL_BYTES if self._config.depth_use else 0
 
     def join(self, inputs: Sequence[ViewInputs], step: int, count: int) -> Sequence[ViewInputs]:  # noqa: ARG002
-        """Views with their depths."""
+        """The views, with their known depths."""
         if not self._config.depth_use or self._pixels is None:
             return inputs
         aims = [self.aims(each.view, each.camera, step, self._pixels(each.view)) for each in inputs]

@@ -1,5 +1,5 @@
-// The radius of a fisheye with coefficients (Kannala and Brandt) by the angle from the axis, for fisheye.h: (18) of
-// docs/cameras.md.
+// For fisheye.h: the image radius as a function of the angle from the axis, for a fisheye with coefficients (Kannala
+// and Brandt), (18) of docs/cameras.md.
 #define FARTHEST_ANGLE(camera) (camera)[CAMERA_FOLD]
 #define IS_IN_PICTURE(radius, camera) ((radius) < (camera)[CAMERA_FOLD_RADIUS])
 #define SERIES(camera) (2.0f * (camera)[CAMERA_K1])
@@ -29,7 +29,7 @@ static inline float bend_of(float t, CAMERA_SPACE float *camera) {
 // The derivative of p = 1 / slope.
 #define SLOPE_OF_INVERSE(theta, p, camera) (-bend_of(theta, camera) * (p) * (p))
 
-// The angle of a radius, by Newton's method; the host makes sure that it converges.
+// The angle whose image radius is `radius`, by Newton's method; the host makes sure that it converges.
 static inline floatL angle_of(floatL radius, CAMERA_SPACE float *camera) {
   const floatL fold = (floatL)(FARTHEST_ANGLE(camera));
   floatL t = radius < fold ? radius : fold;

@@ -1,4 +1,5 @@
-// Shared by the camera models with RAYS, before their headers. Equation numbers refer to docs/cameras.md.
+// Functions that all camera models with RAYS share, included before their headers. Equation numbers refer to
+// docs/cameras.md.
 
 // sin(x) for |x| up to slightly over a quarter turn, relative error 2e-8: minimax in x^2.
 static inline floatL sinL(floatL x) {
@@ -13,7 +14,8 @@ static inline floatL absL(floatL x) { return x < 0.0f ? -x : x; }
 
 #ifdef NEEDS_TANGENTS
 // (9), (10), (19), (30) of an image whose radius depends on the angle from the axis alone. f: the direction; across:
-// its distance from the axis; along / slope and around: radians that fx pixels cover, away from the axis and around it.
+// its distance from the axis; along / slope: radians that fx pixels cover away from the axis; around: radians that fx
+// pixels cover around it.
 static inline void tangent_around_axis(const float *f, float across, float along, float slope, float around,
                                        __constant float *camera, Tangent *t) {
   const float fx = camera[CAMERA_FX], fy = camera[CAMERA_FY];
@@ -31,7 +33,7 @@ static inline void tangent_around_axis(const float *f, float across, float along
 }
 
 // (27), (28) of such an image. r: the direction's distance from the axis; p, q: as along / slope and around above; dp,
-// dq: their derivatives by the angle.
+// dq: their derivatives with respect to the angle.
 static inline void low_pass_around_axis(const float *f, float r, float p, float q, float dp, float dq,
                                         __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]), z = f[2];
@@ -76,7 +78,7 @@ static inline int move(__constant float *camera, __constant float *after, float 
   return distance > after[CAMERA_NEAR] && distance < 1e15f;
 }
 
-// The change of a camera value.
+// The change of a camera value from `camera` to `after`.
 #define GROWN(name)                                                                                                    \
   ((after[CAMERA_##name] - camera[CAMERA_##name]) + (after[CAMERA_##name##_LOW] - camera[CAMERA_##name##_LOW]))
 #endif

@@ -37,8 +37,9 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   t->k[3] = 1.0f / fy;
 }
 
-// (26): the gradient, through the low-pass part of the covariance, by a step of the mean's direction along e1 and e2.
-// g: the gradient by the covariance's xx, xy (once) and yy.
+// (26): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction along
+// e1 and e2.
+// g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]);
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2])), least = 0.5f / camera[CAMERA_FY];
@@ -75,8 +76,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #endif
 
 #ifdef NEEDS_MOTION
-// The change of the angles from the change of the coordinates, (74) of docs/channels.md: subtracting two angles would
-// round small motions away.
+// Computes the change of the angles from the change of the coordinates, (74) of docs/channels.md, because the
+// difference of two angles would round small motions away.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   Moved m;

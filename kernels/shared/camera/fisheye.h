@@ -39,15 +39,15 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   tangent_around_axis(f, across, 1.0f, slope_of(theta, camera), around, camera, t);
 }
 
-// (27), (28): the gradient, through the low-pass part of the covariance, by a step of the mean's direction along e1 and
-// e2. g: the gradient by the covariance's xx, xy (once) and yy.
+// (27), (28): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction
+// along e1 and e2. g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2], theta = half_atan(r, z);
   const float radius = radius_of(theta, camera), slope = slope_of(theta, camera);
   const float p = 1.0f / slope, dp = SLOPE_OF_INVERSE(theta, p, camera);
   const float ratio = theta > 1e-6f ? r / radius : 1.0f, least = 0.5f / (HALF_TURN * camera[CAMERA_FX]);
   const float q = ratio > least ? ratio : least;
-  // near the axis the difference by its series: sin(t) / D(t) is 1 - (1/6 + k1) t^2
+  // near the axis, the series of the difference: sin(t) / D(t) is 1 - (1/6 + k1) t^2
   const float near_axis = theta * (-1.0f / 3.0f - SERIES(camera));
   const float off_axis = fma1(-q, slope, z) / radius;
   const float dq = ratio > least ? (theta > 0.02f ? off_axis : near_axis) : 0.0f;
@@ -87,8 +87,8 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
 #endif
 
 #ifdef NEEDS_MOTION
-// The change of the angles from the change of the coordinates, (75) of docs/channels.md: subtracting two angles would
-// round small motions away.
+// Computes the change of the angles from the change of the coordinates, (75) of docs/channels.md, because the
+// difference of two angles would round small motions away.
 static inline void motion_of(__constant float *camera, __constant float *after, float x, float y, float z,
                              __global const float *to, __global const float *splat, __global float *motion) {
   Moved m;

@@ -1,4 +1,4 @@
-// Orthographic: the image is linear in x and y, (3) and (15) to (17) of docs/cameras.md, as are the equation numbers.
+// Orthographic: the image is linear in x and y, (3) and (15) to (17). Equation numbers refer to docs/cameras.md.
 #define ON_PLANE
 #define PARALLEL_RAYS
 

@@ -7,7 +7,7 @@
 #define ratio_rest slope_rest
 
 #ifdef NEEDS_PROJECTION
-// The low part of x/z as in the Jacobian; where x/z is clamped, the low part of the limit.
+// The low part of the x/z that the Jacobian uses; where x/z is clamped, the low part of the limit.
 static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z, floatL z_low, float low,
                                   float low_rest, float high, float high_rest) {
   const floatL rest = ratio_rest(ratio, x, x_low, z, z_low);
@@ -15,7 +15,7 @@ static inline floatL clamped_rest(floatL ratio, floatL x, floatL x_low, floatL z
   return ratio == high ? (floatL)(high_rest) : above;
 }
 
-// (3), (4): the Jacobian's row by x is jx (1, 0, -rx), by y jy (0, 1, -ry). low, high: limits of the ratio.
+// (3), (4): the Jacobian's row for x is jx (1, 0, -rx), and for y jy (0, 1, -ry). low, high: limits of the ratio.
 static inline void jacobian_row(floatL x, floatL z, float focal, float low, float high, floatL *rx, floatL *jx) {
   *rx = clampL(x / z, low, high);
   *jx = focal / z;
@@ -23,11 +23,11 @@ static inline void jacobian_row(floatL x, floatL z, float focal, float low, floa
 #endif
 
 #ifdef NEEDS_GRADIENT
-// (52): the mean in the camera's frame, through the image position and through J. Where the ratio is clamped, J
-// depends on z alone. at: the mean; limited: rx, ry; jx, jy: of the Jacobian; d_mx, d_my: the gradient by the image
-// position; by_j02, by_j12: the gradient by the Jacobian's last column, divided by -jx and -jy; d_size: by the log of
-// the size. Fills
-// d[3], and beyond[2]: (145), a clamped ratio is a fixed position on the image.
+// (52): the gradient with respect to the mean in the camera's frame, through the image position and through J. Where
+// the ratio is clamped, J depends on z alone. at: the mean; limited: rx, ry; jx, jy: as in (4); d_mx, d_my: the
+// gradient with respect to the image position; by_j02, by_j12: with respect to the Jacobian's last column, divided by
+// -jx and -jy; d_size: with respect to the log of the size. Fills d[3], and beyond[2] of (145), where a clamped ratio
+// is a fixed image position.
 static inline void mean_gradient(const floatL *at, const floatL *limited, floatL jx, floatL jy, floatL d_mx,
                                  floatL d_my, floatL by_j02, floatL by_j12, floatL d_size, floatL *d, floatL *beyond) {
   const floatL z = at[2], rx = at[0] / z, ry = at[1] / z;

@@ -1,5 +1,5 @@
-// Perspective along rays: Gaussians of a pinhole camera on their tangent planes, as a fisheye's. Equation numbers refer
-// to docs/cameras.md.
+// Perspective along rays: a pinhole camera that projects each Gaussian onto its tangent plane, as a fisheye does.
+// Equation numbers refer to docs/cameras.md.
 #define ON_PLANE
 
 // The quantity in which the image position is linear, and its low part.
@@ -25,8 +25,9 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   tangent_around_axis(f, across, f[2] * f[2], 1.0f, f[2], camera, t);
 }
 
-// (31): the gradient, through the low-pass part of the covariance, by a step of the mean's direction along e1 and e2.
-// g: the gradient by the covariance's xx, xy (once) and yy.
+// (31): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction along
+// e1 and e2.
+// g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2];
   low_pass_around_axis(f, r, z * z, z, -2.0f * (z * r), -r, camera, g, by);

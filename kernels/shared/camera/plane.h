@@ -1,5 +1,5 @@
-// Shared by the camera models with an image plane, after their headers: places that are linear in RATIO. Equation
-// numbers refer to docs/gradients.md.
+// Functions that all camera models with an image plane share, included after their headers. Image positions are linear
+// in RATIO. Equation numbers refer to docs/gradients.md.
 
 #if defined(NEEDS_PROJECTION) || defined(NEEDS_MOTION)
 // (2): focal * (x / z) + centre, as whole pixels relative to the window and a remainder in [0, 1). The remainder has
