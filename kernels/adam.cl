@@ -5,7 +5,7 @@
 //
 // Owner: A work-item owns LANES consecutive elements (adam), LANES rows (adam_visible), an element (add_view) or a row
 //   (join_view).
-// Launch: One work-item for each such piece, in groups of 64; work-items past the end do nothing.
+// Launch: One work-item for each of these, in groups of 64; work-items past the end do nothing.
 // Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `readback`
 //   (READBACK_SIZE) counts refused elements. The scalars are those of Step. Shapes are above each kernel.
 // Equations: docs/gradients.md, (42).

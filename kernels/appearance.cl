@@ -1,6 +1,6 @@
 // Exposure and white balance of photographs: a gain for each channel, its gradient, and Adam's step.
 //
-// Owner: A work-item owns a pixel (remove_gains), sixteen pixels of a column (gain_sums), a column of their sums
+// Owner: A work-item owns a pixel (remove_gains), sixteen pixels of a column (gain_sums), a column of these sums
 //   (column_sums), or one entry of one photograph (move_gains, centre_gains). Sums are added in the same order on every
 //   device. Built with one lane.
 // Launch: Grids of stride x rows, stride x tiles_y and stride x sums; a work-item for each of the `count` entries.
@@ -61,7 +61,7 @@ __kernel void move_gains(const int count, const int entries, const int photograp
   if (c < 3) g *= LN2;
   const int begin = begins[photograph], end = begins[photograph + 1];
   if (i / entries == photograph && end > begin) {
-    float told = 0.0f, apart = 0.0f, pull = 0.0f; // no pull on the pulled photographs' mean offset
+    float told = 0.0f, apart = 0.0f, pull = 0.0f; // the mean offset of all pulled photographs is not pulled
     for (int k = 0; entries * k < count; ++k)
       if (begins[k + 1] > begins[k]) told += 1.0f, apart = added(apart, logs[entries * k + c] - start[entries * k + c]);
     for (int k = begin; k < end; ++k) {

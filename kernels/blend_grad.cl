@@ -295,7 +295,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
 #endif
   RAISE_TO_GROUP_MAX(last)
 
-  for (int first = last; first < end; first += ITEMS) { // all items stay: Intel's runtime reads for absent ones
+  for (int first = last; first < end; first += ITEMS) { // no early exit: Intel's runtime reads memory for absent items
     const int i = first + (int)get_local_id(0);
     __global float *slot = slots + (size_t)SLOT_STRIDE * slot_from_sorted[min(i, end - 1)];
     if (i < end)

@@ -1,6 +1,6 @@
 // Adaptive density control: the statistics that it reads, the marking of rows, and the copying of rows.
 //
-// Owner: A work-item owns a Gaussian, in gather_rows an output row.
+// Owner: A work-item owns a Gaussian; in gather_rows, an output row.
 // Launch: One work-item for each Gaussian or row, in groups of 64; work-items past the end do nothing.
 // Buffers: tile_counts (n): 0 where not seen; screen (n, 2): gradient with respect to the mean's image position, per
 //   pixel; splats (n, SPLAT_SIZE) in pixels. Statistics (n) are accumulated in place. The other shapes are above each

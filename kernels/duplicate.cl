@@ -1,8 +1,8 @@
 // Emits one (tile, Gaussian) pair for each tile that the ellipse of a visible Gaussian reaches, in order of depth. A
 // stable sort by tile alone then leaves each tile's Gaussians front to back.
 //
-// Owner: A group owns a chunk of Gaussians in visible_sums and compact_visible. Elsewhere a work-item owns a Gaussian,
-//   in order_pairs a pair.
+// Owner: A group owns a chunk of Gaussians in visible_sums and compact_visible. Elsewhere a work-item owns a Gaussian;
+//   in order_pairs, a pair.
 // Launch: One group of ITEMS work-items for each chunk; elsewhere one work-item for each Gaussian or pair, in groups of
 //   64.
 // Buffers: splats (n, SPLAT_SIZE) in pixels, depth in world units; tile_counts, slots (n): the number of pairs of each
@@ -138,7 +138,7 @@ __kernel void count_by_tile(const uint n, const int tiles_x, const int tiles_y, 
   }
 }
 
-// tile_counts (n): numbers of tiles on the whole image -> band_counts (n): those among [first_tile, end_tile).
+// tile_counts (n): numbers of tiles on the whole image -> band_counts (n): of the tiles [first_tile, end_tile).
 __kernel void band_counts(const uint n, const int tiles_x, const int tiles_y, const int first_tile, const int end_tile,
                           __global const uint *tile_counts, __global const float *splats, __global uint *band_counts) {
   const uint i = get_global_id(0);

@@ -1,6 +1,6 @@
 // The device's peak rates for the pipeline's own operations. `clsplat bench` states each stage's fraction of them.
 //
-// Owner: A work-item owns OWNED cells of imaginary pixels, in limit_copy COPIED elements.
+// Owner: A work-item owns OWNED cells of imaginary pixels; in limit_copy, COPIED elements.
 // Launch: As many groups of ITEMS work-items as keep the device busy; limit_copy: one work-item for each COPIED
 //   elements.
 // Buffers: splats (LIMIT_SPLATS, SPLAT_SIZE) in pixels -> sums (items), which keep compilers from removing the work.

@@ -5,8 +5,8 @@
 //   added in the same order on every device, with any LANES and ITEMS.
 // Launch: Grids of stride / LANES x rows and stride / LANES x tiles_y.
 // Buffers: Planes (3, rows, stride) of colour, or the loss's gradient with respect to it; gains, logs (photographs,
-//   COLOURS): three gains; in logs six mixes follow them, for channel c from channels c + 1 and c + 2, modulo 3;
-//   vignettes (lenses, VIGNETTE); partials (COLOURS + VIGNETTE, tiles_y, stride). Shapes are above each kernel.
+//   COLOURS): three gains; in logs, six mixes follow: into channel c from channels c + 1 and c + 2, modulo 3; vignettes
+//   (lenses, VIGNETTE); partials (COLOURS + VIGNETTE, tiles_y, stride). Shapes are above each kernel.
 // Equations: docs/gradients.md, "Colours and vignettes".
 #include "shared/math.h"
 #include "shared/lanes.h"

@@ -1,9 +1,10 @@
 // The gradient of projection: sums a Gaussian's slots in the order of its tiles, then applies the chain rule back to
 // its parameters. project_step fuses Adam's step into it, so that no gradient goes to memory.
 //
-// Owner: A work-item owns LANES Gaussians, in add_slots one; project_grad skips those that are not visible. A group of
-//   project_step owns ROWS Gaussians and walks each of the model's arrays in order.
-// Launch: One work-item for each LANES Gaussians, or for each one, in groups of 64; work-items past the end do nothing.
+// Owner: A work-item owns LANES Gaussians, or one in add_slots; project_grad skips those that are not visible. A group
+//   of project_step owns ROWS Gaussians and walks each of the model's arrays in order.
+// Launch: One work-item for each LANES Gaussians, or for each in add_slots, in groups of 64; work-items past the end do
+//   nothing.
 //   project_step: groups of one item, or with one lane of ROWS items.
 // Buffers: slots (pairs, SLOT_STRIDE) of blend_grad.cl, or with ADDED_UP their sums (n, SLOT_STRIDE); tile_counts,
 //   first_slots (n): its scan; parameters, splats and camera as in project.cl -> screen (n, 2): gradient with respect
@@ -125,7 +126,7 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
 #else
 #define TAKEN(k) (intL)(-1)
 #endif
-  ulong left = 0; // vectors with a refused element, or with one past the last row
+  ulong left = 0; // bits of the vectors with a refused element or an element past the last row
   for (uint k = 0; k < width; ++k) {
     const floatL g = *(const floatL *)(gradients + k * LANES);
     if ((k + 1) * LANES > count || !step_vector(begin + k * LANES, g, TAKEN(k), s, model)) left |= (ulong)1 << k;
@@ -226,7 +227,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #ifndef NO_SH_REST
   FOR_HIGHER(k, SH_USED(coefficients)) basis[SH_HIGHER * me + k - 1] = any ? d.basis[k].all : 0.0f;
 #endif
-  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // a row has one reader and several writers
+  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // a row is read by one item and written by several
 #ifdef SPARSE
 #define TAKEN(row) in_view[row]
 #else

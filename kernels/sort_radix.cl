@@ -1,6 +1,6 @@
 // One pass of a stable least-significant-digit radix sort in three launches: each chunk's histogram, the scan of each
-// digit's counts over the chunks, the scatter. It needs no forward progress between groups. If one item has all keys,
-// one launch does all passes.
+// digit's counts over the chunks, the scatter. It needs no forward progress between groups. If a single work-item sorts
+// all keys, one launch does all passes.
 //
 // Owner: A group owns a chunk; in radix_offsets some digits. In the scatter, a group of one item takes its keys one by
 //   one. A larger group takes tiles of TILE keys, sorts each by digit in local memory, and writes a digit's keys side

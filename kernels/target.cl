@@ -1,6 +1,7 @@
 // Copies a photograph into blend's layout, with its alpha composited over the render's background.
 //
-// Owner: A work-item owns OWNED pixels of a row of the padded planes: a tile's row if there are vectors, otherwise one.
+// Owner: A work-item owns OWNED pixels of a row of the padded planes: a tile's row if there are vectors, otherwise one
+//   pixel.
 // Launch: A grid of stride / OWNED x rows, whole tiles.
 // Buffers: source (height, width, channels), bytes or floats, interleaved; background (3) -> planes (3, rows, stride):
 //   colour, in [0, 1] for bytes, 0 in padding; with ALPHA a fourth plane, of alpha. With MASKED the source's fifth

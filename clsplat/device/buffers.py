@@ -390,6 +390,6 @@ class Workspace:
         self._forget_command_buffers()
 
     def _forget_command_buffers(self) -> None:
-        """Drop all command buffers, and those being recorded."""
+        """Drop all command buffers, including those being recorded."""
         self._command_buffers.clear()
         self._renewed += 1

@@ -34,7 +34,7 @@ class LaunchParameterWord(int):
 
 
 def asked() -> str:
-    """The use of command buffers: 1, 0 or CHECK_TAPES. Raises InputError."""
+    """The use of command buffers that TAPES_VARIABLE asks for: 1, 0 or CHECK_TAPES. Raises InputError."""
     value = os.environ.get(TAPES_VARIABLE) or "1"
     if value not in ("0", "1", CHECK_TAPES):
         raise InputError(f"{TAPES_VARIABLE}={value}: expected 1, 0 or {CHECK_TAPES}")

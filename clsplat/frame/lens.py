@@ -58,7 +58,7 @@ class ByMap:
         return self.stmap.width, self.stmap.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Pixels of the straight frame, as in `Places`."""
+        """Positions in the straight frame, as in `Places`."""
         u, v = np.moveaxis(self.stmap.at(x, y), 2, 0)
         return np.stack([u * frame.width, (1 - v) * frame.height], axis=2)
 
@@ -77,7 +77,7 @@ class ByLens:
         return frame.width, frame.height
 
     def places(self, frame: Camera, x: Float64, y: Float64) -> Float64:
-        """Pixels of the straight frame, as in `Places`."""
+        """Positions in the straight frame, as in `Places`."""
         bare = self.lens.bare(frame.rotation, frame.translation)
         across, down = np.meshgrid((x - frame.cx) / frame.fx * bare.fx, (y - frame.cy) / frame.fy * bare.fy)
         pixels = np.stack([(across + bare.cx).ravel(), (down + bare.cy).ravel()], axis=1)

@@ -109,7 +109,7 @@ def plan(need: Need, budget: int, max_allocation: int, alignment: int) -> Plan:
     If not everything fits at once, the tiles are divided into bands. If that would make many bands, the parameters are
     also streamed in parts. Bands come first because they repeat little work, while parts cross the bus in every step.
 
-    alignment: number of which the number of rows is a multiple.
+    alignment: the number of rows is a multiple of this.
     Raises CapacityError if not even the smallest pieces fit.
     """
     photographs = min(max(budget - need.total - need.moving, 0) // 2, need.photographs)

@@ -208,7 +208,7 @@ class Rasterizer:
         return row
 
     def listed(self, frame: ForwardPass, band: Band) -> ListedBand:
-        """The band with its pairs and lists. With several bands it reuses the memory of the previous one."""
+        """The band with its pairs and lists. With several bands it reuses the memory of the previous band."""
         if len(frame.bands) == 1:
             return frame.listed
         return self._list(self.device_of(frame.camera), frame.projected, band, tiles_of(frame.camera))
@@ -216,7 +216,7 @@ class Rasterizer:
     def by_band(self, frame: ForwardPass, work_on: Callable[[ListedBand], R]) -> list[R]:
         """Results of `work_on` for each of the frame's bands in turn.
 
-        The lists of a band are not kept: the next band may need the memory for larger ones.
+        The lists of a band are not kept: the next band may need the memory for larger lists.
         """
         return [work_on(self.listed(frame, band)) for band in frame.bands]
 

@@ -61,7 +61,7 @@ ChannelResult = dict[str, NDArray[Any]]
 
 depth, median, first: (H, W) float32, along the camera's axis.
 count, index: (H, W) int32; index is -1 for empty pixels.
-Others, if they were asked for: (H, W) or (H, W, floats) float32, as docs/channels.md defines them.
+Other channels, if requested: (H, W) or (H, W, floats) float32, as docs/channels.md defines them.
 """
 
 

@@ -25,8 +25,7 @@ MAX_PAIRS_PER_BAND = 2**31 - 1024
 
 
 DUPLICATE_GAUSSIAN_BYTES = 3 * 4 + SORT_KEY_BYTES + 3 * 4
-"""Bytes per Gaussian: first slots, the visible Gaussians with their keys, and the same sorted, with counts and
-offsets."""
+"""Bytes per Gaussian: first slots; visible Gaussians and their keys; both sorted, with counts and offsets."""
 BAND_GAUSSIAN_BYTES = 4
 """Additional bytes per Gaussian if there are several bands: its number of tiles in the current band."""
 BAND_TILE_BYTES = 4

@@ -23,7 +23,7 @@ from clsplat.stages.device_camera import FARTHEST_PLANE
 from clsplat.stages.sums import padded, row_sums
 
 EWA_CAMERA_DEFINES = {model.gsplat: model.ewa for model in CAMERA_MODELS if model.gsplat}
-"""Defines of the camera models, by gsplat's names."""
+"""Defines of the camera models, by gsplat's names of the models."""
 EWA_CAMERA_MODELS = tuple(EWA_CAMERA_DEFINES)
 
 EWA_CLAMP_FRACTION = 0.15

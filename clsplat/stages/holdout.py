@@ -54,7 +54,7 @@ def upload_held(device: Device, surfaces: Surfaces) -> Held:
 
 @stage("holdout")
 def holdout(device: Device, held: Held, lists: TileLists, inputs: ImageInputs, blended: Blended) -> None:
-    """Replace the image and transmittance of `blended` by the held-out ones. `blended` must be of the lists' tiles."""
+    """Reduce image and transmittance of `blended` to what the surfaces let through, in the lists' tiles."""
     tiles_x, listed = blended.stops.shape[1] // TILE, (lists.ranges, lists.gaussian_from_sorted)
     planes = (blended.stops, blended.image, blended.transmittance)
     arrays = (*listed, inputs.splats, inputs.background, *planes, *held.arguments)

@@ -18,8 +18,8 @@ MIN_CHUNK_ELEMENTS, MAX_SINGLE_CHUNK_ELEMENTS = 1024, 1 << 14
 """For groups of one item: the fewest elements of a chunk, and the number of elements up to which a single chunk takes
 all. A chunk of that size is done before a second launch would begin."""
 MAX_SCAN_GROUPS = 2048
-"""The most groups, of more than one item, that share a scan or sort. There is a limit as each reads the counts of all
-earlier groups."""
+"""The most groups (of more than one item each) that share a scan or sort, because each reads the counts of all earlier
+groups."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -193,7 +193,7 @@ class TrainingSession:
         for incident in self.trainer.monitor.incidents:
             self.troubles[incident.stage] += 1
             if self.troubles[incident.stage] == 1:
-                warnings.warn(f"{incident} (further ones of this kind are only counted)")
+                warnings.warn(f"{incident} (further incidents of this kind are only counted)")
         self.trainer.monitor.incidents.clear()
 
     def tell_the_rest(self) -> None:
@@ -400,7 +400,7 @@ def _tell_of_limit(trainer: Trainer) -> None:
 
 
 def doubt_length(metrics: Sequence[Mapping[str, Any]], psnr: float) -> None:
-    """Warn if an earlier evaluation of the held-out views was better than the last, of `psnr` dB.
+    """Warn if an earlier evaluation of the held-out views was better than the last evaluation, of `psnr` dB.
 
     metrics: records of metrics.jsonl.
     """

@@ -360,7 +360,7 @@ class Trainer:
     def _note(self, *, begun: bool = False) -> None:
         """Mark the current state. Until it changes, `step_back` returns to it.
 
-        begun: True if the step number has already been increased for the current step, of one view.
+        begun: True if the step number has already been increased for the current step, which has one view.
         """
         self.mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
 

@@ -49,7 +49,7 @@ static inline void refuse(size_t i, Step s, float p, float g, float m, float v, 
 #define RARE static inline
 #endif
 
-// The step of element i along its gradient g, as in `change`.
+// Takes Adam's step for element i along its gradient g, like `change`.
 RARE void step_element(size_t i, float g, Step s, Stepped model) {
   const float before = model.parameters[i], m_before = model.first[i], v_before = model.second[i];
   const float m = fma1(s.beta1, m_before, (1.0f - s.beta1) * g);

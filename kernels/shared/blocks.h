@@ -41,7 +41,7 @@ typedef int Open; // number of the item's cells with an open pixel
 #define OPEN_CELL(open, cell) (++(open))
 #define CLOSE_CELL(open, cell) (--(open))
 
-// Blocks as bits, starting at the item's first block.
+// A set of blocks, with one bit for each block, from the item's first block on.
 typedef uint Reach;
 #define ALL_BLOCKS (0xffffffffu >> (32 - BLOCK_COLUMNS * BLOCK_ROWS))
 #define FROM_OWN(blocks) ((blocks) >> (ITEM / BLOCK_ITEMS))

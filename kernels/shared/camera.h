@@ -1,5 +1,5 @@
-// The camera model of this build: the one place that chooses a header of shared/camera/. All have the same functions
-// and macros, which docs/cameras.md (Adding a camera model) lists. Needs math.h and lanes.h.
+// The camera model of this build: the one place that chooses a header of shared/camera/. All camera models have the
+// same functions and macros, which docs/cameras.md (Adding a camera model) lists. Needs math.h and lanes.h.
 //
 // Before the first include, a kernel defines the macros of the parts that it needs:
 //   NEEDS_PROJECTION   a Gaussian's place on the image plane; gaussian.h and ewa.h define this macro

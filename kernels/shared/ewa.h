@@ -200,8 +200,8 @@ static inline void refine2(const uint *row, __global const float *quaternions, _
 }
 #endif
 
-// Fills *p: (150) to (155). Conditions are positive, so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if
-// every lane is culled.
+// Fills *p: (150) to (155). Conditions are written so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if every
+// lane is culled.
 static inline int project_ellipses(const uint *row, __global const float *means, EWA_SHAPES, __constant float *camera,
                                    Ellipse2 *p) {
   const floatL x = GATHER(means, 3, 0), y = GATHER(means, 3, 1), z = GATHER(means, 3, 2);

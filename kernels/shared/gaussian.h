@@ -100,7 +100,7 @@ static inline void refine(const uint *row, __global const float *quaternions, __
   }
 }
 
-// Fills *p: (1), (3) to (7). Conditions are positive, so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if
+// Fills *p: (1), (3) to (7). Conditions are written so that NaN culls. `row` comes from ROWS_OF_ITEM. Returns 0 if
 // every lane is culled.
 static inline int project_gaussians(const uint *row, __global const float *means, __global const float *quaternions,
                                     __global const float *log_scales, __constant float *camera, Projection *p) {

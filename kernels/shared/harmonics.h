@@ -1,6 +1,6 @@
 // Arguments that harmonics.cl and its gradient share: the directions in which the colours are evaluated, and the mask
-// of rows to evaluate. With DEGREE_4 also the SH band of degree 4, which models do not have; the lower bands are in
-// sh.h.
+// of rows to evaluate. With DEGREE_4, this file adds the SH band of degree 4, which models do not have; the lower bands
+// are in sh.h.
 #ifdef DEGREE_4
 #define MOST_COEFFICIENTS 25
 #else

@@ -182,7 +182,7 @@ static inline floatL exp2L(floatL x) {
             ROW4_(array, width, field, 12)))
 #endif
 
-// Unrolls a short loop if a lane is an item: on a GPU an array with a variable index is in memory, not in registers.
+// Unrolls a short loop if LANES is 1: on a GPU an array with a variable index is in memory, not in registers.
 #if LANES == 1
 #define UNROLL _Pragma("unroll")
 #else

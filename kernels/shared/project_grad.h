@@ -2,8 +2,8 @@
 // numbers refer to docs/gradients.md, with RAYS to docs/cameras.md. Needs splat.h, gaussian.h and sh.h, with RAYS
 // tangent.h; the defines are those of project_grad.cl.
 
-// Address space of the gradients of the higher SH bands: all Gaussians' in global memory, or a work-item's own. With
-// one lane project_step computes them from basis and colour instead.
+// Address space of the gradients of the higher SH bands: global for an array of all Gaussians, private for a
+// work-item's. With one lane project_step computes them from basis and colour instead.
 #if !defined(ADAM)
 #define SH_GRADIENT __global float
 #elif LANES > 1
@@ -105,7 +105,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   d->opacity.all = fmaL(opacity_weight * opacity, sigmoidL(-GATHER(opacity_logits, 1, 0)), d->opacity.all);
 #endif
 
-#ifdef RAYS // along e1 and e2 of the tangent plane; on the screen per pixel there
+#ifdef RAYS // along e1 and e2 of the tangent plane; `screen` is per pixel at the mean
   const floatL d_mx = INVERSE_WHITEN2 * m_gu, d_my = INVERSE_WHITEN2 * m_gv;
   const float side_x = sqrt(fma1(p.t.k[0], p.t.k[0], p.t.k[1] * p.t.k[1]));
   const float side_y = sqrt(fma1(p.t.k[2], p.t.k[2], p.t.k[3] * p.t.k[3]));
@@ -129,8 +129,8 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #endif
 #endif
 
-  // (58): the whitened columns of M = J A S, which are w[k] times the scale. They are of order one, without differences
-  // of large numbers.
+  // (58): the whitened columns of M = J A S, which are w[k] times the scale. They are of order one, and no large
+  // numbers are subtracted.
   const float unwhiten = INVERSE_WHITEN2 * INVERSE_WHITEN2;
 #ifdef ANTIALIASED
   // (84): the compensated opacity falls with the filtered covariance's determinant and rises with the unfiltered one's.
@@ -146,7 +146,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   floatL wu[3], wv[3];
   const floatL lean = l11 / p.syy;
   FOR_AXES(k) {
-#ifdef RAYS // the same, with minors of the directions' plane and of the low-pass columns
+#ifdef RAYS // as above, with minors of the directions' plane and of the low-pass columns
     const float inverse = 1.0f / p.distance, b1 = inverse * p.c1[k], b2 = inverse * p.c2[k];
     float minors = 0.0f;
     for (int j = 3; j < 5; ++j) minors = fma1(p.m2[j], fma1(p.m2[j], b1, -(p.m1[j] * b2)), minors);

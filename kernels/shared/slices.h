@@ -6,7 +6,7 @@
 
 // (73): advances a slice past a Gaussian that takes the light from `before` to `after`. open: the light at the slice's
 // start; once its depth is fixed, minus the light behind the Gaussian at that depth. may_begin: among the lanes in
-// `taken`, those where a new slice may begin. Returns the lanes where one begins.
+// `taken`, those where a new slice may begin. Returns the lanes where a slice begins.
 static inline intL begins_slice(floatL *open, floatL before, floatL after, floatL slack, intL taken, intL may_begin) {
   const intL placed = taken & MASKL(*open - before > slack);
   const floatL now = placed ? -before : *open;

@@ -1,7 +1,7 @@
 // Conventions that the writers and readers of a splat or slot share, in addition to the layouts at the top of every
 // source.
 
-// A splat's L11, L12 and L22 are the whitening W times this, sqrt(log2(e) / 2); the slots' moments use that product.
+// A splat's L11, L12 and L22 are the whitening W times WHITEN = sqrt(log2(e) / 2). Moments in slots use WHITEN W too.
 #define WHITEN 0.84932180028801904f
 #define INVERSE_WHITEN2 1.38629436111989062f // 1 / WHITEN^2 = 2 ln 2
 

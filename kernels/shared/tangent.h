@@ -16,7 +16,7 @@ typedef struct {
 #endif
 } RayProjection;
 
-// (8) to (12); returns 0 if the Gaussian is culled. Conditions are positive, so that NaN culls.
+// (8) to (12); returns 0 if the Gaussian is culled. Conditions are written so that NaN culls.
 static inline int project_ray(size_t i, __global const float *means, __global const float *quaternions,
                               __global const float *log_scales, __constant float *camera, RayProjection *p) {
   const float x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];

@@ -32,7 +32,7 @@ static inline int end_cell(float high, float size, int count) {
 }
 
 // The largest box, in tiles, that is listed whole: for so few tiles, testing which of them the ellipse reaches takes
-// longer than blending takes to find no pixel reached.
+// longer than letting blend find that no pixel is reached.
 #ifdef BOX_TILE_TEST // RasterizerConfig.tile_test
 #define SMALL_BOX 0x7fffffff
 #elif !defined(SMALL_BOX)
@@ -114,7 +114,7 @@ static inline float right_edge(const Ellipse *e, float d0, float d1) {
   return (-e->l12 * dy + sqrt(rest > 0.0f ? rest : 0.0f)) / e->l11;
 }
 
-// The tiles [*x0, *x1) that the ellipse reaches in tile row ty, or those of a small box; all in one part.
+// The tiles [*x0, *x1) in tile row ty that the ellipse reaches; all tiles of a small box. There is one part.
 #define SPANS 1
 static inline void tile_span(const Ellipse *e, int ty, int part, int tiles_x, int *x0, int *x1) {
   *x0 = e->tile_x0;

@@ -12,7 +12,7 @@
 #define LANE_PIXEL_Y(lane) 0
 #endif
 
-// A short loop over the pass's values, unrolled if a lane is an item (lanes.h).
+// A short loop over the pass's values, unrolled if LANES is 1 (lanes.h).
 #define FOR_VALUES(k) UNROLL for (int k = 0; k < VALUES; ++k)
 
 // The cells with a pixel that takes the i-th pair, or may take it.

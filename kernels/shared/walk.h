@@ -19,7 +19,7 @@
 typedef float2 Passing;
 typedef float4 Fixed;
 
-// A Gaussian in progress. i: its pair, before `begin` if there is none.
+// A Gaussian in progress. i: the index of its pair, less than `begin` if there is none.
 typedef struct {
   float mx, my, l11, l12, l22, log2o, red, green, blue;
   int i;

@@ -145,7 +145,7 @@ def test_a_gaussian_that_breaks_is_removed_and_told_once(scene: Scene, default_d
     told, rest = lines
     assert re.fullmatch(
         r"step 7, view 0\d\.png, stage parameters: parameters of 1 Gaussian are not finite, or far too large; 1 "
-        r"removed \(further ones of this kind are only counted\)",
+        r"removed \(further incidents of this kind are only counted\)",
         told,
     )
     assert rest == "2 more steps had values that were not finite"

@@ -19,7 +19,7 @@ from clsplat.scenes.scene import View
 from clsplat.training.cameras.poses import checked_arrays, descend, fallen, first_step
 
 LENS_PARAMETERS = 3
-"""Parameters of a lens: ln of both focal lengths, and the principal point in focal lengths."""
+"""Parameters of a lens: the common change of ln fx and ln fy, and of cx and cy in focal lengths."""
 
 
 class RefinedLenses:

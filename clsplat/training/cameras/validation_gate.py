@@ -31,7 +31,7 @@ DRIFT_ITERATIONS, MIN_DRIFT_RESIDUAL = 10, 1e-12
 
 
 def steps_of(config: TrainConfig) -> tuple[int, ...]:
-    """Steps after which cameras are validated, rising: when refinement begins, and at every tenth of the training.
+    """Steps after which cameras are validated, ascending: when refinement begins, and at every tenth of the training.
 
     Just after a densification, and for long after an opacity reset, the model is too bad to validate cameras with. A
     measurement due then is made at the last step before, ahead of that change of the model.

@@ -154,7 +154,7 @@ def budget(config: DensityConfig, step: int, count: int) -> int:
 
     Taming 3DGS (Mallick et al. 2024): A(x) = (B - S - k N)/N^2 x^2 + k x + S with k = 2 (B - S)/N, from S to B in N
     densifications. That is B - (B - S)(1 - x/N)^2, so each densification reduces the gap to B by a known ratio,
-    whatever was pruned since the last one. The last densification reaches B.
+    whatever was pruned since the last densification. The last densification reaches B.
     """
     last = (config.stop - 1) // config.every * config.every
     before = max(step - config.every, config.start)

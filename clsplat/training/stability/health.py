@@ -60,8 +60,8 @@ def finite_or_zero(values: NDArray[np.float32]) -> NDArray[np.float32]:
 class Incident:
     """An occurrence of non-finite numbers, and the response to it.
 
-    step, view: step and view in which they arose.
-    stage: first stage that showed them: "loss", "project_grad", "parameters" or "adam".
+    step, view: step and view in which the numbers arose.
+    stage: first stage that contained the numbers: "loss", "project_grad", "parameters" or "adam".
     count: number of Gaussians concerned, or of array elements if no Gaussian is.
     done: the response in words.
     gaussians: up to MAX_INCIDENT_GAUSSIANS of the Gaussians concerned, by "parameters/means" and so on.

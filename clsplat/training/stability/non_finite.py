@@ -67,7 +67,7 @@ class NonFiniteMonitor:
         self._noticed: tuple[LastStep, str, int] | None = None
 
     def forget(self) -> None:
-        """Forget the last step and its trouble, as the model is a new one."""
+        """Forget the last step and its trouble, because the model has been replaced."""
         self.last = self._noticed = None
         self.readback.fill(0)
 

@@ -33,7 +33,7 @@ class _Step:
     """A step whose counts the host has not read.
 
     readback, counts: the counts on the device, and a function that waits for their copy.
-    before: the monitor's `last` step before this one.
+    before: the monitor's `last` before this step.
     kept: host memory that the device may still have to read.
     """
 
@@ -52,7 +52,7 @@ def by_capacity(device: Device) -> bool:
 
 
 class SpeculativeSteps:
-    """A training's steps launched by capacity, at most two at a time, and the capacity of the next one.
+    """A training's steps launched by capacity, at most two at a time, and the capacity of the next step.
 
     begin: function that is called before a step is repeated. It first repairs the trouble that `monitor` has noticed.
     redone: number of repeated steps.
@@ -75,7 +75,7 @@ class SpeculativeSteps:
         return MAX_COUNTED_PASSES if self.on else 1
 
     def forget(self) -> None:
-        """Forget all steps, as the model is a new one."""
+        """Forget all steps, because the model has been replaced."""
         self._steps.clear()
         self._most = None
 

@@ -76,13 +76,13 @@ class ImageCache:
         return self._held[index, factor]
 
     def kept(self, index: int, factor: float) -> int | None:
-        """Number of pixels of this image that count; None without a mask."""
+        """Number of pixels that count in the image that `load` returns; None without a mask."""
         if (index, factor) not in self._kept:
             self._kept[index, factor] = kept_pixels(self.load(index, factor))
         return self._kept[index, factor]
 
     def bring(self, index: int, factor: float) -> NDArray[Any] | DeviceArray:
-        """This image: a device array if the device has room for it, else the host's array.
+        """The image that `load` returns: a device array if the device has room for it, else the host's array.
 
         An image is uploaded once and stays, unless `ahead` has already sent it to the upload ring. A device that shares
         the host's memory reads the host's array.
@@ -105,7 +105,7 @@ class ImageCache:
         return self._on_device.get(index, image)
 
     def ahead(self, index: int, factor: float) -> None:
-        """Begin to send this image to the upload ring, for the next `bring`, if the device has no room to keep it.
+        """Begin to send an image to the upload ring, for the next `bring`, if the device has no room to keep it.
 
         Call it after launching a step: the upload then runs while the device computes.
         """

@@ -32,8 +32,8 @@ static inline void tangent_around_axis(const float *f, float across, float along
   t->k[3] = c * around / fy;
 }
 
-// (27), (28) of such an image. r: the direction's distance from the axis; p, q: as along / slope and around above; dp,
-// dq: their derivatives with respect to the angle.
+// (27), (28) of such an image (its radius depends on the angle alone). r: the direction's distance from the axis; p, q:
+// as along / slope and around above; dp, dq: their derivatives with respect to the angle.
 static inline void low_pass_around_axis(const float *f, float r, float p, float q, float dp, float dq,
                                         __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]), z = f[2];

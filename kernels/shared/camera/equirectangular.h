@@ -31,15 +31,14 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
   t->e2[0] = -f[1] * s;
   t->e2[1] = level;
   t->e2[2] = -f[1] * c;
-  const float least = 0.5f / fy; // half a row from the pole, where a pixel is a point
+  const float least = 0.5f / fy; // half a row from a pole: at the pole itself a pixel is a point
   t->k[0] = (level > least ? level : least) / fx;
   t->k[1] = t->k[2] = 0.0f;
   t->k[3] = 1.0f / fy;
 }
 
 // (26): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction along
-// e1 and e2.
-// g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
+// e1 and e2. g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float wide = 1.0f / (camera[CAMERA_FX] * camera[CAMERA_FX]);
   const float level = sqrt(fma1(f[0], f[0], f[2] * f[2])), least = 0.5f / camera[CAMERA_FY];
@@ -63,7 +62,7 @@ static inline void box_of(const float *f, float reach, __constant float *camera,
   const float longitude = f[0] < 0.0f ? -half_atan(-f[0], f[2]) : half_atan(f[0], f[2]);
   t->low_y = fma1(fy, latitude - cap, cy);
   t->high_y = fma1(fy, latitude + cap, cy);
-  if (!(sine < 0.999f * level)) { // it contains a pole, or nearly does
+  if (!(sine < 0.999f * level)) { // the box contains a pole, or nearly does
     t->whole_rows = 1;
     t->low_x = t->high_x = 0.0f;
     return;

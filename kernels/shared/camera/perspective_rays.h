@@ -26,8 +26,7 @@ static inline void tangent_of(const float *f, __constant float *camera, Tangent 
 }
 
 // (31): the gradient, through the low-pass part of the covariance, with respect to a step of the mean's direction along
-// e1 and e2.
-// g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
+// e1 and e2. g: the gradient with respect to the covariance's xx, xy (counted once) and yy.
 static inline void low_pass_gradient(const float *f, __constant float *camera, const float *g, float *by) {
   const float r = sqrt(fma1(f[0], f[0], f[1] * f[1])), z = f[2];
   low_pass_around_axis(f, r, z * z, z, -2.0f * (z * r), -r, camera, g, by);
@@ -38,8 +37,9 @@ static inline void low_pass_gradient(const float *f, __constant float *camera, c
 #define NO_END 1e15f
 #define LEAST_AHEAD 1e-4f // least z of a unit direction; with less it is outside every picture
 
-// (32), one side: the image range, in focal lengths, of the directions within an angle of a given one. `sine` is the
-// sine of that angle; along and z are the direction's coordinates. An end that crosses the camera's plane is unbounded.
+// (32), for one axis: the range on the image, in focal lengths, of the directions within an angle of a given direction.
+// `sine`: the sine of that angle; along, z: the given direction's coordinates. An end that crosses the camera's plane
+// is unbounded.
 static inline void side_of(float along, float z, float sine, float *low, float *high) {
   const float level = sqrt(fma1(along, along, z * z));
   *low = -NO_END;
