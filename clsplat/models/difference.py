@@ -33,7 +33,7 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     Raises ValueError for models of different sizes.
     """
     if len(original) != len(read):
-        raise ValueError(f"{len(original)} and {len(read)} Gaussians")
+        raise ValueError(f"the models have {len(original)} and {len(read)} Gaussians, expected as many")
     low, high = original.means.min(axis=0).astype(np.float64), original.means.max(axis=0).astype(np.float64)
     extent = float(np.linalg.norm(high - low))
     shift = read.origin - original.origin

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edits of a model without a device: crop, transform, thin out, merge. Inputs are never changed in place.
+"""Edits of a model that need no device: crop, transform, thin out, merge. Inputs are never changed in place.
 
 A similarity (4, 4) maps the world to a new one: x' = s Q x + t, where Q is a rotation, possibly with a reflection. A
 Gaussian N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T). Its colour f, a function of the view direction,
@@ -21,7 +21,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 MAX_WORLD_OFFSET_SIZES = 64.0
-"""Largest distance of a transformed model's origin, in standard deviations of its means, that is added to the means
+"""Distance, in standard deviations of a transformed model's means, up to which its origin is added to the means
 (decision 0017)."""
 TRANSFORM_SCALE_LIMITS = (1e-12, 1e12)
 """Smallest and largest scale of a transform; beyond them float32 means would be 0 or infinite."""
@@ -57,7 +57,7 @@ def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
 
 
 def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Drop the SH bands above the degree; a model without any is unchanged."""
+    """Drop the SH bands above the degree. A model without such bands is unchanged."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
 
 
@@ -72,7 +72,7 @@ def without_empty_bands(gaussians: Gaussians) -> Gaussians:
 def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
     """Scale the colours of a model.
 
-    gains: three factors of at least 0, one for each channel, or the nine elements of a colour matrix by rows.
+    gains: three factors of at least 0, one for each channel, or the nine elements of a colour matrix row by row.
     """
     factors = np.asarray(gains, np.float64)
     if len(factors) == 9:
@@ -101,7 +101,7 @@ def faded(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:
-    """Concatenate models. Lower SH degrees are padded with zeros, and means count from the first model's origin.
+    """Concatenate models. Lower SH degrees are padded with zeros, and means become relative to the first origin.
 
     Raises InputError if only some of the models are antialiased, or only some are drawn along rays.
     """
@@ -132,7 +132,7 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
 def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[float, Float64, Float64]:
     """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
 
-    slack: tolerance of Q^T Q against the identity.
+    slack: largest allowed difference of Q^T Q from the identity.
     Raises InputError if the matrix is not a similarity.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
@@ -144,7 +144,7 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
     turn = linear / scale
     if (off := float(np.abs(turn.T @ turn - np.eye(3)).max())) > slack:
         raise InputError(
-            f"a transform that is not a similarity (its axes are {off:.2g} off right angles or equal lengths), "
+            f"a transform that is not a similarity (its axes deviate by {off:.2g} from right angles or equal lengths), "
             "expected rotation, one scale and translation"
         )
     u, _, vt = np.linalg.svd(turn)  # the nearest orthogonal matrix
