@@ -96,8 +96,8 @@ MAX_SPIRAL_ELEVATION_RADIANS = np.deg2rad(85.0)
 """Largest elevation of a spiral, in radians. A level camera that looks straight up or down has no defined right
 axis."""
 SMOOTHING_NEIGHBOURS = 3
-"""Number of neighbours on each side that are used to smooth a camera, which removes the hand's jitter from photograph
-to photograph."""
+"""Number of neighbours on each side that are used to smooth a camera, which removes the hand's jitter between
+photographs."""
 
 
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:

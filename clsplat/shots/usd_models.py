@@ -50,8 +50,7 @@ class StageTrack:
     held: Any
 
     def at(self, frame: float) -> Placement:
-        """World transform and visibility at a time code. Raises InputError for a transform that Gaussians cannot
-        follow."""
+        """World transform and visibility at a time code. Raises InputError if the transform is not a similarity."""
         from pxr import Usd
 
         matrix, shown = self.place.at(Usd.TimeCode(frame))
@@ -119,7 +118,7 @@ def read_here(path: Path) -> StageModels | None:
             elif place.seat is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
         models = tuple(known[place.prim.GetPath()] for place in places)
-        if any(isinstance(model, ModelSeries) for model in models):  # samples are read when they are drawn
+        if any(isinstance(model, ModelSeries) for model in models):  # samples are not read yet: digest the files
             for name in sorted(str(layer.realPath) for layer in layers):
                 sums.update(digest(Path(name)).encode() if name else b"")
         tracks: list[Track] = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]
