@@ -73,13 +73,13 @@ PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAME
 
 JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
-"""World units: the default near plane, for cameras and models without their own."""
+"""Default near plane in world units, for cameras and models that do not set one."""
 MIN_NEAR_PLANES_PER_EXTENT = 100.0
-"""A scene gets a smaller near plane if its extent is less than this many times the default one."""
+"""A scene gets a smaller near plane if its extent is less than this many times the default near plane."""
 ROTATION_TOLERANCE = 1e-2
 """Largest allowed entry of |R^T R - I|. It is this large because poses may be typed with few digits or be float32."""
 MAX_FOCAL_PX = 1e12
-"""Exclusive upper limit of focal lengths, pixels. Already below it float32 cannot store a position to a pixel."""
+"""Exclusive upper limit of focal lengths in pixels. Even below it, float32 cannot store positions to a pixel."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ class Window:
 
     x, y: frame coordinates of the picture's first pixel; negative if it lies left of or above the frame.
     width, height: size of the frame.
-    clamp: distance beyond the frame's edges, in halves of the frame's size, up to which the projection's Jacobian
-    follows a Gaussian's mean. It is larger than the default only for a picture that shows more than that.
+    clamp: distance beyond the frame's edges, as a fraction of half the frame's size, up to which the projection's
+    Jacobian follows a Gaussian's mean. It exceeds the default only for a picture that reaches further beyond the frame.
     """
 
     x: int
@@ -106,43 +106,43 @@ class Camera:
     Attributes
     ----------
     width : int
-        Width of the picture, pixels.
+        Width of the picture in pixels.
     height : int
-        Height of the picture, pixels.
+        Height of the picture in pixels.
     fx : float
-        Horizontal focal length: pixels per unit of the projected coordinates (see Notes).
+        Horizontal focal length in pixels per unit of the projected coordinates (see Notes).
     fy : float
         Vertical focal length, in the same unit.
     cx : float
-        Principal point, pixels from the image's left edge; the centre of the first pixel is at 0.5.
+        Principal point in pixels from the image's left edge. The centre of the first pixel is at 0.5.
     cy : float
-        Principal point, pixels from the image's upper edge; the centre of the first pixel is at 0.5.
+        Principal point in pixels from the image's upper edge. The centre of the first pixel is at 0.5.
     rotation : (3, 3) float64
-        x_cam = rotation @ x_world + translation, COLMAP's `cam_from_world`; no unit.
+        Rotation of COLMAP's `cam_from_world`: x_cam = rotation @ x_world + translation.
     translation : (3,) float64
-        Translation of `cam_from_world`, world units.
+        Translation of `cam_from_world` in world units.
     near : float
-        Least depth of a drawn Gaussian's mean, world units. With the default, DEFAULT_NEAR_PLANE, the model's near
+        Least depth of a drawn Gaussian's mean in world units. With the default, DEFAULT_NEAR_PLANE, the model's near
         plane applies (`Gaussians.near`).
     far : float
-        Largest depth of a drawn Gaussian's mean, world units.
+        Largest depth of a drawn Gaussian's mean in world units.
     projection : str
         "perspective", "orthographic", "equirectangular" or "fisheye" (equidistant).
     window : Window, optional
-        Place of the picture in its frame, pixels, if the picture is a part of a frame or extends beyond it. Then width
-        and height are the picture's, and cx and cy are measured from the frame's corner.
+        Place of the picture in its frame if the picture is a part of the frame or extends beyond it. Then width and
+        height are the picture's, and cx and cy are measured from the frame's corner.
     radial : (4,) float
-        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP), no unit. All 0:
-        equidistant.
+        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP). If all are 0, the
+        fisheye is equidistant.
     by_rays : bool
         True for a perspective camera that draws Gaussians along the rays of its pixels, like fisheye and panorama. Use
-        it for a model that was trained so (`Gaussians.by_rays`).
+        it for a model that was trained in this way (`Gaussians.by_rays`).
 
     Notes
     -----
     Depth is z; for fisheye and equirectangular cameras it is the distance.
 
-    The projected coordinates are, by projection (docs/cameras.md has the equations):
+    The projected coordinates of each projection (docs/cameras.md has the equations):
 
     - perspective: x/z and y/z.
     - orthographic: x and y, so that 1 / fx is world units per pixel.
@@ -152,8 +152,8 @@ class Camera:
     With `radial`, a point at angle t from the axis is t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) focal lengths from the
     principal point.
 
-    Picture and frame have the same bits in their common part if the window's x and y are multiples of a tile and the
-    Jacobian's clamp is the same (docs/pictures.md).
+    A picture and its frame are identical to the bit where they overlap, if the window's x and y are multiples of a tile
+    and the Jacobian's clamp is the same (docs/pictures.md).
     """
 
     width: int
@@ -186,8 +186,8 @@ class Camera:
 
     @property
     def fold(self) -> tuple[float, float]:
-        """The largest angle from the axis that a fisheye shows, radians, and its distance from the principal point,
-        focal lengths."""
+        """Largest angle from the axis that a fisheye shows, in radians, and the distance from the principal point at
+        which it appears, in focal lengths."""
         return self.model.fold(self.radial)
 
     @property
@@ -211,7 +211,7 @@ class Camera:
         for name in ("width", "height"):
             side = getattr(self, name)
             if isinstance(side, bool) or not isinstance(side, int | np.integer) or side < 1:
-                raise InputError(f"camera: {name} is {side}, expected a whole number of pixels from 1 on")
+                raise InputError(f"camera: {name} is {side}, expected a whole number of at least 1")
         for name in ("fx", "fy"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, expected a finite number over 0")
@@ -226,8 +226,8 @@ class Camera:
         rotation = np.asarray(self.rotation, np.float64)
         if (off := float(np.abs(rotation.T @ rotation - np.eye(3)).max())) > ROTATION_TOLERANCE:
             raise InputError(
-                f"camera: rotation is no rotation matrix, its axes are {off:.2g} off right angles or length 1, "
-                "expected the rotation of cam_from_world, without a scale"
+                f"camera: rotation is not a rotation matrix: its axes deviate by {off:.2g} from right angles or length "
+                "1; expected the rotation of cam_from_world, without a scale"
             )
         if not 0 < self.near < self.far:
             raise InputError(f"camera: near is {self.near}, far {self.far}, expected 0 < near < far")
@@ -239,15 +239,15 @@ class Camera:
         for model in CAMERA_MODELS:
             if model.option and model.projection != self.projection and np.any(getattr(self, model.option)):
                 raise InputError(
-                    f"camera: {model.option} is {getattr(self, model.option)} of a camera that is {self.projection}, "
-                    f"expected {model.projection}"
+                    f"camera: {model.option} is {getattr(self, model.option)}, but the projection is "
+                    f"{self.projection}; expected {model.projection}"
                 )
         if len(self.radial) != 4 or not all(math.isfinite(value) for value in self.radial):
             raise InputError(f"camera: radial is {self.radial}, expected four finite numbers")
 
     def through(self, model: CameraModel, radial: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Camera:
-        """The same intrinsics and pose with another projection: the usual model of `model.projection`, and its
-        coefficients."""
+        """The same intrinsics and pose with another projection: the usual model of `model.projection`, with the
+        coefficients `radial`."""
         k1, k2, k3, k4 = radial
         return replace(self, projection=cast("Projection", model.projection), radial=(k1, k2, k3, k4), by_rays=False)
 
@@ -291,16 +291,16 @@ class Camera:
         return replace(self, by_rays=by_rays) if changes else self
 
     def depths_of_distances(self) -> Float32 | None:
-        """Factors (height, width) that turn a perspective camera's distances into depths, z: cosines.
+        """Factors (height, width) that turn distances along rays into depths z: the cosines of the rays.
 
-        None if the kernels compute depths.
+        None if the kernels compute depths themselves.
         """
         return self.cosines() if self.by_rays else None
 
     def cosines(self) -> Float32 | None:
         """Cosines (height, width) of the angles between a perspective camera's axis and the rays of its pixels.
 
-        None for other projections, whose depths are not along rays or are distances.
+        None for other projections: their rays are parallel to the axis, or their depths are distances.
         """
         if not self.is_pinhole:
             return None
@@ -312,7 +312,7 @@ class Camera:
     def depths_of(self, points: Float64) -> Float64:
         """Depths (N,) of points (N, 3) in world coordinates, as files store them.
 
-        They are measured along the optical axis of a camera with an image plane. Other cameras have distances.
+        For a camera with an image plane, depths are measured along the optical axis. For others they are distances.
         """
         local = points @ self.rotation.T + self.translation
         return np.asarray(local[:, 2] if self.model.flat else np.linalg.norm(local, axis=1))
@@ -325,11 +325,11 @@ class Camera:
         )
 
     def reshaped(self, width: int, height: int) -> Camera:
-        """The camera in another size.
+        """The camera with a picture of another size.
 
-        A change of shape, even by rounding, keeps the vertical field of view and the pixel aspect ratio.
-        The picture then shows more or less to the left and right, so all sizes of one shape show the same.
-        A panorama shows all directions in any shape.
+        If the ratio of width to height changes, even by rounding, the vertical field of view and the pixel aspect ratio
+        stay. The picture then shows more or less to the left and right, so all sizes of one ratio show the same.
+        A panorama shows all directions at any ratio.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -350,7 +350,7 @@ class Camera:
         if window is not None:
             edges = [window.x * sx, window.y * sy, window.width * sx, window.height * sy]
             if any(edge != round(edge) for edge in edges):
-                raise ValueError(f"{window} of {self.width}x{self.height} resized to {width}x{height}: no whole pixels")
+                raise ValueError(f"{window} of {self.width}x{self.height} has no whole pixels at {width}x{height}")
             x, y, across, down = (round(edge) for edge in edges)
             window = Window(x, y, across, down, window.clamp)
         return replace(
@@ -366,7 +366,7 @@ class Camera:
 
 
 def focal_length(fov: float, size: float, projection: Projection = "perspective") -> float:
-    """fx (or fy) of a camera that sees the angle `fov`, radians, across `size` pixels around its axis.
+    """fx (or fy) of a camera that sees the angle `fov`, in radians, across `size` pixels around its axis.
 
     Raises ValueError for an angle that the projection cannot show, and for orthographic cameras, which have no angle of
     view.
@@ -375,7 +375,7 @@ def focal_length(fov: float, size: float, projection: Projection = "perspective"
     if model.parallel:
         raise ValueError(f"{model.named} camera has no angle of view")
     if 0 < fov < size / MAX_FOCAL_PX:
-        raise ValueError(f"angle of view {math.degrees(fov):g} degrees, for a focal length of over {MAX_FOCAL_PX:g}")
+        raise ValueError(f"angle of view {math.degrees(fov):g} degrees needs a focal length of over {MAX_FOCAL_PX:g}")
     return model.focal_length(fov, size)
 
 

@@ -75,13 +75,13 @@ _BAD_PATH_ERRNOS = (errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLON
 _REASON_BY_ERRNO = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk's quota is used up",
-    errno.EFBIG: "the file is larger than may be written here",
+    errno.EFBIG: "the file is larger than the system allows",
     errno.EIO: "the disk does not answer as it should (input/output error)",
     errno.EROFS: "the disk is read-only",
     errno.EACCES: "permission is denied",
     errno.EPERM: "permission is denied",
     errno.ENOENT: "there is no such file or folder",
-    errno.ENOTDIR: "a part of the path is a file and no folder",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
     errno.EISDIR: "it is a folder",
     errno.ENAMETOOLONG: "the name is too long",
     errno.EMFILE: "too many files are open",
@@ -121,7 +121,7 @@ def of_argument() -> Iterator[None]:
 
 
 class KernelBuildError(ClsplatError):
-    """A driver refused a kernel.
+    """A driver refused to build a kernel.
 
     The message has the device, the build options and the log's first error. `log` has the whole log. `source` has the
     source with the line numbers that the log uses. CLSPLAT_DEBUG=1 shows both.
@@ -137,7 +137,7 @@ class KernelBuildError(ClsplatError):
 
 
 class DriverError(ClsplatError):
-    """A driver aborted, hung, or returned an invalid kernel. The message has the driver, the shape and the kernel."""
+    """A driver aborted, hung, or returned an invalid kernel. The message has the driver, the kernel and its shape."""
 
 
 class CapacityError(ClsplatError):
