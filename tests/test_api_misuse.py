@@ -105,7 +105,7 @@ def test_numbers_of_a_scene_that_are_not_whole_are_named(arguments: dict[str, An
 
 @pytest.mark.parametrize("degree", [3.0, "3", True, 4, -1], ids=repr)
 def test_a_degree_that_is_none_is_not_written(degree: Any, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=rf"^sh_degree {degree}: expected 0 \(the model's\) to 3$"):
+    with pytest.raises(ValueError, match=rf"^sh_degree is {degree}, expected 0 \(the model's\) to 3$"):
         hidden_model().save(tmp_path / "a.ply", sh_degree=degree)
     assert not list(tmp_path.iterdir())
 
@@ -135,7 +135,7 @@ def test_a_run_that_is_there_is_not_trained_into_and_knows_its_settings(
     for call, message in (
         ({}, "has been trained already; resume=True goes on with it"),
         ({"config": replace(FEW, iterations=1), "resume": True}, "is at step 3 already, expected more"),
-        ({"config": replace(FEW, seed=9), "resume": True}, "seed is 0 there, a resumed run cannot change it to 9"),
+        ({"config": replace(FEW, seed=9), "resume": True}, "seed is 0, a resumed run cannot change it to 9"),
     ):
         with pytest.raises(InputError) as caught:
             train(**{"scene": loaded, "device": default_device, "run": Run.open(run.path), **call})

@@ -165,7 +165,7 @@ def test_a_camera_gets_the_window_of_another() -> None:
     assert (again.width, again.height, again.fx, again.cx) == (30, 40, part.fx, part.cx)
     assert again.window == part.window
     assert reframed(camera, camera).window is None
-    with pytest.raises(ValueError, match="no whole pixels"):
+    with pytest.raises(ValueError, match="has no whole pixels"):
         part.resized(31, 40)
 
 

@@ -89,7 +89,7 @@ def test_other_names_and_cameras_are_refused(run: Path, own: Path, capsys: Captu
     (own / "images" / "00.png").rename(own / "images" / "zz.png")
     listed.write_text("\n".join(lines) + "\n")
     line = refusal(run, own, capsys)
-    assert "1 view not there any more (00.png); 1 view new (zz.png); 1 view another camera (02.png)" in line
+    assert "1 view missing now (00.png); 1 view new (zz.png); 1 view another camera (02.png)" in line
 
 
 def test_changes_can_be_accepted(run: Path, own: Path, capsys: Capture) -> None:

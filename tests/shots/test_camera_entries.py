@@ -52,7 +52,7 @@ def test_sizes_that_cannot_be(write: Any, width: Any, problem: str, tmp_path: Pa
 @pytest.mark.parametrize("write", [own, nerfstudio])
 def test_angles_that_cannot_be(write: Any, tmp_path: Path) -> None:
     path = write(tmp_path / "a.json", 640, 1e-320)
-    with pytest.raises(InputError, match=r"key 0: 'fov(_y)?': angle of view .* for a focal length of over 1e\+12"):
+    with pytest.raises(InputError, match=r"key 0: 'fov(_y)?': angle of view .* needs a focal length of over 1e\+12"):
         read_shot(path)
 
 

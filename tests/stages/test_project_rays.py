@@ -297,7 +297,7 @@ def test_depths_along_rays_are_those_of_the_plane(device: Device) -> None:
 
 def test_by_rays_of_another_projection_is_none(default_device: Device) -> None:
     camera = replace(panorama(64, 32), by_rays=True)
-    with pytest.raises(InputError, match="by_rays is True of a camera that is equirectangular, expected perspective"):
+    with pytest.raises(InputError, match="by_rays is True, but the projection is equirectangular"):
         Renderer(default_device).render(all_around(4, 1), camera)
 
 
