@@ -133,7 +133,7 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
     """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
 
     slack: largest allowed difference of Q^T Q from the identity.
-    Raises InputError if the matrix is not a similarity.
+    Raises InputError, whose message continues "has", if the matrix is not a similarity.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
@@ -209,12 +209,12 @@ def transform_camera(camera: Camera, matrix: Float64) -> Camera:
     translation = scale * camera.translation - rotation @ shift
     near = (
         DEFAULT_NEAR_PLANE if camera.near == DEFAULT_NEAR_PLANE else scale * camera.near
-    )  # DEFAULT_NEAR_PLANE stands for the model's, which scales too
+    )  # DEFAULT_NEAR_PLANE stands for the model's near plane, which scales too
     return replace(camera, rotation=rotation, translation=translation, near=near, far=scale * camera.far)
 
 
 def _turned(quaternions: Float32, turn: Float64) -> Float32:
-    """Quaternions w x y z of Q R, lengths kept. A reflection uses -Q, as R S S R^T does not depend on the sign."""
+    """Quaternions w x y z of Q R, lengths unchanged. A reflection uses -Q, as R S S R^T does not depend on the sign."""
     from scipy.spatial.transform import Rotation
 
     proper = turn if np.linalg.det(turn) > 0 else -turn

@@ -45,7 +45,7 @@ class Placement:
         return np.vstack([np.array(self.matrix).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
 
     def within(self, outer: Placement) -> Placement:
-        """Placement in the world of `outer`, an enclosing group that is placed too."""
+        """Placement in the world of an enclosing group, whose own placement is `outer`."""
         matrix = self.matrix
         if outer.matrix != IDENTITY_ROWS:
             matrix = rows_of(outer.transform @ self.transform)

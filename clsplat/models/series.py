@@ -27,7 +27,7 @@ Tested separately for means, scales and colours. Tracked models are at a few hun
 at about 1, for scales even if their Gaussians are sorted by position.
 """
 TRACKING_TEST_ROWS = 10_000
-"""Rows compared in that test, spread evenly."""
+"""Number of evenly spread rows that this test compares."""
 
 
 class ModelSeries:

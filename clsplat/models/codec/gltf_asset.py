@@ -78,7 +78,7 @@ class Asset:
             if isinstance(required, list)
             else [required]
         ):
-            raise InputError(f"{path}: requires {str(unknown[0])[:80]}, which is not supported; save it without that")
+            raise InputError(f"{path}: requires {str(unknown[0])[:80]}, which is unsupported; save the file without it")
         return asset
 
     def item(self, kind: str, index: object) -> dict[str, Any]:

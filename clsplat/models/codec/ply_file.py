@@ -93,8 +93,8 @@ class PlyHeader:
     by_rays: bool = False
 
     def is_antialiased(self) -> bool:
-        """True if the comments say so (`codec.antialias`). Warns if they contradict each other or are not
-        understood."""
+        """True if the comments say that the model is antialiased (`codec.antialias`). Warns if they contradict each
+        other or are not understood."""
         said = antialias.of_comments(self.comments)
         if said.warning:
             warn(f"{self.path}: {said.warning}")
@@ -210,9 +210,7 @@ def _binary_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Blo
     need, have = vertex.count * row.itemsize, max(0, os.fstat(file.fileno()).st_size - start)
     if have < need:
         whole = have // row.itemsize
-        raise InputError(
-            f"{path}: truncated: {vertex.count} {what}s need {need} bytes, but it has {have} ({whole} {what}s)"
-        )
+        raise InputError(f"{path}: truncated: has {whole} of {vertex.count} {what}s ({have} of {need} bytes)")
     if have > need and header.elements[-1] is vertex:
         warn(f"{path}: {have - need} bytes after the last {what} are ignored")
     file.seek(start)

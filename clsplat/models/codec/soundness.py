@@ -27,13 +27,13 @@ Activated = Literal["opacities", "scales", "both"]
 """Values that a file stores after activation, instead of as logits or logs."""
 
 DRAWN_QUATERNION_SQUARES = (1e-29, 1e29)
-"""Squared lengths of the quaternions that are kept as they are; project.cl accepts 1e-30 to 1e30."""
+"""Range of the squared lengths of quaternions that are not normalised; project.cl accepts 1e-30 to 1e30."""
 MIN_GAUSSIANS_FOR_DOUBTS = 100
 """Smallest number of Gaussians whose values show how they are encoded."""
 BYTE_LOGIT_ERROR = 0.02
 """Largest error of a logit between 0 and 1 after conversion to an 8-bit format."""
 LARGEST_USEFUL_LOGIT = 20.0
-"""Largest useful logit in float32; 8-bit levels go beyond it."""
+"""Largest logit that is useful in float32. Values of 8-bit levels exceed it."""
 MAX_HANDMADE_LOGITS = 10
 """Largest number of distinct logits in a handmade model."""
 TRAINED_OPACITY_SPREAD = (0.35, 0.93)

@@ -37,10 +37,10 @@ OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 
 """Row i: the components of a quaternion other than component i."""
 MORTON_BITS_PER_AXIS = 21
 MAX_FLOAT_HIGHLIGHT = 2.0
-"""Largest value up to which float colours have white at 1, unless all are whole numbers: some may be brighter than
-white."""
+"""Float colours up to this value have white at 1, unless all are whole numbers. Some may then be brighter than white.
+"""
 UNIT_COLOUR_SHARE = 0.95
-"""Fraction of float colours that lie in 0 to 1 if white is 1 and there are highlights."""
+"""Least fraction of float colours that are at most 1, if white is 1 and there are highlights."""
 UNIT_RANGE_TOLERANCE = 1e-3
 """Relative tolerance of float colours above white and of opacities outside 0 to 1, for half floats and averages."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
@@ -162,12 +162,12 @@ def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[n
 
 
 def colours(dc: Float32) -> Float64:
-    """Colours of SH coefficient 0."""
+    """Colours from SH coefficients 0, which are the constant terms."""
     return 0.5 + SH_C0 * dc.astype(np.float64)
 
 
 def coefficients(rgb: NDArray[Any]) -> Float64:
-    """SH coefficient 0 of colours."""
+    """SH coefficients 0 from colours."""
     return (np.asarray(rgb, np.float64) - 0.5) / SH_C0
 
 

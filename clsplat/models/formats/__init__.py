@@ -44,9 +44,9 @@ class Format:
     suffixes: suffixes of its files in lower case; a suffix without a dot is a whole file name.
     read(path): reads the Gaussians. Raises InputError, one line with the path, for a damaged file.
     write(path, gaussians, **options): writes atomically; None for a read-only format.
-    recognises(head): True if the first bytes, at most FORMAT_HEAD_BYTES, are of the format; None if it has none.
+    recognises(head): True if the first bytes, at most FORMAT_HEAD_BYTES, are of the format; None without a signature.
     loses: short description of the information that the format does not keep.
-    floats: True if it stores floats without loss.
+    floats: True if it stores values as floats.
     sh_degree: the highest degree that it holds.
     describe(path): the format's part of `clsplat info`.
     order(gaussians): (n,) index of the Gaussian in each row of a written file; None if the order is kept.
@@ -116,7 +116,7 @@ def suffixes(*, writable: bool = False) -> list[str]:
 
 
 def _named(path: Path) -> Format | None:
-    """Format with the longest suffix that matches."""
+    """Format with the longest suffix that matches the name; None if none does."""
     name = path.name.lower()
     fits = [
         (len(suffix), row)

@@ -88,7 +88,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # counts them before anything is read
+    primitives = list(asset.primitives())  # a list, so that they are counted before any is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -115,7 +115,7 @@ def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[
     if kernel != "ellipse":
         warn(
             f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse; it is drawn as one, as the "
-            "extension says of kernels that a reader does not know"
+            "extension prescribes for unknown kernels"
         )
     if space != GLTF_COLOR_SPACES[0]:
         warn(f"{asset.path}: the colours are in {str(space)[:40]} and are not converted")

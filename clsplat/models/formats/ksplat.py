@@ -87,11 +87,11 @@ def read(path: Path) -> Gaussians:
         header = packing.read_rows(file, KSPLAT_HEADER, 1, path)[0]
         if header["major"] != 0 or header["minor"] < 1 or header["level"] > 2:
             version = f"version {header['major']}.{header['minor']}, compression level {header['level']}"
-            raise InputError(f"{path}: {version}, expected a .ksplat of version 0.1, level 0, 1 or 2")
+            raise InputError(f"{path}: has {version}, expected a .ksplat of version 0.1, level 0, 1 or 2")
         sections = _sections(file, int(header["sections"]), int(header["level"]), size, path)
         count = sum(section.count for section in sections)
         if count != header["count"] or not count:
-            raise InputError(f"{path}: its sections have {count} Gaussians, but its header {header['count']}")
+            raise InputError(f"{path}: its sections have {count} Gaussians, but its header says {header['count']}")
         degree = max(section.degree for section in sections if section.count)
         gaussians = packing.empty(count, degree)
         gaussians.sh[:, 1:] = 0
@@ -125,7 +125,7 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
     """All sections, checked against the file's size."""
     at = KSPLAT_HEADER.itemsize + sections * KSPLAT_SECTION_HEADER.itemsize
     if size < at:
-        raise InputError(f"{path}: truncated: {sections} sections need {at} bytes, but it has {size}")
+        raise InputError(f"{path}: truncated: has {size} bytes, but its {sections} sections need {at}")
     result = []
     for index, fields in enumerate(packing.read_rows(file, KSPLAT_SECTION_HEADER, sections, path)):
         head = {name: fields[name].item() for name in KSPLAT_SECTION_HEADER.names or ()}
@@ -137,7 +137,7 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
         start = at + lengths + buckets
         end = start + kind.itemsize * head["room"]
         if head["count"] > head["room"] or end > size:
-            raise InputError(f"{name} ends at byte {end} with {head['count']} Gaussians, but the file has {size}")
+            raise InputError(f"{name} ends at byte {end} of {size} with {head['count']} Gaussians")
         centres = ends = None
         if level:
             if head["buckets"] and head["bucket_bytes"] != BUCKET_CENTRE_BYTES:

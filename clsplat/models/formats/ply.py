@@ -54,7 +54,7 @@ DC_PROPERTIES = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE_PROPERTIES = ("scale_0", "scale_1", "scale_2")
 ROTATION_PROPERTIES = ("rot_0", "rot_1", "rot_2", "rot_3")
 MIP_FILTER_PROPERTY = "filter_3D"
-"""Mip-Splatting's property, which its renderer adds to the scales."""
+"""Property in Mip-Splatting's files: the filter size that Mip-Splatting's renderer adds to the scales."""
 LOCAL_MEANS_ELEMENT = "clsplat_local"
 """Element with the means relative to the origin."""
 RGB_PROPERTY_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -64,7 +64,7 @@ REQUIRED_PLY_PROPERTIES = (*POSITION_PROPERTIES, *DC_PROPERTIES, "opacity", *SCA
 
 
 def recognises(head: bytes) -> bool:
-    """True for a PLY that is not a compressed one."""
+    """True for a PLY that is not a compressed PLY."""
     return head.startswith(b"ply") and b"packed_position" not in head.partition(b"end_header")[0]
 
 
@@ -237,14 +237,14 @@ def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
     data = file.read(need)
     if len(data) != need:
         raise InputError(
-            f"{header.path}: truncated: element {LOCAL_MEANS_ELEMENT} needs {need} bytes, but it has {len(data)}"
+            f"{header.path}: truncated: element {LOCAL_MEANS_ELEMENT} needs {need} bytes but has {len(data)}"
         )
     rows = np.frombuffer(data, row)
     return np.stack([rows[name] for name in POSITION_PROPERTIES], axis=1).astype(np.float32)
 
 
 def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
-    """Make the means relative to the origin: exactly as written, unless another tool moved the vertices since."""
+    """Make the means relative to the origin. Uses the exact means `local` where no tool has moved the vertex."""
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         means = (world - origin).astype(np.float32)

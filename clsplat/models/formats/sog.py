@@ -70,8 +70,8 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
-    """True if meta.json says so, in `antialias` or `model`. Warns if they contradict each other or are not
-    understood."""
+    """True if meta.json says in `antialias` or `model` that the model is antialiased. Warns if they contradict each
+    other or are not understood."""
     said = antialias.of_object(meta)
     if said.warning:
         warn(f"{path}: {SOG_META_FILE} {said.warning}")

@@ -127,7 +127,7 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     if len(behind) > MAX_EXTENSION_BYTES and isinstance(stream, gzip.GzipFile):
         raise InputError(
             f"{path}: unpacks to more than {header.count} Gaussians: over {MAX_EXTENSION_BYTES} bytes follow, expected "
-            "extensions at most; is it damaged?"
+            "only extensions; is it damaged?"
         )
     if header.flags & EXTENSIONS_FLAG and (signs := _frame(behind, path)) != RUB_SIGNS:
         flip(result, (signs[0] * RUB_SIGNS[0], signs[1] * RUB_SIGNS[1], signs[2] * RUB_SIGNS[2]))
@@ -156,7 +156,7 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
     stream = gzip.GzipFile(fileobj=file, mode="rb") if head[:2] == GZIP_MAGIC else file
     start = _next(stream, 16, path, "the header")
     if start[:4] != SPZ_MAGIC:
-        raise InputError(f"{path}: not an SPZ file (a gzip file of something else)")
+        raise InputError(f"{path}: not an SPZ file (it is a gzip file of something else)")
     header = SpzHeader(*struct.unpack("<IIBBB", start[4:15]))
     _check(header, path)
     return header, stream
@@ -172,7 +172,7 @@ def _check(header: SpzHeader, path: Path) -> None:
 
 
 def _frame(extensions: bytes, path: Path) -> Signs:
-    """Signs of the axes. An extension is its type and length, 32 bits each, followed by its bytes."""
+    """Signs of the axes from the extensions. Each consists of type and length, 32 bits each, and its bytes."""
     at, system = 0, b""
     while len(extensions) - at >= 8:
         kind, length = struct.unpack_from("<II", extensions, at)
@@ -211,7 +211,7 @@ def _zstd_streams(file: BinaryIO, header: SpzHeader, size: int, path: Path) -> I
     for name, (packed, unpacked) in zip(header.widths, struct.iter_unpack("<QQ", table), strict=True):
         wanted = header.count * header.widths[name]
         if packed > size - at:
-            raise InputError(f"{path}: truncated: {name} need {packed} bytes, but it has {size - at}")
+            raise InputError(f"{path}: truncated: has {size - at} bytes of {name}, expected {packed}")
         if unpacked != wanted:
             raise InputError(f"{path}: {name} have {unpacked} bytes unpacked, expected {wanted}")
         file.seek(at)
@@ -242,7 +242,7 @@ def _rest(stream: Any, path: Path) -> bytes:
 
 @contextmanager
 def _decompressing(path: Path, place: str) -> Iterator[None]:
-    """Raise InputError for a stream that ends, or is damaged, at this place."""
+    """Raise InputError for a stream that ends or is damaged. place: where in the file, for the message."""
     import zstandard
 
     try:
@@ -325,7 +325,7 @@ def write(
     and for positions that fit no number of bits. Raises ValueError for settings out of range.
     """
     if version not in SPZ_VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
-        raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
+        raise ValueError(f"version is {version}, sh_bits {sh_bits}, expected version 2, 3 or 4, bits from 1 to 8")
     values.check_writable(path, gaussians, least=1)
     header = header_for(path, gaussians, version, fractional_bits)
     with atomic_writer(path) as file:
@@ -335,8 +335,8 @@ def write(
 def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> SpzHeader:
     """Header for `write_to`, for at least one Gaussian.
 
-    fractional_bits: the default is the number that suits the model's size, measured without the farthest 1 % of its
-      Gaussians, if all positions fit.
+    fractional_bits: the default is 12, more for a small model (measured without its farthest 1 % of Gaussians), and
+      fewer if the positions would not fit.
     Raises InputError if the positions do not fit.
     """
     low, high = (
@@ -354,7 +354,7 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
         )
     if bits is None:
         spread = np.quantile(np.abs(gaussians.means - np.median(gaussians.means, axis=0)).max(axis=1), 0.99)
-        # 2^-12 for a model of 16 units; in proportion for a smaller one
+        # steps of 2^-12 for a model of 16 units, finer in proportion for a smaller one
         bits = min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
     elif bits < 0:
         raise ValueError(f"fractional_bits is {bits}, expected 0 to 23")

@@ -130,7 +130,7 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
-    """Open a stage by name. Raises InputError about the path."""
+    """Open the stage `name`. Raises InputError, prefixed with `path`."""
     from pxr import Tf, Usd
 
     with suppress(Tf.ErrorException):

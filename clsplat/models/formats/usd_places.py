@@ -34,14 +34,14 @@ _VELOCITY_ATTRIBUTES = ("velocities", "angularVelocities")
 _MEMBERSHIP_ATTRIBUTES = ("protoIndices", "ids", "invisibleIds")
 
 Key = tuple[int, int]
-"""Instance of an instancer: its id or number, and the index of its prototype."""
+"""Key of an instance in its instancer: its id or number, and the index of its prototype."""
 
 
 @dataclass(frozen=True, eq=False)
 class UsdPlacement:
-    """One drawing of a prim of Gaussians.
+    """One occurrence of a prim of Gaussians in a stage.
 
-    name: the prim's path; for an instance INSTANCER[ID] and the path below the prototype.
+    name: the prim's path; for an instance, INSTANCER[ID] followed by the path below the prototype.
     seat: the instance that contains the prim; None outside of instancers.
     """
 
@@ -146,8 +146,8 @@ class Instances:
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
         """USD's matrix from the prototype's parent to the world, and visibility of the instance.
 
-        An instance that does not exist at that time is invisible. It has its last matrix before, or else its next.
-        Raises InputError.
+        An instance that does not exist at that time is invisible. Its matrix is the latest before that time, or else
+        the next one. Raises InputError.
         """
         places, hidden = self._at(code)
         if key in places:
@@ -211,7 +211,7 @@ class Instances:
         return attribute.Get(code) if attribute else None
 
     def _keys(self, time: float) -> dict[Key, None]:
-        """Instances at a time, in their order."""
+        """Keys of the instances that exist at a time, in the stage's order."""
         code = _code(time)
         indices = [int(index) for index in self._instancer.GetProtoIndicesAttr().Get(code) or ()]
         if wrong := [index for index in indices if not 0 <= index < len(self.roots)]:
@@ -242,7 +242,7 @@ class Instances:
 
 @dataclass
 class _StageFindings:
-    """Findings in a stage.
+    """Results of a walk through a stage.
 
     where: prefix of errors.
     unused, shapes: descriptions of prims that are not drawn, by path.

@@ -34,7 +34,7 @@ ZIP_FILE_MAGIC = b"PK\x03\x04"
 """First bytes of an archive that contains a file."""
 MACOS_METADATA_FOLDER = "__MACOSX"
 ZIP_MEMBER_HEAD_BYTES = 16 << 20
-"""Bytes of a file that show if it has Gaussians: a whole JSON, and the header of any PLY."""
+"""Number of bytes of a file that are searched for signs of Gaussians: a whole JSON, and the header of any PLY."""
 ENCRYPTED_FLAG = 1
 """Bit in the flags of an encrypted file."""
 
