@@ -115,7 +115,7 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
 
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
-    """Context with an open binary file, which is flushed to the disk and then takes its place like in `atomic_name`."""
+    """Context with an open binary file, which is flushed to the disk and then renamed as in `atomic_name`."""
     # mode "x" instead of mkstemp, so that the file gets the permissions of the user's umask
     with atomic_name(path, needs) as temporary, open(temporary, "xb") as file:
         yield file
