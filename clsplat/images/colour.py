@@ -128,7 +128,7 @@ class Colours:
         """Load the configuration and look up the spaces.
 
         recorded: `recorded_space` of the model.
-        Raises InputError for a configuration that does not load, and for a space that it lacks, with similar names.
+        Raises InputError for a configuration that does not load, and, with similar names, for a space that it lacks.
         """
         config = config or ColourConfig()
         self._source = config.ocio_config or os.environ.get("OCIO", "") or BUILT_IN_OCIO_CONFIG
@@ -244,5 +244,5 @@ class Colours:
         pixels = oiio.ImageBuf(np.ascontiguousarray(rgb, np.float32))
         result = oiio.ImageBufAlgo.colorconvert(pixels, source, target, unpremult=False, colorconfig=self._source)
         if reason := result.geterror():
-            raise InputError(f"{self._source}: {source} to {target}: {' '.join(reason.split())}")
+            raise InputError(f"{self._source}: cannot convert {source} to {target}: {' '.join(reason.split())}")
         return np.asarray(result.get_pixels(oiio.FLOAT), np.float32)

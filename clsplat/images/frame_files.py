@@ -181,8 +181,8 @@ def is_whole(
 ) -> bool:
     """True if the file is complete and holds these channels as `write_channels` writes them.
 
-    It must have that size and no other values of these attributes, and its last row must decode. If the file contains a
-    block of zeros, every row is decoded. A truncated file fails.
+    Its size must be as given, its attributes must not differ from those given, and its last row must decode. If the
+    file contains a block of zeros, every row is decoded. A truncated file fails.
 
     deep: expect a deep image, whose channels are DEEP_CHANNELS.
     views: number of views, each with these channels.

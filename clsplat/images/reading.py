@@ -27,7 +27,7 @@ from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
-"""Extensions of the images that are searched for in a folder, in lower case. A named file may have any other."""
+"""Lower-case extensions of images that a folder search finds. A named file may be anything OpenImageIO reads."""
 
 T = TypeVar("T", bound=np.generic)
 
@@ -115,7 +115,7 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
-        real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
+        real = os.path.realpath(root)  # not the inode, which is 0 for every folder on some file systems of Windows
         if real in seen:
             folders.clear()
             continue
@@ -185,7 +185,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
         raise InputError(f"{path}: does not decode: {one_line(reason)}; copy the picture again or leave it out")
     pixels = np.asarray(pixels, np.float32)
     if pixels.size != spec.height * spec.width * spec.nchannels:
-        raise InputError(f"{path}: does not decode: its header and its pixels are of different sizes; save it again")
+        raise InputError(f"{path}: does not decode: its header and its pixels differ in size; save it again")
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     image = _as_rgb(path, pixels, spec)
     if not np.isfinite(image).all():

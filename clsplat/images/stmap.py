@@ -29,8 +29,8 @@ _ORIENTATION_CELLS_PER_SIDE = 32
 _MIN_CELL_SINE = 0.05
 """Smallest sine of the angle between a cell's mapped sides; for a grey image the two sides coincide."""
 _MIN_ORIENTED_SHARE = 0.7
-"""Least fraction of a map's cells that have the same orientation. In ordinary images half of them do, or none has any
-because the image is grey."""
+"""Least fraction of a map's cells that have the same orientation. In ordinary images about half do. The cells of a grey
+image have no orientation."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -164,7 +164,7 @@ def _left_sited(chroma: NDArray[Any]) -> NDArray[Any]:
 
 
 def planes_of(path: Path, image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> VideoPlanes:
-    """The frame in the form that the encoder of a video of that name takes."""
+    """The frame in the form that the encoder for the video `path` takes."""
     return prores_planes(image, alpha, prores) if path.suffix.lower() == ".mov" else frame_planes(image)
 
 
@@ -268,7 +268,7 @@ class VideoWriter:
         if self._comment:
             self._container.metadata["comment"] = self._comment
         if kind == "mov":
-            # Apple's readers expect its vendor code; 16-bit alpha loses nothing
+            # Apple's readers expect Apple's vendor code; 16-bit alpha loses nothing
             options = {
                 "profile": _PRORES_PROFILES[config.prores],
                 "vendor": "apl0",
