@@ -74,7 +74,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """The `held_out_looks` of a run that has an appearance.json; else looks that change nothing. Raises InputError."""
+    """`held_out_looks` of a run's appearance.json. Without this file the looks change nothing. Raises InputError."""
     return _looks(_read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {})
 
 

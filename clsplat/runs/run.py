@@ -258,7 +258,7 @@ def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, expected a folder for the run")
     if resume and not is_run(path):
-        raise InputError(f"{path}: no run to resume there (no config.toml of clsplat)")
+        raise InputError(f"{path}: has no run to resume (no config.toml of clsplat)")
     if is_run(path):
         if not (resume or overwrite):
             raise InputError(f"{path}: is already a run, use --resume to go on with it or --overwrite to replace it")

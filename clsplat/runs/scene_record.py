@@ -135,7 +135,7 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     changed: dict[str, list[str]] = {
         "missing now": [name for name in was if name not in new],
         "new": [name for name in new if name not in was],
-        **{what: [] for what in ("another photograph", "another camera", "another size", held_out)},
+        **{what: [] for what in ("with another photograph", "with another camera", "with another size", held_out)},
     }
     both = [name for name in was if name in new]
     for name in both:
@@ -144,11 +144,11 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
         turned = not (_close(a["pose"][:9], b["pose"][:9]) and _close(a["pose"][9:], b["pose"][9:]))
         bent = "radial" in a and (a["projection"] != b.get("projection") or not _close(a["radial"], b["radial"]))
         if turned or bent or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
-            changed["another camera"].append(name)
+            changed["with another camera"].append(name)
         elif a["size"] != b["size"] and not resized:
-            changed["another size"].append(name)
+            changed["with another size"].append(name)
         if a["blake2b"] != b["blake2b"] and (same_file or not resized):
-            changed["another photograph"].append(name)
+            changed["with another photograph"].append(name)
         if a["split"] != b["split"]:
             changed[held_out].append(name)
     changes = [_listed(what, names) for what, names in changed.items() if names]
@@ -216,7 +216,8 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         view.name
         for view in known
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
-        and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")  # not the mask's
+        # the first word is the digest of the photograph alone, without its mask
+        and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
     reasons = []
     if seen:

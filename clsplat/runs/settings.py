@@ -77,7 +77,7 @@ def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
     for key in document:
         if key not in ("clsplat", "scene", "train"):
             raise InputError(
-                f"{path}: has {key!r}, which is no setting; expected clsplat, scene and the tables of train"
+                f"{path}: has {key!r}, which is no setting; expected only clsplat, scene and the tables of train"
             )
     scene = document.get("scene")
     if scene is not None and not (isinstance(scene, str) and scene):
