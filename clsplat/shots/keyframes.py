@@ -24,7 +24,7 @@ length from its ends. For a scalar it is the largest limit at which a cubic is a
 class Key:
     """A camera at a frame number, which may be fractional.
 
-    roll: rotation about the camera's own z axis in radians, after its other rotation.
+    roll: additional rotation about the camera's own z axis, in radians.
     """
 
     frame: float

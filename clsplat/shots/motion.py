@@ -69,8 +69,8 @@ def _values(camera: Camera) -> Float64:
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: Iterable[float]) -> Moments:
     """Cameras of a shot that has `moment`, evaluated around the frame `number`.
 
-    times: times in frames relative to that frame. Times between the first and the last at which the source has values
-    are added.
+    times: times in frames relative to that frame. Times at which the source has values are added if they lie
+    between the first and the last of these.
     """
     assert shot.moment is not None
     moment, wanted = shot.moment, list(times)

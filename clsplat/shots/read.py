@@ -84,7 +84,7 @@ def choose_shot(
     path: turntable, spiral or through, for `count` frames of a path generated from the cameras; None for the cameras
       themselves.
     applied: names of the stage's settings that the call applies elsewhere, so that they need no warning.
-    distort: use the photographs' cameras as they were taken, including their lenses.
+    distort: use the photographs' own cameras, including the distortion of their lenses.
     Raises InputError.
     """
     if count is not None and path is None:

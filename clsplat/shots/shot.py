@@ -121,7 +121,7 @@ class Shot:
                 )
 
     def at(self, frame: float) -> Camera:
-        """The camera at a frame number that need not be whole, such as a time while the shutter is open.
+        """The camera at a frame number that may be fractional, such as a time while the shutter is open.
 
         The camera is interpolated as between key frames.
         """

@@ -42,7 +42,7 @@ class StageTrack:
     """The `Track` of a prim.
 
     where: prefix of error messages.
-    held: the stage, kept here because USD closes it with its last reference.
+    held: the stage, held here because USD closes it with its last reference.
     """
 
     where: str
@@ -67,7 +67,7 @@ class StageTrack:
 class StageModels:
     """The Gaussians of a stage in their own coordinates, one model per prim, and one per instance of an instanced prim.
 
-    names: names of the models' places in the stage.
+    names: name of each model's prim or instance, as in `UsdPlacement`.
     digest: SHA-256 of the data that they are read from.
     space: their colour space.
     """
