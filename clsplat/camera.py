@@ -69,7 +69,7 @@ CAMERA_MODELS: tuple[CameraModel, ...] = (
 """Every camera model. docs/cameras.md (Adding a camera model) lists the parts of a row."""
 
 PROJECTIONS: dict[str, CameraModel] = {model.projection: model for model in CAMERA_MODELS if not model.option}
-"""The usual model of each projection, by its name, in the order of messages and the self-test."""
+"""Default camera model of each projection, by the projection's name. Messages and the self-test use this order."""
 
 JACOBIAN_CLAMP_HALF_FRAMES = 0.3
 DEFAULT_NEAR_PLANE = 0.01
@@ -118,7 +118,7 @@ class Camera:
     cy : float
         Principal point in pixels from the image's upper edge. The centre of the first pixel is at 0.5.
     rotation : (3, 3) float64
-        Rotation of COLMAP's `cam_from_world`: x_cam = rotation @ x_world + translation.
+        Rotation of COLMAP's `cam_from_world`, without unit: x_cam = rotation @ x_world + translation.
     translation : (3,) float64
         Translation of `cam_from_world` in world units.
     near : float
@@ -132,8 +132,8 @@ class Camera:
         Place of the picture in its frame if the picture is a part of the frame or extends beyond it. Then width and
         height are the picture's, and cx and cy are measured from the frame's corner.
     radial : (4,) float
-        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP). If all are 0, the
-        fisheye is equidistant.
+        Coefficients k1 to k4 of a fisheye (Kannala and Brandt; OPENCV_FISHEYE in OpenCV and COLMAP), without unit. If
+        all are 0, the fisheye is equidistant.
     by_rays : bool
         True for a perspective camera that draws Gaussians along the rays of its pixels, like fisheye and panorama. Use
         it for a model that was trained in this way (`Gaussians.by_rays`).
@@ -173,7 +173,7 @@ class Camera:
 
     @property
     def model(self) -> CameraModel:
-        """Its camera model: properties, formulas and kernels."""
+        """The camera's model: properties, formulas and kernels."""
         for model in CAMERA_MODELS:
             if model.option and model.projection == self.projection and np.any(getattr(self, model.option)):
                 return model
@@ -252,7 +252,7 @@ class Camera:
         return replace(self, projection=cast("Projection", model.projection), radial=(k1, k2, k3, k4), by_rays=False)
 
     def from_origin(self, origin: Float64) -> Camera:
-        """The camera that shows the same view of a world whose coordinates are relative to origin (3,)."""
+        """The camera that shows the same view of a world whose coordinates are relative to `origin` (3,)."""
         if not origin.any():
             return self
         return replace(self, translation=self.translation + self.rotation @ origin)
@@ -380,12 +380,12 @@ def focal_length(fov: float, size: float, projection: Projection = "perspective"
 
 
 def model_with(column: str, value: object) -> CameraModel | None:
-    """The camera model that has `value` among the names of a column, such as "usd"; None if there is none."""
+    """The camera model whose field `column`, such as "usd", has the name `value`; None if there is none."""
     return next((model for model in CAMERA_MODELS if value in getattr(model, column)), None)
 
 
 def names_of(column: str) -> tuple[str, ...]:
-    """All names of a column of CAMERA_MODELS; the names of panoramas come last."""
+    """All names in the field `column` of CAMERA_MODELS; the names of panoramas come last."""
     return tuple(
         name for model in sorted(CAMERA_MODELS, key=lambda each: each.wraps) for name in getattr(model, column)
     )

@@ -37,7 +37,7 @@ def endings() -> tuple[signal.Signals, ...]:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, or the signal with this number."""
+    """Exception for Ctrl-C, or for the signal with this number."""
 
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__()

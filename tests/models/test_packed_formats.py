@@ -121,7 +121,7 @@ def test_morton_order_interleaves_the_bits() -> None:
         (lambda data: data.replace(b"element sh 2", b"element sh 1"), "sh has 1 rows, expected 2"),
         (lambda data: data.replace(b"binary_little_endian", b"ascii"), "in ascii"),
         (lambda data: data.replace(b"element chunk", b"element lumps"), "0 elements 'chunk'"),
-        (lambda data: data[:-1], "truncated: its header promises"),
+        (lambda data: data[:-1], "bytes that its header promises"),
         (
             lambda data: data.replace(struct.pack("<f", -2.0), struct.pack("<f", np.nan)),
             "2 of 2 Gaussians have a value",
@@ -263,7 +263,7 @@ def test_records_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
         (1, b"\0", "version 0.0"),
         (20, b"\3", "compression level 3"),
         (4, b"\xff\xff\xff\xff", "truncated: 4294967295 sections"),
-        (16, b"\xff\xff\xff\xff", "but its header 4294967295"),
+        (16, b"\xff\xff\xff\xff", "but its header says 4294967295"),
         (4096, b"\xff\xff\xff\xff", "section 0 ends at byte"),
         (4100, b"\xff\xff\xff\xff", "section 0 ends at byte"),
         (4108, b"\xff\xff\xff\xff", "section 0 ends at byte"),

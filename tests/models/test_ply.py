@@ -175,7 +175,7 @@ def test_broken_headers(tmp_path: Path) -> None:
 def test_truncated(tmp_path: Path) -> None:
     data = plain_table(5).tobytes()
     message = bad(tmp_path, header(NAMES, 5) + data[:-1])
-    assert "truncated: 5 Gaussians need 280 bytes, but it has 279 (4 Gaussians)" in message
+    assert "truncated: has 4 of 5 Gaussians (279 of 280 bytes)" in message
     assert "truncated" in bad(tmp_path, header(NAMES, 10**15) + data)  # nothing of that size is allocated
     text = "\n".join(" ".join(map(str, row)) for row in plain_table(5)).encode()
     assert "truncated: has 5 Gaussians, expected 6" in bad(tmp_path, header(NAMES, 6, "ascii") + text)
