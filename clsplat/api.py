@@ -27,7 +27,7 @@ def devices() -> list[DeviceInfo]:
     Returns
     -------
     list of DeviceInfo
-        Index, name, platform, version, kind, compute_units, memory_bytes, and the shape of kernels. Other calls take as
+        Index, name, platform, version, kind, compute_units, memory_bytes, and kernel shape. Other calls take as
         `device` an index as text, "cpu", "gpu", or a part of a name, platform or version.
     """
     return list_devices()
@@ -57,7 +57,7 @@ def train(
         An open device, or a name as `clsplat devices` lists them. Several devices, or names separated by commas, share
         the views of a step (`TrainConfig.batch`).
     max_device_mem : str or int, optional
-        Largest amount of each device's memory to use, in bytes or such as "256MiB".
+        Largest amount of memory to use on each device: a number of bytes, or text such as "256MiB".
     run : Run, optional
         A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool
@@ -105,12 +105,12 @@ def train(
 
 
 def _opened(device: Device | str | Sequence[Device] | None, limit: int | None) -> list[Device]:
-    """The devices, with `limit` bytes of memory each. Raises InputError for an argument that names no device."""
+    """Open the devices, with at most `limit` bytes of memory each. Raises InputError if there is no such device."""
     if device is None or isinstance(device, str):
         with of_argument():
             return open_devices(device, limit)
     given = [device] if isinstance(device, Device) else device if isinstance(device, Sequence) else ()
     devices = [one for one in given if isinstance(one, Device)]
     if not devices or len(devices) < len(given):
-        raise InputError(f"device is {device!r:.100}, expected open devices, or names with commas between")
+        raise InputError(f"device is {device!r:.100}, expected open devices, or device names separated by commas")
     return devices if limit is None else [one.with_memory_limit(limit) for one in devices]

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 
 class ClsplatError(Exception):
-    """Base of every error that is reported as one line: the work failed (exit status 1)."""
+    """Base class of errors that are reported as one line. Its exit status, 1, means that the work failed."""
 
     exit_status = 1
 
@@ -45,7 +45,7 @@ def amount(nbytes: int) -> str:
 
 
 class InputError(ClsplatError):
-    """A file, folder or argument is wrong (exit status 2).
+    """Error about a wrong file, folder or argument (exit status 2).
 
     The message is one line with the wrong value and the expected one.
     """
@@ -57,8 +57,8 @@ class InputError(ClsplatError):
 
 
 class WriteError(ClsplatError, OSError):
-    """A file cannot be written. The error has the system's error number, the reason in plain words, and the file's
-    name.
+    """Error about a file that cannot be written. It has the system's error number, the reason in plain words, and the
+    file's name.
 
     The exit status is 2 if the name is wrong, else 1.
     """
@@ -75,13 +75,13 @@ _BAD_PATH_ERRNOS = (errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLON
 _REASON_BY_ERRNO = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk's quota is used up",
-    errno.EFBIG: "the file is larger than may be written here",
+    errno.EFBIG: "the file is larger than the system allows",
     errno.EIO: "the disk does not answer as it should (input/output error)",
     errno.EROFS: "the disk is read-only",
     errno.EACCES: "permission is denied",
     errno.EPERM: "permission is denied",
     errno.ENOENT: "there is no such file or folder",
-    errno.ENOTDIR: "a part of the path is a file and no folder",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
     errno.EISDIR: "it is a folder",
     errno.ENAMETOOLONG: "the name is too long",
     errno.EMFILE: "too many files are open",
@@ -108,7 +108,7 @@ def switched_on(variable: str) -> bool:
 
 
 class DeviceError(InputError):
-    """There is no OpenCL device, or none matches the request."""
+    """Error if there is no OpenCL device, or none that matches the request."""
 
 
 @contextmanager
@@ -121,7 +121,7 @@ def of_argument() -> Iterator[None]:
 
 
 class KernelBuildError(ClsplatError):
-    """A driver refused a kernel.
+    """Error about a kernel that a driver refused to build.
 
     The message has the device, the build options and the log's first error. `log` has the whole log. `source` has the
     source with the line numbers that the log uses. CLSPLAT_DEBUG=1 shows both.
@@ -137,8 +137,8 @@ class KernelBuildError(ClsplatError):
 
 
 class DriverError(ClsplatError):
-    """A driver aborted, hung, or returned an invalid kernel. The message has the driver, the shape and the kernel."""
+    """Error about a driver that aborted, hung or returned an invalid kernel. It names the driver, shape and kernel."""
 
 
 class CapacityError(ClsplatError):
-    """A buffer would exceed the device's limit, or all buffers together would exceed --max-device-mem."""
+    """Error if a buffer would exceed the device's limit, or all buffers together would exceed --max-device-mem."""

@@ -37,16 +37,16 @@ class Gaussians:
         World coordinates of the means' origin. It is 0 except for scenes far from the world's origin, where float32
         would be too coarse (docs/decisions/0017).
     near : float
-        Near plane for cameras without their own, world units (docs/decisions/0019).
+        Near plane in world units, for cameras that do not set one (docs/decisions/0019).
     antialiased : bool
         True for a model that was trained, and is drawn, with the filter of docs/gradients.md, section 13.
     by_rays : bool
-        True for a model that was trained, and is drawn by perspective cameras, along the rays of pixels
+        True for a model that was trained along the rays of pixels, and that perspective cameras draw along them
         (`Camera.by_rays`).
 
     Notes
     -----
-    Kerbl et al. 2023. The parameters are stored like in 3DGS files (docs/conventions.md).
+    Kerbl et al. 2023. The parameters are stored as in 3DGS files (docs/conventions.md).
     """
 
     means: Float32
@@ -64,11 +64,11 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        """0 to 3."""
+        """Degree of the SH coefficients, 0 to 3."""
         return round(float(np.sqrt(self.sh.shape[1]))) - 1
 
     def arrays(self) -> dict[str, Any]:
-        """The parameters, float32, by name, in the order of the class."""
+        """The float32 arrays of the parameters by name, in the order of the class's fields."""
         return {group.field: getattr(self, group.field) for group in PARAMETER_GROUPS.values()}
 
     def local(self, camera: Camera) -> Camera:
@@ -82,7 +82,7 @@ class Gaussians:
         Raises
         ------
         ValueError
-            If an array is not as the class describes; it names the array.
+            If an array is not as the class describes. The message names the array.
         """
         for name, array in {**self.arrays(), "origin": self.origin}.items():
             if not isinstance(array, np.ndarray):
@@ -120,7 +120,7 @@ class Gaussians:
         Raises
         ------
         InputError
-            If the file is missing or wrong; it names the file and the reason.
+            If the file is missing or wrong. The message has the file and the reason.
         """
         from clsplat.models.formats import load
 
@@ -134,9 +134,9 @@ class Gaussians:
         path : str or path
             The file.
         sh_degree : int, optional
-            Pad with zero coefficients up to this degree, in formats that store several. None means the model's own.
+            Pad SH with zeros up to this degree, in formats that store several degrees. None means the model's degree.
         comments : sequence of str
-            Lines for the header, in formats with one, such as `colour.comment`.
+            Lines such as `colour.comment` for the header, in formats that have a header.
 
         Raises
         ------

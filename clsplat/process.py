@@ -15,8 +15,8 @@ from types import FrameType
 from typing import Any
 
 MAX_SIGNAL_WAIT_SECONDS = 0.5
-"""Longest wait of the main thread, seconds. On some systems a signal does not end a wait, so it is handled only after
-it."""
+"""Longest wait of the main thread in seconds. On some systems a signal does not end a wait, so its handler runs only
+after the wait."""
 
 
 def apart() -> dict[str, Any]:
@@ -29,7 +29,7 @@ def apart() -> dict[str, Any]:
 def endings() -> tuple[signal.Signals, ...]:
     """Signals other than Ctrl-C that ask a process to end: from job managers, and from a terminal that closes.
 
-    Windows has no SIGTERM from outside; its signal is Ctrl-Break. Ignored signals, as under nohup, are left out.
+    On Windows, processes are ended by Ctrl-Break instead of SIGTERM. Ignored signals, as under nohup, are left out.
     """
     names = ("SIGTERM", "SIGHUP", "SIGBREAK")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
@@ -37,7 +37,7 @@ def endings() -> tuple[signal.Signals, ...]:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, or the signal with this number."""
+    """Exception for Ctrl-C, or for the signal with this number."""
 
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def status_of(error: KeyboardInterrupt) -> int:
-    """The exit status of an interrupted process, by the shells' convention: 130 for Ctrl-C."""
+    """The exit status that shells report for an interrupted process: 130 for Ctrl-C."""
     return 128 + (error.number if isinstance(error, Interrupted) else signal.SIGINT)
 
 
@@ -56,7 +56,7 @@ def interrupt(number: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], object]) -> Iterator[dict[int, Any]]:
-    """Install a handler for these signals inside. Yields the previous handlers.
+    """Context in which `handler` handles these signals. Yields the previous handlers.
 
     Outside the main thread it does nothing, since Python handles signals only there.
     """
@@ -71,17 +71,17 @@ def handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], o
 
 
 def terminable() -> AbstractContextManager[object]:
-    """Inside, a signal that asks the process to end acts like Ctrl-C: temporary files are removed, and child processes
-    end."""
+    """Context in which a signal that asks the process to end acts like Ctrl-C: temporary files are removed, and child
+    processes end."""
     return handled(endings(), interrupt)
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Inside, signals that ask the process to end are delayed. Afterwards the first of them is raised.
+    """Context in which signals that ask the process to end are delayed. Afterwards the first of them is raised.
 
-    As in `handled`, the main thread removes handlers that a library has installed inside. In threads that a library
-    starts inside these signals stay blocked, also for the programs that those threads run.
+    In the main thread, handlers that a library installs meanwhile are removed at the end. In threads that a library
+    starts meanwhile, and in the programs that these threads run, the signals stay blocked.
     """
     came: list[int] = []
 

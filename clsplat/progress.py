@@ -21,16 +21,16 @@ Progress = Callable[[str, float | None], None]
 PLAIN_LINE_SECONDS = 10.0
 """Seconds between plain lines."""
 METRIC_SMOOTHING_WEIGHT = 0.1
-"""Weight of the newest report in the shown PSNR and loss, which are smoothed because they differ from view to view."""
+"""Weight of the newest report in the displayed PSNR and loss, which are smoothed because views differ."""
 RATE_WINDOW_SECONDS = 20.0
-"""Seconds of training over which the shown rate is averaged."""
+"""Seconds of training over which the displayed rate is averaged."""
 
 
 class RemainingTime(Protocol):
     """An estimator of the remaining time, for `TrainProgress` (`training.forecast.Forecast`)."""
 
     def see(self, report: Any) -> None:
-        """Take a report."""
+        """Update the estimate with a report."""
 
     def left(self) -> float | None:
         """Seconds from the last report to the end, or None if they cannot be estimated yet."""
@@ -62,8 +62,8 @@ class _Bar:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         if sys.stderr.isatty():
-            # Frames take similar times, so that rich can estimate the rest. Steps have their remaining time in the
-            # description.
+            # Frames take similar times, so rich can estimate the remaining time. For training steps the description
+            # has it.
             more = [MofNCompleteColumn(), TimeRemainingColumn()] if counted else []
             columns = (TextColumn("{task.description}"), BarColumn(bar_width=None), *more)
             self.live = Progress(
@@ -142,7 +142,7 @@ class TrainProgress(_Bar):
         return "" if seconds is None else f"  {duration(seconds)} left"
 
     def _print_line(self) -> None:
-        with suppress(OSError):  # the reader has gone: training continues, or reaches its checkpoint
+        with suppress(OSError):  # the reader of the output has ended: training goes on
             print(f"{self._numbers()}{self._left()}", file=sys.stderr, flush=True)
         self.printed_at, self.printed_step = time.monotonic(), self.last.step
 
@@ -151,7 +151,7 @@ class StageProgress:
     """Progress of work in named stages. Call it with the stage and the fraction done, or None if unknown.
 
     A `CountedFraction` is reported as a count. The last report of a stage is always shown.
-    after: seconds without any output at the start, for work that is mostly quick.
+    after: seconds at the start during which nothing is printed, for work that is usually quick.
     """
 
     def __init__(self, after: float = 0.0) -> None:
@@ -184,7 +184,7 @@ class FrameProgress(_Bar):
 
     total: number of frames, skipped ones included.
     style: "auto": a bar on standard error if that is a terminal, and on `lines` a line for each written frame, with the
-      remaining time. No lines are written if `lines` is None, or if both are the same terminal.
+      remaining time. No lines are written if `lines` is None, or if both streams are terminals.
       "json": one object per line on `lines`. "openjd": progress lines of Open Job Description. "none": nothing.
     """
 
@@ -218,7 +218,7 @@ class FrameProgress(_Bar):
             }
             text = json.dumps(line)
         elif self.style == "openjd":
-            did = "is there" if record.skipped else f"took {record.seconds:.2f} s"
+            did = "exists" if record.skipped else f"took {record.seconds:.2f} s"
             text = f"openjd_progress: {100 * self.done / self.total:.1f}\nopenjd_status: frame {record.frame} {did}"
         elif record.skipped:
             return

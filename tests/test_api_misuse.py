@@ -105,7 +105,7 @@ def test_numbers_of_a_scene_that_are_not_whole_are_named(arguments: dict[str, An
 
 @pytest.mark.parametrize("degree", [3.0, "3", True, 4, -1], ids=repr)
 def test_a_degree_that_is_none_is_not_written(degree: Any, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=rf"^sh_degree {degree}: expected 0 \(the model's\) to 3$"):
+    with pytest.raises(ValueError, match=rf"^sh_degree is {degree}, expected 0 \(the model's\) to 3$"):
         hidden_model().save(tmp_path / "a.ply", sh_degree=degree)
     assert not list(tmp_path.iterdir())
 

@@ -127,7 +127,7 @@ def test_errors_of_the_system_are_plain_sentences() -> None:
 def test_a_file_that_git_lfs_did_not_fetch_is_told(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'ab' * 32}\nsize 123456\n")
-    with pytest.raises(InputError, match=r"is Git LFS's note .*; git lfs pull"), open_input(path, "a file"):
+    with pytest.raises(InputError, match=r"is a Git LFS pointer, .*; run git lfs pull"), open_input(path, "a file"):
         pass
     path.write_bytes(b"version 1" + bytes(20))
     with open_input(path, "a file") as file:

@@ -78,10 +78,10 @@ def check_new(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> N
         return
     if any(source.exists() and path.exists() and source.samefile(path) for source in sources):
         raise InputError(
-            f"{path}: is read, and would be replaced by the result; name another file, or give --overwrite to change "
-            "it in place"
+            f"{path}: is an input, and would be replaced by the result; name another file, or give --overwrite to "
+            "change it in place"
         )
-    raise InputError(f"{path}: is there already; name another file, or give --overwrite to replace it")
+    raise InputError(f"{path}: exists already; name another file, or give --overwrite to replace it")
 
 
 @contextmanager
@@ -105,17 +105,17 @@ def atomic_name(path: str | os.PathLike[str], needs: int | None = None) -> Itera
         written = 0
         with suppress(OSError):
             written = temporary.stat().st_size
-            temporary.unlink()  # before the message is made, so that its free space is without this file
+            temporary.unlink()  # before the message is made, so that its free space includes this file's
         names = (None, str(temporary), str(path))
         if isinstance(error, OSError) and error.errno and not isinstance(error, WriteError) and error.filename in names:
-            # The error names the temporary file, which users do not know, or for a full disk no file.
+            # The error names the temporary file, which users do not know, or, for a full disk, no file at all.
             raise write_error(path, error, written, needs) from None
         raise
 
 
 @contextmanager
 def atomic_writer(path: str | os.PathLike[str], needs: int | None = None) -> Iterator[BinaryIO]:
-    """Context with an open binary file, which is flushed to the disk and then takes its place like in `atomic_name`."""
+    """Context with an open binary file, which is flushed to the disk and then renamed as in `atomic_name`."""
     # mode "x" instead of mkstemp, so that the file gets the permissions of the user's umask
     with atomic_name(path, needs) as temporary, open(temporary, "xb") as file:
         yield file
@@ -205,7 +205,7 @@ def scratch_folder(needs: int) -> Iterator[Path]:
         except WriteError as error:
             if not str(error.filename).startswith(name):
                 raise
-            raise WriteError(error.errno or 0, f"{error.strerror} (TMPDIR names another folder)", str(folder)) from None
+            raise WriteError(error.errno or 0, f"{error.strerror} (TMPDIR sets another folder)", str(folder)) from None
         except (OSError, InputError, KeyboardInterrupt):
             raise
         except Exception:
@@ -215,7 +215,7 @@ def scratch_folder(needs: int) -> Iterator[Path]:
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write `data` as the whole content of `path`, like with `atomic_writer`."""
+    """Write `data` as the whole content of `path`, as with `atomic_writer`."""
     with atomic_writer(path, len(data)) as file:
         file.write(data)
 

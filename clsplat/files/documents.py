@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 from clsplat.errors import InputError, WriteError, reason_of
 
 MAX_DOCUMENT_BYTES = 32 << 20
-"""Largest size of a JSON or TOML file, bytes. As Python objects its content takes up to 24 times as much memory."""
+"""Largest size of a JSON or TOML file in bytes. As Python objects its content takes up to 24 times as much memory."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
 MAX_LFS_POINTER_BYTES = 1024
 """The pointer file that Git LFS leaves in place of a file: its first bytes, and its largest size in bytes.
@@ -30,8 +30,8 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def short_digest(path: Path) -> str | None:
-    """BLAKE2b digest of the file's content, 16 bytes in hexadecimal, which is quicker than `digest`; None without a
-    file."""
+    """BLAKE2b digest of the file's content, 16 bytes in hexadecimal, which is quicker than `digest`; None if there
+    is no file."""
     return _digest(path, hashlib.blake2b(digest_size=16)) if is_file(path) else None
 
 
@@ -58,7 +58,7 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
     Raises InputError if the file is missing, cannot be read, or is not a regular file: a folder, or a pipe, from which
     nothing may ever come. Also raises it for the pointer of Git LFS in place of a file that was not fetched.
 
-    expected: end of the message of an error.
+    expected: text that follows "expected" in error messages.
     """
     try:
         status = path.stat()
@@ -78,7 +78,7 @@ def open_input(path: Path, expected: str) -> Iterator[BinaryIO]:
         try:
             if status.st_size < MAX_LFS_POINTER_BYTES:
                 if file.read(len(LFS_POINTER)) == LFS_POINTER:
-                    raise InputError(f"{path}: is Git LFS's note of a file that is not here; git lfs pull fetches it")
+                    raise InputError(f"{path}: is a Git LFS pointer, not the file itself; run git lfs pull to fetch it")
                 file.seek(0)
             yield file
         except WriteError:
@@ -107,14 +107,14 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(result) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in result if names.count(name) > 1)
-        raise ValueError(f"the key {twice[:40]!r} is there twice")
+        raise ValueError(f"the key {twice[:40]!r} occurs twice")
     return result
 
 
 def parse_json(text: str | bytes, *, once: bool = False) -> Any:
     """The value of a JSON text. Raises ValueError if it does not parse, or is nested too deeply.
 
-    once: also raise it if an object has a key twice, of which otherwise the last would count.
+    once: also raise ValueError if an object has a key twice. Otherwise the last one counts.
     """
     try:
         return json.loads(text, object_pairs_hook=_once if once else None)

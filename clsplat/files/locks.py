@@ -26,7 +26,7 @@ _PROCESS_TOKEN = secrets.token_hex(4)
 
 @contextmanager
 def briefly_locked(path: Path, seconds: float = 5.0) -> Iterator[None]:
-    """Context that only one thread of one process is in at a time, for a file that need not exist.
+    """Context that only one thread of all processes can be in at a time. The file need not exist.
 
     The marker is FILE.lock beside the file. A lock of the operating system, as in `clsplat.runs.locks`, would not keep
     the threads of one process apart, and homes on a network may not support it. A marker older than `seconds` is taken
@@ -82,7 +82,7 @@ def _is_given_up(claimed: Path) -> bool:
         return age > EMPTY_CLAIM_SECONDS
     if (
         token[:12] == f"{machine_mark()}{os.getpid():08x}"
-    ):  # a process before this one, of the same number, as in containers
+    ):  # an earlier process that had the same number, as happens in containers
         return token[12:] != _PROCESS_TOKEN
     return is_abandoned(claimed, token)
 

@@ -13,7 +13,7 @@ from clsplat.errors import InputError
 
 ON_WINDOWS = os.name == "nt"
 CASE_INSENSITIVE_FILES = sys.platform in ("win32", "darwin")
-"""True if the system's usual file systems take A.png and a.png for one file, and so for two Unicode forms of an
+"""True if the system's usual file systems take A.png and a.png for one file, and likewise two Unicode forms of an
 accent."""
 _FORBIDDEN_NAME_CHARACTERS = re.compile(r'[<>:"|?*\x00-\x1f]')
 _WINDOWS_DEVICE_NAME = re.compile(
@@ -47,7 +47,7 @@ def native_name(path: str | os.PathLike[str]) -> str:
     try:
         return os.fsencode(path).decode("utf-8")
     except UnicodeError:
-        raise InputError(f"{path}: has a name that is no text in UTF-8; rename it") from None
+        raise InputError(f"{path}: has a name that is not UTF-8 text; rename it") from None
 
 
 def identity(path: PurePath, *, ignores_case: bool = CASE_INSENSITIVE_FILES) -> str:

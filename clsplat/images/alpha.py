@@ -14,7 +14,7 @@ Image = NDArray[Any]
 
 
 def background_colour(name: str) -> tuple[float, float, float]:
-    """Background colour of held-out views: white, or black, which also stands for "random"."""
+    """Background colour of held-out views: white for "white", black for all other names, such as "random"."""
     return (1.0, 1.0, 1.0) if name == "white" else (0.0, 0.0, 0.0)
 
 
@@ -31,11 +31,11 @@ def composite(image: Image, background: ArrayLike) -> Image:
 
 
 def associate(image: Float32) -> Float32:
-    """Premultiply (H, W, 4) that has straight alpha."""
+    """Premultiply the colours of an image (H, W, 4) by its straight alpha."""
     return np.concatenate([image[:, :, :3] * image[:, :, 3:], image[:, :, 3:]], axis=2)
 
 
 def unassociate(image: Float32) -> Float32:
-    """Convert (H, W, 4) with premultiplied alpha to straight alpha. Colour with an alpha of 0 is kept."""
+    """Convert an image (H, W, 4) from premultiplied to straight alpha. Colours with an alpha of 0 do not change."""
     alpha = image[:, :, 3:]
     return np.concatenate([image[:, :, :3] / np.where(alpha > 0, alpha, np.float32(1)), alpha], axis=2)

@@ -34,7 +34,7 @@ _SPACE_ALIASES = {
     SRGB: ("srgb_texture", "sRGB - Texture", "srgb_tx", "sRGB", "Utility - sRGB - Texture"),
     LINEAR: ("lin_rec709", "Linear Rec.709 (sRGB)", "lin_srgb", "Utility - Linear - sRGB", "lin_rec709_scene"),
 }
-"""Names of these two in OpenColorIO configurations."""
+"""Names of sRGB and linear Rec.709 in OpenColorIO configurations."""
 COLOR_INTEROP_IDS = {
     SRGB: "srgb_rec709_scene",
     LINEAR: "lin_rec709_scene",
@@ -114,7 +114,7 @@ def displayed(rgb: NDArray[Any], space: str) -> Float32:
 
 @lru_cache(maxsize=8)
 def _to_srgb(space: str, source: str) -> Colours:
-    """Colour spaces of images on a display, cached because a viewer shows many."""
+    """Colour spaces for showing a model's images on a display. Cached because a viewer shows many images."""
     return Colours(ColourConfig(colorspace=SRGB, ocio_config=source), space)
 
 
@@ -128,7 +128,7 @@ class Colours:
         """Load the configuration and look up the spaces.
 
         recorded: `recorded_space` of the model.
-        Raises InputError for a configuration that does not load, and for a space that it lacks, with similar names.
+        Raises InputError for a configuration that does not load, and, with similar names, for a space that it lacks.
         """
         config = config or ColourConfig()
         self._source = config.ocio_config or os.environ.get("OCIO", "") or BUILT_IN_OCIO_CONFIG
@@ -156,7 +156,7 @@ class Colours:
         return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *colours[3]], colours[3, 0], atol=2e-3))
 
     def check_file(self, path: str, extension: str, videos: Collection[str]) -> None:
-        """Raise InputError if a file of that extension would show other colours than it holds.
+        """Raise InputError if files with that extension cannot hold the output's colours.
 
         Integer formats cannot hold linear light. A video, whose extension is one of `videos`, must be in Rec.709.
         """
@@ -170,7 +170,7 @@ class Colours:
     def _config(self) -> Any:
         config = oiio.ColorConfig(self._source)
         if reason := config.geterror():
-            raise InputError(f"{self._source}: no OpenColorIO configuration: {' '.join(reason.split())}")
+            raise InputError(f"{self._source}: is not an OpenColorIO configuration: {' '.join(reason.split())}")
         return config
 
     def _known(self, name: str, flag: str) -> str:
@@ -186,7 +186,7 @@ class Colours:
             advice = (
                 f"similar names: {', '.join(near)}" if near else f"it has {examples(self._config.getColorSpaceNames())}"
             )
-            raise InputError(f"{flag} {name}: not in the configuration {self._source}; {advice}")
+            raise InputError(f"{flag} {name}: is not in the configuration {self._source}; {advice}")
         for space, names in _SPACE_ALIASES.items():
             if any(self._config.resolve(alias) == resolved for alias in names):
                 return space
@@ -227,7 +227,7 @@ class Colours:
             self._matrices[names] = self._matrix(*names) if linear else None
         if (matrix := self._matrices[names]) is None:
             return self._converted(rgb, names[0], names[1])
-        red, green, blue = (rgb[:, :, index, None] for index in range(3))  # not a library's sum, whose order varies
+        red, green, blue = (rgb[:, :, index, None] for index in range(3))  # BLAS would vary the order of the sum
         return np.asarray(red * matrix[0] + green * matrix[1] + blue * matrix[2], np.float32)
 
     def _matrix(self, source: str, target: str) -> Float32 | None:
@@ -238,11 +238,11 @@ class Colours:
         light = np.array([[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [4, -1, 2], [0.2, 0.01, 0.5]]], np.float32)
         colours = self._converted(light, source, target)
         matrix, sums = colours[0, :3], colours[0, 3:]
-        return matrix if np.allclose(light[0, 3:] @ matrix, sums, rtol=1e-5, atol=1e-5) else None  # sums up to 4
+        return matrix if np.allclose(light[0, 3:] @ matrix, sums, rtol=1e-5, atol=1e-5) else None  # values up to 4
 
     def _converted(self, rgb: Float32, source: str, target: str) -> Float32:
         pixels = oiio.ImageBuf(np.ascontiguousarray(rgb, np.float32))
         result = oiio.ImageBufAlgo.colorconvert(pixels, source, target, unpremult=False, colorconfig=self._source)
         if reason := result.geterror():
-            raise InputError(f"{self._source}: {source} to {target}: {' '.join(reason.split())}")
+            raise InputError(f"{self._source}: cannot convert {source} to {target}: {' '.join(reason.split())}")
         return np.asarray(result.get_pixels(oiio.FLOAT), np.float32)

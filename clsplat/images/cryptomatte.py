@@ -60,7 +60,7 @@ def ranked(coverage: Float32, names: Sequence[str]) -> Float32:
     """Rank coverage (H, W, objects) into (H, W, 4 CRYPTOMATTE_LAYERS): ids and coverages of each pixel's largest
     objects, largest first.
 
-    Ties go by the order of the names; unused ranks are 0.
+    Equal coverages keep the order of the names. Unused ranks are 0.
     """
     kept = min(2 * CRYPTOMATTE_LAYERS, len(names))
     ids = np.array([id_bits(name) for name in names], np.uint32).view(np.float32)

@@ -34,9 +34,9 @@ def samples_bytes(pixels: int, most: int) -> int:
 def deep_data(scratch: Path, counts: NDArray[np.int32], columns: dict[str, NDArray[Any]]) -> Any:
     """OpenImageIO's deep data of rows of pixels.
 
-    scratch: a file to go through.
-    counts (H, W): samples of each pixel.
-    columns: halves or floats (samples,) by channel, in order of rows and pixels, front to back.
+    scratch: path of the temporary file to write and read.
+    counts (H, W): number of samples of each pixel.
+    columns: halves or floats (samples,) of each channel: row by row, pixel by pixel, front to back.
     Raises ClsplatError.
     """
     _write(scratch, counts, columns)

@@ -15,7 +15,7 @@ from clsplat.files.documents import open_input
 from clsplat.images.reading import MAX_IMAGE_PIXELS, error_of, image_size, one_line, open_image
 
 DEPTH_MAP_SUFFIXES = (".png", ".exr", ".tif", ".tiff", ".npy")
-"""Depth map extensions when a folder is searched, in lower case."""
+"""Extensions of the depth maps that are searched for in a folder, in lower case."""
 DEPTH_MAP_KINDS = "a depth map: PNG or TIFF of whole numbers, EXR, or NPY"
 
 
@@ -72,7 +72,7 @@ def _numpy(path: Path) -> Any:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path}: does not read as NPY: {one_line(str(error))}; expected {DEPTH_MAP_KINDS}") from None
+        raise InputError(f"{path}: cannot be read as NPY: {one_line(str(error))}; expected {DEPTH_MAP_KINDS}") from None
     array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if array.ndim != 2 or array.dtype.kind not in "fiu" or not 0 < array.size <= MAX_IMAGE_PIXELS:
         raise InputError(f"{path}: is {array.dtype} of shape {array.shape}, expected numbers (height, width)")

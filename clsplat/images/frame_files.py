@@ -35,7 +35,7 @@ Together they take a fifth of the time of level 6 with the best of five filters 
 larger. On a CPU device, level 6 can take longer than the frame.
 """
 _EXR_ZIP_LEVEL = 1
-"""Level of zip and zips: two thirds of the time of the default 4, for 2 to 7 % more bytes."""
+"""Level of zip and zips compression: two thirds of the time of level 4, the default, for 2 to 7 % more bytes."""
 _MAX_EXACT_FLOAT_INDEX = 2**24
 _DISK_BLOCK_BYTES = 1 << 12
 """Bytes in a disk block."""
@@ -48,7 +48,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov")
 class FrameFileHeader:
     """Contents of a frame file other than pixels.
 
-    window: None if the image is the display window.
+    window: place of the image in the display window; None if they are the same.
     chromaticities: x and y of red, green, blue and white; empty if unknown.
     is_srgb: True if the colours are in sRGB.
     typed: EXR attributes with OpenImageIO's names of their types.
@@ -69,7 +69,7 @@ def camera_matrices(camera: Camera) -> dict[str, Float64]:
 
     Camera space has x right, y up and z along the view, a left-handed frame. In NDC, (0, 0) is the upper left corner of
     the display window and (1, 1) the lower right one. OpenEXR does not define z; here it is 0 at the near plane and 1
-    at infinity. For an orthographic camera it is 1 at the far plane, or grows by 1 a world unit if there is none.
+    at infinity. For an orthographic camera it is 1 at the far plane, or grows by 1 per world unit if there is none.
     """
     display = camera.window or camera
     projection = camera.model.ndc_from_cam(camera, display.width, display.height)
@@ -127,8 +127,8 @@ def write_channels(
 ) -> None:
     """Write a frame, atomically.
 
-    channels: by name, (H, W) or (H, W, channels); rgb is over black, so premultiplied by alpha. In an integer part the
-      id -1, for no Gaussian, becomes 4294967295.
+    channels: arrays by name, (H, W) or (H, W, channels). rgb is over black, so it is premultiplied by alpha. In an
+      integer part the id -1, for no Gaussian, becomes 4294967295.
     Raises InputError and ClsplatError like `writing.write_image`.
     """
     write_views(path, [(channels, header or FrameFileHeader())], encoding)
@@ -181,8 +181,8 @@ def is_whole(
 ) -> bool:
     """True if the file is complete and holds these channels as `write_channels` writes them.
 
-    It must have that size and no other values of these attributes, and its last row must decode. If the file contains a
-    block of zeros, every row is decoded. A truncated file fails.
+    Its size must be as given, its attributes must not differ from those given, and its last row must decode. If the
+    file contains a block of zeros, every row is decoded. A truncated file fails.
 
     deep: expect a deep image, whose channels are DEEP_CHANNELS.
     views: number of views, each with these channels.
@@ -193,7 +193,7 @@ def is_whole(
     if not path.is_file():
         return False
     try:
-        image_size(path)  # rejects a truncated PNG, about which libpng would print
+        image_size(path)  # rejects a truncated PNG, for which libpng would print a message
     except InputError:
         return False
     holed = _has_hole(path)
@@ -276,8 +276,8 @@ def _exr_part(
 def _check_floats(name: str, plane: NDArray[Any]) -> None:
     if WRITABLE_CHANNELS[name].kind == "whole" and plane.max(initial=0) > _MAX_EXACT_FLOAT_INDEX:
         raise InputError(
-            f"--channels {name}: the largest is {plane.max():,}, more than a float holds exactly; use --parts several, "
-            "where it is a whole number"
+            f"--channels {name}: the largest value is {plane.max():,}, which a float cannot hold exactly; use --parts "
+            "several, which stores whole numbers"
         )
 
 
@@ -298,7 +298,7 @@ def _picture(
         spec.attribute("oiio:BitsPerSample", bits)
         spec.attribute("oiio:Endian", "big")
     if extension == ".png":
-        if not header.is_srgb:  # otherwise OpenImageIO writes the chunks sRGB, gAMA and cHRM
+        if not header.is_srgb:  # by default OpenImageIO would write the chunks sRGB, gAMA and cHRM
             spec.attribute("oiio:ColorSpace", "unknown")
         spec.attribute("oiio:UnassociatedAlpha", 1)
         spec.attribute("png:compressionLevel", _PNG_LEVEL)
@@ -309,7 +309,7 @@ def _picture(
 
 
 def deep_spec(width: int, height: int, encoding: Encoding, header: FrameFileHeader) -> Any:
-    """OpenImageIO's specification of a deep EXR: colours are half or float by the encoding, depths are float."""
+    """OpenImageIO's specification of a deep EXR: colours are half or float as in the encoding, depths float."""
     spec = _exr_spec((height, width, len(DEEP_CHANNELS)), DEEP_CHANNELS, [oiio.FLOAT], header)
     spec.deep = True
     spec.channelformats = (oiio.TypeDesc(encoding.depth),) * 4 + (oiio.TypeDesc("float"),) * 2
@@ -345,7 +345,7 @@ def _spec(shape: tuple[int, ...], names: Sequence[str], kind: Any, header: Frame
         spec.full_width, spec.full_height = header.window.width, header.window.height
     if header.chromaticities:
         spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(header.chromaticities))
-    spec.attribute("DateTime", "")  # OpenImageIO's default is now, but equal frames need equal bytes
+    spec.attribute("DateTime", "")  # OpenImageIO would write the current time, but equal frames need equal bytes
     for name, value in header.attributes.items():
         spec.attribute(name, value)
     return spec

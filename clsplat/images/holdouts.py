@@ -34,7 +34,7 @@ class Surfaces:
 
     @property
     def dense(self) -> int:
-        """Average number of surfaces a pixel in the fullest row, rounded up."""
+        """Average number of surfaces per pixel in the row that has the most, rounded up."""
         return int(np.ceil(self.counts.mean(axis=1).max(initial=0)))
 
     def taken(self, across: NDArray[np.int64], down: NDArray[np.int64]) -> Surfaces:
@@ -74,7 +74,7 @@ class Holdout:
 
 
 def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
-    """True if the depths are half floats.
+    """Check a file's header. Returns True if its depths are half floats.
 
     Raises InputError if the header shows that the file cannot be the holdout of a frame of that size (width, height).
     """
@@ -87,7 +87,7 @@ def check_holdout(path: Path, size: tuple[int, int], channel: str = "") -> bool:
 def read_holdout(path: Path, size: tuple[int, int], channel: str = "", *, inverse: bool = False) -> Holdout:
     """Read the holdout of a frame of that size (width, height).
 
-    channel: name of the depths, Z if empty. Samples of a deep file have A and may have ZBack; a flat file may have A.
+    channel: name of the depth channel, Z if empty. A deep file has A too and may have ZBack; a flat file may have A.
     inverse: the file stores 1 / depth.
     Depths of 0 and infinity are no surface. Raises InputError like `check_holdout`, and for NaN, negative depths, and
     files that do not decode.
@@ -166,11 +166,11 @@ def _part(path: Path, size: tuple[int, int], channel: str) -> Iterator[tuple[Any
         spec = source.spec()
         if not source.seek_subimage(part, 0):
             raise InputError(
-                f"{path}: has no channel {name}, but {examples(seen)}; name its depths with --holdout.channel"
+                f"{path}: has the channels {examples(seen)}, expected {name}; name its depths with --holdout.channel"
             )
         if (spec.full_width, spec.full_height) != size:
             raise InputError(
-                f"{path}: is of a frame of {spec.full_width}x{spec.full_height}, expected {size[0]}x{size[1]} as the "
+                f"{path}: holds a frame of {spec.full_width}x{spec.full_height}, expected {size[0]}x{size[1]} like the "
                 "frame that is rendered"
             )
         layer = name[: name.rfind(".") + 1]

@@ -30,7 +30,7 @@ def parse_record(text: object) -> dict[str, str]:
 
 
 def attribute_of(spec: Any, name: str) -> Any:
-    """Attribute of a file by OpenImageIO's specification, or from the record in it; None if neither has it."""
+    """Attribute in OpenImageIO's specification of a file, or in the record there; None if neither has it."""
     value = spec.getattribute(name)
     for place in dict.fromkeys(RECORD_TAGS.values()) if value is None else ():
         value = parse_record(spec.getattribute(place)).get(name) if value is None else value

@@ -27,7 +27,7 @@ from clsplat.files.names import native_name
 from clsplat.images.alpha import associate, unassociate
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".bmp", ".hdr", ".tga", ".ppm", ".pgm")
-"""Image extensions when a folder is searched, in lower case. A file given by name may be anything OpenImageIO reads."""
+"""Lower-case extensions of images that a folder search finds. A named file may be anything OpenImageIO reads."""
 
 T = TypeVar("T", bound=np.generic)
 
@@ -44,8 +44,8 @@ IMAGE_SIGNATURES = (
     *(PNG_SIGNATURE, b"\xff\xd8\xff", b"\x76\x2f\x31\x01", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"BM", b"#?"),
     *(b"SDPX", b"XPDS", b"RIFF", b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"),
 )
-"""First bytes of images larger than MAX_UNSIGNED_IMAGE_BYTES; some decoders read the whole of a file that is not
-theirs."""
+"""First bytes that a file larger than MAX_UNSIGNED_IMAGE_BYTES must have: some decoders read the whole file even if it
+is not in their format."""
 # libjpeg's notes about data that it does not need; every other message means lost pixels
 HARMLESS_DECODER_NOTES = ("extraneous bytes",)
 
@@ -115,7 +115,7 @@ def find_images(folder: Path, *, deep: bool = True) -> list[Path]:
     paths: list[Path] = []
     seen: set[str] = set()
     for root, folders, files in os.walk(folder, followlinks=True, onerror=cannot_be_searched):
-        real = os.path.realpath(root)  # not the inode: some file systems of Windows number every folder 0
+        real = os.path.realpath(root)  # not the inode, which is 0 for every folder on some file systems of Windows
         if real in seen:
             folders.clear()
             continue
@@ -169,7 +169,7 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
     B and A of its whole display window; other channels are ignored.
 
     orient: apply the EXIF orientation, right for plain photographs. COLMAP (pycolmap 4.2.1) ignores it, and its
-      keypoints and camera sizes refer to the pixels as stored, so a COLMAP model's photographs are read without.
+      keypoints and camera sizes refer to the pixels as stored, so a COLMAP model's photographs are read without it.
 
     Raises InputError with the file and the decoder's reason if it is missing, not an image, damaged or truncated.
     Raises it also for unsupported channels and non-finite values.
@@ -185,12 +185,12 @@ def read_image(path: Path, *, orient: bool = True) -> Float32:
         raise InputError(f"{path}: does not decode: {one_line(reason)}; copy the picture again or leave it out")
     pixels = np.asarray(pixels, np.float32)
     if pixels.size != spec.height * spec.width * spec.nchannels:
-        raise InputError(f"{path}: does not decode: its header and its pixels are of different sizes; save it again")
+        raise InputError(f"{path}: does not decode: its header and its pixels differ in size; save it again")
     pixels = pixels.reshape(spec.height, spec.width, spec.nchannels)
     image = _as_rgb(path, pixels, spec)
     if not np.isfinite(image).all():
         count = int(np.count_nonzero(~np.isfinite(image).all(axis=2)))
-        raise InputError(f"{path}: {count} pixels are not finite, expected numbers only; repair or leave it out")
+        raise InputError(f"{path}: has {count} pixels that are not finite; repair the picture or leave it out")
     if source.format_name() == "openexr":
         image = _display_window(image, spec)
     if image.shape[2] == 4 and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
@@ -237,8 +237,8 @@ def channels_of(spec: Any) -> list[str]:
 def alpha_of(spec: Any) -> int:
     """Index of the alpha channel, -1 for none.
 
-    A decoder's index may be outside the channels (OpenImageIO gives 4 of 4 for GIF) or a colour channel; then names
-    decide.
+    A decoder's index may be outside the channels (OpenImageIO gives 4 for a GIF of 4 channels) or a colour channel.
+    Then the names decide.
     """
     names, index = channels_of(spec), int(spec.alpha_channel)
     if 0 <= index < len(names) and names[index] not in ("R", "G", "B", "Y", "I"):
@@ -260,7 +260,7 @@ def open_image(path: Path) -> Any:
         known = file.read(8).startswith(IMAGE_SIGNATURES)
     if size > MAX_IMAGE_FILE_BYTES or (size > MAX_UNSIGNED_IMAGE_BYTES and not known):
         raise InputError(
-            f"{path}: has {size} bytes and does not begin as a picture, expected at most {MAX_IMAGE_FILE_BYTES}"
+            f"{path}: has {size} bytes, expected a picture of at most {MAX_IMAGE_FILE_BYTES} bytes in a usual format"
         )
     source = oiio.ImageInput.open(native_name(path), hints)
     if source is None:
@@ -348,7 +348,7 @@ def _display_window(image: Float32, spec: Any) -> Float32:
 
 
 def _check_png_is_whole(path: Path) -> None:
-    """Raise InputError for a truncated file, before training, and before libpng prints."""
+    """Raise InputError for a truncated file, before training starts and before libpng prints a message."""
     if not png_is_whole(path):
         size = path.stat().st_size
         raise InputError(
@@ -357,7 +357,7 @@ def _check_png_is_whole(path: Path) -> None:
 
 
 def png_is_whole(path: Path) -> bool:
-    """True if the chunks lead to the last one."""
+    """True if the chunks of a PNG are complete up to the last one, IEND."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         position = len(PNG_SIGNATURE) if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE else size
@@ -374,7 +374,7 @@ def png_is_whole(path: Path) -> bool:
 
 def _resampling(source: int, target: int) -> Any:
     """Sparse matrix (target, source) that resamples an axis; each row's weights sum to 1."""
-    from scipy import sparse  # a quarter of a second, of which most commands have no use
+    from scipy import sparse  # takes a quarter of a second, and most commands do not need it
 
     if target >= source:
         centres = (np.arange(target) + 0.5) * (source / target) - 0.5

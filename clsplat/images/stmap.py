@@ -29,8 +29,8 @@ _ORIENTATION_CELLS_PER_SIDE = 32
 _MIN_CELL_SINE = 0.05
 """Smallest sine of the angle between a cell's mapped sides; for a grey image the two sides coincide."""
 _MIN_ORIENTED_SHARE = 0.7
-"""Least fraction of the cells that have the same orientation in a map. In ordinary images it is a half, or they have
-none because they are grey."""
+"""Least fraction of a map's cells that have the same orientation. In ordinary images about half do. The cells of a grey
+image have no orientation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class StMap:
     """STMap read from a file.
 
     values (H, W, 2): float32, across and up.
-    x, y: position of its first pixel in the frame; may be negative.
+    x, y: position of the map's first pixel in the frame; may be negative.
     width, height: size of the frame.
-    digest: SHA-256 of its file.
+    digest: SHA-256 of the map's file.
     """
 
     values: Float32
@@ -51,7 +51,7 @@ class StMap:
     digest: str
 
     def covers(self, x: int, y: int, width: int, height: int) -> bool:
-        """True if it has a value for each pixel of a window of the frame."""
+        """True if the map has a value for each pixel of a window of the frame."""
         rows, columns, _ = self.values.shape
         across = self.x <= x and x + width <= self.x + columns
         return across and self.y <= y and y + height <= self.y + rows
@@ -101,7 +101,7 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # read again if t
     kinds = {str(kind) for kind in spec.channelformats} or {str(spec.format)}
     if spec.nchannels < 2 or not kinds <= {"half", "float", "double"}:
         held = ", ".join(spec.channelnames)
-        raise InputError(f"{path}: has {held} as {', '.join(sorted(kinds))}, expected an STMap: R and G as floats")
+        raise InputError(f"{path}: has {held} as {', '.join(sorted(kinds))}, expected an STMap's R and G as floats")
     pixels = source.read_image(oiio.FLOAT)
     reason = error_of(source)
     source.close()
@@ -114,7 +114,7 @@ def _read(path: Path, changed: int) -> StMap:  # noqa: ARG001  # read again if t
             "expected an STMap, whose R and G are neighbouring positions"
         )
     if "half" in kinds and max(spec.full_width, spec.full_height) >= HALF_FLOAT_SIDE_LIMIT_PX:
-        warn(f"{path}: is of half floats, which are pixels off at {spec.full_width}x{spec.full_height}; write floats")
+        warn(f"{path}: has half floats, which are pixels off at {spec.full_width}x{spec.full_height}; write floats")
     place = (spec.x - spec.full_x, spec.y - spec.full_y, spec.full_width, spec.full_height)
     return StMap(np.ascontiguousarray(values), *place, digest(path))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Video writing, frame by frame: .mp4 (H.264) or .mov (ProRes), by PyAV (`pip install 'clsplat[video]'`)."""
+"""Video writing, frame by frame: .mp4 (H.264) or .mov (ProRes), with PyAV (`pip install 'clsplat[video]'`)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _BLUE_CHROMA_RANGE, _RED_CHROMA_RANGE = (np.float32(2 * (1 - REC709_LUMA_WEIGHTS
 
 
 VideoPlanes = NDArray[np.uint8] | tuple[NDArray[np.uint16], ...]
-"""Frame in the encoder's form: of `frame_planes` or `prores_planes`."""
+"""Frame in the form that the encoder takes: the result of `frame_planes` or `prores_planes`."""
 _PRORES_PROFILES: dict[ProRes, str] = {"422": "standard", "hq": "hq", "4444": "4444"}
 """FFmpeg's names of the ProRes profiles."""
 
@@ -52,7 +52,7 @@ With the tree, up to 102 of 250 videos of 48x40 differed in their bytes on a bus
 MAX_VIDEO_SIDE_PX = 16384
 """Largest side in pixels: x264's MAX_RESOLUTION."""
 MAX_VIDEO_MEGAPIXELS = 260
-"""Largest frame in megapixels, about: FFmpeg's av_image_check_size wants 8 (width + 128) (height + 128) under 2^31."""
+"""Size of the largest frame, about: FFmpeg's av_image_check_size requires 8 (width + 128) (height + 128) < 2^31."""
 
 
 def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
@@ -74,7 +74,7 @@ def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
 
 
 def check_video(path: Path) -> None:
-    """Raise InputError if this installation cannot write a video there."""
+    """Raise InputError if this installation cannot write a video at `path`."""
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected {' or '.join(VIDEO_SUFFIXES)}")
     if reason := video_missing():
@@ -102,7 +102,7 @@ def check_size(path: Path, width: int, height: int) -> None:
     """Raise InputError if frames are larger than the encoder accepts."""
     if max(width, height) > MAX_VIDEO_SIDE_PX or 8 * (width + 128) * (height + 128) >= 1 << 31:
         raise InputError(
-            f"{path}: frames of {width}x{height}, expected at most {MAX_VIDEO_SIDE_PX:,} pixels a side and "
+            f"{path}: its frames are {width}x{height}, expected at most {MAX_VIDEO_SIDE_PX:,} pixels a side and "
             f"{MAX_VIDEO_MEGAPIXELS} "
             "megapixels in a video; give a smaller --width, or write pictures"
         )
@@ -119,7 +119,7 @@ def frame_planes(image: NDArray[Any]) -> NDArray[np.uint8]:
     """
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
-        raise ValueError(f"frame {pixels.shape}: expected (H, W, 3)")
+        raise ValueError(f"frame has the shape {pixels.shape}, expected (H, W, 3)")
     values = pixels / np.float32(255) if pixels.dtype == np.uint8 else np.clip(np.nan_to_num(pixels), 0, 1)
     rgb = values.astype(np.float32, copy=False)
     height, width, _ = rgb.shape
@@ -164,7 +164,7 @@ def _left_sited(chroma: NDArray[Any]) -> NDArray[Any]:
 
 
 def planes_of(path: Path, image: NDArray[Any], alpha: NDArray[Any] | None, prores: ProRes) -> VideoPlanes:
-    """The frame in the form that the encoder of a video of that name takes."""
+    """The frame in the form that the encoder for the video `path` takes."""
     return prores_planes(image, alpha, prores) if path.suffix.lower() == ".mov" else frame_planes(image)
 
 
@@ -180,8 +180,8 @@ def rate_of(fps: float) -> Fraction:
 
 @contextmanager
 def video_writer(path: Path, config: VideoConfig | None = None, comment: str = "") -> Iterator[VideoWriter]:
-    """Context with a writer of a video, which replaces `path` if the block succeeds; after an exception nothing is left
-    there.
+    """Context with a writer of a video. The video replaces `path` if the block succeeds; after an exception `path`
+    stays as it was.
 
     comment: provenance record for the header.
     Raises InputError for another extension, a missing folder, no frames, or if PyAV is not installed.
@@ -243,7 +243,7 @@ class VideoWriter:
         height, width = planes[0].shape if isinstance(planes, tuple) else (planes.shape[0] * 2 // 3, planes.shape[1])
         size = height, width
         if self.frames and size != self._size:
-            raise ValueError(f"a frame of {width}x{height}: expected the first one's {self._size[1]}x{self._size[0]}")
+            raise ValueError(f"frame is {width}x{height}, expected {self._size[1]}x{self._size[0]} like the first one")
         self._size = size
         with self._refusals():
             if self._container is None:
@@ -268,7 +268,7 @@ class VideoWriter:
         if self._comment:
             self._container.metadata["comment"] = self._comment
         if kind == "mov":
-            # Apple's readers expect its vendor code; 16-bit alpha loses nothing
+            # Apple's readers expect Apple's vendor code; 16-bit alpha loses nothing
             options = {
                 "profile": _PRORES_PROFILES[config.prores],
                 "vendor": "apl0",
@@ -305,7 +305,7 @@ class VideoWriter:
     def finish(self) -> None:
         """Flush the encoder and the file to the disk. Raises InputError for a video of no frames."""
         if self.frames == 0:
-            raise InputError(f"{self._path}: a video of no frames, expected at least one")
+            raise InputError(f"{self._path}: the video has no frames, expected at least one")
         with self._refusals():
             self._container.mux(self._stream.encode(None))
             self._container.close()

@@ -39,7 +39,7 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
     pixels = np.asarray(image)
     pixels = pixels[:, :, None] if pixels.ndim == 2 else pixels
     if pixels.ndim != 3 or pixels.shape[2] not in CHANNEL_NAMES_BY_COUNT or 0 in pixels.shape:
-        raise ValueError(f"image {np.shape(image)}: expected (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)")
+        raise ValueError(f"image has the shape {np.shape(image)}, expected (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)")
     if pixels.dtype == np.uint8:
         pixels = pixels.astype(np.float32) / np.float32(255)
     pixels = pixels.astype(np.float32)
@@ -152,7 +152,7 @@ def _write(
                 if kind == "dpx":
                     _without_name(temporary)
                 return
-            reason = "the file is not whole" if written else "; ".join(reasons) or file.geterror()
+            reason = "the file is incomplete" if written else "; ".join(reasons) or file.geterror()
             if error := room_error(temporary.parent):  # OpenImageIO seldom reports the system's error
                 raise OSError(error.errno, error.strerror)
             raise ClsplatError(f"{path}: cannot be written: {plain(one_line(reason))}")
@@ -174,7 +174,7 @@ def _without_name(path: Path) -> None:
 
 
 def _is_whole(path: Path, kind: str, parts: int) -> bool:
-    """True if the end of a written image is there: the last chunk of a PNG, the last row of other formats."""
+    """True if a written image has its end: the last chunk of a PNG, or the last row in other formats."""
     if kind == "png":
         return png_is_whole(path)
     with opened(path) as source:

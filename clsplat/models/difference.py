@@ -27,13 +27,13 @@ def errors(original: Gaussians, read: Gaussians) -> dict[str, dict[str, float]]:
     """Largest and mean error of each attribute in ERROR_UNITS, over all Gaussians.
 
     A position's error is a distance and a rotation's an angle; the others take the largest component. Scale errors
-    compare standard deviations and are fractions of the Gaussian's largest one. The thickness of a disc may be too
-    small to see, and formats clamp it. SH coefficients that only one model has count as 0 in the other.
+    compare standard deviations and are fractions of the Gaussian's largest one, because formats clamp the thickness of
+    discs that are too thin to see. SH coefficients that only one model has count as 0 in the other.
 
     Raises ValueError for models of different sizes.
     """
     if len(original) != len(read):
-        raise ValueError(f"{len(original)} and {len(read)} Gaussians")
+        raise ValueError(f"the models have {len(original)} and {len(read)} Gaussians, expected equal numbers")
     low, high = original.means.min(axis=0).astype(np.float64), original.means.max(axis=0).astype(np.float64)
     extent = float(np.linalg.norm(high - low))
     shift = read.origin - original.origin

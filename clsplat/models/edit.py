@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edits of a model without a device: crop, transform, thin out, merge. Inputs are never changed in place.
+"""Edits of a model that need no device: crop, transform, thin out, merge. Inputs are never changed in place.
 
 A similarity (4, 4) maps the world to a new one: x' = s Q x + t, where Q is a rotation, possibly with a reflection. A
 Gaussian N(m, R S S R^T) becomes N(s Q m + t, Q R s S s S R^T Q^T). Its colour f, a function of the view direction,
@@ -21,7 +21,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 MAX_WORLD_OFFSET_SIZES = 64.0
-"""Largest distance of a transformed model's origin, in standard deviations of its means, that is added to the means
+"""Distance, in standard deviations of a transformed model's means, up to which its origin is added to the means
 (decision 0017)."""
 TRANSFORM_SCALE_LIMITS = (1e-12, 1e12)
 """Smallest and largest scale of a transform; beyond them float32 means would be 0 or infinite."""
@@ -57,7 +57,7 @@ def opaque(gaussians: Gaussians, least: float) -> NDArray[np.bool_]:
 
 
 def drop_sh(gaussians: Gaussians, degree: int) -> Gaussians:
-    """Drop the SH bands above the degree; a model without any is unchanged."""
+    """Drop the SH bands above the degree. A model without such bands is unchanged."""
     return replace(gaussians, sh=np.ascontiguousarray(gaussians.sh[:, : (degree + 1) ** 2]))
 
 
@@ -72,7 +72,7 @@ def without_empty_bands(gaussians: Gaussians) -> Gaussians:
 def exposed(gaussians: Gaussians, gains: Sequence[float]) -> Gaussians:
     """Scale the colours of a model.
 
-    gains: three factors of at least 0, one for each channel, or the nine elements of a colour matrix by rows.
+    gains: three factors of at least 0, one for each channel, or the nine elements of a colour matrix row by row.
     """
     factors = np.asarray(gains, np.float64)
     if len(factors) == 9:
@@ -101,7 +101,7 @@ def faded(gaussians: Gaussians, factor: float) -> Gaussians:
 
 
 def merge(models: Sequence[Gaussians]) -> Gaussians:
-    """Concatenate models. Lower SH degrees are padded with zeros, and means count from the first model's origin.
+    """Concatenate models. Lower SH degrees are padded with zeros, and means become relative to the first origin.
 
     Raises InputError if only some of the models are antialiased, or only some are drawn along rays.
     """
@@ -132,8 +132,8 @@ def merge(models: Sequence[Gaussians]) -> Gaussians:
 def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[float, Float64, Float64]:
     """Scale s, rotation Q (3, 3) and translation t (3,) of a similarity (4, 4).
 
-    slack: tolerance of Q^T Q against the identity.
-    Raises InputError if the matrix is not a similarity.
+    slack: largest allowed difference of Q^T Q from the identity.
+    Raises InputError, whose message continues "has", if the matrix is not a similarity.
     """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise InputError(f"a transform of {matrix.shape}, expected 4 x 4 finite numbers")
@@ -144,7 +144,7 @@ def decompose(matrix: Float64, slack: float = _SIMILARITY_TOLERANCE) -> tuple[fl
     turn = linear / scale
     if (off := float(np.abs(turn.T @ turn - np.eye(3)).max())) > slack:
         raise InputError(
-            f"a transform that is not a similarity (its axes are {off:.2g} off right angles or equal lengths), "
+            f"a transform that is not a similarity (its axes deviate by {off:.2g} from right angles or equal lengths), "
             "expected rotation, one scale and translation"
         )
     u, _, vt = np.linalg.svd(turn)  # the nearest orthogonal matrix
@@ -209,12 +209,12 @@ def transform_camera(camera: Camera, matrix: Float64) -> Camera:
     translation = scale * camera.translation - rotation @ shift
     near = (
         DEFAULT_NEAR_PLANE if camera.near == DEFAULT_NEAR_PLANE else scale * camera.near
-    )  # DEFAULT_NEAR_PLANE stands for the model's, which scales too
+    )  # DEFAULT_NEAR_PLANE stands for the model's near plane, which scales too
     return replace(camera, rotation=rotation, translation=translation, near=near, far=scale * camera.far)
 
 
 def _turned(quaternions: Float32, turn: Float64) -> Float32:
-    """Quaternions w x y z of Q R, lengths kept. A reflection uses -Q, as R S S R^T does not depend on the sign."""
+    """Quaternions w x y z of Q R, lengths unchanged. A reflection uses -Q, as R S S R^T does not depend on the sign."""
     from scipy.spatial.transform import Rotation
 
     proper = turn if np.linalg.det(turn) > 0 else -turn

@@ -37,9 +37,9 @@ class Bounds(TypedDict):
 
 
 class ValueStatistics(TypedDict, total=False):
-    """Statistics of the finite Gaussians; empty without any.
+    """Statistics of the finite Gaussians; empty if there are none.
 
-    scale, opacity: by percentile.
+    scale, opacity: values by the name of the percentile.
     """
 
     bounds: Bounds
@@ -85,7 +85,7 @@ def size(path: Path, form: Format) -> int:
 def _summary(blocks: Iterator[Gaussians], path: Path) -> ModelStatistics:
     """Statistics over all blocks. Warns about doubtful values, as loading does.
 
-    Means, log scales and opacity logits are held for the percentiles: 28 bytes a Gaussian.
+    Means, log scales and opacity logits stay in memory for the percentiles: 28 bytes per Gaussian.
     """
     parts: list[list[Float32]] = []
     not_finite = unturned = degree = used = 0
@@ -166,7 +166,7 @@ def text(info: dict[str, Any]) -> str:
     if info.get("near", DEFAULT_NEAR_PLANE) != DEFAULT_NEAR_PLANE:
         lines.append(("near plane", f"{info['near']:.6g}"))
     if info.get("antialiased"):
-        lines.append(("antialiased", "yes: to be drawn with Mip-Splatting's low-pass"))
+        lines.append(("antialiased", "yes: to be drawn with Mip-Splatting's low-pass filter"))
     if info.get("by_rays"):
         lines.append(("perspective", "along rays, as a fisheye: other programs show a haze"))
     lines.append(("colour space", info["colorspace"]))

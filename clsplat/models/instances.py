@@ -29,8 +29,8 @@ class Placement:
     """Placement of a model at one time.
 
     matrix: first three rows of the (4, 4) matrix from the model's world to the shot's.
-    opacity: factor from 0, hidden, to 1.
-    colour: empty, or the rows of (3, 4), a colour matrix and its offset column.
+    opacity: factor from 0 (hidden) to 1.
+    colour: a colour matrix with its offset column, (3, 4), row by row; empty if colours do not change.
     frame: frame to take from a `ModelSeries`; None for a static model.
     """
 
@@ -45,7 +45,7 @@ class Placement:
         return np.vstack([np.array(self.matrix).reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])
 
     def within(self, outer: Placement) -> Placement:
-        """Placement in the world of `outer`, an enclosing group that is placed too."""
+        """Placement in the world of an enclosing group, whose own placement is `outer`."""
         matrix = self.matrix
         if outer.matrix != IDENTITY_ROWS:
             matrix = rows_of(outer.transform @ self.transform)
@@ -75,7 +75,7 @@ class Track(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Changing:
-    """`Track` of a changing model, whose Gaussians are taken at the frame of its placement."""
+    """`Track` of a model that changes over time: its placements have the frame of the Gaussians."""
 
     inner: Track
 
@@ -104,7 +104,7 @@ def grade(gain: Float64, offset: Float64, saturation: float) -> tuple[float, ...
 
 
 def checked(placement: Placement, where: str) -> Placement:
-    """The placement itself. Raises InputError, prefixed with `where`, if Gaussians cannot follow its transform."""
+    """The placement itself. Raises InputError, prefixed with `where`, if its transform is not a similarity."""
     try:
         decompose(placement.transform, NODE_SIMILARITY_TOLERANCE)
     except InputError as error:
@@ -124,9 +124,8 @@ def placed(gaussians: Gaussians, placement: Placement) -> Gaussians:
 
 
 def gone_on(track: Track, frame: float, end: float) -> Placement:
-    """Placement of a track at a frame beyond `end`, the last or first frame of its reach; it continues its motion
-    there.
-
+    """Placement of a track at a frame beyond `end`, the last or first frame of its reach. The track's motion is
+    continued there.
     A fraction of a frame mirrors the motion just before the end. Each further whole frame repeats the last whole-frame
     step. Cameras continue the same way (`shots.motion`). Opacity and colour come from the track itself. Raises
     InputError for a transform that is no longer invertible.

@@ -19,9 +19,9 @@ from clsplat.files.documents import open_input
 from clsplat.models.formats.usd import USD_SUFFIXES, open_stage, readable, survive
 
 MAX_MESH_TRIANGLES = 100_000
-"""Triangle limit of a volume: each is tested against every Gaussian in the mesh's bounding box."""
+"""Largest number of triangles of a volume: each triangle is tested against every Gaussian in the bounding box."""
 MAX_MESH_POINTS = 1_000_000
-"""Point limit of a file; triangles need not use all points."""
+"""Largest number of points in a file; triangles need not use all points."""
 MAX_MESH_FILE_BYTES = 256 << 20
 _MAX_OBJ_LINE_BYTES = 1 << 16
 _MAX_POINT_TRIANGLE_PAIRS = 1 << 21
@@ -65,8 +65,8 @@ class Mesh:
 def read_mesh(path: Path) -> Mesh:
     """Read the mesh of an OBJ file, or all meshes of a USD stage at its start time, in the stage's world.
 
-    Polygons become triangle fans. Raises InputError for another file type, an unreadable file, and no or too many
-    triangles.
+    Polygons become triangle fans. Raises InputError for another file type, an unreadable file, and for no triangles or
+    too many.
     """
     extension = path.suffix.lower()
     if extension == ".obj":
@@ -75,7 +75,7 @@ def read_mesh(path: Path) -> Mesh:
         survive(path, "clsplat.models.mesh:read_here")
         corners = read_here(path)
     else:
-        raise InputError(f"{path}: expected a mesh, an .obj file or a USD stage")
+        raise InputError(f"{path}: is not a mesh, expected an .obj file or a USD stage")
     if not 1 <= len(corners) <= MAX_MESH_TRIANGLES:
         raise InputError(f"{path}: has {len(corners):,} triangles, expected 1 to {MAX_MESH_TRIANGLES:,}")
     if not np.isfinite(corners).all():
@@ -89,7 +89,7 @@ def _of_obj(path: Path) -> Float64:
     count = 0
     with open_input(path, "a mesh") as file:
         if (size := path.stat().st_size) > MAX_MESH_FILE_BYTES:
-            raise InputError(f"{path}: is of {size:,} bytes, expected a mesh of at most {MAX_MESH_FILE_BYTES:,}")
+            raise InputError(f"{path}: has {size:,} bytes, expected a mesh of at most {MAX_MESH_FILE_BYTES:,}")
         for number, line in enumerate(iter(partial(file.readline, _MAX_OBJ_LINE_BYTES), b""), 1):
             words = line.split()
             try:
@@ -152,5 +152,5 @@ def _fans(path: Path, points: Float64, polygons: list[list[int]]) -> Float64:
     """Corners (T, 3, 3) of the polygons, as triangle fans."""
     fans = [(own[0], one, next_one) for own in polygons for one, next_one in pairwise(own[1:])]
     if fans and not 0 <= min(map(min, fans)) <= max(map(max, fans)) < len(points):
-        raise InputError(f"{path}: has faces with points beyond its {len(points):,}; is it damaged?")
+        raise InputError(f"{path}: has faces with indices beyond its {len(points):,} points; is it damaged?")
     return points[np.array(fans, np.int64).reshape(-1, 3)]

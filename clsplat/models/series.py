@@ -18,24 +18,24 @@ from clsplat.gaussians import Gaussians
 from clsplat.models.edit import take
 
 CACHED_SAMPLES_SINGLE, CACHED_SAMPLES_PAIR = 2, 3
-"""Samples held after a request for one sample, or for two neighbours; both include the one that is read ahead."""
+"""Number of cached samples after a request for one sample, or for two neighbours, including the next one to come."""
 MAX_TRACKED_CHANGE_RATIO = 0.25
-"""Largest ratio of the median change of a row to the median difference of two rows at which Gaussians keep their rows
-between two samples.
+"""Largest ratio, between two samples, of the median change of a row to the median difference of two rows, for which
+each row counts as the same Gaussian in both samples.
 
 Tested separately for means, scales and colours. Tracked models are at a few hundredths. Models trained separately are
 at about 1, for scales even if their Gaussians are sorted by position.
 """
 TRACKING_TEST_ROWS = 10_000
-"""Rows compared in that test, spread evenly."""
+"""Number of evenly spread rows that this test compares."""
 
 
 class ModelSeries:
     """Gaussians that change over time. Thread-safe.
 
     At a sample's frame they are that sample. Between two samples they are interpolated, means linearly, if Gaussians
-    keep their rows; otherwise the nearer sample is used. Beyond the ends they are the end sample; unless `held`, its
-    means continue their motion, mirrored.
+    keep their rows; otherwise the nearer sample is used. Beyond the ends the end sample is used. Unless `held` is
+    set, its means continue their motion, which is mirrored at the end.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ModelSeries:
         self._known[0].set_result(first)
 
     def at(self, frame: float) -> Gaussians:
-        """Gaussians at a frame. Raises InputError if a sample cannot be read, or is drawn otherwise than the first."""
+        """Gaussians at a frame. Raises InputError if a sample cannot be read, or is not drawn like the first."""
         with self._lock:
             inside = min(max(frame, self.frames[0]), self.frames[-1])
             if inside != frame and not self.held:
@@ -80,7 +80,7 @@ class ModelSeries:
     def moved(self, start: float, end: float) -> Gaussians:
         """Gaussians at `start` with their means at `end`.
 
-        If Gaussians do not keep their rows between the two, they keep their means, and a warning is given.
+        If Gaussians do not keep their rows between the two frames, they keep their means, and a warning is given.
         """
         with self._lock:
             there = self.at(start)
@@ -125,9 +125,9 @@ class ModelSeries:
         self._wanted = sorted({*self._wanted, *wanted})
 
     def _sample(self, index: int, most: int = CACHED_SAMPLES_PAIR) -> Gaussians:
-        """Sample from memory or its file; starts to read the next expected one.
+        """Get a sample from memory or its file, and start to read the next expected sample.
 
-        most: samples to hold; the least recently requested are dropped.
+        most: number of samples to keep in memory; the least recently requested ones are dropped.
         """
         future = self._future(index)
         self._known.move_to_end(index)

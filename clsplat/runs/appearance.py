@@ -20,10 +20,10 @@ from clsplat.runs.run import Run, run_of
 MAX_APPEARANCE_BYTES = 1 << 28
 MAX_LOG2_GAIN = 16.0
 MAX_CHANNEL_MIX = 0.25
-"""Exclusive limit of a mix's magnitude. Below it the matrix of any six mixes can be inverted."""
+"""Exclusive limit of the magnitude of a channel mix. Below it the matrix of any six mixes can be inverted."""
 KINDS_WITH_GAINS = ("exposure", "ppisp")
-"""Settings of --appearance whose files have gains, which a render can take."""
-EXPECTED_APPEARANCE_FILE = "what clsplat train --appearance writes"
+"""Settings of --appearance whose files have gains, which a render can apply."""
+EXPECTED_APPEARANCE_FILE = "a file that clsplat train --appearance writes"
 
 MAX_CENTRE_PICTURE_SIZES = 100.0
 """Limit of a vignette centre's coordinates, in picture widths and heights."""
@@ -39,7 +39,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
     """Gains, or a colour matrix, that give a run's model the appearance of one photograph.
 
     model: the run's folder, or a file in it.
-    photograph: its name in the data set, or the end of it from a folder boundary, with or without extension.
+    photograph: its name in the data set, with or without leading folders and extension.
     Returns three gains, or the nine entries of a 3 x 3 matrix by rows if channels mix.
     A held-out photograph has the gains that follow from its EXIF, or 1, and no mixes.
     Raises InputError.
@@ -54,17 +54,17 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
     kind = _kind(path)
     if isinstance(kind, str) and kind not in KINDS_WITH_GAINS:
         raise InputError(
-            f"--appearance {photograph}: {path} is of --appearance {kind}, which is for training alone; expected a run "
+            f"--appearance {photograph}: {path} is of --appearance {kind}, which is only for training; expected a run "
             f"of clsplat train --appearance {' or '.join(KINDS_WITH_GAINS)}"
         )
     rows = _read(path, "photographs") | _read(path, "held_out")
     found = [name for name in rows if photograph in (name, *_ends(name))]
     if len(found) > 1 and photograph not in found:
-        raise InputError(f"--appearance {photograph}: is {len(found)} photographs, {examples(found)}; name one of them")
+        raise InputError(f"--appearance {photograph}: fits {len(found)} photographs, {examples(found)}; name one")
     if not found:
         near = get_close_matches(photograph, rows, 3, 0.0)
         raise InputError(
-            f"--appearance {photograph}: is no photograph of {path}, expected one of its {len(rows)}, such as "
+            f"--appearance {photograph}: is not a photograph in {path}, expected one of its {len(rows)}, such as "
             f"{examples(near)}"
         )
     row = rows[photograph if photograph in found else found[0]]
@@ -74,7 +74,7 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 
 def looks_of_run(run: Run | None) -> Look:
-    """The `held_out_looks` of a run that has an appearance.json; else looks that change nothing. Raises InputError."""
+    """`held_out_looks` of a run's appearance.json. Without this file the looks change nothing. Raises InputError."""
     return _looks(_read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {})
 
 
@@ -177,5 +177,5 @@ def _row(record: Any) -> Row:
 def _numbers(name: str, values: Any, count: int, most: float) -> Float64:
     numbers = [float(value) for value in values] if isinstance(values, list) else []
     if len(numbers) != count or not all(math.isfinite(value) and abs(value) <= most for value in numbers):
-        raise ValueError(f"{name} of {values}")
+        raise ValueError(f"{name} is {values}")
     return np.array(numbers)

@@ -53,7 +53,7 @@ class Checkpoint:
 
 def unusable(checkpoint: Checkpoint, why: str) -> InputError:
     """Error for a checkpoint that is intact but cannot be resumed from."""
-    advice = "is it of another run or version?"
+    advice = "is it from another run or version?"
     return InputError(f"checkpoint of step {checkpoint.step}: {why}; {advice}")
 
 
@@ -69,7 +69,7 @@ def read_arrays(path: Path, expected: str) -> Arrays:
 
     expected: as in `open_input`.
     Raises ValueError, InputError or an error of zipfile if the file is anything else.
-    np.load is not used: it trusts the array size in the header, and it decompresses.
+    np.load is not used: it trusts the array size in the header, and it decompresses members.
     """
     arrays: Arrays = {}
     with open_input(path, expected) as file, ZipFile(_Bounded(file)) as archive:
@@ -99,7 +99,7 @@ def write_checkpoint(path: Path, step: int, arrays: Mapping[str, NDArray[Any]], 
 
 
 def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
-    """Read a checkpoint and check that it is the one that `write_checkpoint` wrote, and that it is of step `expected`
+    """Read a checkpoint. Checks that its arrays are as `write_checkpoint` wrote them, and that its step is `expected`
     if that is given.
 
     Raises ValueError, InputError or an error of zipfile.
@@ -107,7 +107,7 @@ def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
     arrays = read_arrays(path, "a checkpoint")
     record = parse_json(arrays.pop(STATE_KEY).tobytes())
     if not isinstance(record, dict) or type(step := record.get("step")) is not int or step < 0:
-        raise ValueError("its state names no step")
+        raise ValueError("its state has no step")
     if not isinstance(state := record.get("state"), dict):
         raise ValueError("its state is missing")
     digests = record.get("sha256")  # earlier versions wrote no digests

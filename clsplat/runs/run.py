@@ -79,7 +79,7 @@ class Run:
                 if (was := earlier.config.background) != config.background:
                     warn(
                         f"{path}: the background was {was} so far and is {config.background} from here on: "
-                        "Gaussians that stand for the old one have to be learnt anew"
+                        "Gaussians that imitate the old background have to be learnt anew"
                     )
                 scene = scene or earlier.scene
             elif overwrite and is_run(path):
@@ -97,7 +97,7 @@ class Run:
         if not path.is_dir():
             raise InputError(f"{path}: no such folder, expected a run")
         if not is_run(path):
-            raise InputError(f"{path}: not a run (no config.toml of clsplat in it)")
+            raise InputError(f"{path}: is not a run (no config.toml of clsplat in it)")
         config, scene = read_config(path / "config.toml")
         return cls(path, config, scene)
 
@@ -128,14 +128,14 @@ class Run:
     def model_record(self) -> dict[str, Any]:
         """The `step` and `seconds` of model.ply, if known.
 
-        They come from eval.json, which is written after the model: a run that was resumed and stopped has later
-        metrics.
+        They come from eval.json, which is written after the model. The last metrics may be later than the model, in a
+        run that was resumed and stopped.
         An eval.json older than the model describes an earlier model, as after an interrupted evaluation.
-        Then the last record of metrics.jsonl is used.
+        In that case, or without a usable eval.json, the last record of metrics.jsonl is returned.
         """
         with suppress(OSError, ValueError, InputError):
             if self.eval_path.stat().st_mtime_ns < self.model_path.stat().st_mtime_ns:
-                raise ValueError("of an earlier model")
+                raise ValueError("eval.json is older than model.ply")
             record = parse_json(read_document(self.eval_path, "the evaluation of a run"))
             if isinstance(record, dict) and type(record.get("step")) is int:
                 return record
@@ -180,7 +180,7 @@ class Run:
         """Write checkpoints/step-STEP.npz atomically and keep the latest two.
 
         arrays, state: as in `write_checkpoint`.
-        Checkpoints of later steps are removed, because training has gone back before them.
+        Checkpoints of later steps are removed, because training has gone back to an earlier step.
         """
         self.checkpoints_path.mkdir(parents=True, exist_ok=True)
         path = self.checkpoints_path / f"step-{step:07d}.npz"
@@ -193,7 +193,7 @@ class Run:
         return path
 
     def checkpoints(self) -> list[tuple[int, Path]]:
-        """Step and path of every checkpoint, by step."""
+        """Step and path of every checkpoint, in the order of the steps."""
         matches = [(re.fullmatch(r"step-(\d+)\.npz", path.name), path) for path in self.checkpoints_path.glob("*.npz")]
         return sorted((int(match[1]), path) for match, path in matches if match)
 
@@ -212,11 +212,11 @@ class Run:
                 break
             except Exception as error:  # noqa: BLE001  # zipfile and NumPy raise nearly any exception for a flipped bit
                 why = str(error) or type(error).__name__
-                warn(f"{path}: checkpoint is damaged and was passed over ({why})")
+                warn(f"{path}: is a damaged checkpoint and is skipped ({why})")
         if checkpoints and checkpoint is None:
-            raise InputError(f"{self.checkpoints_path}: no checkpoint there is whole, use --overwrite to start again")
+            raise InputError(f"{self.checkpoints_path}: has no intact checkpoint, use --overwrite to start again")
         if checkpoint is None and (lost := max((record.get("step", 0) for record in self.read_metrics()), default=0)):
-            warn(f"{self.path}: has no checkpoint: training begins again, the {lost} steps before are lost")
+            warn(f"{self.path}: has no checkpoint: training starts again, and the {lost} earlier steps are lost")
         if self.resuming:
             for left in self.path.rglob(".*" + TEMPORARY_SUFFIX):
                 remove(left)
@@ -258,7 +258,7 @@ def check_output(path: Path, *, resume: bool, overwrite: bool) -> None:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, expected a folder for the run")
     if resume and not is_run(path):
-        raise InputError(f"{path}: no run to resume there (no config.toml of clsplat)")
+        raise InputError(f"{path}: has no run to resume (no config.toml of clsplat)")
     if is_run(path):
         if not (resume or overwrite):
             raise InputError(f"{path}: is already a run, use --resume to go on with it or --overwrite to replace it")
@@ -291,4 +291,4 @@ def check_resumed(earlier: Run, config: TrainConfig) -> None:
     for name in (*of_model, "refine_poses", "refine_lenses"):
         was, now = getattr(earlier.config, name), getattr(config, name)
         if was != now:
-            raise InputError(f"{earlier.config_path}: {name} is {was} there, a resumed run cannot change it to {now}")
+            raise InputError(f"{earlier.config_path}: {name} is {was}, a resumed run cannot change it to {now}")

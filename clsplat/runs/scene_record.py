@@ -28,13 +28,13 @@ MAX_SCENE_RECORD_BYTES = 256 << 20
 """Size limit of scene.json in bytes, enough for some hundred thousand views."""
 CAMERA_RELATIVE_TOLERANCE = 1e-6
 """Relative difference up to which camera parameters count as equal, as another version may round differently."""
-_EXPECTED_SCENE_RECORD = "what a run knows of its scene"
+_EXPECTED_SCENE_RECORD = "the record of a run's scene"
 
 
 def record_of(scene: Scene, resolution: int) -> dict[str, Any]:
     """Content of scene.json. Reads every photograph that has no digest yet.
 
-    resolution: the setting.
+    resolution: value of the setting `resolution`.
     """
     points = hashlib.blake2b(np.ascontiguousarray(scene.points, "<f8").tobytes(), digest_size=16)
     points.update(np.ascontiguousarray(scene.point_colors, "<f4").tobytes())
@@ -102,7 +102,7 @@ def read(run: Run) -> dict[str, Any] | None:
             assert all(len(np.array(view[key], float)) == n for key, n in (("size", 2), ("lens", 4), ("pose", 12)))
             assert "radial" not in view or ("projection" in view and len(np.array(view["radial"], float)) == 4)
     except (ValueError, KeyError, TypeError, AttributeError, AssertionError) as error:
-        why = str(error) or "not of its form"
+        why = str(error) or "its form is wrong"
         raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED_SCENE_RECORD}; {advice}") from None
     return dict(record)
 
@@ -133,9 +133,9 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
     was, new, resized = earlier["views"], now["views"], earlier["resolution"] != now["resolution"]
     held_out = "held out in one and not in the other"
     changed: dict[str, list[str]] = {
-        "not there any more": [name for name in was if name not in new],
+        "missing now": [name for name in was if name not in new],
         "new": [name for name in new if name not in was],
-        **{what: [] for what in ("another photograph", "another camera", "another size", held_out)},
+        **{what: [] for what in ("with another photograph", "with another camera", "with another size", held_out)},
     }
     both = [name for name in was if name in new]
     for name in both:
@@ -144,11 +144,11 @@ def differences(earlier: dict[str, Any], now: dict[str, Any]) -> list[str]:
         turned = not (_close(a["pose"][:9], b["pose"][:9]) and _close(a["pose"][9:], b["pose"][9:]))
         bent = "radial" in a and (a["projection"] != b.get("projection") or not _close(a["radial"], b["radial"]))
         if turned or bent or (a["size"] == b["size"] and not _close(a["lens"], b["lens"])):
-            changed["another camera"].append(name)
+            changed["with another camera"].append(name)
         elif a["size"] != b["size"] and not resized:
-            changed["another size"].append(name)
+            changed["with another size"].append(name)
         if a["blake2b"] != b["blake2b"] and (same_file or not resized):
-            changed["another photograph"].append(name)
+            changed["with another photograph"].append(name)
         if a["split"] != b["split"]:
             changed[held_out].append(name)
     changes = [_listed(what, names) for what, names in changed.items() if names]
@@ -197,9 +197,8 @@ def keep(run: Run, scene: Scene, *, resuming: bool) -> None:
         return
     if known is None and resuming and run.checkpoints():
         warn(
-            f"{run.path}: has no {SCENE_RECORD_FILE_NAME}, as runs of earlier versions: it is not known whether this "
-            "is the scene that "
-            "it began with; from now on it will be"
+            f"{run.path}: has no {SCENE_RECORD_FILE_NAME}, like runs of earlier versions: it is not known whether this "
+            "is the scene that it began with; this scene is recorded now"
         )
     write(run, scene)
 
@@ -217,7 +216,8 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
         view.name
         for view in known
         if (was[view.name]["file"], was[view.name]["folder"]) == (view.path.name, view.path.parent.name)
-        and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")  # without the mask's
+        # the first word is the digest of the photograph alone, without its mask
+        and (was[view.name]["blake2b"] or "").partition(" ")[0] != (short_digest(view.path) or "")
     ]
     reasons = []
     if seen:
@@ -225,7 +225,7 @@ def of_evaluation(run: Run, views: Sequence[View]) -> list[str]:
     if changed:
         reasons.append(_listed("with another photograph than in training", changed))
     if was and not known:
-        reasons.append(f"none of the views is of the scene that {run.path} began with")
+        reasons.append(f"none of the views belongs to the scene that {run.path} began with")
     return reasons
 
 
@@ -236,5 +236,5 @@ def _close(a: list[float], b: list[float]) -> bool:
 
 
 def _listed(what: str, names: list[str]) -> str:
-    """Text such as "3 views not there any more (a.png, b.png, c.png)"."""
+    """Text such as "3 views missing now (a.png, b.png, c.png)"."""
     return f"{len(names):,} {'view' if len(names) == 1 else 'views'} {what} ({examples(names)})"

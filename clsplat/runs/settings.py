@@ -73,11 +73,11 @@ def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as TOML ({error})") from None
+        raise InputError(f"{path}: is not readable as TOML ({error})") from None
     for key in document:
         if key not in ("clsplat", "scene", "train"):
             raise InputError(
-                f"{path}: has {key!r}, which is no setting; expected clsplat, scene and the tables of train"
+                f"{path}: has {key!r}, which is no setting; expected only clsplat, scene and the tables of train"
             )
     scene = document.get("scene")
     if scene is not None and not (isinstance(scene, str) and scene):
@@ -85,7 +85,7 @@ def parse_config(text: str, path: Path) -> tuple[TrainConfig, Path | None]:
     passed_over: list[str] = []
     config = _from_table(TrainConfig, document.get("train", {}), path, "train", passed_over)
     if passed_over:
-        _warn_once(plain(f"{path}: passed over, as this version has no such setting: {', '.join(passed_over)}"))
+        _warn_once(plain(f"{path}: has settings that this version lacks, which are ignored: {', '.join(passed_over)}"))
     try:
         config.check()
     except InputError as error:
@@ -133,7 +133,7 @@ def _meant(key: str, where: str) -> str:
     near = get_close_matches(key, here, 1) or get_close_matches(key, places, 1)
     if near:
         return f"did you mean {near[0]!r} in [{places[near[0]]}]?"
-    return "take it out: was it written by another version?"
+    return "remove it; was it written by another version?"
 
 
 @cache

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Default cameras for a model without camera files.
 
-An orbit follows from where the Gaussians are and how much detail they show. If a run knows the photographs' own
-cameras, a path can go among those instead.
+An orbit follows from where the Gaussians are and how much detail they show. If a run has recorded the
+photographs' own cameras, a path can go among those instead.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ ORBIT_FRAMING_MARGIN = 1.1
 """Radius that a picture shows, relative to the subject's radius, since strays lie beyond the subject."""
 RING_ELEVATIONS_RADIANS = (math.radians(20.0), math.radians(5.0), math.radians(40.0))
 """Elevations of the camera rings, in radians. A turntable follows the first ring; a spiral rises and sinks between the
-others."""
+other two."""
 CAMERAS_PER_RING = 24
 """Number of cameras in a ring."""
 
 
 def parse_up(text: str) -> tuple[float, float, float]:
-    """Unit vector for an axis such as `x` or `-y`, or for three numbers with commas. Raises InputError."""
+    """Unit vector for an axis such as `x` or `-y`, or for three numbers separated by commas. Raises InputError."""
     expected = InputError(f"--up {text[:80]}: expected x, y, z, -x, -y, -z or three numbers with commas, not all 0")
     name, sign = text.strip().removeprefix("-"), -1.0 if text.strip().startswith("-") else 1.0
     if name in ("x", "y", "z"):
@@ -105,7 +105,7 @@ def among(own: Sequence[Camera], size: tuple[int | None, int | None] = (None, No
 
     size: width and height in pixels. If both are given, the field of view is the largest that fits into the
       photographs'. Otherwise the pictures keep the photographs' aspect ratio.
-    Photographs that are not perspective are replaced by pinholes with the default field of view.
+    Cameras that are not perspective are replaced by pinholes with the default field of view.
     """
     far = stray_cameras(own)
     return [_pinhole(camera, size) for camera, stray in zip(own, far, strict=True) if not stray]

@@ -137,7 +137,7 @@ def output_paths(pattern: str, frames: Sequence[tuple[int, str]]) -> list[Path]:
     for frame, name in frames:
         path = path_of(pattern, frame, name)
         if (key := identity(path)) in taken:
-            raise InputError(f"{path}: would be both {taken[key]} and {name}")
+            raise InputError(f"{path}: would be the file of both {taken[key]} and {name}")
         taken[key] = name
         paths.append(path)
     return paths

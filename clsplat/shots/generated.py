@@ -96,18 +96,18 @@ MAX_SPIRAL_ELEVATION_RADIANS = np.deg2rad(85.0)
 """Largest elevation of a spiral, in radians. A level camera that looks straight up or down has no defined right
 axis."""
 SMOOTHING_NEIGHBOURS = 3
-"""Number of neighbours on each side that are used to smooth a camera, which removes the hand's jitter from photograph
-to photograph."""
+"""Number of neighbours on each side that are used to smooth a camera, which removes the hand's jitter between
+photographs."""
 
 
 def spiral(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """A closed path of two turns that rises and sinks over the cameras' range of heights, facing their focus point.
 
-    Coordinates are spherical about `focus_point`. At the cameras' median distance, the elevation goes from its 10th to
-    its 90th percentile and back. If the cameras leave a wide gap, the azimuth swings over the arc that they cover, once
-    per turn, a quarter turn behind the elevation. This gives an ellipse in front of the scene, on which the distance
-    also goes from its 10th to its 90th percentile and back. Intrinsics are the first camera's. Raises ValueError for no
-    cameras or no frames.
+    Coordinates are spherical about `focus_point`. At the cameras' median distance, the path goes from the 10th to the
+    90th percentile of their elevations and back. If the cameras leave a wide gap, the azimuth swings over the arc that
+    they cover, once per turn, a quarter turn behind the elevation. This gives an ellipse in front of the scene, on
+    which the distance also goes from the 10th to the 90th percentile and back. Intrinsics are the first camera's.
+    Raises ValueError for no cameras or no frames.
     """
     _check("spiral", cameras, frames)
     ring = _ring(cameras)

@@ -22,9 +22,9 @@ length from its ends. For a scalar it is the largest limit at which a cubic is a
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """A camera at a frame, which need not be whole.
+    """A camera at a frame number, which may be fractional.
 
-    roll: rotation about the camera's own z axis in radians, after its other rotation.
+    roll: additional rotation about the camera's own z axis, in radians.
     """
 
     frame: float
@@ -44,7 +44,7 @@ def interpolate(keys: Sequence[Key], frames: Sequence[float], *, loop: float | N
         raise ValueError("expected at least one key")
     times = np.array([key.frame for key in keys], np.float64)
     if not (np.diff(times) > 0).all() or (loop is not None and not times[-1] - times[0] < loop):
-        raise ValueError("expected keys whose frames rise, within the loop where there is one")
+        raise ValueError("expected keys at rising frames, which span less than the loop if there is one")
     at = np.asarray(frames, np.float64)
     positions = np.stack([key.camera.position for key in keys])
     rotations = Rotation.from_matrix(np.stack([key.camera.rotation.T for key in keys]))
@@ -105,7 +105,7 @@ def tangents(times: Float64, slopes: Float64) -> Float64:
     result = np.concatenate([slopes[:1], slopes[-1:]])
     if len(slopes) > 1:
         inner = (after * slopes[:-1] + before * slopes[1:]) / (before + after)
-        # at an end the same parabola, unless it starts backwards
+        # at an end, the slope of the same parabola, unless it points backwards
         first = ((2 * before[0] + after[0]) * slopes[0] - before[0] * slopes[1]) / (before[0] + after[0])
         last = ((2 * after[-1] + before[-1]) * slopes[-1] - after[-1] * slopes[-2]) / (before[-1] + after[-1])
         first = first if first @ slopes[0] > 0 else np.zeros_like(first)

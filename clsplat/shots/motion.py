@@ -26,7 +26,7 @@ class Moments:
     """Cameras of one frame at several times, evaluated in advance for processes that do not have the shot's source.
 
     first: the camera at the first time.
-    times: (T,), rising, in frames from the frame.
+    times: (T,), rising, in frames relative to the frame.
     values: (T, 18), the quantities that change over time: fx, fy, cx, cy, near, far, rotation (9) and translation (3).
     """
 
@@ -36,7 +36,7 @@ class Moments:
 
     @classmethod
     def of(cls, moment: Callable[[float], Camera], times: Iterable[float]) -> Moments:
-        """Evaluate the camera at each of the times. Raises InputError if they differ in projection."""
+        """Evaluate the camera at each of the times. Raises InputError if the cameras differ in projection."""
         rising = np.unique(np.array(list(times), np.float64))
         cameras = [moment(float(time)) for time in rising]
         for time, camera in zip(rising, cameras, strict=True):
@@ -69,8 +69,8 @@ def _values(camera: Camera) -> Float64:
 def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: Iterable[float]) -> Moments:
     """Cameras of a shot that has `moment`, evaluated around the frame `number`.
 
-    times: times in frames from that frame. Times between the first and the last at which the source has values are
-    added.
+    times: times in frames relative to that frame. Times at which the source has values are added if they lie
+    between the first and the last of these.
     """
     assert shot.moment is not None
     moment, wanted = shot.moment, list(times)
@@ -125,7 +125,7 @@ def stretches(
 ) -> Callable[[int], Shot | None]:
     """A function from a frame's number to the part of the shot that its shutter covers, None if nothing can move.
 
-    opens, closes: times of the shutter, in frames from the frame.
+    opens, closes: times at which the shutter opens and closes, in frames relative to the frame.
     motion, backward: also cover the middle of the next frame's shutter, or of the previous frame's.
     The part's frame numbers count from the given frame. Before its first and after its last frame, the shot is
     extrapolated, as for motion. Raises InputError if the frames' pictures differ in size or projection, as one moving

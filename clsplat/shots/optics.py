@@ -20,7 +20,7 @@ MAX_TIME_CODE_FPS = 30
 class Optics:
     """Shutter and lens at a frame.
 
-    shutter: opening and closing time, in frames from the frame.
+    shutter: opening and closing time, in frames relative to the frame.
     f_stop: f-number, 0 for a pinhole.
     focus: focus distance in world units, 0 if it is not set.
     focal_length: focal length in world units.
@@ -56,7 +56,7 @@ class Optics:
 
 
 def settled(flags: SamplingConfig, optics: Optics | None, camera: Camera) -> SamplingConfig:
-    """Shutter and lens of a frame: the flags, with settings that they leave open taken from the stage.
+    """Shutter and lens of a frame: settings of the flags, and settings of the stage that no flag gives.
 
     The lens size becomes an aperture radius, unless flags give the sensor width or the metres per unit.
     """

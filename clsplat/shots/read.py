@@ -31,7 +31,7 @@ from clsplat.shots.shot import MAX_SHOT_FRAMES, Frame, Shot, named, numbered, ph
 from clsplat.shots.viewpoints import COLMAP_UP
 
 DEFAULT_PATH_FRAMES = 120
-"""Frames of a generated path: five seconds at 24 fps."""
+"""Default number of frames of a generated path: five seconds at 24 fps."""
 EXPECTED_CAMERA_SOURCES = (
     "a COLMAP model's folder, a transforms.json, a nerfstudio camera_path.json, a cameras.json of a 3DGS training, a "
     "clsplat camera file (.json) or a USD stage"
@@ -84,7 +84,7 @@ def choose_shot(
     path: turntable, spiral or through, for `count` frames of a path generated from the cameras; None for the cameras
       themselves.
     applied: names of the stage's settings that the call applies elsewhere, so that they need no warning.
-    distort: use the photographs' cameras as they were taken, including their lenses.
+    distort: use the photographs' own cameras, including the distortion of their lenses.
     Raises InputError.
     """
     if count is not None and path is None:
@@ -117,8 +117,8 @@ def _without_strays(frames: Sequence[Frame], source: Path) -> tuple[list[Camera]
     if not far.any():
         return near, ()
     names = examples(frame.name for frame, stray in zip(frames, far, strict=True) if stray)
-    text = f"{source}: the cameras of {names} stand over {OUTLIER_DISTANCE_RATIO:g} times as far off as the others"
-    return near, (f"{text}, and the path is made of the others",)
+    text = f"{source}: the cameras of {names} are over {OUTLIER_DISTANCE_RATIO:g} times as far away as the others"
+    return near, (f"{text}, and the path is made without them",)
 
 
 def photographed(path: Path, size: tuple[int | None, int | None] = (None, None)) -> list[PosedImage]:
@@ -204,7 +204,7 @@ def _read_folder(path: Path, size: tuple[int | None, int | None], lenses: Lenses
         model = find_model(path)
         if model is None or "colmap" in model.relative_to(path).parts:
             if listed != ["transforms.json"]:
-                raise InputError(f"{path}: holds {examples(listed)}, expected one of them to be named by --cameras")
+                raise InputError(f"{path}: holds {examples(listed)}, expected --cameras to name one of them")
             return _read_json(path / listed[0], size, lenses)
     if is_file(path / CAMERAS_JSON_NAME) and find_model(path) is None:
         return _read_json(path / CAMERAS_JSON_NAME, size, lenses)

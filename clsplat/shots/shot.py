@@ -46,7 +46,7 @@ class Shot:
     frames: frames in rising order of their numbers.
     warnings: one line each, for the user.
     fps: frames per second, if the source gives it.
-    unapplied: settings of the source that no frame shows.
+    unapplied: names of the source's settings that are not applied to the frames.
     moment: the camera at a time in frames, if the source defines one for every time.
     authored: rising times at which the source has values.
     reach: first and last time at which the source has values for the camera's transform.
@@ -84,7 +84,7 @@ class Shot:
         wanted = parse_frames(text)
         numbers = {frame.number for frame in self.frames}
         missing = [number for number in wanted if number not in numbers]
-        have = f"there are the frames {ranges(sorted(numbers))}"
+        have = f"the shot has the frames {ranges(sorted(numbers))}"
         if len(missing) == len(wanted):
             raise InputError(f"--frames {text}: holds none of the frames to render, expected some; {have}")
         asked = set(wanted)
@@ -116,12 +116,12 @@ class Shot:
             kind, wanted = frame.camera.projection, before.camera.projection
             if kind != wanted:
                 raise InputError(
-                    f"--channels {moving[0]}: frame {frame.number} is {kind}, expected {wanted} as frame "
-                    f"{before.number} is"
+                    f"--channels {moving[0]}: frame {frame.number} is {kind}, expected {wanted} like "
+                    f"frame {before.number}"
                 )
 
     def at(self, frame: float) -> Camera:
-        """The camera at a frame number that need not be whole, such as a time while the shutter is open.
+        """The camera at a frame number that may be fractional, such as a time while the shutter is open.
 
         The camera is interpolated as between key frames.
         """

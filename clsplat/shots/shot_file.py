@@ -63,7 +63,7 @@ class AnimatedProperty:
     def at(self, frame: float, *, held: bool) -> Float64:
         """Value (d,) at a frame, interpolated linearly between keys.
 
-        held: take the value of the last key instead, and the first key's before that.
+        held: instead take the value of the latest key; before the first key, the first key's.
         """
         if held:
             return np.asarray(self.values[max(int(np.searchsorted(self.frames, frame, side="right")) - 1, 0)])
@@ -121,7 +121,7 @@ class KeyedTrack:
 
 
 def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
-    """Matrix (4, 4) at a frame, interpolated from a channel of matrices; at a key, the key's own.
+    """Matrix (4, 4) at a frame, interpolated from a channel of matrices; at a key, the key's matrix.
 
     Translation and the logarithm of the scale are interpolated linearly, rotation along the shorter arc.
     """
@@ -146,7 +146,7 @@ def _between(channel: AnimatedProperty, frame: float, *, held: bool) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Within:
-    """A `Track` inside another, which is placed as well."""
+    """A `Track` relative to an outer track, which moves it along."""
 
     inner: Track
     outer: Track
@@ -315,7 +315,7 @@ def _numbers(where: str, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not np.isfinite(values).all():
-        expected = f"{count} numbers with commas" if count > 1 else "one number: a model has the same in all directions"
+        expected = f"{count} numbers with commas" if count > 1 else "one number, the same scale in all directions"
         raise InputError(f"{where}: expected {expected}, found {short(text.strip())}")
     return values
 

@@ -42,7 +42,7 @@ class StageTrack:
     """The `Track` of a prim.
 
     where: prefix of error messages.
-    held: the stage, kept here because USD closes it with its last reference.
+    held: the stage, held here because USD closes it with its last reference.
     """
 
     where: str
@@ -50,8 +50,7 @@ class StageTrack:
     held: Any
 
     def at(self, frame: float) -> Placement:
-        """World transform and visibility at a time code. Raises InputError for a transform that Gaussians cannot
-        follow."""
+        """World transform and visibility at a time code. Raises InputError if the transform is not a similarity."""
         from pxr import Usd
 
         matrix, shown = self.place.at(Usd.TimeCode(frame))
@@ -68,7 +67,7 @@ class StageTrack:
 class StageModels:
     """The Gaussians of a stage in their own coordinates, one model per prim, and one per instance of an instanced prim.
 
-    names: names of the models' places in the stage.
+    names: name of each model's prim or instance, as in `UsdPlacement`.
     digest: SHA-256 of the data that they are read from.
     space: their colour space.
     """
@@ -119,7 +118,7 @@ def read_here(path: Path) -> StageModels | None:
             elif place.seat is not None:
                 sums.update(f"again {list(known).index(own)}\n".encode())
         models = tuple(known[place.prim.GetPath()] for place in places)
-        if any(isinstance(model, ModelSeries) for model in models):  # samples are read when they are drawn
+        if any(isinstance(model, ModelSeries) for model in models):  # samples are not read yet: digest the files
             for name in sorted(str(layer.realPath) for layer in layers):
                 sums.update(digest(Path(name)).encode() if name else b"")
         tracks: list[Track] = [StageTrack(f"{path}: {place.name}", place, stage) for place in places]

@@ -35,8 +35,9 @@ def look_at(position: Float64, target: Float64, up: Float64) -> tuple[Float64, F
 def up_axis(cameras: Sequence[Camera]) -> Float64:
     """Estimate the world's up direction, a unit vector (3,), from how the photographers held their cameras.
 
-    People hold cameras level, tilted up or down, so up is the direction most nearly at right angles to every camera's x
-    axis. If these axes do not span a plane (all photographs from one side), up is the mean of the cameras' up axes.
+    People tilt cameras up and down but hold them level sideways, so up is the direction most nearly at right angles to
+    every camera's x axis. If these axes do not span a plane (all photographs from one side), up is the mean of the
+    cameras' up axes.
     """
     right = np.stack([camera.rotation[0] for camera in cameras])
     mean_up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
@@ -52,7 +53,7 @@ def focus_point(cameras: Sequence[Camera]) -> Float64:
     """The point (3,) that the cameras look at: the least-squares nearest point to all optical axes.
 
     If the axes are nearly parallel, or most cameras have the point behind them, it is a point ahead of the cameras
-    instead, as far away as they are spread.
+    instead, at a distance equal to their spread.
     """
     positions = np.stack([camera.position for camera in cameras])
     forward = np.stack([camera.rotation[2] for camera in cameras])

@@ -140,7 +140,7 @@ def test_warnings_are_lines(model: str, folder: str, pipeline: Pipeline, capsys:
     with open(model, "ab") as file:
         file.write(b"more")
     assert pipeline.main(["eval", model, "--scene", folder]) == 0
-    assert f"clsplat: warning: {model}: 4 bytes after the last Gaussian ignored\n" in capsys.readouterr().err
+    assert f"clsplat: warning: {model}: 4 bytes after the last Gaussian are ignored\n" in capsys.readouterr().err
 
 
 def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:

@@ -111,7 +111,7 @@ def test_render_of_a_camera_path(model: str, pipeline: Pipeline, tmp_path: Path,
     assert pipeline.calls[3:] == [("render", 4, 80, 60, (0, 0, 0))]
     captured = capsys.readouterr()
     assert captured.err == (
-        "clsplat: warning: --frames 12-13: 1 of these frames do not exist; there are the frames 1-12\n"
+        "clsplat: warning: --frames 12-13: 1 of these frames do not exist; the shot has the frames 1-12\n"
     )
 
 
@@ -173,7 +173,7 @@ def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_
         assert pipeline.main(["render", model, *arguments]) == 2, arguments
         assert message in error_line(capsys)
     for names, message in [
-        (["a.jpg", "a.png"], "would be both a.jpg and a.png"),
+        (["a.jpg", "a.png"], "would be the file of both a.jpg and a.png"),
         (["../../a.jpg"], "leads out of the output folder"),
         ([], "has no images"),
     ]:

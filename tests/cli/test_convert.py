@@ -274,7 +274,7 @@ def test_a_file_that_is_there_is_replaced_only_if_asked(name: str, model: Path, 
         (model.parent / first).write_bytes(b"precious")
         target = model.parent / first
     assert convert(model, model.parent / name) == 2
-    said = f"clsplat: error: {target}: is there already; name another file, or give --overwrite to replace it\n"
+    said = f"clsplat: error: {target}: exists already; name another file, or give --overwrite to replace it\n"
     assert capsys.readouterr().err == said
     assert name == "link.ply" or target.read_bytes() == b"precious"
     assert convert(model, model.parent / name, "--overwrite") == 0
@@ -286,7 +286,7 @@ def test_a_model_is_changed_in_place_only_if_asked(model: Path, capsys: Capture)
     for target in (model, model.parent / "." / "x" / ".." / model.name):
         (model.parent / "x").mkdir(exist_ok=True)
         assert convert(model, target, "--prune-opacity", "0.5") == 2
-        assert "is read, and would be replaced by the result" in capsys.readouterr().err
+        assert "is an input, and would be replaced by the result" in capsys.readouterr().err
     other = model.with_name("b.ply")
     random_gaussians(3).save(other)
     assert convert(model, other, "--merge", other) == 2

@@ -59,7 +59,7 @@ def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture) -> None:
     assert len(device["digests"]) == 3 * len(device["stages"])  # three scenes
     assert any(line["part"] == "package" for line in report["installation"])
     assert main(["selftest", "--report", str(file)]) == 2
-    assert "is there already" in error_line(capsys)
+    assert "exists already" in error_line(capsys)
 
 
 def test_the_report_is_refused_before_the_test(tmp_path: Path, capsys: Capture) -> None:

@@ -168,7 +168,7 @@ def test_one_scale_is_one_number(steps: str, found: str, tmp_path: Path, capsys:
         steps,
     ]
     assert main(call) == 2
-    wanted = f"expected one number: a model has the same in all directions, found '{found}'"
+    wanted = f"expected one number, the same scale in all directions, found '{found}'"
     assert error_line(capsys) == f"clsplat: error: --transform {steps}: {wanted}"
 
 

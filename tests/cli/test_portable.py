@@ -84,7 +84,7 @@ def test_frames_that_differ_in_case_or_spelling_alone(monkeypatch: pytest.Monkey
         monkeypatch.setattr(frame_numbers, "identity", partial(identity, ignores_case=False))
         assert len(frame_numbers.output_paths("{name}.png", cameras)) == 2
         monkeypatch.setattr(frame_numbers, "identity", partial(identity, ignores_case=True))
-        with pytest.raises(InputError, match="would be both"):
+        with pytest.raises(InputError, match="would be the file of both"):
             frame_numbers.output_paths("{name}.png", cameras)
 
 

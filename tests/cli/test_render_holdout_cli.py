@@ -239,8 +239,8 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
     held = f"--holdout {folder}/z.####.exr"
     cases = [
         (f"--holdout {folder}/none.####.exr", "none.0001.exr: no such holdout, expected a depth or deep EXR"),
-        (f"{held} --width 20", f"z.0001.exr: is of a frame of {WIDTH}x{HEIGHT}, expected 20x"),
-        (f"{held} --holdout.channel depth.Z", "has no channel depth.Z, but Z; name its depths with --holdout.channel"),
+        (f"{held} --width 20", f"z.0001.exr: holds a frame of {WIDTH}x{HEIGHT}, expected 20x"),
+        (f"{held} --holdout.channel depth.Z", "has the channels Z, expected depth.Z; name its depths with"),
         ("--holdout.channel Z", "--holdout.channel Z: is for holdouts, expected --holdout with it"),
         (f"{held} --deep", "--deep and --holdout exclude each other: a deep picture is held out where"),
         ("--holdout.depths ray", "--holdout.depths ray: is for holdouts, expected --holdout with it"),

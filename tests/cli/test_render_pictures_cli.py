@@ -382,7 +382,7 @@ def test_a_video_says_how_it_was_made(name: str, flags: str, shot: list[str], tm
     assert video.read_bytes() == whole
     video.write_bytes(b"precious")
     assert render(shot, tmp_path, f"{flags} --skip-existing", name) == 2
-    assert "is there already" in error_line(capsys)
+    assert "exists already" in error_line(capsys)
     assert video.read_bytes() == b"precious"
 
 
@@ -399,7 +399,7 @@ def test_a_video_that_is_there_is_replaced_only_if_asked(
     else:
         pytest.skip("this user may not make symbolic links")
     assert render(shot, tmp_path, "", "a.mp4") == 2
-    said = f"clsplat: error: {video}: is there already; name another file, or give --overwrite to replace it\n"
+    said = f"clsplat: error: {video}: exists already; name another file, or give --overwrite to replace it\n"
     assert capsys.readouterr().err == said
     assert not target.exists() and (kind == "link" or video.read_bytes() == b"precious")
     assert render(shot, tmp_path, "--dry-run", "a.mp4") == 0, "which writes nothing"
@@ -523,9 +523,9 @@ def test_everything_on_a_farm(shot: list[str], tmp_path: Path) -> None:
 @pytest.mark.needs("av")
 def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Capture, monkeypatch: Any) -> None:
     cases = [
-        ("--colorspace ACEScq", "a.#.exr", "--colorspace ACEScq: not in the configuration"),
-        ("--model-colorspace srbg", "a.#.exr", "--model-colorspace srbg: not in the configuration"),
-        ("--ocio-config none.ocio --colorspace ACEScg", "a.#.exr", "none.ocio: no OpenColorIO configuration"),
+        ("--colorspace ACEScq", "a.#.exr", "--colorspace ACEScq: is not in the configuration"),
+        ("--model-colorspace srbg", "a.#.exr", "--model-colorspace srbg: is not in the configuration"),
+        ("--ocio-config none.ocio --colorspace ACEScg", "a.#.exr", "none.ocio: is not an OpenColorIO configuration"),
         ("--region 40,0,20,10", "a.#.exr", f"--region 40,0,20,10: ends at 60,10, expected at most the frame's {WIDTH}"),
         ("--region 0,0,8,8 --overscan 2", "a.#.exr", "--overscan and --region exclude each other"),
         ("--supersample 0", "a.#.exr", "--supersample 0: expected 1 to 64"),

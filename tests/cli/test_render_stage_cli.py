@@ -198,7 +198,7 @@ def test_a_linear_stage(where: str, stage: Usd.Stage, tmp_path: Path, capsys: Ca
     other = UsdGeom.Xform.Define(stage, "/Other").GetPrim()
     other.GetReferences().AddReference("../asset/model.usdc")
     assert render(stage, tmp_path / "none") == 2
-    assert "has Gaussians of the colour spaces lin_rec709 (/Asset/Gaussians), sRGB (/Other" in error_line(capsys)
+    assert "has Gaussians in the colour spaces lin_rec709 (/Asset/Gaussians), sRGB (/Other" in error_line(capsys)
 
 
 def test_wrong_stages_are_one_line(stage: Usd.Stage, tmp_path: Path, capsys: Capture) -> None:

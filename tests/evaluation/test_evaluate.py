@@ -95,7 +95,7 @@ def test_renders_in_other_spaces_are_left_as_srgb(tmp_path: Path) -> None:
     values = half(views[0]).astype(np.float64)
     curve = np.where(values > 0.0031308, 1.055 * values ** (1 / 2.4) - 0.055, 12.92 * values)  # IEC 61966-2-1
     np.testing.assert_allclose(imread(tmp_path / "a.png") / 255, curve, atol=0.5 / 255 + 1e-6)
-    with pytest.raises(InputError, match="the model's colour space nowhere: not in the configuration"):
+    with pytest.raises(InputError, match="the model's colour space nowhere: is not in the configuration"):
         evaluate(half, views, (0, 0, 0), tmp_path, model=EvaluatedModel(1, 1, 0.0), space="nowhere")
 
 

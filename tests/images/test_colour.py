@@ -113,7 +113,7 @@ def test_a_model_in_linear_values() -> None:
 
 def test_a_space_that_is_not_there() -> None:
     with pytest.raises(
-        InputError, match=r"^--colorspace ACEScq: not in the configuration ocio://.*; similar names: ACEScg"
+        InputError, match=r"^--colorspace ACEScq: is not in the configuration ocio://.*; similar names: ACEScg"
     ):
         Colours(ColourConfig(colorspace="ACEScq"))
     with pytest.raises(InputError, match=r"^--model-colorspace zzz: .*; it has .+, .+, .+ and \d+ more"):
@@ -123,10 +123,10 @@ def test_a_space_that_is_not_there() -> None:
 
 
 def test_a_configuration_that_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"^ocio://nonsense: no OpenColorIO configuration: "):
+    with pytest.raises(InputError, match=r"^ocio://nonsense: is not an OpenColorIO configuration: "):
         Colours(ColourConfig(colorspace="ACEScg", ocio_config="ocio://nonsense"))
     monkeypatch.setenv("OCIO", str(tmp_path / "none.ocio"))
-    with pytest.raises(InputError, match=r"none\.ocio: no OpenColorIO configuration: .*non-existent"):
+    with pytest.raises(InputError, match=r"none\.ocio: is not an OpenColorIO configuration: .*non-existent"):
         Colours(ColourConfig(colorspace="ACEScg"))
 
 

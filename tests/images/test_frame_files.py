@@ -75,7 +75,7 @@ def formats(spec: Any) -> set[str]:
 def test_exr(parts: Any, depth: Any, tmp_path: Path) -> None:
     layers, path = everything(), tmp_path / "a.exr"
     if parts == "one":
-        with pytest.raises(InputError, match="more than a float holds exactly; use --parts several"):
+        with pytest.raises(InputError, match="which a float cannot hold exactly; use --parts several"):
             write_channels(path, layers, Encoding(depth=depth, parts=parts))
         layers["id"] %= 2**24
     write_channels(path, layers, Encoding(depth=depth, parts=parts))

@@ -81,7 +81,7 @@ def test_a_full_folder_for_temporary_files_is_named(tmp_path: Path) -> None:
     for said in lines[::2]:
         assert said.startswith(f"1 {disk}/clsplat-")
         assert "the disk is full: " in said
-        assert said.endswith("(TMPDIR names another folder)")
+        assert said.endswith("(TMPDIR sets another folder)")
 
 
 PICTURES = """

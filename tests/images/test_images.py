@@ -105,7 +105,7 @@ def test_undecodable_images_are_named_with_the_reason(tmp_path: Path) -> None:
 
 def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     write_raw(tmp_path / "a.exr", np.full((2, 2, 3), np.nan, np.float32), ("R", "G", "B"))
-    with pytest.raises(InputError, match=r"a\.exr: 4 pixels are not finite"):
+    with pytest.raises(InputError, match=r"a\.exr: has 4 pixels that are not finite"):
         read_image(tmp_path / "a.exr")
 
 

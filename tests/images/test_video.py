@@ -193,7 +193,7 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), video_writer(path) as video:
         video.add(frame_planes(made[0]))
         raise KeyboardInterrupt
-    with pytest.raises(InputError, match="a video of no frames"):
+    with pytest.raises(InputError, match="the video has no frames"):
         write_video(path, [])
     with pytest.raises(ValueError, match=r"frame \(16, 32\): expected \(32, 32\)"):
         write_video(path, [made[0], made[0][:16]])

@@ -83,7 +83,7 @@ def test_levels_of_which_it_cannot_be_known(tmp_path: Path) -> None:
     path, model = tmp_path / "model.ply", lopsided(400, degree=0)
     model.opacity_logits = np.arange(400, dtype=np.float32) % 36
     model.save(path)
-    with pytest.raises(InputError, match=r"up to 35, expected .* these may be parts of 100 or of 255$"):
+    with pytest.raises(InputError, match=r"up to 35, expected .* these may be percentages or levels of 255$"):
         formats.load(path, activated="opacities")
 
 
@@ -132,7 +132,7 @@ def test_numbers_are_those_of_the_file(tmp_path: Path) -> None:
     assert "2 of 20 Gaussians have a value that is not finite, the first is Gaussian 2 with a position" in out
     assert "1 of 20 Gaussians has a quaternion of 0, the first is Gaussian 3; it is drawn unrotated" in turned
     for which, said in (
-        ("opacities", "Gaussian 9 has an opacity outside"),
+        ("opacities", "Gaussian 9 has an opacity of"),
         ("scales", "Gaussian 12 has a scale of -1"),
     ):
         with pytest.warns(UserWarning, match="left out"), pytest.raises(InputError, match=said):

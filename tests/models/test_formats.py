@@ -245,7 +245,7 @@ def test_a_spoilt_file_is_one_line_in_bounded_memory(name: str, way: str, tmp_pa
 
 
 def test_no_such_ending_and_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"x\.doc: not the ending .*\.ply"):
+    with pytest.raises(InputError, match=r"x\.doc: does not end like a model file, .*\.ply"):
         formats.save(tmp_path / "x.doc", asymmetric())
     with pytest.raises(InputError, match=r"x\.ksplat: ksplat is read only, expected one of .*\.ply"):
         formats.save(tmp_path / "x.ksplat", asymmetric())
@@ -253,7 +253,7 @@ def test_no_such_ending_and_no_such_file(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"{name}: no such file, expected a model file, .*ply"):
             formats.load(tmp_path / name)
     (tmp_path / "x.doc").write_bytes(b"words")
-    with pytest.raises(InputError, match=r"x\.doc: not the ending of a model file"):
+    with pytest.raises(InputError, match=r"x\.doc: does not end like a model file"):
         formats.load(tmp_path / "x.doc")
 
 

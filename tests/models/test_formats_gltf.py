@@ -314,9 +314,9 @@ def test_lies(tmp_path: Path, lie: str) -> None:
 @pytest.mark.parametrize(
     ("accessor", "change", "message"),
     [
-        (3, {"type": "VEC2"}, "KHR_gaussian_splatting:OPACITY is of the type VEC2, expected SCALAR"),
-        (0, {"type": "MAT4"}, "POSITION is of the type MAT4, expected VEC3"),
-        (1, {"type": "VEC3"}, "KHR_gaussian_splatting:ROTATION is of the type VEC3, expected VEC4"),
+        (3, {"type": "VEC2"}, "KHR_gaussian_splatting:OPACITY has the type VEC2, expected SCALAR"),
+        (0, {"type": "MAT4"}, "POSITION has the type MAT4, expected VEC3"),
+        (1, {"type": "VEC3"}, "KHR_gaussian_splatting:ROTATION has the type VEC3, expected VEC4"),
         (2, {"componentType": 5124}, "KHR_gaussian_splatting:SCALE has the componentType 5124, expected 5120 to 5126"),
     ],
 )

@@ -251,7 +251,7 @@ def test_a_little_behind_the_gaussians_is_passed_over(behind: int, tmp_path: Pat
     spz.write(path, lopsided(20), version=2)
     plain = spz.read(path)
     path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()) + bytes(behind)))
-    with pytest.warns(UserWarning, match="bytes after the last Gaussian ignored"):
+    with pytest.warns(UserWarning, match="bytes after the last Gaussian are ignored"):
         assert_within(spz.read(path), plain, **dict.fromkeys(BOUNDS, 0))
 
 

@@ -248,4 +248,4 @@ def test_without_usd_core_there_is_one_line(tmp_path: Path) -> None:
         f"usd.read(Path({str(tmp_path / 'model.usda')!r}))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "USD needs usd-core, expected it installed: pip install 'clsplat[usd]'" in done.stderr
+    assert "USD needs usd-core, which is not installed: pip install 'clsplat[usd]'" in done.stderr

@@ -90,11 +90,11 @@ def Xform "a"
         ("", "a.obj", "has 0 triangles, expected 1 to 100,000"),
         ("v 0 0\n", "a.obj", "line 1 is b'v 0 0"),
         ("v 0 0 0\nf 1 a 2\n", "a.obj", "line 2 is b'f 1 a 2"),
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "a.obj", "has faces with points beyond its 3"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "a.obj", "has faces with indices beyond its 3 points"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "a.obj", "has points that are not finite"),
         ("f " + "1 " * 40000, "a.obj", "line 1 is b'f 1 1"),
-        (f"v 0 0 0\nf 1 1 {10**40}\n", "a.obj", "has faces with points beyond its 1"),
-        (CUBE, "a.stl", "expected a mesh, an .obj file or a USD stage"),
+        (f"v 0 0 0\nf 1 1 {10**40}\n", "a.obj", "has faces with indices beyond its 1 points"),
+        (CUBE, "a.stl", "is not a mesh, expected an .obj file or a USD stage"),
     ],
 )
 def test_wrong_meshes_are_one_line(text: str, name: str, message: str, tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_a_file_of_holes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     """8 GiB without an end of a line were read as one (`tools/stress/run files`); and other files too large."""
     with open(tmp_path / "a.obj", "wb") as file:
         file.truncate(1 << 33)
-    with pytest.raises(InputError, match=r"a.obj: is of 8,589,934,592 bytes, expected a mesh of at most 268,435,456"):
+    with pytest.raises(InputError, match=r"a.obj: has 8,589,934,592 bytes, expected a mesh of at most 268,435,456"):
         read_mesh(tmp_path / "a.obj")
     monkeypatch.setattr("clsplat.models.mesh.MAX_MESH_TRIANGLES", 6)
     for text, count in ((CUBE, 8), ("v 0 0 0\nf" + " 1" * 1002, 1000)):

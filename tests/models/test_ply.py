@@ -127,7 +127,7 @@ def test_trailing_bytes_give_a_warning(tmp_path: Path) -> None:
     path, gaussians = tmp_path / "model.ply", random_gaussians(3)
     gaussians.save(path)
     path.write_bytes(path.read_bytes() + b"1234567")
-    with pytest.warns(UserWarning, match=r"model\.ply: 7 bytes after the last Gaussian ignored"):
+    with pytest.warns(UserWarning, match=r"model\.ply: 7 bytes after the last Gaussian are ignored"):
         assert_equal(gaussians, Gaussians.load(path))
 
 
@@ -175,10 +175,10 @@ def test_broken_headers(tmp_path: Path) -> None:
 def test_truncated(tmp_path: Path) -> None:
     data = plain_table(5).tobytes()
     message = bad(tmp_path, header(NAMES, 5) + data[:-1])
-    assert "truncated: 5 Gaussians need 280 bytes, 279 are there (4 Gaussians)" in message
+    assert "truncated: has 4 of 5 Gaussians (279 of 280 bytes)" in message
     assert "truncated" in bad(tmp_path, header(NAMES, 10**15) + data)  # nothing of that size is allocated
     text = "\n".join(" ".join(map(str, row)) for row in plain_table(5)).encode()
-    assert "truncated: 6 Gaussians expected, 5 are there" in bad(tmp_path, header(NAMES, 6, "ascii") + text)
+    assert "truncated: has 5 Gaussians, expected 6" in bad(tmp_path, header(NAMES, 6, "ascii") + text)
     assert "Gaussian 4 has 13 values, expected 14" in bad(tmp_path, header(NAMES, 5, "ascii") + text.rsplit(b" ", 1)[0])
     wrong = text.rsplit(b" ", 1)[0] + b" red"
     assert "Gaussian 4 has 'red', expected a number" in bad(tmp_path, header(NAMES, 5, "ascii") + wrong)
@@ -273,7 +273,7 @@ def test_real_trained_model_comes_back_byte_for_byte(tmp_path: Path) -> None:
 
 def test_real_model_with_trailing_bytes() -> None:
     source = real_file("samples/cvlab-epfl_pc_short_100.ply")
-    with pytest.warns(UserWarning, match="14029 bytes after the last Gaussian ignored"):
+    with pytest.warns(UserWarning, match="14029 bytes after the last Gaussian are ignored"):
         assert len(Gaussians.load(source)) == 100
 
 

@@ -87,7 +87,7 @@ def test_what_is_wrong_with_the_model_names_the_archive(tmp_path: Path) -> None:
     data = path.read_bytes()
     archive = packed(tmp_path / "model.zip", {"x/model.ply": data + b"123"})
     with pytest.warns(
-        UserWarning, match=rf"{archive}: x/model\.ply: 3 bytes after the last Gaussian ignored"
+        UserWarning, match=rf"{archive}: x/model\.ply: 3 bytes after the last Gaussian are ignored"
     ) as caught:
         assert_equal(formats.load(archive), model)
     assert len(caught) == 1
@@ -192,7 +192,7 @@ def test_an_archive_of_sog_is_one_by_any_name(tmp_path: Path) -> None:
     empty = packed(tmp_path / "none.sog", {"readme.txt": b"x"})
     with pytest.raises(InputError, match=r"has no meta\.json in it"):
         formats.load(empty)
-    with pytest.raises(InputError, match=r"meta\.json has no means, expected a SOG model's"):
+    with pytest.raises(InputError, match=r"meta\.json has no means, expected that of a SOG model"):
         formats.load(packed(empty, {"meta.json": b'{"title": "a scan"}'}))
 
 

@@ -183,7 +183,7 @@ def test_cut_element_is_named(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     far_model().save(path)
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(InputError, match=r"truncated: element clsplat_local needs 2400 bytes, 2399"):
+    with pytest.raises(InputError, match=r"truncated: element clsplat_local needs 2400 bytes but has 2399"):
         Gaussians.load(path)
 
 

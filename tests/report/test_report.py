@@ -310,7 +310,7 @@ def test_a_page_that_is_there_is_replaced_only_if_asked(copied: Path, tmp_path: 
     for output in (page, own, copied / "model.ply"):
         output.write_bytes(b"precious")
         assert main(["report", str(copied), "-o", str(output)]) == 2
-        said = f"clsplat: error: {output}: is there already; name another file, or give --overwrite to replace it\n"
+        said = f"clsplat: error: {output}: exists already; name another file, or give --overwrite to replace it\n"
         assert capsys.readouterr().err == said
         assert output.read_bytes() == b"precious"
     assert main(["report", str(copied), "-o", str(page), "--overwrite"]) == 0

@@ -66,7 +66,7 @@ def test_a_page_that_is_there_is_replaced_only_if_asked(runs: list[Path], tmp_pa
     page.write_bytes(b"precious")
     call = ["compare", *map(str, runs), "-o", str(page)]
     assert main(call) == 2
-    said = f"clsplat: error: {page}: is there already; name another file, or give --overwrite to replace it\n"
+    said = f"clsplat: error: {page}: exists already; name another file, or give --overwrite to replace it\n"
     assert capsys.readouterr() == ("", said)
     assert page.read_bytes() == b"precious"
     assert main([*call, "--overwrite"]) == 0

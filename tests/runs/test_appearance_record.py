@@ -39,8 +39,8 @@ def test_gains_by_name(run: Run) -> None:
 @pytest.mark.parametrize(
     ("photograph", "message"),
     [
-        ("b", r"--appearance b: is 2 photographs, x/b.jpg, y/b.jpg; name one of them$"),
-        ("othr.png", r"is no photograph of .*appearance.json, expected one of its 5, such as other.png"),
+        ("b", r"--appearance b: fits 2 photographs, x/b.jpg, y/b.jpg; name one$"),
+        ("othr.png", r"is not a photograph in .*appearance.json, expected one of its 5, such as other.png"),
         ("", r"expected one of its 5, such as"),
     ],
 )
@@ -57,7 +57,7 @@ def test_a_photograph_that_is_not_there(run: Run, photograph: str, message: str)
 )
 def test_a_damaged_record(run: Run, text: str) -> None:
     run.appearance_path.write_text(text, "utf-8")
-    with pytest.raises(InputError, match=r"appearance.json: .*expected what clsplat train --appearance writes"):
+    with pytest.raises(InputError, match=r"appearance.json: .*expected a file that clsplat train --appearance writes"):
         gains_of(run.path, "a.jpg")
 
 

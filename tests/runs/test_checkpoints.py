@@ -74,7 +74,7 @@ def test_no_flipped_bit_goes_unnoticed(run: Run) -> None:
         assert len(told) == (checkpoint.step == 1), told
         if told:
             passed += 1
-            assert told[0].startswith(f"{path}: checkpoint is damaged and was passed over (")
+            assert told[0].startswith(f"{path}: is a damaged checkpoint and is skipped (")
     assert passed > 0.8 * len(data)
 
 
@@ -151,7 +151,7 @@ def test_training_goes_on_from_the_checkpoint_before(
     assert main(["train", "-o", str(folder), "--resume", "--iterations", "40"]) == 0
     told = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
     assert len(told) == 1
-    assert told[0].startswith(f"clsplat: warning: {path}: checkpoint is damaged and was passed over (")
+    assert told[0].startswith(f"clsplat: warning: {path}: is a damaged checkpoint and is skipped (")
     assert (folder / "model.ply").read_bytes() == (trained / "model.ply").read_bytes()
     assert [record["step"] for record in Run.open(folder).read_metrics()] == [10, 20, 30, 40]
 

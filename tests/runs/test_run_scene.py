@@ -68,7 +68,7 @@ def test_the_same_scene_goes_on_from_anywhere(run: Path, own: Path) -> None:
 def test_a_changed_photograph_is_refused(run: Path, own: Path, capsys: Capture) -> None:
     brighten(own / "images" / "03.png")
     line = refusal(run, own, capsys)
-    assert f"{own}: is not the scene that {run} began with: 1 view another photograph (03.png); expected" in line
+    assert f"{own}: is not the scene that {run} began with: 1 view with another photograph (03.png); expected" in line
     assert "--accept-changes goes on" in line
 
 
@@ -76,7 +76,7 @@ def test_another_scene_is_refused_with_three_examples(run: Path, own: Path, caps
     for path in (own / "images").iterdir():
         brighten(path)
     line = refusal(run, own, capsys)
-    assert "10 views another photograph (00.png, 01.png, 02.png and 7 more)" in line
+    assert "10 views with another photograph (00.png, 01.png, 02.png and 7 more)" in line
 
 
 def test_other_names_and_cameras_are_refused(run: Path, own: Path, capsys: Capture) -> None:
@@ -89,7 +89,7 @@ def test_other_names_and_cameras_are_refused(run: Path, own: Path, capsys: Captu
     (own / "images" / "00.png").rename(own / "images" / "zz.png")
     listed.write_text("\n".join(lines) + "\n")
     line = refusal(run, own, capsys)
-    assert "1 view not there any more (00.png); 1 view new (zz.png); 1 view another camera (02.png)" in line
+    assert "1 view missing now (00.png); 1 view new (zz.png); 1 view with another camera (02.png)" in line
 
 
 def test_changes_can_be_accepted(run: Path, own: Path, capsys: Capture) -> None:
@@ -135,7 +135,7 @@ def test_the_digest_is_of_the_photograph(scene: Path, own: Path) -> None:
     assert json.loads(json.dumps(record(scene))) == record(own)
     with open(own / "images" / "05.png", "ab") as file:
         file.write(b"x")
-    assert scene_record.differences(record(scene), record(own)) == ["1 view another photograph (05.png)"]
+    assert scene_record.differences(record(scene), record(own)) == ["1 view with another photograph (05.png)"]
 
 
 def test_a_scene_of_any_size_is_compared(scene: Path) -> None:
@@ -248,5 +248,5 @@ def test_a_lens_that_is_no_pinhole_is_recorded(scene: Path) -> None:
     assert one["views"][bent.name]["projection"] == "fisheye"
     assert one["views"][bent.name]["radial"] == [0.1, 0.0, 0.0, 0.0]
     assert scene_record.differences(one, one) == []
-    assert scene_record.differences(one, other) == [f"1 view another camera ({bent.name})"]
-    assert scene_record.differences(one, plain) == [f"1 view another camera ({bent.name})"]
+    assert scene_record.differences(one, other) == [f"1 view with another camera ({bent.name})"]
+    assert scene_record.differences(one, plain) == [f"1 view with another camera ({bent.name})"]

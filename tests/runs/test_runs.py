@@ -60,7 +60,7 @@ def test_config_comes_back(tmp_path: Path) -> None:
         ('clsplat = "1"\n[train]\nbackground = "red"\n', "expected one of black, white, random"),
         ('clsplat = "1"\n[train]\neval_at = [1, "x"]\n', "train.eval_at is [1, 'x'], expected whole numbers"),
         ('clsplat = "1"\n[train]\noptimiser = 3\n', "train.optimiser is 3, expected a table"),
-        ('clsplat = "1"\n[train\n', "not readable as TOML"),
+        ('clsplat = "1"\n[train\n', "is not readable as TOML"),
     ],
 )
 def test_wrong_config_is_named(tmp_path: Path, text: str, message: str) -> None:
@@ -188,7 +188,7 @@ def test_resume_keeps_what_cannot_change(tmp_path: Path) -> None:
     assert resumed.resuming
     assert resumed.scene == Path("/scene")
     assert Run.open(tmp_path).config.iterations == 20
-    with pytest.raises(InputError, match="seed is 0 there, a resumed run cannot change it to 9"):
+    with pytest.raises(InputError, match="seed is 0, a resumed run cannot change it to 9"):
         Run.create(tmp_path, replace(CONFIG, seed=9), resume=True)
     with pytest.raises(InputError, match="exclude each other"):
         Run.create(tmp_path, CONFIG, resume=True, overwrite=True)

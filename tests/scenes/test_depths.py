@@ -253,7 +253,7 @@ def test_arrays_that_are_no_maps(tmp_path: Path, array: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"map\.npy"):
         map_header(tmp_path / "map.npy")
     (tmp_path / "map.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(InputError, match="does not read as NPY"):
+    with pytest.raises(InputError, match="cannot be read as NPY"):
         read_map(tmp_path / "map.npy")
 
 

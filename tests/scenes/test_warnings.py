@@ -34,7 +34,7 @@ def test_a_warning_of_a_reader_reaches_the_command_line(tmp_path: Path, capsys: 
     random_gaussians(4).save(path)
     path.write_bytes(path.read_bytes() + b"more")
     assert main(["info", str(path)]) == 0
-    assert capsys.readouterr().err == f"clsplat: warning: {path}: 4 bytes after the last Gaussian ignored\n"
+    assert capsys.readouterr().err == f"clsplat: warning: {path}: 4 bytes after the last Gaussian are ignored\n"
 
 
 def test_a_warning_is_one_line() -> None:
@@ -53,6 +53,6 @@ def test_a_scene_gathers_what_its_readers_warn_of(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         told = load_scene(tmp_path).warnings
-    wanted = ("'rolling_shutter' is ignored", "text after the last point ignored", "does not list 1 image(s)")
+    wanted = ("'rolling_shutter' is ignored", "text after the last point is ignored", "does not list 1 image(s)")
     assert len(told) == len(wanted), told
     assert all(words in line for words, line in zip(wanted, told, strict=True)), told

@@ -101,7 +101,7 @@ def test_frames_elsewhere_are_lines() -> None:
         "openjd_progress: 50.0",
         "openjd_status: frame 7 took 0.25 s",
         "openjd_progress: 100.0",
-        "openjd_status: frame 8 is there",
+        "openjd_status: frame 8 exists",
     ]
     assert plain.getvalue() == ""
 

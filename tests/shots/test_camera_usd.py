@@ -163,10 +163,10 @@ def test_one_camera_of_several(stage: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("#usda", "usda", "is no USD stage that can be opened"),
+        ("#usda", "usda", "cannot be opened as a USD stage"),
         ("def Camera", "def Xform", "has no camera in it"),
-        ("horizontalAperture = 36", "horizontalAperture = 0", "/rig/shot: aperture 0 x 24, expected both above 0"),
-        ("(0.5, 500)", "(0, 500)", "/rig/shot at 1001: clippingRange 0 to 500, expected 0 < near < far"),
+        ("horizontalAperture = 36", "horizontalAperture = 0", "has an aperture of 0 x 24, expected both above 0"),
+        ("(0.5, 500)", "(0, 500)", "/rig/shot at 1001: clippingRange is 0 to 500, expected 0 < near < far"),
         ("1001: 35,", "1001: 0,", "/rig/shot at 1001: focalLength is 0, expected more than 0"),
         ("1001: 35,", "1001: nan,", "/rig/shot at 1001: focalLength is nan, expected a number"),
         ("endTimeCode = 1005", "endTimeCode = 1000.5", "/rig/shot: has no whole time code from 1001 to 1000.5"),
@@ -211,7 +211,7 @@ def test_a_stage_without_a_size(stage: Path) -> None:
 def test_without_usd_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     (tmp_path / "shot.usda").write_text(STAGE)
-    with pytest.raises(InputError, match=r"USD needs usd-core, expected it installed: pip install 'clsplat\[usd\]'"):
+    with pytest.raises(InputError, match=r"USD needs usd-core, which is not installed: pip install 'clsplat\[usd\]'"):
         read_shot(tmp_path / "shot.usda")
     (tmp_path / "a.json").write_text("{}")
     with pytest.raises(InputError, match=r"--usd-camera cam: .*a.json is no USD stage"):

@@ -130,7 +130,7 @@ def test_every_frame_has_a_file_of_its_own() -> None:
     assert output_paths("one.png", [(1, "a.jpg")]) == [Path("one.png")]
     assert output_paths("o/{name}.png", [(1, "a.jpg"), (2, "s/b.jpg")]) == [Path("o/a.png"), Path("o/s/b.png")]
     assert output_paths("o/##.png", [(1, "a.jpg"), (2, "a.png")]) == [Path("o/01.png"), Path("o/02.png")]
-    with pytest.raises(InputError, match=r"would be both a\.jpg and a\.png"):
+    with pytest.raises(InputError, match=r"would be the file of both a\.jpg and a\.png"):
         output_paths("o/{name}.png", [(1, "a.jpg"), (2, "a.png")])
     with pytest.raises(InputError, match="expected one to tell 2 cameras apart, or a frame number such as ####"):
         output_paths("one.png", [(1, "a"), (2, "b")])

@@ -160,7 +160,7 @@ def test_what_is_not_applied_is_one_warning(tmp_path: Path) -> None:
         ("float fStop = -2", "", "/rig/shot at 1: fStop is -2, expected at least 0"),
         ("float fStop = inf", "", "/rig/shot at 1: fStop is inf, expected a number"),
         ("float focusDistance = -1", "", "/rig/shot at 1: focusDistance is -1, expected at least 0"),
-        ("float2 clippingRange = (1, 1)", "", "/rig/shot at 1: clippingRange 1 to 1, expected 0 < near < far"),
+        ("float2 clippingRange = (1, 1)", "", "/rig/shot at 1: clippingRange is 1 to 1, expected 0 < near < far"),
         ("", "int2 resolution = (0, 9)", "/Render: resolution is 0 x 9, expected both above 0"),
         ("", "float pixelAspectRatio = 0", "/Render: pixelAspectRatio is 0.0, expected a number above 0"),
         ("", "float pixelAspectRatio = nan", "/Render: pixelAspectRatio is nan, expected a number above 0"),

@@ -69,4 +69,4 @@ def test_a_run_keeps_its_grids(
     cameras = str(scene.train_views[1].path.parents[1])
     names = ["--appearance", scene.train_views[1].name]
     assert main(["render", str(run.path), "--cameras", cameras, "-o", f"{tmp_path}/{{name}}.png", *names]) == 2
-    assert "is of --appearance grid, which is for training alone" in capsys.readouterr().err
+    assert "is of --appearance grid, which is only for training" in capsys.readouterr().err

@@ -106,7 +106,7 @@ def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: C
     )
     again = ["train", str(folder), "-o", str(run), "--iterations", "30", "--resume", "--perspective", "plane"]
     assert main(again) == 2
-    assert "perspective is rays there, a resumed run cannot change it to plane" in capsys.readouterr().err
+    assert "perspective is rays, a resumed run cannot change it to plane" in capsys.readouterr().err
 
 
 def test_what_it_does_not_go_with(folder: Path, tmp_path: Path, capsys: Capture) -> None:

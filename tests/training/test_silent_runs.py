@@ -113,13 +113,13 @@ def test_a_checkpoint_of_more_coefficients_is_named(scene: Path, run: Path, defa
 def test_a_checkpoint_under_another_name_is_passed_over(run: Path) -> None:
     latest = run / "checkpoints" / "step-0000003.npz"
     latest.rename(latest.with_name("step-0000900.npz"))
-    with pytest.warns(UserWarning, match="it is of step 3"), pytest.raises(InputError, match="no checkpoint there"):
+    with pytest.warns(UserWarning, match="it is of step 3"), pytest.raises(InputError, match="no intact checkpoint"):
         Run.open(run).load_latest_checkpoint()
 
 
 def test_beginning_again_for_want_of_a_checkpoint_is_told(run: Path) -> None:
     shutil.rmtree(run / "checkpoints")
-    with pytest.warns(UserWarning, match="has no checkpoint: training begins again, the 3 steps before are lost"):
+    with pytest.warns(UserWarning, match="has no checkpoint: training starts again, and the 3 earlier steps are lost"):
         assert Run.open(run).load_latest_checkpoint() is None
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words in file headers that mark a model as antialiased, trained with Mip-Splatting's low-pass filter, or not.
+"""Words in file headers that tell if a model is antialiased, which means trained with Mip-Splatting's low-pass filter.
 
 A header line counts if it is a key and a value and nothing else:
 
@@ -8,11 +8,11 @@ A header line counts if it is a key and a value and nothing else:
 - `rasterize_mode antialiased` of gsplat and nerfstudio.
 - `mip_filter: true` of Mip-Splatting.
 
-A colon, an equals sign or blanks separate the two. Case, quotation marks, hyphens and underscores are ignored. The word
-alone counts too, and so does a command-line flag, such as `--antialiasing` of the paper's authors. Ambiguous keys, such
-as `model` for the name of a scene, count only with an exact mode word. A sentence with such a word decides nothing; it
-is reported in a warning unless it negates the word. Of several lines the last counts, as programs that rewrite a file
-append theirs.
+A colon, an equals sign or blanks separate key and value. Case, quotation marks, hyphens and underscores are ignored.
+The word `antialiased` alone counts too, and so does a command-line flag such as `--antialiasing` of the 3DGS authors'
+program. Ambiguous keys, such as `model`, which may hold the name of a scene, count only with an exact mode word. A
+sentence that mentions antialiasing decides nothing; it is reported in a warning unless it has a negation. Of several
+lines the last counts, since programs that rewrite a file append theirs.
 """
 
 from __future__ import annotations

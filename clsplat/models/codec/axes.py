@@ -14,12 +14,12 @@ from clsplat.spherical_harmonics import sh_basis
 Signs = tuple[int, int, int]
 
 RUB_SIGNS: Signs = (1, -1, -1)
-"""Signs between our x right, y down, z forward and x right, y up, z backward (RUB), either way: half a turn about x."""
+"""Signs between our axes (x right, y down, z forward) and RUB (x right, y up, z backward): half a turn about x."""
 LUF_SIGNS: Signs = (-1, -1, 1)
-"""Signs between our axes and x left, y up, z forward (LUF), either way: half a turn about z."""
+"""Signs between our axes and LUF (x left, y up, z forward): half a turn about z."""
 
 NODE_SIMILARITY_TOLERANCE = 1e-4
-"""Tolerance of a node's axes against right angles and equal lengths; matrices are written with few digits."""
+"""Tolerated deviation of a node's axes from right angles and equal lengths: matrices are written with few digits."""
 
 
 def sh_signs(signs: Signs) -> Float32:
@@ -31,8 +31,8 @@ def sh_signs(signs: Signs) -> Float32:
 def quaternion_signs(signs: Signs) -> Float32:
     """Factors (4,) of quaternions w x y z when axes change sign.
 
-    The axes of the world and of the Gaussian change together. The ellipsoid is the same as after a rotation, and exact.
-    This holds for a mirrored axis too.
+    Both the world's and the Gaussian's axes change sign, so the result is a rotation even if an axis is mirrored. The
+    ellipsoid is exact.
     """
     handedness = int(np.prod(signs))
     return np.array([1, *(handedness * sign for sign in signs)], np.float32)
@@ -49,7 +49,7 @@ def flip(gaussians: Gaussians, signs: Signs) -> None:
 def place(gaussians: Gaussians, matrix: Float64, where: str) -> Gaussians:
     """Transform a model by the matrix (4, 4) of a node (`edit.transform`).
 
-    Raises InputError, prefixed with `where`, if Gaussians and their colours cannot follow the matrix.
+    Raises InputError, prefixed with `where`, if the matrix is not a similarity.
     """
     if np.array_equal(matrix, np.eye(4)):
         return gaussians

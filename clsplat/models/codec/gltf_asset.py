@@ -71,24 +71,24 @@ class Asset:
         asset = cls(path, document, binary, size)
         version = as_object(document.get("asset")).get("version")
         if not str(version).startswith("2."):
-            raise InputError(f"{path}: glTF version {version!r}, expected 2.0")
+            raise InputError(f"{path}: has glTF version {version!r}, expected 2.0")
         required = document.get("extensionsRequired", [])
         if (
             unknown := [name for name in required if name not in SUPPORTED_EXTENSIONS]
             if isinstance(required, list)
             else [required]
         ):
-            raise InputError(f"{path}: requires {str(unknown[0])[:80]}, which is not supported; save it without")
+            raise InputError(f"{path}: requires {str(unknown[0])[:80]}, which is unsupported; save the file without it")
         return asset
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
         """Object at an index of one of the document's lists."""
         items = self.document.get(kind)
         if not isinstance(items, list) or not isinstance(index, int) or not 0 <= index < len(items):
-            raise InputError(f"{self.path}: {kind} has no {index!r}; is it damaged?")
+            raise InputError(f"{self.path}: {kind} has no item {index!r}; is the file damaged?")
         item = items[index]
         if not isinstance(item, dict):
-            raise InputError(f"{self.path}: {kind} {index} is no object; is it damaged?")
+            raise InputError(f"{self.path}: item {index} of {kind} is not an object; is the file damaged?")
         return item
 
     def integer(self, holder: dict[str, Any], key: str, default: int | None = None) -> int:
@@ -98,7 +98,7 @@ class Asset:
         return value
 
     def primitives(self) -> Iterator[tuple[str, NDArray[np.float64], dict[str, Any]]]:
-        """Primitives of Gaussians in the default scene: name, matrix from the node to the world, and primitive."""
+        """Yield the primitives of Gaussians in the default scene: name, matrix from node to world, and JSON object."""
         nodes = self.document.get("nodes", [])
         if "scenes" in self.document:
             roots = self.item("scenes", self.document.get("scene", 0)).get("nodes", [])
@@ -113,7 +113,7 @@ class Asset:
             assert isinstance(index, int)
             if index in seen or len(seen) >= MAX_SCENE_NODES:
                 raise InputError(
-                    f"{self.path}: node {index} is there twice, expected a tree of up to {MAX_SCENE_NODES} nodes"
+                    f"{self.path}: node {index} is used twice, expected a tree of up to {MAX_SCENE_NODES} nodes"
                 )
             seen.add(index)
             matrix = parent @ self.matrix(node, index)
@@ -158,9 +158,7 @@ class Asset:
             raise InputError(f"{self.path}: {semantic} has the componentType {found}, expected 5120 to 5126, not 5124")
         if ACCESSOR_WIDTHS.get(str(said.get("type"))) != width:
             expected = next(name for name, numbers in ACCESSOR_WIDTHS.items() if numbers == width)
-            raise InputError(
-                f"{self.path}: {semantic} is of the type {str(said.get('type'))[:20]}, expected {expected}"
-            )
+            raise InputError(f"{self.path}: {semantic} has the type {str(said.get('type'))[:20]}, expected {expected}")
         if "sparse" in said or "bufferView" not in said:
             raise InputError(f"{self.path}: {semantic} is sparse or has no values of its own, which is not supported")
         view = self.item("bufferViews", said["bufferView"])
@@ -169,7 +167,7 @@ class Asset:
         stride = self.integer(view, "byteStride", width * item.itemsize)
         need = offset + stride * (count - 1) + width * item.itemsize if count else offset
         if need > len(data) or stride < width * item.itemsize:
-            raise InputError(f"{self.path}: {semantic} needs {need} bytes, its buffer view has {len(data)}")
+            raise InputError(f"{self.path}: {semantic} needs {need} bytes, but its buffer view has {len(data)}")
         values = np.ndarray((count, width), item, data.data, offset, (stride, item.itemsize))
         return values.view(_Normalised) if said.get("normalized") is True and item.kind != "f" else values
 
@@ -182,7 +180,7 @@ class Asset:
         data = self.buffer(self.integer(said, "buffer"))
         if length > len(data) - offset:
             raise InputError(
-                f"{self.path}: truncated: a buffer view ends at byte {offset + length}, its buffer has {len(data)}"
+                f"{self.path}: truncated: a buffer view ends at byte {offset + length}, but its buffer has {len(data)}"
             )
         return data[offset : offset + length]
 
@@ -192,12 +190,12 @@ class Asset:
             length = self.integer(said, "byteLength")
             if "uri" not in said:
                 if self.binary is None or index != 0:
-                    raise InputError(f"{self.path}: buffer {index} has no data, expected a uri or the .glb's own")
+                    raise InputError(f"{self.path}: buffer {index} has no data, expected a uri or the buffer of a .glb")
                 data = _map(self.path, *self.binary)
             else:
                 data = self.outside(str(said["uri"]))
             if len(data) < length:
-                raise InputError(f"{self.path}: truncated: buffer {index} needs {length} bytes, {len(data)} are there")
+                raise InputError(f"{self.path}: truncated: buffer {index} needs {length} bytes but has {len(data)}")
             self.buffers[index] = data
         return self.buffers[index]
 
@@ -224,7 +222,7 @@ class Asset:
 
 
 def sh_attributes(degree: int) -> list[str]:
-    """Attribute names of one degree's coefficients, in our order."""
+    """Attribute names of one degree's coefficients, in the order of `Gaussians.sh`."""
     return [f"{GAUSSIAN_EXTENSION}:SH_DEGREE_{degree}_COEF_{index}" for index in range(2 * degree + 1)]
 
 
@@ -253,12 +251,12 @@ def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, in
     """JSON of a .glb, and offset and length of its buffer."""
     head = file.read(16)
     if len(head) < 16:
-        raise InputError(f"{path}: truncated: {size} bytes, expected a .glb")
+        raise InputError(f"{path}: truncated: has {size} bytes, expected a .glb")
     version, _, length, kind = struct.unpack("<IIII", head)
     if version != 2 or kind != GLB_JSON_CHUNK:
-        raise InputError(f"{path}: .glb of version {version} with a first chunk {kind:#x}, expected version 2 and JSON")
+        raise InputError(f"{path}: has .glb version {version}, first chunk {kind:#x}, expected version 2 and JSON")
     if length > min(MAX_DOCUMENT_BYTES, size - 20):
-        raise InputError(f"{path}: truncated: its JSON has {length} bytes, {size - 20} are there")
+        raise InputError(f"{path}: truncated: its JSON needs {length} bytes but has {size - 20}")
     text = file.read(length)
     head = file.read(8)
     if len(head) < 8:
@@ -268,7 +266,7 @@ def _chunks(file: BinaryIO, size: int, path: Path) -> tuple[bytes, tuple[int, in
     if kind != GLB_BIN_CHUNK:
         return text, None
     if have > size - start:
-        raise InputError(f"{path}: truncated: its buffer has {have} bytes, {size - start} are there")
+        raise InputError(f"{path}: truncated: its buffer needs {have} bytes but has {size - start}")
     return text, (start, have)
 
 

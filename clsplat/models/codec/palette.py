@@ -23,7 +23,7 @@ PRINCIPAL_AXIS_SAMPLES, POWER_ITERATIONS = 128, 30
 def codebook(values: NDArray[np.float32], size: int = 256) -> Float32:
     """Codebook (size,), ascending, with a small squared error when each value takes its nearest entry.
 
-    With more distinct values than entries, the density of the first entries is the cube root of the values' density.
+    With more distinct values than entries, the initial entries are as dense as the cube root of the values' density.
     That is optimal for many entries (Panter and Dite 1951). Lloyd iterations follow.
     """
     ordered = np.sort(values.ravel())
@@ -56,7 +56,7 @@ def nearest(entries: NDArray[np.floating], values: NDArray[np.floating]) -> NDAr
 def palette(
     vectors: Float32, size: int, iterations: int = 10, progress: Callable[[float], None] = lambda part: None
 ) -> tuple[Float32, NDArray[np.int64]]:
-    """Palette of up to `size` vectors, and the entry of each vector: (n, d) -> (size, d), (n,).
+    """Palette of up to `size` vectors, and the index of each vector's entry: (n, d) -> (size, d), (n,).
 
     Two-level k-means: clusters first, and in each a share of the palette that grows with its squared error. The cost is
     n d sqrt(size) instead of n d size.
@@ -73,7 +73,7 @@ def palette(
     errors = np.array(
         [vectors[rows].var(axis=0, dtype=np.float64).sum() * len(rows) if len(rows) else 0 for rows in members]
     )
-    # high-dimensional clusters have structure: the geometric mean of shares by count and by error
+    # a cluster's share is the geometric mean of its shares of vectors and of error, as the clusters have structure
     weights = np.sqrt(errors * [len(rows) for rows in members])
     shares = np.floor(weights / max(weights.sum(), 1e-30) * (size - coarse)).astype(np.int64) + 1
     centres, labels = [], np.empty(count, np.int64)
@@ -101,7 +101,7 @@ def _k_means(vectors: Float32, size: int, iterations: int) -> tuple[Float32, NDA
         return vectors.mean(axis=0, keepdims=True, dtype=np.float64).astype(np.float32), np.zeros(
             len(vectors), np.int64
         )
-    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # far from 0, float32 would lose its digits
+    middle = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)  # float32 would lose digits far from 0
     centred = vectors - middle
     sample = centred[:: max(1, len(vectors) // max(CODEBOOK_SAMPLES, 8 * size))]
     order = np.argsort(np.einsum("ij,j->i", sample, _direction(sample)), kind="stable")
@@ -130,10 +130,10 @@ def _direction(vectors: Float32) -> Float32:
 
 
 def _nearest_centres(vectors: Float32, centres: Float32) -> NDArray[np.int64]:
-    """Index of each vector's nearest centre, by |c|^2 / 2 - v c: half the squared distance, less a term of v alone.
+    """Index of each vector's nearest centre: the least |c|^2 / 2 - v c, half the squared distance without |v|^2 / 2.
 
-    The tiles are too small for a library's threads, which would wait for each other longer than they work. On a busy
-    machine that took several times as long.
+    The tiles are so small that the BLAS library does not split them among threads. Its threads would wait for each
+    other longer than they work; on a busy machine this took several times as long.
     """
     halves = np.float32(0.5) * np.einsum("ij,ij->i", centres, centres)
     columns = [

@@ -31,7 +31,7 @@ MAX_PLY_HEADER_BYTES = 1 << 24
 """Largest size of the whole header in bytes, as it is held in memory."""
 MAX_BLOCK_BYTES, MAX_BLOCK_WORDS = 1 << 26, 1 << 21
 MAX_NUMBER_TEXT_BYTES = 128
-"""Longest number in text, bytes. It bounds the array of a row, whose elements are all as wide as the widest."""
+"""Longest text of a number, in bytes. It bounds the array of a row, whose elements are all as wide as the longest."""
 
 _PLY_1_0_DTYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8"}  # fmt: skip
@@ -54,7 +54,7 @@ ALONG_RAYS_COMMENT = ["comment", "clsplat", "rays"]
 class Element:
     """An element of the header.
 
-    properties: name and NumPy type without byte order of each; the type is "" for a list.
+    properties: name and NumPy type of each property, without byte order. The type is "" for a list.
     """
 
     name: str
@@ -78,8 +78,8 @@ class PlyHeader:
     path: the file, for messages.
     format: "ascii" or a key of PLY_BYTE_ORDERS.
     size: the header's length in bytes, `end_header` included.
-    origin: origin of the means in the element LOCAL of a model.
-    near: near plane, if the file sets another than the default.
+    origin: origin of the means in the element `ply.LOCAL_MEANS_ELEMENT`, if the file has one.
+    near: near plane; the default if the file sets none.
     by_rays: as in `Gaussians`.
     """
 
@@ -93,8 +93,8 @@ class PlyHeader:
     by_rays: bool = False
 
     def is_antialiased(self) -> bool:
-        """True if the comments say so (`codec.antialias`). Warns if they contradict each other or are not
-        understood."""
+        """True if the comments say that the model is antialiased (`codec.antialias`). Warns if they contradict each
+        other or are not understood."""
         said = antialias.of_comments(self.comments)
         if said.warning:
             warn(f"{self.path}: {said.warning}")
@@ -149,7 +149,7 @@ def read_header(file: BinaryIO, path: Path) -> PlyHeader:
     for line in _header_lines(file, path):
         words = line.decode("ascii", "replace").split()
         if not words or words[0] in ("comment", "obj_info"):
-            given = numbers(words[3:])  # empty if the comment is not one of ours after all
+            given = numbers(words[3:])  # empty for other comments, which are not numbers
             if words[:3] == ORIGIN_COMMENT:
                 origin = given if len(given) == 3 and np.isfinite(given).all() else None
             if words[:3] == NEAR_PLANE_COMMENT:
@@ -204,17 +204,15 @@ def _binary_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Blo
     path, vertex = header.path, header.vertex
     for element in header.before:
         if element.has_list:
-            raise InputError(f"{path}: PLY has lists (element {element.name!r}) before its vertices, not supported")
+            raise InputError(f"{path}: PLY has lists before its vertices (in {element.name!r}), which is not supported")
     start = header.start(len(header.before))
     row = header.row_type(vertex)
     need, have = vertex.count * row.itemsize, max(0, os.fstat(file.fileno()).st_size - start)
     if have < need:
         whole = have // row.itemsize
-        raise InputError(
-            f"{path}: truncated: {vertex.count} {what}s need {need} bytes, {have} are there ({whole} {what}s)"
-        )
+        raise InputError(f"{path}: truncated: has {whole} of {vertex.count} {what}s ({have} of {need} bytes)")
     if have > need and header.elements[-1] is vertex:
-        warn(f"{path}: {have - need} bytes after the last {what} ignored")
+        warn(f"{path}: {have - need} bytes after the last {what} are ignored")
     file.seek(start)
     block = min(IO_BLOCK_ROWS, max(MAX_BLOCK_BYTES // max(row.itemsize, 1), 1))
     for first in range(0, vertex.count, block):
@@ -233,7 +231,7 @@ def _text_lines(file: BinaryIO, path: Path) -> Iterator[bytes]:
 
 
 def _spelt(words: list[bytes], where: str) -> list[float]:
-    """Numbers of a row, in which Microsoft's C library may have spelt non-finite values.
+    """Numbers of a row whose non-finite values may be spelt as by Microsoft's C library.
 
     Raises InputError, prefixed with `where`.
     """
@@ -267,13 +265,13 @@ def _ascii_blocks(file: BinaryIO, header: PlyHeader, what: str) -> Iterator[Bloc
             if max(map(len, words), default=0) > MAX_NUMBER_TEXT_BYTES:
                 raise InputError(f"{path}: {what} {first + index} has a value that is no number")
         if len(rows) < count:
-            raise InputError(f"{path}: truncated: {vertex.count} {what}s expected, {first + len(rows)} are there")
+            raise InputError(f"{path}: truncated: has {first + len(rows)} {what}s, expected {vertex.count}")
         if too_many:
-            raise InputError(f"{path}: truncated: {vertex.count} {what}s expected, {have} bytes are too few for them")
+            raise InputError(f"{path}: truncated: has {have} bytes, too few for {vertex.count} {what}s")
         try:
             table = np.array(rows, dtype="S").astype(np.float64).reshape(count, width)
         except ValueError:
             table = np.array([_spelt(words, f"{path}: {what} {first + at}") for at, words in enumerate(rows)])
         yield {name: table[:, index] for index, (name, _) in enumerate(vertex.properties)}
     if header.elements[-1] is vertex and next(lines, None) is not None:
-        warn(f"{path}: text after the last {what} ignored")
+        warn(f"{path}: text after the last {what} is ignored")

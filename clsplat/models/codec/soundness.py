@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Invalid values in model files, repaired or left out, and doubts about how the others are encoded.
+"""Repair or removal of invalid values in model files, and doubts about how valid values are encoded.
 
 - Infinite values that stand for a number become that number. A log scale of -inf is a scale of 0; logits of -inf and
   inf are opacities of 0 and 1. splat-transform writes flat and opaque Gaussians like this.
@@ -27,34 +27,33 @@ Activated = Literal["opacities", "scales", "both"]
 """Values that a file stores after activation, instead of as logits or logs."""
 
 DRAWN_QUATERNION_SQUARES = (1e-29, 1e29)
-"""Squared lengths of the quaternions that are kept as they are; project.cl accepts 1e-30 to 1e30."""
+"""Range of the squared lengths of quaternions that are not normalised; project.cl accepts 1e-30 to 1e30."""
 MIN_GAUSSIANS_FOR_DOUBTS = 100
 """Smallest number of Gaussians whose values show how they are encoded."""
 BYTE_LOGIT_ERROR = 0.02
-"""Largest error of a logit between 0 and 1 after an 8-bit format."""
+"""Largest error of a logit between 0 and 1 after conversion to an 8-bit format."""
 LARGEST_USEFUL_LOGIT = 20.0
-"""Largest useful logit in float32; 8-bit levels go beyond it."""
+"""Largest logit that is useful in float32. Values of 8-bit levels exceed it."""
 MAX_HANDMADE_LOGITS = 10
 """Largest number of distinct logits in a handmade model."""
 TRAINED_OPACITY_SPREAD = (0.35, 0.93)
-"""Opacities of a trained model: a hundredth lies below the first, even after pruning, and the largest exceeds the
-second.
+"""Limits for the opacities of a trained model: 1 % of them lie below the first, even after pruning, and the largest
+exceeds the second.
 
-Logits over the same range, with none below 0, would need a model pruned to opacities of at least 0.5 to 0.58. Its
-largest opacity would be 0.717 to 0.735. Trained models have some over 0.8, and short trainings end lower.
+If such values were logits, the model would be pruned to opacities of at least 0.5 to 0.58, and its largest opacity
+would be 0.717 to 0.735. Trained models have opacities over 0.8, or after short trainings lower ones.
 """
 CLIPPED_OPACITY_SHARE = (1e-3, 0.02)
 """Largest distance of clipped opacities from 1, and the least fraction of them in a network's output. Logits never
 cluster like that."""
 PERCENTAGE_MAXIMA = (40.0, 100.0)
-"""Range of the largest value of percentages. Taken as levels of 255, no opacity of such a model would exceed 0.4."""
+"""Range of the largest opacity in percent. If such values were levels of 255, no opacity would exceed 0.4."""
 ZERO_SCALE_LOG_LIMIT = float(np.log(values.MIN_SCALE)) + 1
 """Log scales below this come from scales of 0, which do not show how the others are encoded."""
 LENGTH_SKEW_RATIO = 3.0
 """Ratio of the spread above the median to the spread below it, beyond which values are lengths and not logs.
 
-Lengths spread in proportion, by a factor of e or more, which gives a ratio of 10. Their logs spread evenly to both
-sides.
+Lengths vary by a factor of e or more to both sides of the median, which gives a ratio of 10. Their logs spread evenly.
 """
 
 
@@ -132,7 +131,7 @@ def _turn(gaussians: Gaussians, numbers: NDArray[np.intp], count: int, where: Pa
 def doubts(logits: Float32, log_scales: Float32) -> list[str]:
     """Warnings about finite values that look like opacities and scales instead of logits and logs.
 
-    They have no file name. Models of few Gaussians raise no doubts.
+    The texts do not name the file. Models of few Gaussians raise no doubts.
     """
     if len(logits) < MIN_GAUSSIANS_FOR_DOUBTS:
         return []
@@ -204,7 +203,7 @@ def _deactivated(gaussians: Gaussians, which: Activated, numbers: NDArray[np.int
             raise InputError(
                 f"{where}: opacities are whole numbers up to {most:g}, expected 0 to 1, or some over "
                 f"{PERCENTAGE_MAXIMA[0]:g}; "
-                "these may be parts of 100 or of 255"
+                "these may be percentages or levels of 255"
             )
         opacity = logits / np.float32(white)
         near = (opacity >= -BYTE_LOGIT_ERROR) & (opacity <= 1 + BYTE_LOGIT_ERROR)

@@ -23,24 +23,24 @@ IO_BLOCK_ROWS = 1 << 15
 MIN_SCALE = 2.0**-149
 """Replacement for a scale of 0, whose log has to be finite: the smallest float32."""
 LOG_SCALES_MIN_NEGATIVE_SHARE = 0.01
-"""Fraction of Gaussians with a negative linear scale from which all scales are taken for logs.
+"""Fraction of Gaussians with a negative scale, at or above which all scales are taken for logs.
 
-In a model in metres nearly all logs are negative. A file of scales with a few damaged ones stays below.
+In a model in metres nearly all logs are negative. A file of linear scales with a few damaged ones stays below it.
 """
 MAX_UNCHECKED_GAUSSIANS = 1 << 20
 """Number of Gaussians that a compressed file of any length may have. A file may have more only if it has a byte for
 each.
 
-Any real scene stays below, as positions alone take several bytes each. A decompression bomb asks for more.
+Real files meet this limit, since positions alone take several bytes each. A decompression bomb claims more.
 """
 OTHER_QUATERNION_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Row i: the components of a quaternion other than component i."""
 MORTON_BITS_PER_AXIS = 21
 MAX_FLOAT_HIGHLIGHT = 2.0
-"""Largest float colour for which white is 1, if the values are not all whole numbers: some may be brighter than
-white."""
+"""Float colours up to this value have white at 1, unless all are whole numbers. Some may then be brighter than white.
+"""
 UNIT_COLOUR_SHARE = 0.95
-"""Fraction of float colours that lie in 0 to 1 if white is 1 and there are highlights."""
+"""Least fraction of float colours that are at most 1, if white is 1 and there are highlights."""
 UNIT_RANGE_TOLERANCE = 1e-3
 """Relative tolerance of float colours above white and of opacities outside 0 to 1, for half floats and averages."""
 GAUSSIAN_ARRAY_NOUNS = ("a position", "a rotation", "a scale", "an opacity", "a colour")
@@ -72,7 +72,7 @@ def world_means(gaussians: Gaussians, rows: slice | NDArray[Any] = slice(None)) 
 
 
 def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Round 0 to 1 to bytes 0 to 255; values outside are clamped."""
+    """Convert values from 0 to 1 to bytes from 0 to 255; values outside are clamped."""
     return np.asarray(np.clip(np.rint(values * 255), 0, 255).astype(np.uint8))
 
 
@@ -106,12 +106,11 @@ def to_log_scales(gaussians: Gaussians, where: Path | str) -> None:
 
 
 def all_to_log_scales(parts: Sequence[tuple[Path | str, Gaussians]], writer: str = "") -> None:
-    """Replace linear scales, standard deviations that a file has instead of logs, by their logs, in place, in all
-    parts.
+    """Replace the linear scales (standard deviations) of all parts by their logs, in place.
 
-    If the fraction LOG_SCALES_MIN_NEGATIVE_SHARE or more of the Gaussians has a negative scale, all are logs and stay,
-    with a warning. All parts decide together. splat-transform's .glb before 22 June 2026, and the review draft of
-    KHR_gaussian_splatting, had logs.
+    If the fraction LOG_SCALES_MIN_NEGATIVE_SHARE or more of all Gaussians has a negative scale, the scales of all parts
+    are logs already: they stay, and a warning says so. Files by splat-transform before 22 June 2026, and files after
+    the review draft of KHR_gaussian_splatting, have logs.
 
     parts: prefix of messages and Gaussians of each part.
     writer: a program that is known to write logs, negative or not.
@@ -156,19 +155,19 @@ def logits_of(opacity: NDArray[Any], where: Path | str, numbers: int | NDArray[n
         at = int(bad.argmax())
         number = numbers + at if isinstance(numbers, int) else numbers[at]
         raise InputError(
-            f"{where}: Gaussian {number} has an opacity outside [0, 1], {float(opacity[at]):g}; if these are "
-            "logits, expected 1 / (1 + exp(-logit))"
+            f"{where}: Gaussian {number} has an opacity of {float(opacity[at]):g}, expected 0 to 1; if these are "
+            "logits, replace them by 1 / (1 + exp(-logit))"
         )
     return logits(opacity)
 
 
 def colours(dc: Float32) -> Float64:
-    """Colours of SH coefficient 0."""
+    """Colours from SH coefficients 0, which are the constant terms."""
     return 0.5 + SH_C0 * dc.astype(np.float64)
 
 
 def coefficients(rgb: NDArray[Any]) -> Float64:
-    """SH coefficient 0 of colours."""
+    """SH coefficients 0 from colours."""
     return (np.asarray(rgb, np.float64) - 0.5) / SH_C0
 
 
@@ -221,7 +220,7 @@ def restore_largest(which: NDArray[Any], three: Float32) -> Float32:
 
 
 def leave_out_largest(unit: Float64) -> tuple[NDArray[np.intp], Float64]:
-    """Inverse of `restore_largest`; signs of (n, 4) change so that the component left out is positive."""
+    """Inverse of `restore_largest`. A quaternion changes sign if its largest component is negative."""
     which = np.abs(unit).argmax(axis=1)
     sign = np.where(np.take_along_axis(unit, which[:, None], axis=1) < 0, -1, 1)
     return which, np.take_along_axis(unit, OTHER_QUATERNION_COMPONENTS[which], axis=1) * sign

@@ -31,7 +31,7 @@ from clsplat.models.formats import compressed_ply, gltf, ksplat, ply, sog, splat
 
 FORMAT_HEAD_BYTES = 1 << 16
 MODEL_SIZE_SAMPLES = 10_000
-"""Means sampled to estimate a model's size."""
+"""Number of means that are sampled to estimate a model's size."""
 SMALL_MODEL_NEAR_PLANES = 10.0
 """Model size, in default near planes, below which the default near plane is too far."""
 
@@ -41,17 +41,17 @@ class Format:
     """A row of the table.
 
     name: its name in messages.
-    suffixes: suffixes of its files in lower case; one without a dot is a whole name.
+    suffixes: suffixes of its files in lower case; a suffix without a dot is a whole file name.
     read(path): reads the Gaussians. Raises InputError, one line with the path, for a damaged file.
     write(path, gaussians, **options): writes atomically; None for a read-only format.
     recognises(head): True if the first bytes, at most FORMAT_HEAD_BYTES, are of the format; None without a signature.
     loses: short description of the information that the format does not keep.
-    floats: True if it keeps floats.
+    floats: True if it stores values as floats.
     sh_degree: the highest degree that it holds.
     describe(path): the format's part of `clsplat info`.
-    order(gaussians): (n,), the Gaussian of each row of a written file; None if the order is kept.
+    order(gaussians): (n,) index of the Gaussian in each row of a written file; None if the order is kept.
     blocks(path): yields the Gaussians in world coordinates, some rows at a time; None if the file is read whole.
-    side_files(path): the other files of a model of this name.
+    side_files(path): the other files of the model at this path.
     space(path): colour space of its colours.
     marks: byte strings, of which a file with Gaussians has at least one near its beginning; empty if all files have
     Gaussians.
@@ -116,7 +116,7 @@ def suffixes(*, writable: bool = False) -> list[str]:
 
 
 def _named(path: Path) -> Format | None:
-    """Format with the longest suffix that matches."""
+    """Format with the longest suffix that matches the name; None if none does."""
     name = path.name.lower()
     fits = [
         (len(suffix), row)
@@ -132,7 +132,7 @@ def format_of_name(path: str | os.PathLike[str], *, writable: bool = False) -> F
     named = _named(Path(path))
     known = " ".join(suffixes(writable=writable))
     if named is None:
-        raise InputError(f"{path}: not the ending of a model file, expected one of {known}")
+        raise InputError(f"{path}: does not end like a model file, expected one of {known}")
     if writable and named.write is None:
         raise InputError(f"{path}: {named.name} is read only, expected one of {known}")
     return named
@@ -148,7 +148,7 @@ def format_of(path: Path) -> Format:
         head = file.read(FORMAT_HEAD_BYTES)
         if head.startswith(b"ply") and b"end_header" not in head:  # long comments push the properties further down
             head += file.read(MAX_PLY_HEADER_BYTES)
-    # without a signature of its own, another format's decides; but JSON alone says too little
+    # a format without a signature yields to another format's signature, unless that is only the start of JSON
     fits = named and (named.recognises(head) if named.recognises else head.lstrip()[:1] == b"{")
     if head.startswith(zipped.ZIP_FILE_MAGIC) and (not fits or named is _row("SOG")):
         return _archive(path, named)
@@ -157,9 +157,9 @@ def format_of(path: Path) -> Format:
 
 
 def _archive(path: Path, named: Format | None) -> Format:
-    """Format of a zip archive that is not named .zip or as OpenUSD.
+    """Format of a zip archive whose name is not that of a .zip or OpenUSD file.
 
-    It is SOG if one of its files is SOG's meta.json, or if it is named as SOG and contains no other model.
+    It is SOG if one of its files is SOG's meta.json, or if it has SOG's suffix and contains no other model.
     """
     names = _ZIPPED_MODEL.names(path)
     is_sog = sog.SOG_META_FILE in names or (named is _row("SOG") and not names)

@@ -2,7 +2,7 @@
 """PlayCanvas' compressed PLY: 16 bytes a Gaussian in chunks of 256, and a byte for each higher SH coefficient.
 
 https://blog.playcanvas.com/compressing-gaussian-splats and https://github.com/playcanvas/splat-transform (read-ply,
-write-compressed-ply). Frame, quaternion order, log scales and signs are the PLY's.
+write-compressed-ply). Frame, quaternion order, log scales and signs are as in the 3DGS PLY.
 
 - element `chunk`: bounds of position, log scale and colour (0.5 + C0 f_dc) of 256 Gaussians. Older files have no colour
   bounds, which are then 0 and 1. Log scales are clamped to -20 to 20 when written.
@@ -13,8 +13,8 @@ write-compressed-ply). Frame, quaternion order, log scales and signs are the PLY
 - element `sh`, if there are higher coefficients: f_rest_*, channel-major, in bytes for -4 to 4. A byte is the middle of
   one of 256 steps, but 0 and 255 are the ends.
 
-Some writers let infinite bounds pass, such as the log -inf of a scale of 0. Such a bound belongs to the Gaussians at
-that end of the steps and to all between the ends, whose values are lost.
+Some writers store infinite bounds, such as -inf, the log of a scale of 0. The Gaussians at that end of the steps get
+the infinite value, and so do all Gaussians between the ends, whose own values are lost.
 
 The Gaussians of a chunk share its bounds, so they are sorted by position when written.
 """
@@ -63,7 +63,7 @@ def read(path: Path) -> Gaussians:
         chunks, vertex, sh = _elements(header)
         end, have = header.start(len(header.elements)), os.fstat(file.fileno()).st_size
         if have < end:
-            raise InputError(f"{path}: truncated: its header promises {end} bytes, {have} are there")
+            raise InputError(f"{path}: truncated: has {have} of the {end} bytes that its header promises")
         bounds = _bounds(file, header, chunks)
         rest = [] if sh is None else [f"f_rest_{index}" for index in range(len(sh.properties))]
         result = packing.empty(vertex.count, {0: 0, 9: 1, 24: 2, 45: 3}[len(rest)])
@@ -128,10 +128,10 @@ def _elements(header: ply_file.PlyHeader) -> tuple[ply_file.Element, ply_file.El
     """Elements chunk, vertex and, if present, sh, with their properties checked."""
     path, names = header.path, [element.name for element in header.elements]
     if header.format == "ascii":
-        raise InputError(f"{path}: a compressed PLY in ascii, expected binary")
+        raise InputError(f"{path}: is a compressed PLY in ascii, expected binary")
     for name in ("chunk", "vertex"):
         if names.count(name) != 1:
-            raise InputError(f"{path}: {names.count(name)} elements {name!r} in the header, expected one")
+            raise InputError(f"{path}: its header has {names.count(name)} elements {name!r}, expected one")
     chunks, vertex = (header.elements[names.index(name)] for name in ("chunk", "vertex"))
     sh = header.elements[names.index("sh")] if "sh" in names else None
     wanted = (
@@ -147,19 +147,21 @@ def _elements(header: ply_file.PlyHeader) -> tuple[ply_file.Element, ply_file.El
         raise InputError(f"{path}: has 0 Gaussians (element vertex 0), expected at least one")
     if chunks.count * CHUNK_GAUSSIANS < vertex.count:
         raise InputError(
-            f"{path}: {chunks.count} chunks are too few for {vertex.count} Gaussians, {CHUNK_GAUSSIANS} in each"
+            f"{path}: has {chunks.count} chunks of {CHUNK_GAUSSIANS} Gaussians, too few for {vertex.count} Gaussians"
         )
     if sh is not None:
         counts = [3 * degree * (degree + 2) for degree in range(1, MAX_SH_DEGREE + 1)]
         properties = [(f"f_rest_{index}", "u1") for index in range(len(sh.properties))]
         if len(sh.properties) not in counts or set(properties) != set(sh.properties):
-            raise InputError(f"{path}: element sh, expected uchars f_rest_*, {', '.join(map(str, counts))} of them")
+            raise InputError(
+                f"{path}: element sh has other properties than {' or '.join(map(str, counts))} uchars f_rest_*"
+            )
         if sh.count != vertex.count:
-            raise InputError(f"{path}: element sh has {sh.count} rows, expected {vertex.count}, as vertex has")
+            raise InputError(f"{path}: element sh has {sh.count} rows, expected {vertex.count} like element vertex")
     for element in header.elements:
         kept = [name for name, _ in element.properties]
         if element.has_list or len(set(kept)) < len(kept):
-            raise InputError(f"{path}: element {element.name} has a list or a property twice, expected numbers")
+            raise InputError(f"{path}: element {element.name} has a list or the same property twice")
     return chunks, vertex, sh
 
 
@@ -181,7 +183,7 @@ def _bounds(file: BinaryIO, header: ply_file.PlyHeader, chunks: ply_file.Element
 
 
 def _fields(words: NDArray[Any], layout: tuple[tuple[int, int], ...]) -> NDArray[np.float32]:
-    """Bit fields (n, fields) as 0 to 1; layout: shift and bits of each."""
+    """Bit fields (n, fields), scaled to 0 to 1. layout: shift and number of bits of each field."""
     columns = [(words >> shift & (1 << bits) - 1) / np.float32((1 << bits) - 1) for shift, bits in layout]
     return np.stack(columns, axis=1).astype(np.float32)
 

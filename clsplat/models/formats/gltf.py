@@ -4,15 +4,15 @@
 Specifications: https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html, and for Gaussians
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting (ratified).
 
-- Frame: x left, y up, z forward, as the base specification says; half a turn about z from ours. Written values include
-  that turn, and no node has it, as not every viewer turns spherical harmonics with their node. An `origin` becomes the
-  node's translation. When reading, the nodes' transforms are applied.
+- Frame: x left, y up, z forward, as the base specification says; half a turn about z from ours. The turn is applied
+  to the written values and not to a node, since not every viewer turns spherical harmonics with their node. An `origin`
+  becomes the node's translation. When reading, the nodes' transforms are applied.
 - Values are float32: linear scales, opacities in [0, 1], unit quaternions x y z w. Each SH coefficient has an
   attribute, with our order and signs. Normalised integers are read too. COLOR_0 is for viewers that draw points, in
   linear light as glTF requires.
 - Colour space: srgb_rec709_display by default, or lin_rec709_display for a model trained in linear light.
-- Compression: the draft KHR_gaussian_splatting_compression_spz_2 stores an SPZ file in a buffer view. Its text says
-  version 2, to be unpacked into glTF's frame. It is read, and written on request.
+- Compression: the draft KHR_gaussian_splatting_compression_spz_2 stores an SPZ file in a buffer view. It demands
+  SPZ version 2, unpacked into glTF's frame. Such files are read, and written on request.
 
 The container, a JSON object and arrays at offsets, is parsed here, in place. Libraries for it load whole files and
 trust their contents.
@@ -60,7 +60,7 @@ GLB_MAGIC = 0x46546C67
 FLOAT32_COMPONENT, UINT16_COMPONENT = 5126, 5123
 MAX_GLB_BYTES = (1 << 32) - 1
 LOG_SCALE_WRITER, LOG_SCALE_WRITER_FIXED_VERSION = re.compile(r"splat-transform v?(\d+)\.(\d+)(?:\..*)?"), (2, 7)
-"""A program whose files before that version store logs instead of scales."""
+"""Pattern of a program's name and version, and the first version that writes scales. Earlier ones write their logs."""
 Rows = Callable[[slice], Array]
 """An attribute: a function that returns some of its rows."""
 
@@ -88,7 +88,7 @@ def side_files(path: Path) -> list[Path]:
 def read(path: Path) -> Gaussians:
     """Read every primitive of Gaussians in the scene, as one model. Raises InputError."""
     asset = Asset.open(path)
-    primitives = list(asset.primitives())  # counts them before anything is read
+    primitives = list(asset.primitives())  # a list, so that they are counted before any is read
     if not primitives:
         raise InputError(f"{path}: has no primitive with {GAUSSIAN_EXTENSION} in its scene, expected at least one")
     scaled: list[tuple[str, Gaussians]] = []
@@ -115,10 +115,10 @@ def _gaussians(asset: Asset, name: str, primitive: dict[str, Any], scaled: list[
     if kernel != "ellipse":
         warn(
             f"{asset.path}: {name} has the kernel {str(kernel)[:40]!r}, expected ellipse; it is drawn as one, as the "
-            "extension says of kernels that a reader does not know"
+            "extension prescribes for unknown kernels"
         )
     if space != GLTF_COLOR_SPACES[0]:
-        warn(f"{asset.path}: the colours are in {str(space)[:40]}, kept as they are")
+        warn(f"{asset.path}: the colours are in {str(space)[:40]} and are not converted")
     nested = as_object(said.get("extensions", {}))
     for extension in SPZ_EXTENSIONS:
         if extension in nested:
@@ -171,7 +171,7 @@ def write(
     Raises InputError for non-finite values, and for a .glb of more than 4 GiB.
     """
     if color_space not in GLTF_COLOR_SPACES:
-        raise ValueError(f"color_space {color_space!r}: expected {' or '.join(GLTF_COLOR_SPACES)}")
+        raise ValueError(f"color_space is {color_space!r}, expected {' or '.join(GLTF_COLOR_SPACES)}")
     values.check_writable(path, gaussians, least=1)
     document, contents = _document(path, gaussians, spz_compression, color_space)
     length = sum(view["byteLength"] for view in document["bufferViews"])
@@ -188,7 +188,7 @@ def write(
     padded = length + -length % 4
     total = 28 + len(text) + padded
     if total > MAX_GLB_BYTES:
-        raise InputError(f"{path}: a .glb holds 4 GiB at most, {total} bytes would be needed; write a .gltf")
+        raise InputError(f"{path}: a .glb holds 4 GiB at most, but {total} bytes are needed; write a .gltf")
     with atomic_writer(path, total) as file:
         file.write(struct.pack("<IIIII", GLB_MAGIC, 2, total, len(text), GLB_JSON_CHUNK) + text)
         file.write(struct.pack("<II", padded, GLB_BIN_CHUNK))

@@ -7,7 +7,7 @@ buckets' centres and the Gaussians.
 
 - A Gaussian: position, scale, quaternion w x y z, bytes of red, green, blue and opacity, and higher SH.
 - Scales are standard deviations, not logs. SH above degree 0 are stored by degree, channel-major in each.
-- The frame and the signs of SH are the PLY's.
+- The frame and the signs of SH are as in the 3DGS PLY.
 - Level 0: float32.
 - Level 1: half floats, and positions in 16 bits around their bucket's centre.
 - Level 2: as level 1, but SH in bytes between the header's two bounds.
@@ -58,9 +58,9 @@ class Section:
     """Place and encoding of a section's Gaussians.
 
     count: number of Gaussians.
-    start: byte offset of the first.
+    start: byte offset of the first Gaussian.
     kind: dtype of a record.
-    step: world units of one unit of a stored position, relative to `middle`.
+    step: world units per unit of a stored position. `middle` is the stored position at the centre of a bucket.
     centres: (buckets, 3); None at level 0.
     ends: index of the first Gaussian after each bucket; None at level 0.
     """
@@ -78,7 +78,7 @@ class Section:
 def read(path: Path) -> Gaussians:
     """Read the file.
 
-    Raises InputError for another version or level, a truncated file, inconsistent counts, and a few negative scales.
+    Raises InputError for another version or level, a truncated file, inconsistent counts, and some negative scales.
     """
     with open_input(path, "a .ksplat file") as file:
         size = os.fstat(file.fileno()).st_size
@@ -87,11 +87,11 @@ def read(path: Path) -> Gaussians:
         header = packing.read_rows(file, KSPLAT_HEADER, 1, path)[0]
         if header["major"] != 0 or header["minor"] < 1 or header["level"] > 2:
             version = f"version {header['major']}.{header['minor']}, compression level {header['level']}"
-            raise InputError(f"{path}: {version}, expected a .ksplat of version 0.1, level 0, 1 or 2")
+            raise InputError(f"{path}: has {version}, expected a .ksplat of version 0.1, level 0, 1 or 2")
         sections = _sections(file, int(header["sections"]), int(header["level"]), size, path)
         count = sum(section.count for section in sections)
         if count != header["count"] or not count:
-            raise InputError(f"{path}: its sections have {count} Gaussians, its header {header['count']}")
+            raise InputError(f"{path}: its sections have {count} Gaussians, but its header says {header['count']}")
         degree = max(section.degree for section in sections if section.count)
         gaussians = packing.empty(count, degree)
         gaussians.sh[:, 1:] = 0
@@ -125,7 +125,7 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
     """All sections, checked against the file's size."""
     at = KSPLAT_HEADER.itemsize + sections * KSPLAT_SECTION_HEADER.itemsize
     if size < at:
-        raise InputError(f"{path}: truncated: {sections} sections need {at} bytes, {size} are there")
+        raise InputError(f"{path}: truncated: has {size} bytes, but its {sections} sections need {at}")
     result = []
     for index, fields in enumerate(packing.read_rows(file, KSPLAT_SECTION_HEADER, sections, path)):
         head = {name: fields[name].item() for name in KSPLAT_SECTION_HEADER.names or ()}
@@ -137,7 +137,7 @@ def _sections(file: BinaryIO, sections: int, level: int, size: int, path: Path) 
         start = at + lengths + buckets
         end = start + kind.itemsize * head["room"]
         if head["count"] > head["room"] or end > size:
-            raise InputError(f"{name} ends at byte {end} with {head['count']} Gaussians, {size} bytes are there")
+            raise InputError(f"{name} ends at byte {end} of {size} with {head['count']} Gaussians")
         centres = ends = None
         if level:
             if head["buckets"] and head["bucket_bytes"] != BUCKET_CENTRE_BYTES:
@@ -171,12 +171,12 @@ def _ends(head: dict[str, Any], partial: NDArray[np.int64], name: str) -> NDArra
     full = head["full"]
     if full + len(partial) > head["buckets"]:
         raise InputError(
-            f"{name} has {full} full and {len(partial)} other buckets, expected {head['buckets']} together"
+            f"{name} has {full} full and {len(partial)} other buckets, expected at most {head['buckets']} in all"
         )
     lengths = np.concatenate([np.full(full, head["bucket_size"], np.int64), partial])
     ends = np.cumsum(lengths)
     if head["count"] > (ends[-1] if len(ends) else 0):
-        raise InputError(f"{name} has {head['count']} Gaussians, its buckets have fewer")
+        raise InputError(f"{name} has {head['count']} Gaussians, but its buckets have fewer")
     return ends
 
 

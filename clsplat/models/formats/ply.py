@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 3DGS model file: a PLY with one vertex a Gaussian, as written by the paper's authors and read by every tool.
+"""The 3DGS model file: a PLY with one vertex per Gaussian, as the paper's authors write it and every tool reads it.
 
 https://github.com/graphdeco-inria/gaussian-splatting (scene/gaussian_model.py, save_ply).
 Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3. f_rest is channel-major: all higher
 coefficients of red, then of green, then of blue. Files are streamed in blocks of rows, so reading or writing takes
 little more than the model's own memory.
 
-Means relative to another origin are written in world coordinates, which rounds them, as every tool expects. The exact
-means follow in a second element, with their origin in a comment. Other tools ignore both.
+Every tool expects means in world coordinates, so means relative to another origin are converted, which rounds them. The
+exact means follow in a second element, with their origin in a comment. Other tools ignore both.
 """
 
 from __future__ import annotations
@@ -54,27 +54,27 @@ DC_PROPERTIES = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE_PROPERTIES = ("scale_0", "scale_1", "scale_2")
 ROTATION_PROPERTIES = ("rot_0", "rot_1", "rot_2", "rot_3")
 MIP_FILTER_PROPERTY = "filter_3D"
-"""Mip-Splatting's property, which its renderer adds to the scales."""
+"""Property in Mip-Splatting's files: the filter size that Mip-Splatting's renderer adds to the scales."""
 LOCAL_MEANS_ELEMENT = "clsplat_local"
 """Element with the means relative to the origin."""
 RGB_PROPERTY_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Property names of colours without view dependence, in any case, instead of DC: nerfstudio's export, and point
-files."""
+"""Names, in upper or lower case, of colour properties that nerfstudio's exports and point files have instead of f_dc.
+"""
 REQUIRED_PLY_PROPERTIES = (*POSITION_PROPERTIES, *DC_PROPERTIES, "opacity", *SCALE_PROPERTIES, *ROTATION_PROPERTIES)
 
 
 def recognises(head: bytes) -> bool:
-    """True for a PLY that is not a compressed one."""
+    """True for a PLY that is not a compressed PLY."""
     return head.startswith(b"ply") and b"packed_position" not in head.partition(b"end_header")[0]
 
 
 def read(path: str | os.PathLike[str]) -> Gaussians:
     """Read a 3DGS PLY: ascii or binary of either byte order, properties in any order, of any numeric type.
 
-    - SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45). Degree 4 (72) loses its fourth band, with a
+    - SH degree 0 to 3 by the number of f_rest properties (0, 9, 24, 45). Degree 4 (72) is cut to 3, with a
       warning.
-    - Without scale_2, as 2DGS writes them, Gaussians are flat.
-    - Colours named as in RGB may replace f_dc; their values give their range (`values.full_scale`).
+    - Gaussians without scale_2, as 2DGS writes them, are flat.
+    - Colours named as in RGB_PROPERTY_NAMES may replace f_dc; their values show their range (`values.full_scale`).
     - Other properties are ignored. MIP_FILTER_PROPERTY, and bytes after the data, give a warning.
 
     Raises InputError, one line with the path, if the file is missing, truncated, not a PLY, lacks a property or has no
@@ -122,7 +122,7 @@ def read_whole_numbers(path: Path, name: str) -> NDArray[np.int64]:
 def blocks(path: Path) -> Iterator[Gaussians]:
     """Gaussians in the file's order and in world coordinates, some rows at a time, each block with the file's origin.
 
-    Non-finite values, and colours named as in RGB, are passed through unchanged. Raises InputError like `read`.
+    Non-finite values, and colours named as in RGB_PROPERTY_NAMES, are passed through. Raises InputError like `read`.
     """
     with open_input(path, "a 3DGS PLY") as file:
         header = read_header(file, path)
@@ -165,7 +165,7 @@ def write(
     values.check_writable(Path(path), gaussians)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if misfit(int, degree) or not gaussians.sh_degree <= degree <= MAX_SH_DEGREE:
-        raise ValueError(f"sh_degree {degree}: expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
+        raise ValueError(f"sh_degree is {degree}, expected {gaussians.sh_degree} (the model's) to {MAX_SH_DEGREE}")
     stored, padded = gaussians.sh.shape[1] - 1, (degree + 1) ** 2 - 1
     rest_names = [f"f_rest_{index}" for index in range(3 * padded)]
     names = [
@@ -199,7 +199,7 @@ def write(
 
 
 def _header(gaussians: Gaussians, names: Sequence[str], comments: Sequence[str]) -> bytes:
-    """Header of a written file, to its last line. names: properties of a Gaussian."""
+    """Header of a written file, including its last line. names: properties of a Gaussian."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     far, count = bool(gaussians.origin.any()), len(gaussians)
     if far:
@@ -221,7 +221,7 @@ def check_comments(comments: Sequence[str]) -> None:
     """Raise ValueError for a comment that is not a line of ASCII."""
     for line in comments:
         if not (line.isascii() and line.isprintable()):
-            raise ValueError(f"comment {line!r}: expected one line of ASCII")
+            raise ValueError(f"comment is {line!r}, expected one line of ASCII")
 
 
 def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
@@ -237,21 +237,21 @@ def _local_means(file: BinaryIO, header: PlyHeader) -> Float32 | None:
     data = file.read(need)
     if len(data) != need:
         raise InputError(
-            f"{header.path}: truncated: element {LOCAL_MEANS_ELEMENT} needs {need} bytes, {len(data)} are there"
+            f"{header.path}: truncated: element {LOCAL_MEANS_ELEMENT} needs {need} bytes but has {len(data)}"
         )
     rows = np.frombuffer(data, row)
     return np.stack([rows[name] for name in POSITION_PROPERTIES], axis=1).astype(np.float32)
 
 
 def _count_from(origin: Float64, gaussians: Gaussians, local: Float32 | None, path: Path) -> None:
-    """Make the means relative to the origin: exactly as written, unless another tool moved the vertices since."""
+    """Make the means relative to the origin. Uses the exact means `local` where no tool has moved the vertex."""
     world = gaussians.means.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         means = (world - origin).astype(np.float32)
         if local is not None:
             means = np.where((local + origin).astype(np.float32) == world, local, means)
     if not np.isfinite(means[np.isfinite(world)]).all():
-        raise InputError(f"{path}: the origin in the comment, {origin}, leaves means that are not finite")
+        raise InputError(f"{path}: the origin in the comment, {origin}, gives means that are not finite")
     gaussians.origin, gaussians.means = origin, np.ascontiguousarray(means)
 
 
@@ -275,26 +275,26 @@ def _check_properties(header: PlyHeader) -> int:
         raise InputError(f"{path}: PLY has {rest} f_rest properties, expected {', '.join(map(str, counts))} (SH)")
     for index in range(rest):
         if f"f_rest_{index}" not in names:
-            raise InputError(f"{path}: PLY lacks the property f_rest_{index}, though it has {rest} of f_rest")
+            raise InputError(f"{path}: PLY lacks the property f_rest_{index}, expected f_rest_0 to {rest - 1}")
     if rest == counts[-1]:
-        left_out = f"SH of degree {MAX_SH_DEGREE + 1} is left out, {MAX_SH_DEGREE} is the highest that is known"
+        left_out = f"has SH of degree {MAX_SH_DEGREE + 1}; coefficients above degree {MAX_SH_DEGREE} are left out"
         warn(f"{path}: {left_out}")
     return rest
 
 
 def _degree(rest: int) -> int:
-    """SH degree kept from a file with this number of f_rest properties."""
+    """SH degree that is read from a file with this number of f_rest properties."""
     return min(isqrt(1 + rest // 3) - 1, MAX_SH_DEGREE)
 
 
 def _colour_names(vertex: Element) -> tuple[str, ...]:
-    """Properties to read colours from: DC, unless the file has none of these but colours by another name."""
+    """Properties to read colours from: f_dc, unless the file lacks these and has colours by another name."""
     names = [name for name, _ in vertex.properties]
     return _rgb_names(names) or DC_PROPERTIES if set(DC_PROPERTIES).isdisjoint(names) else DC_PROPERTIES
 
 
 def _rgb_names(names: Iterable[str]) -> tuple[str, ...]:
-    """Properties among `names` that match an entry of RGB, as spelt in the file; empty unless all three are there."""
+    """Properties among `names` that match an entry of RGB_PROPERTY_NAMES, as spelt in the file; empty if none does."""
     spelt = {name.lower(): name for name in names}
     return next((tuple(spelt[name] for name in rgb) for rgb in RGB_PROPERTY_NAMES if spelt.keys() >= {*rgb}), ())
 
@@ -313,7 +313,7 @@ def _take_colours(gaussians: Gaussians, vertex: Element) -> None:
 
 
 def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
-    """Destination in the model's arrays of each property that is kept."""
+    """The part of the model's arrays into which each property is read, by the property's name."""
     columns: dict[str, NDArray[Any]] = {"opacity": gaussians.opacity_logits}
     arrays = (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh[:, 0])
     for names, array in zip(
@@ -327,7 +327,7 @@ def _columns(gaussians: Gaussians, rest: int) -> dict[str, NDArray[Any]]:
 
 
 def _fill(gaussians: Gaussians, block: Block, rest: int) -> None:
-    """Write a block into as many Gaussians. A double beyond the range of float32 becomes infinite."""
+    """Write a block into a model of as many Gaussians. A double beyond the range of float32 becomes infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
         for name, column in _columns(gaussians, rest).items():
             if name in block:

@@ -4,12 +4,12 @@
 Specification: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/ (version 2). Version 1,
 without a number in meta.json, is read as in https://github.com/playcanvas/splat-transform.
 
-- Frame: as ours and the PLY's. Each pixel is a Gaussian, row by row from the top.
+- Frame: as ours and the 3DGS PLY's. Each pixel is a Gaussian, row by row from the top.
 - means_l, means_u: low and high bytes of 16 bits between an axis's smallest and largest sign(x) ln(1 + |x|).
 - quats: w x y z without the largest component, whose index plus 252 is in alpha; the others in steps of 1/180.
 - scales: indices into a codebook of 256 natural logs.
-- sh0: indices into a codebook of 256 SH coefficients 0. Alpha is the opacity in steps of 1/255; an opacity of 0 loses
-  the colours.
+- sh0: indices into a codebook of 256 values of SH coefficient 0. Alpha is the opacity in steps of 1/255; an
+  opacity of 0 loses the colours.
 - shN: a palette of up to 65,536 sets of coefficients, each an index into a third codebook; order and signs as ours.
 - Version 1 has ranges in 255 steps instead of codebooks, and opacity as a logit.
 """
@@ -55,7 +55,7 @@ MAX_PALETTE_ENTRIES = 1 << 16
 PALETTE_COLUMNS = 64
 QUATERNION_TAG_BASE = 252
 MAX_UNCHECKED_IMAGE_BYTES = 16 << 20
-"""Bytes that an image in an archive may have, plus 8 for each Gaussian: twice its raw pixel."""
+"""Bytes that an image in an archive may have, in addition to 8 for each Gaussian, which are two raw pixels."""
 
 
 def recognises(head: bytes) -> bool:
@@ -70,8 +70,8 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def _is_antialiased(path: Path, meta: dict[str, Any]) -> bool:
-    """True if meta.json says so, in `antialias` or `model`. Warns if they contradict each other or are not
-    understood."""
+    """True if meta.json says in `antialias` or `model` that the model is antialiased. Warns if they contradict each
+    other or are not understood."""
     said = antialias.of_object(meta)
     if said.warning:
         warn(f"{path}: {SOG_META_FILE} {said.warning}")
@@ -127,7 +127,7 @@ def _names(folder: Path) -> list[str]:
 
 
 def _spelt(name: str, names: Iterable[str]) -> str:
-    """The name, or the single one of `names` that differs only in case, as Windows and macOS find files."""
+    """The name itself, or the only one of `names` that differs just in case, as Windows and macOS find files."""
     names = list(names)
     alike = [other for other in names if other.lower() == name.lower()] if name not in names else []
     return alike[0] if len(alike) == 1 else name
@@ -139,7 +139,7 @@ def _parsed(path: Path, text: str | bytes) -> dict[str, Any]:
     except ValueError as error:
         raise InputError(f"{path}: {SOG_META_FILE} does not parse ({error})") from None
     if not isinstance(meta, dict) or "means" not in meta:
-        raise InputError(f"{path}: {SOG_META_FILE} has no means, expected a SOG model's")
+        raise InputError(f"{path}: {SOG_META_FILE} has no means, expected that of a SOG model")
     return meta
 
 
@@ -191,7 +191,7 @@ class _Meta:
         self.version = meta.get("version", 1)
         if self.version not in (1, 2):
             found = json.dumps(self.version)[:20]
-            raise InputError(f"{self.path}: SOG version {found} in {SOG_META_FILE}, expected the number 1 or 2")
+            raise InputError(f"{self.path}: has SOG version {found} in {SOG_META_FILE}, expected the number 1 or 2")
         shape = self.section("means").get("shape", [0])
         count = meta.get("count") if self.version == 2 else shape[0] if isinstance(shape, list) and shape else 0
         if self.version == 2 and (not isinstance(count, int) or isinstance(count, bool)):
@@ -301,14 +301,14 @@ class _Meta:
             return packing.at_ends(low + (high - low) * part, low, high, part).astype(np.float32)
 
     def tell_of_nulls(self, entries: Float32, indices: Bytes) -> None:
-        """Warn of null in the codebook of scales, unless it comes first: entries ascend, so -inf would be first."""
+        """Warn of null in the codebook of scales, unless it comes first, where -inf belongs as entries ascend."""
         null = np.isinf(entries)
         if (count := int(null.sum())) and null[int((~null).argmax()) :].any():
             users = int(null[indices].any(axis=1).sum())
             warn(
                 f"{self.path}: codebook of scales in {SOG_META_FILE} has null in place of {count} of {len(entries)} "
                 "numbers, "
-                f"which {users:,} of {self.count:,} Gaussians use as a scale of 0; is the model that it is of damaged?"
+                f"which {users:,} of {self.count:,} Gaussians use as a scale of 0; was it made from a damaged model?"
             )
 
     def rest(self) -> Float32:
@@ -345,7 +345,7 @@ def write(
     sort: order the Gaussians by position (Morton order), so that the images compress better. They are read back in that
       order.
     progress: function that is called with the current task and its finished fraction.
-    Means are relative to the world's origin, and lose more far from it. Equal Gaussians give equal values. Raises
+    Means are relative to the world's origin, and lose precision far from it. Equal Gaussians give equal values. Raises
     InputError for non-finite values.
     """
     packing.check_writable(path, gaussians, least=1)
@@ -450,7 +450,7 @@ def _write_webp(path: Path, pixels: Bytes) -> None:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, oiio.UINT8)
     spec.attribute("compression", "lossless")
-    spec.attribute("oiio:UnassociatedAlpha", 1)  # or colours would be divided by alpha
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours would be divided by alpha
     name = native_name(path)
     output = oiio.ImageOutput.create(name)
     if output is None or not output.open(name, spec) or not output.write_image(pixels) or not output.close():

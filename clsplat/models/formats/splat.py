@@ -3,11 +3,11 @@
 
 https://github.com/antimatter15/splat (convert.py and main.js). A record:
 
-- position: 3 float32, in the frame of the PLY.
+- position: 3 float32, in the frame of the 3DGS PLY.
 - scale: 3 float32, standard deviations, not logs.
 - red, green, blue, opacity: 4 bytes. The colour is SH coefficient 0's, clamped to 0 to 1; there are no other
   coefficients.
-- quaternion: w x y z in 4 bytes, 128 (q + 1) of a unit one.
+- quaternion: w x y z in 4 bytes, 128 (q + 1) for each component q of the unit quaternion.
 
 The Gaussians keep our order; other writers sort them by size and opacity.
 """
@@ -34,12 +34,12 @@ SPLAT_RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1
 
 
 def read(path: Path) -> Gaussians:
-    """Read the file. Raises InputError for a partial record, no records, or a few negative scales."""
+    """Read the file. Raises InputError for a partial record or no records, or if a few scales are negative."""
     with open_input(path, "a .splat file") as file:
         size = os.fstat(file.fileno()).st_size
         count, over = divmod(size, SPLAT_RECORD.itemsize)
         if over or not count:
-            raise InputError(f"{path}: has {size} bytes, expected some Gaussians of {SPLAT_RECORD.itemsize} bytes each")
+            raise InputError(f"{path}: has {size} bytes, expected {SPLAT_RECORD.itemsize} for each of its Gaussians")
         _check_first(values.read_rows(file, SPLAT_RECORD, min(IO_BLOCK_ROWS, count), path), path)
         file.seek(0)
         result = values.empty(count, 0)

@@ -58,10 +58,10 @@ COORDINATE_SYSTEM_SIGNS: tuple[Signs, ...] = (
     *(RUB_SIGNS, (-1, 1, -1), (1, 1, -1), (-1, -1, -1), RUB_SIGNS),  # unspecified, LDB, RDB, LUB, RUB
     *((-1, 1, 1), (1, 1, 1), (-1, -1, 1), (1, -1, 1)),  # LDF, RDF, LUF, RUF
 )
-"""Signs between our axes and each value of the coordinate system extension; larger values have z up."""
+"""Signs between our axes and those of each value of the coordinate system extension; larger values have z up."""
 MAX_EXTENSION_BYTES = 1 << 20
 MAX_ZSTD_WINDOW_BYTES = 1 << 27
-"""Bytes that a Zstandard frame may make the decoder keep; the library's own limit."""
+"""Largest window in bytes that a Zstandard frame may demand of the decoder; the library's own limit."""
 COLOUR_STEPS_PER_UNIT = 0.15 * 255
 SQRT_HALF = 0.5**0.5
 
@@ -104,7 +104,7 @@ def describe(path: Path) -> dict[str, Any]:
 
 
 def read(path: Path) -> Gaussians:
-    """Read an SPZ file; SH of degree 4 lose their fourth band. Raises InputError."""
+    """Read an SPZ file. SH coefficients of degree 4 are left out. Raises InputError."""
     with open_input(path, "an SPZ file") as file:
         return read_from(file, os.fstat(file.fileno()).st_size, path)
 
@@ -127,12 +127,12 @@ def read_from(file: BinaryIO, size: int, path: Path) -> Gaussians:
     if len(behind) > MAX_EXTENSION_BYTES and isinstance(stream, gzip.GzipFile):
         raise InputError(
             f"{path}: unpacks to more than {header.count} Gaussians: over {MAX_EXTENSION_BYTES} bytes follow, expected "
-            "extensions at most; is it damaged?"
+            "only extensions; is it damaged?"
         )
     if header.flags & EXTENSIONS_FLAG and (signs := _frame(behind, path)) != RUB_SIGNS:
         flip(result, (signs[0] * RUB_SIGNS[0], signs[1] * RUB_SIGNS[1], signs[2] * RUB_SIGNS[2]))
     elif behind and not header.flags & EXTENSIONS_FLAG:
-        warn(f"{path}: bytes after the last Gaussian ignored")
+        warn(f"{path}: bytes after the last Gaussian are ignored")
     return result
 
 
@@ -141,7 +141,7 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
     head = file.read(32)
     if head[:4] == SPZ_MAGIC and head[4:8] == struct.pack("<I", 4):
         if len(head) < 32:
-            raise InputError(f"{path}: truncated: {len(head)} bytes, expected a header of 32")
+            raise InputError(f"{path}: truncated: has {len(head)} bytes, expected a header of 32")
         header = SpzHeader(4, *struct.unpack("<IBBBBI", head[8:20]))
         _check(header, path)
         expected = len(header.widths)
@@ -156,7 +156,7 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
     stream = gzip.GzipFile(fileobj=file, mode="rb") if head[:2] == GZIP_MAGIC else file
     start = _next(stream, 16, path, "the header")
     if start[:4] != SPZ_MAGIC:
-        raise InputError(f"{path}: not an SPZ file (a gzip file of something else)")
+        raise InputError(f"{path}: not an SPZ file (it is a gzip file of something else)")
     header = SpzHeader(*struct.unpack("<IIBBB", start[4:15]))
     _check(header, path)
     return header, stream
@@ -164,7 +164,7 @@ def _open(file: BinaryIO, size: int, path: Path) -> tuple[SpzHeader, Any]:
 
 def _check(header: SpzHeader, path: Path) -> None:
     if header.version not in SPZ_VERSIONS:
-        raise InputError(f"{path}: SPZ version {header.version}, expected 2, 3 or 4")
+        raise InputError(f"{path}: has SPZ version {header.version}, expected 2, 3 or 4")
     if header.degree > 4:
         raise InputError(f"{path}: SPZ has SH of degree {header.degree}, expected 0 to 4")
     if header.fractional_bits > 31:
@@ -172,12 +172,12 @@ def _check(header: SpzHeader, path: Path) -> None:
 
 
 def _frame(extensions: bytes, path: Path) -> Signs:
-    """Signs of the axes. An extension is its type and length, 32 bits each, followed by its bytes."""
+    """Signs of the axes from the extensions. Each consists of type and length, 32 bits each, and its bytes."""
     at, system = 0, b""
     while len(extensions) - at >= 8:
         kind, length = struct.unpack_from("<II", extensions, at)
         if length > len(extensions) - at - 8:
-            raise InputError(f"{path}: truncated: SPZ extension {kind:#x} of {length} bytes")
+            raise InputError(f"{path}: truncated: SPZ extension {kind:#x} lacks some of its {length} bytes")
         at += 8 + length
         if kind == COORDINATE_SYSTEM_EXTENSION:
             system = extensions[at - length : at]
@@ -185,7 +185,7 @@ def _frame(extensions: bytes, path: Path) -> Signs:
         return RUB_SIGNS
     (value,) = struct.unpack("<I", system)
     if value >= len(COORDINATE_SYSTEM_SIGNS):
-        raise InputError(f"{path}: SPZ in the coordinate system {value}, expected one with y up or down (0 to 8)")
+        raise InputError(f"{path}: SPZ has the coordinate system {value}, expected one with y up or down (0 to 8)")
     return COORDINATE_SYSTEM_SIGNS[value]
 
 
@@ -211,7 +211,7 @@ def _zstd_streams(file: BinaryIO, header: SpzHeader, size: int, path: Path) -> I
     for name, (packed, unpacked) in zip(header.widths, struct.iter_unpack("<QQ", table), strict=True):
         wanted = header.count * header.widths[name]
         if packed > size - at:
-            raise InputError(f"{path}: truncated: {name} have {packed} bytes, {size - at} are there")
+            raise InputError(f"{path}: truncated: has {size - at} bytes of {name}, expected {packed}")
         if unpacked != wanted:
             raise InputError(f"{path}: {name} have {unpacked} bytes unpacked, expected {wanted}")
         file.seek(at)
@@ -223,7 +223,7 @@ def _zstd_streams(file: BinaryIO, header: SpzHeader, size: int, path: Path) -> I
             if _rest(stream, path):
                 raise InputError(f"{path}: {name} have more than {wanted} bytes unpacked")
     if at != size:
-        warn(f"{path}: {size - at} bytes after the last Gaussian ignored")
+        warn(f"{path}: {size - at} bytes after the last Gaussian are ignored")
 
 
 def _next(stream: Stream, count: int, path: Path, what: str) -> bytes:
@@ -242,7 +242,7 @@ def _rest(stream: Any, path: Path) -> bytes:
 
 @contextmanager
 def _decompressing(path: Path, place: str) -> Iterator[None]:
-    """Raise InputError for a stream that ends, or is damaged, at this place."""
+    """Raise InputError for a stream that ends or is damaged. place: where in the file, for the message."""
     import zstandard
 
     try:
@@ -318,14 +318,14 @@ def write(
 ) -> None:
     """Write an SPZ file, atomically; equal Gaussians give equal bytes.
 
-    fractional_bits: number of fractional bits of positions. The default is 12, like the format's library; more for a
-    model so small that 12 would be coarse, fewer for one that does not fit.
+    fractional_bits: number of fractional bits of positions. The default is 12, as in the format's library; more for a
+    model so small that 12 would be coarse, fewer for a model so large that it does not fit.
     sh_bits: bits of band 1 and of the higher bands, 1 to 8.
-    Means are relative to the world's origin, and lose more far from it. Raises InputError for non-finite values and for
-    positions that fit no number of bits. Raises ValueError for settings out of range.
+    Means are relative to the world's origin, and lose precision far from it. Raises InputError for non-finite values
+    and for positions that fit no number of bits. Raises ValueError for settings out of range.
     """
     if version not in SPZ_VERSIONS or not all(1 <= bits <= 8 for bits in sh_bits):
-        raise ValueError(f"version {version}, sh_bits {sh_bits}: expected version 2, 3 or 4, bits from 1 to 8")
+        raise ValueError(f"version is {version}, sh_bits {sh_bits}, expected version 2, 3 or 4, bits from 1 to 8")
     values.check_writable(path, gaussians, least=1)
     header = header_for(path, gaussians, version, fractional_bits)
     with atomic_writer(path) as file:
@@ -335,8 +335,8 @@ def write(
 def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: int | None = None) -> SpzHeader:
     """Header for `write_to`, for at least one Gaussian.
 
-    fractional_bits: the default follows the model's size, without its farthest hundredth, within the range of the
-      positions.
+    fractional_bits: the default is 12, more for a small model (measured without its farthest 1 % of Gaussians), and
+      fewer if the positions would not fit.
     Raises InputError if the positions do not fit.
     """
     low, high = (
@@ -354,10 +354,10 @@ def header_for(path: Path, gaussians: Gaussians, version: int, fractional_bits: 
         )
     if bits is None:
         spread = np.quantile(np.abs(gaussians.means - np.median(gaussians.means, axis=0)).max(axis=1), 0.99)
-        # 2^-12 for a model of 16 units; in proportion for a smaller one
+        # steps of 2^-12 for a model of 16 units, finer in proportion for a smaller one
         bits = min(fits, max(12, 16 - int(np.ceil(np.log2(max(float(spread), 1e-6))))))
     elif bits < 0:
-        raise ValueError(f"fractional_bits {bits}: expected 0 to 23")
+        raise ValueError(f"fractional_bits is {bits}, expected 0 to 23")
     flags = ANTIALIASED_FLAG if gaussians.antialiased else 0
     return SpzHeader(version, len(gaussians), gaussians.sh_degree, bits, flags)
 
@@ -446,7 +446,7 @@ def _to_smallest_three(unit: Float32) -> Bytes:
 def _to_sh(rest: Float32, sh_bits: tuple[int, int]) -> Bytes:
     """Bytes of coefficients (n, K - 1, 3) in our frame.
 
-    sh_bits: bits kept of band 1 and of the higher bands.
+    sh_bits: number of bits of band 1 and of the higher bands.
     """
     coefficients = rest.shape[1]
     steps = np.array([1 << (8 - sh_bits[0 if index < 3 else 1]) for index in range(coefficients)], np.int16)[:, None]

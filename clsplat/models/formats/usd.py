@@ -9,9 +9,9 @@ Specification: https://openusd.org/release/api/class_usd_vol_particle_field3_d_g
   `origin` becomes the translation of the parent prim.
 - Values are float32 (half is read too): linear scales, opacities in [0, 1], unit quaternions. SH coefficients are
   stored by Gaussian; order and signs as ours.
-- Hints: perspective projection, sorted by depth along the camera's axis, as this renderer does.
-- Colours: in the colour space named by the SH coefficients, their prim or a prim above; sRGB, as 3DGS trains, by
-  default.
+- Hints: perspective projection, sorted by depth along the camera's axis, as in this renderer.
+- Colours: in the colour space that the SH coefficients, their prim or a prim above names. The default is sRGB, in which
+  3DGS trains.
 - A prim without SH has primvars:displayColor, linear by default, and displayOpacity if it lacks opacities.
 """
 
@@ -52,8 +52,8 @@ SH_COEFFICIENTS_ATTRIBUTE, SH_DEGREE_ATTRIBUTE = (
     "radiance:sphericalHarmonicsDegree",
 )
 MAX_TEXT_BRACES = 5000
-"""Most opening braces in a text file that is read without a trial process. USD's stack of 8 MiB suffices for under
-20,000 levels of prims."""
+"""Largest number of opening braces in a text file that is read without a trial process. USD's stack of 8 MiB
+suffices for under 20,000 levels of prims."""
 WORLD_PRIM_PATH, GAUSSIANS_PRIM_PATH = "/World", "/World/Gaussians"
 
 
@@ -61,7 +61,7 @@ def _require_pxr(path: Path) -> None:
     try:
         import pxr.Usd  # noqa: F401
     except ImportError:
-        raise InputError(f"{path}: USD needs usd-core, expected it installed: pip install 'clsplat[usd]'") from None
+        raise InputError(f"{path}: USD needs usd-core, which is not installed: pip install 'clsplat[usd]'") from None
 
 
 def recognises(head: bytes) -> bool:
@@ -130,13 +130,13 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def open_stage(path: Path, name: str | Path, *load: Any) -> Any:
-    """Open a stage by name. Raises InputError about the path."""
+    """Open the stage `name`. Raises InputError, prefixed with `path`."""
     from pxr import Tf, Usd
 
     with suppress(Tf.ErrorException):
         if stage := Usd.Stage.Open(native_name(name), *load):
             return stage
-    raise InputError(f"{path}: is no USD stage that can be opened, expected one; usdchecker may know more")
+    raise InputError(f"{path}: cannot be opened as a USD stage; usdchecker may know why")
 
 
 def _open(path: Path) -> Any:
@@ -205,15 +205,15 @@ def recorded_space(path: Path) -> str:
 
 
 def space_of(path: Path, prims: Sequence[Any]) -> str:
-    """Our name for the colour space of the prims with SH; sRGB if no prim has SH. Raises InputError if there are
-    several."""
+    """Our name for the colour space of the prims with SH; sRGB if no prim has SH. Raises InputError if they differ
+    in it."""
     spaces: dict[str, object] = {}
     for prim in prims:
         if attribute := _coefficients(prim):
             spaces.setdefault(_space(attribute, SRGB), prim.GetPath())
     if len(spaces) > 1:
         found = ", ".join(f"{name} ({place})" for name, place in spaces.items())
-        raise InputError(f"{path}: has Gaussians of the colour spaces {found}, expected one: SH cannot be converted")
+        raise InputError(f"{path}: has Gaussians in the colour spaces {found}, expected one: SH cannot be converted")
     return next(iter(spaces), SRGB)
 
 
@@ -289,7 +289,7 @@ def _sh(where: str, prim: Any, time: Any, count: int) -> Float32:
         raise InputError(f"{where}: lacks {SH_COEFFICIENTS_ATTRIBUTE}")
     sh = sh.reshape(count, coefficients, 3)
     if degree > MAX_SH_DEGREE:
-        warn(f"{where}: SH of degree {degree}, those above {MAX_SH_DEGREE} left out")
+        warn(f"{where}: has SH of degree {degree}; coefficients above degree {MAX_SH_DEGREE} are left out")
         sh = np.ascontiguousarray(sh[:, : (MAX_SH_DEGREE + 1) ** 2])
     return sh
 
@@ -306,7 +306,7 @@ def _plain(where: str, prim: Any, time: Any, count: int, space: str) -> Float32:
     if own != space:
         convert = {(LINEAR, SRGB): linear_to_srgb, (SRGB, LINEAR): srgb_to_linear}.get((own, space))
         if convert is None:
-            raise InputError(f"{where}: has displayColor of {own}, expected {space}, as the other Gaussians have")
+            raise InputError(f"{where}: has displayColor in {own}, expected {space} like the other Gaussians")
         colour = convert(colour)
     return np.asarray(packing.coefficients(colour)[:, None], np.float32)
 
@@ -330,7 +330,7 @@ def write(path: Path, gaussians: Gaussians, *, up_axis: str = "Y", meters_per_un
     Raises InputError for non-finite values, and if usd-core is not installed.
     """
     if up_axis not in ("Y", "Z") or not meters_per_unit > 0:
-        raise ValueError(f"up_axis {up_axis!r}, meters_per_unit {meters_per_unit}: expected Y or Z, and more than 0")
+        raise ValueError(f"up_axis is {up_axis!r}, meters_per_unit {meters_per_unit}, expected Y or Z, and more than 0")
     packing.check_writable(path, gaussians, least=1)
     _require_pxr(path)
     from pxr import Usd, UsdUtils

@@ -7,7 +7,7 @@ USD's own renderers follow the same rules:
   place.
 - An instance has the local transform of its prototype's prim. It is visible if the instancer and all prims from the
   prototype down to the Gaussians are visible.
-- Instances keep their number, or their id if the instancer has ids.
+- An instance is identified by its number, or by its id if the instancer has ids.
 - Between time samples USD interpolates, or follows the velocities.
 """
 
@@ -28,21 +28,21 @@ from clsplat.errors import InputError
 MAX_PLACED_PRIMS = 1_000_000
 """Most prims of Gaussians that a stage may place; more are a mistake or an attempt to exhaust memory."""
 _MAX_CACHED_TIMES = 16
-"""Times for which an instancer's transforms are cached."""
+"""Number of times for which an instancer's transforms are cached."""
 _TRANSFORM_ATTRIBUTES = ("positions", "orientations", "orientationsf", "scales")
 _VELOCITY_ATTRIBUTES = ("velocities", "angularVelocities")
 _MEMBERSHIP_ATTRIBUTES = ("protoIndices", "ids", "invisibleIds")
 
 Key = tuple[int, int]
-"""Instance of an instancer: its id or number, and the index of its prototype."""
+"""Key of an instance in its instancer: its id or number, and the index of its prototype."""
 
 
 @dataclass(frozen=True, eq=False)
 class UsdPlacement:
-    """One drawing of a prim of Gaussians.
+    """One occurrence of a prim of Gaussians in a stage.
 
-    name: the prim's path; for an instance INSTANCER[ID] and the path below the prototype.
-    seat: the instance that contains it.
+    name: the prim's path; for an instance, INSTANCER[ID] followed by the path below the prototype.
+    seat: the instance that contains the prim; None outside of instancers.
     """
 
     prim: Any
@@ -66,7 +66,7 @@ class UsdPlacement:
 
     @property
     def moves(self) -> bool:
-        """True if its transform or visibility may change over time."""
+        """True if the prim's transform or visibility may change over time."""
         if self.seat is None:
             return any(map(_varies, _above(self.prim, None)))
         return self.seat.instances.moves or any(map(_varies, _above(self.prim, self.seat.root)))
@@ -103,7 +103,7 @@ class Instances:
     def __init__(self, prim: Any, name: str, where: str, seat: Seat | None) -> None:
         """Read the prototypes of an instancer.
 
-        name: its path, or a name as in `UsdPlacement`.
+        name: the instancer's path, or its name as in `UsdPlacement`.
         where: prefix of errors.
         Raises InputError for missing prototypes.
         """
@@ -115,7 +115,7 @@ class Instances:
         targets = self._instancer.GetPrototypesRel().GetForwardedTargets()
         self.roots = [stage.GetPrimAtPath(path) for path in targets]
         if lost := [str(path) for path, root in zip(targets, self.roots, strict=True) if not root]:
-            raise InputError(f"{self.where}: has the prototype {lost[0]}, expected a prim that is there")
+            raise InputError(f"{self.where}: has the prototype {lost[0]}, expected an existing prim")
         chosen = [self._instancer.GetProtoIndicesAttr(), self._instancer.GetIdsAttr()]
         self._times = sorted({float(time) for attribute in chosen for time in attribute.GetTimeSamples()})
         self._there = [self._keys(time) for time in self._times or [self._first()]]
@@ -146,8 +146,8 @@ class Instances:
     def of(self, key: Key, code: Any) -> tuple[Any, bool]:
         """USD's matrix from the prototype's parent to the world, and visibility of the instance.
 
-        An instance that does not exist at the time has its last matrix, or else its next, and is invisible. Raises
-        InputError.
+        An instance that does not exist at that time is invisible. Its matrix is the latest before that time, or else
+        the next one. Raises InputError.
         """
         places, hidden = self._at(code)
         if key in places:
@@ -185,7 +185,7 @@ class Instances:
         """USD's matrices of the instances, relative to the instancer, from its positions, orientations and scales.
 
         Empty if USD finds arrays of different lengths. Rotations are computed from the quaternions as xformOp:orient
-        does. ComputeInstanceTransformsAtTime would shear if a length is not exactly 1, and with halves it never is.
+        does. ComputeInstanceTransformsAtTime shears if a quaternion's length is not exactly 1, as with half floats.
         """
         from pxr import Gf, UsdGeom
 
@@ -211,12 +211,12 @@ class Instances:
         return attribute.Get(code) if attribute else None
 
     def _keys(self, time: float) -> dict[Key, None]:
-        """Instances at a time, in their order."""
+        """Keys of the instances that exist at a time, in the stage's order."""
         code = _code(time)
         indices = [int(index) for index in self._instancer.GetProtoIndicesAttr().Get(code) or ()]
         if wrong := [index for index in indices if not 0 <= index < len(self.roots)]:
             raise InputError(
-                f"{self.where}: has protoIndices of {wrong[0]}, expected 0 to {len(self.roots) - 1}, as it has "
+                f"{self.where}: has the protoIndex {wrong[0]}, expected 0 to {len(self.roots) - 1}, as it has "
                 f"{len(self.roots)} prototypes"
             )
         ids = [int(number) for number in self._instancer.GetIdsAttr().Get(code) or ()]
@@ -242,10 +242,10 @@ class Instances:
 
 @dataclass
 class _StageFindings:
-    """Findings in a stage.
+    """Results of a walk through a stage.
 
     where: prefix of errors.
-    unused, shapes: prims that are not drawn, by path, each with a description.
+    unused, shapes: descriptions of prims that are not drawn, by path.
     """
 
     where: str
@@ -257,9 +257,9 @@ class _StageFindings:
     def walk(self, prims: Any, root: Any, seat: Seat | None, name: str, chain: tuple[Any, ...]) -> None:
         """Collect the Gaussians among the prims.
 
-        root: prim of their prototype.
+        root: prim of the prototype that contains the prims; None outside of instancers.
         name: name of the instance.
-        chain: paths of the instancers that contain them.
+        chain: paths of the instancers that contain the prims.
         Raises InputError.
         """
         from pxr import UsdGeom
@@ -284,7 +284,7 @@ class _StageFindings:
 
         path = instances.prim.GetPath()
         if path in chain:
-            raise InputError(f"{instances.where}: is inside its own prototype, expected one outside it")
+            raise InputError(f"{instances.where}: is inside its own prototype, expected an instancer outside it")
         used, empty = set(), set()
         for number, index in instances.keys:
             root, count = instances.roots[index], len(self.places)
@@ -327,14 +327,14 @@ def _lost(stage: Any) -> list[str]:
 
 
 def _of_prototypes() -> Any:
-    """USD's predicate for the drawn prims of a prototype, which may be undefined."""
+    """USD predicate for the drawn prims of a prototype. It also accepts prims that are not defined."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded & ~Usd.PrimIsAbstract)
 
 
 def _of_classes() -> Any:
-    """USD's predicate that includes classes, which are never drawn."""
+    """USD predicate that also accepts classes, which are never drawn."""
     from pxr import Usd
 
     return Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
@@ -379,7 +379,7 @@ def _local(prim: Any, code: Any) -> Any:
 
 
 def _turn_of(matrix: Any, scales: Any) -> Any:
-    """Rotation in USD's matrix of a scale and a slightly sheared rotation: the nearest true rotation."""
+    """The true rotation nearest to the one in USD's matrix, which is slightly sheared and multiplied by the scales."""
     from pxr import Gf
 
     rows = np.array(matrix)[:3, :3] / np.array(scales, np.float64)[:, None]

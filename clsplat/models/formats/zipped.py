@@ -26,7 +26,7 @@ from clsplat.gaussians import Gaussians
 MAX_ARCHIVE_FILES = 100_000
 MAX_UNCHECKED_UNPACKED_BYTES = 64 << 20
 MAX_UNPACK_RATIO = 100
-"""Limits of the bytes unpacked: the larger of MAX_UNCHECKED_UNPACKED_BYTES and this many for each byte of the archive.
+"""Limit of the unpacked bytes: the larger of MAX_UNCHECKED_UNPACKED_BYTES and this many for each byte of the archive.
 
 A PLY whose spherical harmonics are all 0 has a ratio of about 5. The limit of deflate, which a bomb reaches, is 1032.
 """
@@ -34,9 +34,9 @@ ZIP_FILE_MAGIC = b"PK\x03\x04"
 """First bytes of an archive that contains a file."""
 MACOS_METADATA_FOLDER = "__MACOSX"
 ZIP_MEMBER_HEAD_BYTES = 16 << 20
-"""Bytes of a file that show if it has Gaussians: a whole JSON, and the header of any PLY."""
+"""Number of bytes of a file that are searched for signs of Gaussians: a whole JSON, and the header of any PLY."""
 ENCRYPTED_FLAG = 1
-"""Bit in the flags of a file."""
+"""Bit in the flags of an encrypted file."""
 
 
 def recognises(head: bytes) -> bool:
@@ -59,7 +59,7 @@ class Inside:
 
     @contextmanager
     def model(self, path: Path) -> Iterator[tuple[Path, Any]]:
-        """Context with the unpacked model's file, removed afterwards, and its row. Raises InputError like
+        """Context with the unpacked model's file, which is removed afterwards, and its `Format`. Raises InputError like
         `unpacked`."""
         with unpacked(path, self) as model:
             yield self.resolve(model)

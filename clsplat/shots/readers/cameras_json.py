@@ -31,7 +31,7 @@ def read_cameras_json(path: Path, entries: list[Any], size: tuple[int | None, in
     """Read frames numbered from 1, one for each entry, named by `img_name`.
 
     size: width and height for entries that have none.
-    In a Blender scene two frames may share a name, as pictures of both splits do. Raises InputError, naming the file
+    In a Blender scene two frames may share a name, as training and test pictures do. Raises InputError, naming the file
     and the entry, for a list of other values, and for missing or invalid values.
     """
     expected = "an object with 'position', 'rotation', 'width', 'height', 'fx' and 'fy'"

@@ -39,7 +39,7 @@ KEY_FRAME_PROPERTIES = ("frame", "seconds", "position", "world_from_cam", *LENS_
 
 
 def read_keyed(path: Path, document: dict[str, Any]) -> Shot:
-    """Read the whole frames from the first key to the last, or of one turn of the loop, interpolated smoothly.
+    """Read the whole-numbered frames from the first key to the last, or one period of the loop, smoothly interpolated.
 
     Raises InputError, naming the file and the key, for another version, no keys, an unknown name, and missing or
     invalid values.
@@ -77,11 +77,11 @@ def _known(where: str, values: dict[str, Any], names: tuple[str, ...]) -> None:
 def _frame(keys: Keys, fps: float | None, first: float) -> float:
     frame, seconds = keys.frame.get("frame"), keys.frame.get("seconds")
     if (frame is None) == (seconds is None):
-        raise InputError(f"{keys.where}: expected 'frame' or 'seconds', and one of them only")
+        raise InputError(f"{keys.where}: expected either 'frame' or 'seconds'")
     if frame is not None:
         return keys.require("frame")
     if fps is None:
-        raise InputError(f"{keys.where}: 'seconds' without 'fps' in the file, expected the frames per second")
+        raise InputError(f"{keys.where}: has 'seconds', but the file has no 'fps', expected frames per second")
     return round(first + keys.require("seconds") * fps, 6)  # so that 0.1 s at 30 fps is frame 3
 
 
@@ -111,7 +111,7 @@ def _camera(keys: Keys, whole: Keys) -> Camera:
         raise InputError(f"{keys.path}: 'near' is {near:g} and 'far' {far:g}, expected 0 < near < far")
     fx, fy = _focal(keys, projection, width, height)
     if not max(fx, fy) <= MAX_FOCAL_PX:
-        raise InputError(f"{keys.where}: a focal length of {max(fx, fy):g}, expected at most {MAX_FOCAL_PX:g}")
+        raise InputError(f"{keys.where}: has a focal length of {max(fx, fy):g}, expected at most {MAX_FOCAL_PX:g}")
     cx, cy = _principal(keys, width, height)
     rotation = _rotation(keys).T
     position = keys.vector("position", 3)
@@ -140,8 +140,8 @@ def _focal(keys: Keys, projection: Projection, width: int, height: int) -> tuple
         degrees = values.require("fov_x", across), values.require("fov_y", down)
         if not set(given) <= {"fov_x", "fov_y"} or not (0 < degrees[0] <= across and 0 < degrees[1] <= down):
             raise InputError(
-                f"{keys.where}: has {_listed(source, given)}, expected of {model.named} camera at most 'fov_x' up "
-                f"to {across:g} degrees and 'fov_y' up to {down:g}"
+                f"{keys.where}: has {_listed(source, given)}, expected only 'fov_x' up to {across:g} degrees and "
+                f"'fov_y' up to {down:g} for {model.named} camera"
             )
         return width / math.radians(degrees[0]), height / math.radians(degrees[1])
     if set(given) not in ({"fx"}, {"fx", "fy"}, *({key} for key in model.focal_keys)):

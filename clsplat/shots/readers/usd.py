@@ -33,8 +33,8 @@ SUPPORTED_PROJECTIONS = names_of("usd")
 
 
 def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), prim: str | None = None) -> Shot:
-    """Read the frames of a stage's camera, from the stage's start to its end time code, or over the samples if it has
-    no range.
+    """Read the frames of a stage's camera, from the stage's start to its end time code. Without these, the frames span
+    the time samples.
 
     The frame rate is the stage's timeCodesPerSecond, for which USD takes framesPerSecond if only that is authored. Each
     frame has the shutter and the lens of its time code. `Shot.moment` gives the camera at any time, with USD's own
@@ -44,9 +44,9 @@ def read_usd(path: Path, size: tuple[int | None, int | None] = (None, None), pri
     size: width and height in pixels. A missing side follows from the resolution of the render settings, or without one
       from the first frame's aperture. If both sides are missing, the size is that resolution.
     prim: path or name of the camera, needed if the stage has several and its render settings name none.
-    The render settings also give the pixel aspect ratio and how the aperture is conformed to the size. Without any, the
-    aperture's width fills the picture's, and pixels are square. Raises InputError if the stage cannot be opened, has no
-    such camera, no size or invalid values, or if usd-core is not installed.
+    The render settings also give the pixel aspect ratio and how the aperture is conformed to the size. Without them,
+    the aperture's width fills the picture's, and pixels are square. Raises InputError if the stage cannot be opened,
+    has no such camera, no size or invalid values, or if usd-core is not installed.
     """
     survive(path, "clsplat.shots.readers.usd:read_here", size=size, prim=prim)
     return read_here(path, size, prim)
@@ -83,7 +83,7 @@ def read_here(path: Path, size: tuple[int | None, int | None] = (None, None), pr
             replace(frame, optics=_optics(f"{where} at {frame.number}", camera, frame.number, settings, metres, rate))
             for frame in frames
         )
-    lost = () if known or not asked else (f"camera ({asked}, which is not there)",)
+    lost = () if known or not asked else (f"camera ({asked}, which does not exist)",)
     unapplied = (*_unapplied(camera, codes), *settings.unapplied, *lost)
     # without the end of the line, where USD prints the stage's address in memory
     lines = [message.commentary.split(" (instantiating")[0] for message in diagnostics.TakeUncoalescedDiagnostics()]
@@ -110,8 +110,8 @@ def _optics(where: str, camera: Any, code: int, settings: Settings, metres: floa
     )
     if closes < opens:
         raise InputError(
-            f"{where}: shutter:open is {opens:g} and shutter:close {closes:g}, expected two times in frames from the "
-            "frame, the second not before the first"
+            f"{where}: shutter:open is {opens:g} and shutter:close {closes:g}, expected two times relative to "
+            "the frame, the second not before the first"
         )
     if settings.instantaneous:
         closes = opens
@@ -174,8 +174,8 @@ def _moved(camera: Any) -> Iterator[Any]:
 def _time_codes(where: str, stage: Any, camera: Any) -> tuple[list[int], tuple[float, ...]]:
     """Whole time codes to render, and the times of all values of the camera or of an ancestor's transform.
 
-    The codes are the stage's range, or go from the first of these times to the last if it has none. The value at each
-    of the times is read once, on a whole frame or not.
+    The codes are the stage's range, or go from the first of these times to the last if it has none. The values at all
+    of these times are read once, to find those that USD cannot read.
     """
     attributes = camera.GetPrim().GetAttributes()
     ops = [op for moved in _moved(camera) for op in moved.GetOrderedXformOps()]
@@ -204,7 +204,7 @@ def _aperture(where: str, camera: Any, code: float) -> tuple[float, float]:
     horizontal = _number(where, camera.GetHorizontalApertureAttr(), code)
     vertical = _number(where, camera.GetVerticalApertureAttr(), code)
     if not (horizontal > 0 and vertical > 0):
-        raise InputError(f"{where}: aperture {horizontal:g} x {vertical:g}, expected both above 0")
+        raise InputError(f"{where}: has an aperture of {horizontal:g} x {vertical:g}, expected both above 0")
     return horizontal, vertical
 
 
@@ -222,12 +222,12 @@ def _size(
     if height is None:
         height = max(1, round(width / aspect))
     if not (width > 0 and height > 0):
-        raise InputError(f"{path}: size {width} x {height} pixels, expected both above 0")
+        raise InputError(f"{path}: the size is {width} x {height} pixels, expected both above 0")
     return width, height
 
 
 def _check_projection(where: str, camera: Any, code: float) -> None:
-    """Raise InputError for a lens that is neither pinhole nor orthographic, by USD's attributes or Omniverse's."""
+    """Raise InputError if USD's or Omniverse's attributes name a lens that is neither pinhole nor orthographic."""
     for name in ("projection", "cameraProjectionType", "omni:lensdistortion:model"):
         attribute = camera.GetPrim().GetAttribute(name)
         value = attribute.Get(code) if attribute else None
@@ -274,7 +274,7 @@ def _camera(where: str, camera: Any, code: float, size: tuple[int, int], setting
     if clipping.HasAuthoredValue():
         near, far = (scale * float(value) for value in clipping.Get(code))
     if not 0 < near < far:
-        raise InputError(f"{where}: clippingRange {near:g} to {far:g}, expected 0 < near < far")
+        raise InputError(f"{where}: clippingRange is {near:g} to {far:g}, expected 0 < near < far")
     cx, cy = width / 2 - right * to_x, height / 2 + up * to_y
     model = model_with("usd", str(camera.GetProjectionAttr().Get(code)))
     if model is not None and model.parallel:

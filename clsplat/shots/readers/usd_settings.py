@@ -27,9 +27,9 @@ class Settings:
     resolution: width and height in pixels, None if it is not authored.
     pixel_aspect: width of a pixel over its height.
     policy: a value of aspectRatioConformPolicy.
-    window: left, bottom, right and top of the wanted pixels, in frames from the frame's lower left corner.
-    instantaneous: the shutter closes as it opens.
-    unapplied: other authored settings.
+    window: left, bottom, right and top of the pixels to render, as fractions of the frame from its lower left corner.
+    instantaneous: True if the shutter closes at the time at which it opens.
+    unapplied: names of authored settings that are not applied.
     A stage without render settings has the defaults: the aperture's width fills the picture's.
     """
 
@@ -43,7 +43,7 @@ class Settings:
     unapplied: tuple[str, ...] = ()
 
     def aspect(self, aperture: tuple[float, float]) -> float:
-        """Width over height, in pixels, of a picture with only one side given."""
+        """Ratio of width to height, in pixels, for a picture of which only one side is given."""
         if self.resolution is not None:
             return self.resolution[0] / self.resolution[1]
         pixels = 1.0 if self.policy == "adjustPixelAspectRatio" else self.pixel_aspect
@@ -186,6 +186,6 @@ def _window(path: Path, prims: list[Any]) -> tuple[float, float, float, float]:
     left, bottom, right, top = (float(edge) for edge in attribute.Get())
     if not (-math.inf < left < right < math.inf and -math.inf < bottom < top < math.inf):
         raise _wrong(
-            path, attribute, f"({left:g}, {bottom:g}, {right:g}, {top:g})", "left, bottom, right and top that rise"
+            path, attribute, f"({left:g}, {bottom:g}, {right:g}, {top:g})", "left below right and bottom below top"
         )
     return left, bottom, right, top
