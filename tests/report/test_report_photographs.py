@@ -87,7 +87,7 @@ def test_exposures_are_a_chart(reported: Path, tmp_path: Path) -> None:
     gains["00.png"]["vignette"] = [-0.5, 0.0, -0.5]
     (run / "appearance.json").write_text(json.dumps({"kind": "ppisp", "photographs": gains}))
     assert main(["report", str(run)]) == 0
-    assert "Corners have 50% of the light of the middle" in (run / "report.html").read_text("utf-8")
+    assert "Corners get 50% of the light in the middle" in (run / "report.html").read_text("utf-8")
     gains["00.png"]["vignette"] = [0.0, 0.0, 0.0]  # of a panorama
     (run / "appearance.json").write_text(json.dumps({"kind": "ppisp", "photographs": gains}))
     assert main(["report", str(run)]) == 0
