@@ -58,7 +58,7 @@ def test_a_model_of_linear_colours_has_a_thumbnail(model: Path, capsys: Capture)
         (["render", "model.ply", "-o", "a.png", "--cameras", "x", "--up", "y"], "--up y: is for paths around the"),
         (["thumbnail", "model.ply", "--up", "north"], "--up north: expected x, y, z"),
         (["thumbnail", "model.ply", "--size", "8"], "--size 8: expected 16 to 8192"),
-        (["thumbnail", "model.ply", "-o", "a.##.png"], "a.##.png: has a place for frame numbers, expected the name"),
+        (["thumbnail", "model.ply", "-o", "a.##.png"], "a.##.png: is a pattern for frame numbers, expected the name"),
         (["thumbnail", "model.ply", "-o", "shot#1/a.png"], "shot#1/a.png: has a place for frame numbers"),
         (["thumbnail", "model.ply", "-o", "a.$F.png"], "a.$F.png: has a place for frame numbers"),
         (["thumbnail", "a@@b.ply"], "a@@b.ply.png: has a place for frame numbers"),
