@@ -243,11 +243,11 @@ def table(result: dict[str, Any]) -> str:
     )
     seen = f"{result['gaussians']:,} Gaussians, SH degree {result['sh_degree']}, {result['visible']:,} visible"
     most = f"{arithmetic:.2f} Gpairs/s for blending arithmetic, {gradient:.2f} Gpairs/s for its gradient"
-    of_pixels = f"{pairs['contributing']:,} contributing and {pairs['evaluated']:,} evaluated with pixels"
+    of_pixels = f"{pairs['contributing']:,} contribute and {pairs['evaluated']:,} are evaluated"
     lines = [
         f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
         f"{result['source']}: {seen}, at {size}",
-        f"pairs: {pairs['listed']:,} with tiles, {of_pixels}",
+        f"pairs: {pairs['listed']:,} with tiles; with pixels, {of_pixels}",
         f"limits: {most}, {copying:.1f} GB/s for copying",
         "",
     ]
