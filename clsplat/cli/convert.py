@@ -140,7 +140,7 @@ class ConvertVerb(Verb):
     test_every: int = TEST_EVERY
     """Every n-th view of --scene in name order is held out. 0: all views are measured."""
     resolution: int = 0
-    """Longest image side for --scene, in pixels. 0: the images' size up to 1600."""
+    """Longest image side in pixels, for --scene. 0: the images' size up to 1600."""
     background: Literal["black", "white"] = "black"
     """Background behind the Gaussians and behind images with alpha, for --scene."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
@@ -222,7 +222,7 @@ def _check(verb: ConvertVerb) -> None:
     )
     check_rules(verb, "--", rules)
     if (verb.prune_contribution is None) != (verb.cameras is None):
-        raise InputError("--prune-contribution and --cameras need each other: cameras define the pictures")
+        raise InputError("--prune-contribution and --cameras need each other: the cameras define the pictures")
     defaults = {field.name: field.default for field in fields(verb)}
     names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
     if verb.scene is None and names:

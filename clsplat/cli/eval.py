@@ -141,7 +141,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of views whose scores are no held-out scores of the run's scene, and of pictures that look wrong."""
+    """Warn of views whose scores are not held-out scores for the run's scene, and of pictures that look wrong."""
     from clsplat.runs import scene_record
     from clsplat.scenes.analysis import sanity_checks
 
@@ -162,7 +162,7 @@ def _print_result(result: Evaluation, *, as_json: bool) -> None:
 
 
 def tell_of_lpips() -> None:
-    """Print the reason if LPIPS will be missing. This is called before the work, so that users can interrupt it."""
+    """Print the reason if LPIPS will be missing. Called before the work begins."""
     from clsplat.evaluation.metrics import prepare_lpips
 
     if reason := prepare_lpips():
