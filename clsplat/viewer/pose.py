@@ -59,7 +59,7 @@ class Pose:
         """Vertical field of view in radians for a picture of this size. It is usually that of the page.
 
         On an upright page, a picture with a larger aspect ratio than the page's keeps the horizontal field of view
-        instead. Aspect ratios above 1 count as 1.
+        instead. The picture's aspect ratio counts as 1 if it is larger.
         """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)
