@@ -169,7 +169,7 @@ def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
 
 
 def _evaluation(value: object) -> Record | None:
-    """Validate an evaluation in the format of eval.json; None for anything else."""
+    """Valid parts of an evaluation in the format of eval.json; None for anything else."""
     if not isinstance(value, dict) or not isinstance(value.get("views"), list):
         return None
     views = []
