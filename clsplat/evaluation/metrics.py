@@ -109,7 +109,7 @@ def lpips_missing() -> str | None:
 def prepare_lpips() -> str | None:
     """Prepare LPIPS without loading it: download the network's weights if they are missing.
 
-    Returns None, or the reason that LPIPS cannot be used, with advice.
+    Returns None, or the reason why LPIPS cannot be used, with advice.
     """
     for name in ("lpips", "torch"):
         if find_spec(name) is None:
@@ -145,5 +145,5 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Convert both images to float64 and clamp them to [0, 1]."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
-        raise ValueError(f"image {image.shape} and truth {truth.shape} have these shapes, expected (H, W, 3) for both")
+        raise ValueError(f"image has the shape {image.shape} and truth {truth.shape}, expected (H, W, 3) for both")
     return np.clip(image.astype(np.float64), 0, 1), np.clip(truth.astype(np.float64), 0, 1)
