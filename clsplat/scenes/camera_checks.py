@@ -117,7 +117,7 @@ def _corner(views: Sequence[Named]) -> str:
     _, x, y, lens = odd[0]
     return (
         f"the principal point (cx cy) of {examples(name for name, *_ in odd)} is {x:g} {y:g} in a picture of "
-        f"{lens.width}x{lens.height}: is it relative to the middle, or a fraction? Give pixels from the upper left"
+        f"{lens.width}x{lens.height}: is it relative to the middle, or a fraction? Give pixels from the top left corner"
     )
 
 
@@ -173,7 +173,7 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         evidence = (
             f"the cameras face no common point, but {100 * meeting:.0f} % face one place if the poses have {words}"
         )
-    return f"{evidence}: were they exported so? Export them again, or correct the file"
+    return f"{evidence}: were they exported like that? Export them again, or correct the file"
 
 
 def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
@@ -281,7 +281,7 @@ def _facing(cameras: Sequence[Camera]) -> float:
 
 
 def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
-    """Warning about lenses with implausible distortion, or "". `lenses` has the name of a picture with each lens."""
+    """Warning about lenses with implausible distortion, or "". `lenses` has pairs of a picture's name and its lens."""
     bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
     bent = [(name, lens) for name, lens in lenses if bend[lens]]
     if not bent:

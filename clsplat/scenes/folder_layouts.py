@@ -25,7 +25,7 @@ Kind = Literal["colmap", "blender", "transforms", "photos"]
 COLMAP_IMAGE_FOLDER = "images"
 """Name of the picture folder of a COLMAP model."""
 OTHER_IMAGE_FOLDERS = ("input", "inputs", "image", "img", "imgs", "rgb", "color", "frames", "photos", "pictures")
-"""Names of the picture folder in other programs' data sets, in the order tried. 3DGS' convert.py reads input/."""
+"""Names of the picture folder in other programs' data sets, in order of precedence. 3DGS' convert.py reads input/."""
 MODEL_FOLDERS = ("sparse", "colmap", "distorted")
 """Names of folders with a model but without pictures. Users may specify them instead of the scene's folder."""
 HELD_OUT_LIST_FILE = "test.txt"
@@ -49,7 +49,7 @@ def detect(path: Path) -> Kind:
     if (path / "transforms_train.json").is_file():
         return "blender"
     model = colmap.find_model(path)
-    # nerfstudio keeps the COLMAP model from which it made transforms.json in colmap/, for larger pictures: not used
+    # a model in colmap/ is that from which nerfstudio made transforms.json; its pictures are larger, so it is not used
     if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
         return "colmap"
     if (path / "transforms.json").is_file():

@@ -189,8 +189,8 @@ def without_strays(scene: Scene) -> Scene:
 def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = None) -> tuple[Float64, Float64]:
     """Cube (low, high) for random points, around the point that the cameras face, large enough to hold the cameras.
 
-    The centre is the point nearest to all optical axes. A weak pull towards a point ahead of the cameras decides if the
-    axes are parallel. If the cameras face away from the centre (outward from one place), the cube is three times as
+    The centre is the point nearest to all optical axes. If these are parallel, a weak pull towards a point ahead of the
+    cameras determines it. If the cameras face away from the centre (outward from one place), the cube is three times as
     large. The cube is clipped to `box` if they overlap.
     """
     centres = np.stack([camera.position for camera in cameras])
@@ -296,6 +296,6 @@ def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
     if 1 / MAX_ASPECT_RATIO_CHANGE <= stored[0] / lens.width / (stored[1] / lens.height) <= MAX_ASPECT_RATIO_CHANGE:
         return lens.resized(*stored), False
     raise InputError(
-        f"{path}: has {stored[0]}x{stored[1]} pixels, expected its camera's size, {lens.width}x{lens.height}, or a "
-        "multiple of it; are these the pictures from which the cameras were computed?"
+        f"{path}: has {stored[0]}x{stored[1]} pixels, expected its camera's size, {lens.width}x{lens.height}, or "
+        "that aspect ratio; are these the pictures from which the cameras were computed?"
     )

@@ -103,7 +103,7 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
         header = ply_file.read_header(file, path)
         vertex = header.elements[0] if header.elements else None
         if vertex is None or vertex.name != "vertex" or vertex.has_list:
-            raise InputError(f"{path}: its first element is not vertices without lists, expected a point cloud")
+            raise InputError(f"{path}: does not begin with vertices without list properties, expected a point cloud")
         kinds = dict(vertex.properties)
         if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
@@ -136,7 +136,7 @@ def _read_las(path: Path) -> Cloud:
     """Read a LAS or LAZ with laspy."""
     with open_input(path, "a cloud of points") as file:
         if file.read(4) != b"LASF":
-            raise InputError(f"{path}: is not a LAS or LAZ, which its extension promises")
+            raise InputError(f"{path}: is not a LAS or LAZ file, although it has such an extension")
     try:
         import laspy
     except ImportError:

@@ -138,7 +138,7 @@ class Scene:
     bounds: corners (low, high) of the box for random initial points, each (3,) float64, in world units.
     warnings: messages for the user, one line each.
     start: choice of the initial points (`scenes.start`).
-    colourless: (N,), True for points without colours, which photographs give them; None if all have colours.
+    colourless: (N,), True for points that get their colours from photographs; None if no point does.
     source: the folder from which the scene was read.
     depth_use: choice of known depths (`scenes.depth_sources`).
     clouds: point files next to the scene that are not used.

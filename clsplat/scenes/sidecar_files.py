@@ -118,8 +118,8 @@ def owned(
 
 
 def _series(names: Iterable[str]) -> dict[int, str]:
-    """Name for each number at the end of a name, before extensions. Empty unless there are two or more names that
-    differ only in this number."""
+    """Name for each number at the end of a name, before extensions. Empty unless there are several names, which differ
+    only in this number."""
     texts, numbers = set(), {}
     names = sorted(names)
     for name in names:

@@ -131,7 +131,7 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
     if (name := changes.pop(SCHEDULE_SETTING, None)) is not None:
         paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED_SETTINGS)
         if values(config) != values(paper):
-            raise InputError(f"--schedule {name}: the run already replaces settings of the paper's schedule")
+            raise InputError(f"--schedule {name}: the run has settings that differ from the paper's schedule")
         changes = dict(zip(SCHEDULED_SETTINGS, values(scheduled(name, config.iterations)), strict=True)) | changes
     for each, value in changes.items():
         config = changed(config, each, value)

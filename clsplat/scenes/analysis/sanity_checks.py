@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene, View
 
 FIRST_RENDER_CHECK_STEP = 100
-"""Training step after which rendered pictures are checked first."""
+"""Training step after which rendered pictures are checked for the first time."""
 MAX_CHECKED_VIEWS = 8
 """Maximum number of views that are checked, evenly spaced."""
 CHECK_DOWNSCALE = 4

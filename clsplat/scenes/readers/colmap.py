@@ -97,7 +97,7 @@ def _read_posed_images(folder: Path) -> list[PosedImage]:
 
 
 def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Cameras of a model by image name, sorted. Points and pictures are not read.
+    """Cameras of a model, sorted by image name. The keys are the image names. Points and pictures are not read.
 
     folder: the folder of the model or of the scene, as for `find_model`.
     lenses: treatment of distorted cameras, as for training (`Lens.camera`). By default they become full-size pinhole
@@ -332,7 +332,7 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
         quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
         norm = math.hypot(*pose[:4])
         if not (0.5 < norm < 2 and (np.abs(translation) < MAX_COORDINATE).all()):
-            raise corrupt(path, f"image {name} has the pose {list(pose)}, expected finite numbers, a unit quaternion")
+            raise corrupt(path, f"image {name} has the pose {list(pose)}, expected a unit quaternion, finite numbers")
         images[name] = PosedImage(name, lenses[camera], rotation_from_quaternion(quaternion / norm), translation)
     if not images:
         raise InputError(f"{path}: holds no images, expected at least one")

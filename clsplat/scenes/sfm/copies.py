@@ -39,7 +39,7 @@ LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
 COPY_THUMBNAIL_SIZE_PX = (96, 72)
 """Width and height of the thumbnails that are compared."""
 MAX_COMPARED_PIXELS_PER_PIXEL, MIN_COMPARED_WIDTH_PX = 0.5, 24
-"""Maximum width of a compared thumbnail as a fraction of the picture's shorter side, and its minimum width in pixels.
+"""Maximum width of compared thumbnails as a fraction of the narrower picture's width, and minimum width in pixels.
 
 In small pictures, resizing changes the pixels visibly.
 """

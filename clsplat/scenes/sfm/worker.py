@@ -59,7 +59,7 @@ class Worker:
         self.match()
         models = self.map(relaxed=False)
         if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
-            # The baseline may be weak, or features few: try again with an initial pair of smaller angle.
+            # The baseline may be weak, or features few: try again with a smaller angle of the initial pair.
             models |= self.map(relaxed=True)
         if not models:
             self.say(failure=self.evidence())
@@ -183,7 +183,7 @@ class Worker:
         self.undistort_masks(model, result / "masks")
 
     def undistort_masks(self, model: Path, result: Path) -> None:
-        """Resample the masks of the registered photographs like these. The masks' names are NAME.png."""
+        """Resample the masks of the registered photographs like the photographs. The mask of NAME is NAME.png."""
         placed = pycolmap.Reconstruction(model)
         named = {placed.images[image].name: placed.images[image] for image in placed.reg_image_ids()}
         for name in set(self.task["masks"]) & named.keys():

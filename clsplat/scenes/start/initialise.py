@@ -53,7 +53,7 @@ MAX_OCCLUSION_CELL_FRACTION = 1 / 25
 OCCLUSION_DEPTH_RATIO = 1.05
 """Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
 HIDDEN_POINT_RANK = 1e30
-"""An occluded point's rank is this times its relative depth, so that it is larger than that of any visible point."""
+"""An occluded point's rank is this times its relative depth. It thus exceeds the rank of any visible point."""
 UNSEEN_GREY = UNCOLOURED_GREY
 """Grey value of points that no photograph shows."""
 
@@ -147,8 +147,8 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
 
 
 def is_colourless(scene: Scene) -> bool:
-    """True if some points of a --points file lack colours, or all points have the same colour, as those of other clouds
-    without colours do."""
+    """True if points have no colours: some are marked as colourless, as for --points, or all have the same colour, as
+    after reading other clouds without colours."""
     return scene.colourless is not None or of_one_colour(scene.point_colors)
 
 

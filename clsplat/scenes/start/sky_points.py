@@ -27,14 +27,15 @@ SKY_OVERSAMPLING = 4
 SKYLINE_COLUMNS = 24
 """Number of column strips of a photograph. In each, the sky is above all points."""
 MIN_SKY_VOTE_FRACTION = 0.5
-"""Fraction of the photographs that show a direction which must show sky there."""
+"""A direction is sky if at least this fraction of the photographs that show it have sky there."""
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5.0))
 
 
 def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
     """At most `count` points (N, 3) on the sky sphere in the world, and their mean colours (N, 3) in the photographs.
 
-    A direction above the horizon is sky if most photographs that show it have no scene point above it in its column.
+    A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in its
+    column strip.
     Raises InputError if there is no such direction, no common up direction, or no points in the scene.
     """
     if len(scene.points) == 0:

@@ -153,8 +153,8 @@ def _without_void(path: Path, values: Float32) -> Float32:
         found = ", ".join(map(str, np.unique(np.rint(values * most)).astype(int).tolist()[:-1]))
         what = "labels of several things and void" if several else "either labels 0 and 1 with void or black and white"
         raise InputError(
-            f"{path}: the mask's values are {found} and {most}, {what}, expected 0 and {most}, where a half or more "
-            "counts (or 0 and 1); make the pixels that count white, and all others black"
+            f"{path}: the mask's values are {found} and {most}, {what}, expected 0 and {most} (values of at least a "
+            "half count) or labels 0 and 1; make the pixels that count white, and all others black"
         )
     return _labels(np.rint(values * most), most)
 
@@ -169,7 +169,7 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
     black and white."""
     levels = values * most
     dark = levels < most * MASK_THRESHOLD
-    whole = np.abs(levels - np.rint(levels)).max() < 0.25  # integers but for rounding, as they are means of channels
+    whole = np.abs(levels - np.rint(levels)).max() < 0.25  # integers up to rounding: values are means of channels
     if not most or not whole or not (levels[~dark] > most - MASK_THRESHOLD).all() or (levels[dark] > MAX_LABEL).any():
         return None
     found = np.unique(np.rint(levels[dark])).astype(int).tolist()
@@ -225,7 +225,7 @@ def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict: bool = True) -> dict[str, Mask]:
-    """Mask for each name of a scene's photographs; empty if neither masks nor alpha leave out pixels.
+    """Mask for each name of a scene's photographs; empty if masks are not used and alpha is blended.
 
     where: the scene, for messages.
     strict: False if photographs are missing, as their masks may still exist.
