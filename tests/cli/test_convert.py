@@ -215,7 +215,7 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
     assert convert(source, tmp_path / "same.ply", "--scene", scene, "--test-every", 0, "--background", "white") == 0
     said = capsys.readouterr().out
     assert f"{len(cameras())} views" in said
-    assert "against each other 120.00" in said, "the same numbers give the same frames"
+    assert "between the renders 120.00" in said, "the same numbers give the same frames"
 
 
 @pytest.mark.parametrize(
@@ -513,7 +513,7 @@ def test_a_near_plane_that_a_format_does_not_keep(model: Path, tmp_path: Path, c
     assert convert(model, tmp_path / "a.ply") == 0
     assert capsys.readouterr().err == ""
     assert convert(model, tmp_path / "a.splat") == 0
-    said = "splat cannot store the near plane, which is 0.2; readers will take 0.01"
+    said = "splat cannot store the near plane, which is 0.2; readers will use 0.01"
     assert said in capsys.readouterr().err
 
 

@@ -59,9 +59,9 @@ def test_a_model_of_linear_colours_has_a_thumbnail(model: Path, capsys: Capture)
         (["thumbnail", "model.ply", "--up", "north"], "--up north: expected x, y, z"),
         (["thumbnail", "model.ply", "--size", "8"], "--size 8: expected 16 to 8192"),
         (["thumbnail", "model.ply", "-o", "a.##.png"], "a.##.png: is a pattern for frame numbers, expected the name"),
-        (["thumbnail", "model.ply", "-o", "shot#1/a.png"], "shot#1/a.png: has a place for frame numbers"),
-        (["thumbnail", "model.ply", "-o", "a.$F.png"], "a.$F.png: has a place for frame numbers"),
-        (["thumbnail", "a@@b.ply"], "a@@b.ply.png: has a place for frame numbers"),
+        (["thumbnail", "model.ply", "-o", "shot#1/a.png"], "shot#1/a.png: is a pattern for frame numbers"),
+        (["thumbnail", "model.ply", "-o", "a.$F.png"], "a.$F.png: is a pattern for frame numbers"),
+        (["thumbnail", "a@@b.ply"], "a@@b.ply.png: is a pattern for frame numbers"),
         (["thumbnail", "model.ply", "-o", "a.gif"], "a.gif: has the extension '.gif', expected one of .exr, .png"),
         (["thumbnail", "model.ply", "-o", "a.mp4"], "a.mp4: has the extension '.mp4', expected one of .exr, .png"),
         (

@@ -101,7 +101,7 @@ def test_a_silent_server_has_a_limit(seconds: str, server: str, monkeypatch: pyt
         lpips_weights.fetch()
     assert time.monotonic() - start < 2
     assert f"curl --create-dirs -o {lpips_weights.place()} {server}/silent/{NAME}" in str(caught.value)
-    assert ("did not come within 0.3 s" in str(caught.value)) == (seconds != "0")
+    assert ("did not arrive in 0.3 s" in str(caught.value)) == (seconds != "0")
 
 
 def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -258,7 +258,7 @@ def test_an_unfinished_run_has_a_report(scene: Path, tmp_path: Path, copied: Pat
     lines = (copied / "metrics.jsonl").read_text().splitlines(keepends=True)
     (copied / "metrics.jsonl").write_text("".join(lines[:2]) + '{"step": 30, "lo')
     html = report(copied)
-    assert "Not finished: at step 20 of 40" in notes(html)
+    assert "Not finished: the run is at step 20 of 40" in notes(html)
     assert figures_of(parse(html))["curves"]["step"] == [10, 20]
 
 
@@ -292,7 +292,7 @@ def test_without_the_scene_there_are_renders_alone(copied: Path) -> None:
     text = (copied / "config.toml").read_text()
     (copied / "config.toml").write_text(re.sub(r"(?m)^scene = .*$", 'scene = "/nowhere/gone"', text))
     html = report(copied)
-    assert "renders without photographs: the scene cannot be read (gone: no such folder" in notes(html)
+    assert "shown without photographs: the scene cannot be read (gone: no such folder" in notes(html)
     assert len(parse(html).all("img")) == 2
     assert "nowhere" not in html
 

@@ -109,7 +109,7 @@ def test_text_that_is_cut_at_the_end_of_a_line_is_told(tmp_path: Path, stem: str
     told = f"{path}: its header announces {counts[0]} records, but it has {counts[1]}; was it truncated or edited?"
     assert warnings_of(lambda: read_model(tmp_path / "txt")) == [told]
     if stem == "images":
-        with pytest.warns(UserWarning, match="its header announces 3, and it holds 2"):
+        with pytest.warns(UserWarning, match="its header announces 3 records, but it has 2"):
             read_cameras(tmp_path / "txt")
 
 

@@ -266,7 +266,7 @@ def test_white_may_be_what_moves(tmp_path: Path) -> None:
     inverted = load_scene(scene, masks=MaskUse("ignore", invert=True))
     assert not [text for text in inverted.warnings if "dynamic_masks" in text]
     paths = sorted((scene / "images").iterdir())
-    with pytest.warns(UserWarning, match="white is taken for what counts"):
+    with pytest.warns(UserWarning, match="white pixels are the ones that count"):
         reconstruct._masks(scene / "images", paths, IGNORE)
 
 

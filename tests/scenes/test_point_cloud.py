@@ -109,7 +109,7 @@ def test_a_cloud_elsewhere_is_one_error(scene: Scene, move: object, said: str) -
     with pytest.raises(InputError, match=said) as caught:
         check_place(move(points), scene, Path("fused.ply"))  # type: ignore[operator]
     assert "fused.ply" in str(caught.value)
-    assert "scene's frame" in str(caught.value)
+    assert "axes, scale and origin of the scene's cameras" in str(caught.value)
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:

@@ -320,7 +320,9 @@ def test_what_is_no_photo_is_left_out_with_a_line(photos, tmp_path, monkeypatch)
     tasks = task_of(monkeypatch)
     messages = warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "out"))
     assert sorted(tasks[0]["groups"][0]) == [f"view_{index:02d}.jpg" for index in range(COUNT)]
-    masks = "12 photo(s) (masks/view_00.png, masks/view_01.png, masks/view_02.png and 9 more) left out: by their names "
+    masks = (
+        "12 photo(s) (masks/view_00.png, masks/view_01.png, masks/view_02.png and 9 more) left out: their names mark "
+    )
     assert messages[-1].startswith(f"{folder}: {masks}")
     assert messages[:-1] == ([f"{folder}: 1 photo(s) (gone.jpg) left out: broken links"] if broken else [])
 

@@ -109,7 +109,7 @@ def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: C
         capsys.readouterr()
         assert main(["convert", str(run), str(tmp_path / name)]) == 0
         assert load(tmp_path / name).antialiased
-        assert "no place for antialiasing" not in capsys.readouterr().err
+        assert "cannot store antialiasing" not in capsys.readouterr().err
         assert main(["info", str(tmp_path / name), "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["antialiased"] is True
     assert main(["info", str(run / "model.ply")]) == 0
