@@ -119,7 +119,7 @@ def test_errors_of_the_system_are_plain_sentences() -> None:
     error = OSError(errno.EACCES, "Permission denied", "/a/b")
     assert one_line(error) == "/a/b: permission is denied"
     assert one_line(OSError(errno.ENOSPC, "No space left on device")) == "the disk is full"
-    assert one_line(MemoryError()) == "there is not enough main memory: the system gave no more"
+    assert one_line(MemoryError()) == "there is not enough main memory: the system has no more"
 
 
 @pytest.mark.brings("GitHub's archives", "Git LFS's notes in place of files", "named, with `git lfs pull`")

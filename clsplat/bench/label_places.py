@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 from clsplat.arrays import Float64
 
 LABEL_GAP_PX = 9.0
-"""Pixels between a point and its label."""
+"""Minimum distance in pixels between a point and its label."""
 RING_SPACING_PX = 8.0
-"""Pixels between rings of candidates."""
+"""Distance in pixels between rings of candidate boxes."""
 RING_COUNT, DIRECTIONS_PER_RING = 50, 24
 MARKER_RADIUS_PX = 6.0
 LEADER_LINE_DISTANCE_PX = 12.0
 """Distance in pixels beyond which a label has a leader line."""
 CROSSING_COST_PX = 60.0
-"""Cost of crossing a line. It counts as much as this distance between point and label."""
+"""Cost of crossing a line, in pixels: equal to the cost of this distance between point and label."""
 AMBIGUOUS_POINT_COST_PX = 40.0
-"""Cost of another point that is about as near to the label as its own point, in the same unit."""
+"""Cost in pixels of each other point that is about as near to the label as the labelled point."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelBox:
-    """Box (4,) of a label, and the leader line (2, 2) from its point if the label is away from it."""
+    """Box (4,) of a label, and the leader line (2, 2) to its point; None if the label is near the point."""
 
     box: Float64
     leader: Float64 | None
@@ -40,13 +40,13 @@ class LabelBox:
 def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64) -> list[LabelBox]:
     """Place a label near each point, inside the box `frame`.
 
-    points: (n, 2).
-    sizes: (n, 2), sizes of the labels.
+    points: (n, 2), in pixels.
+    sizes: (n, 2), widths and heights of the labels.
     lines: segments that labels and leader lines should not cross.
     A point's marker covers a square around it.
     The search is greedy and starts with the points that have the most neighbours.
-    Each takes the cheapest candidate around it that covers nothing; distance and crossings cost.
-    If every candidate covers something, the one that covers least wins.
+    Each label gets the candidate box that covers least, and among equals the one with the lowest cost.
+    Costs are the distance, crossings, and other points as near to the label as the labelled one.
     """
     markers = np.hstack([points - MARKER_RADIUS_PX, points + MARKER_RADIUS_PX])
     crowded = (1 / (1 + np.linalg.norm(points[:, None] - points, axis=2))).sum(axis=1)
@@ -74,9 +74,9 @@ def place_labels(points: Float64, sizes: Float64, frame: Float64, lines: Float64
 
 
 def _candidates(point: Float64, size: Float64) -> Float64:
-    """Boxes around a point, (candidates, 4), ring by ring, starting to the right.
+    """Candidate boxes around a point, (candidates, 4), ring by ring. Each ring begins on the right.
 
-    Each box lies outside its ring and touches it, at a point of its edge that depends on the direction.
+    Each box touches its ring from outside in one of the directions.
     """
     angles = 2 * pi * np.arange(DIRECTIONS_PER_RING) / DIRECTIONS_PER_RING
     directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 9)
@@ -86,21 +86,21 @@ def _candidates(point: Float64, size: Float64) -> Float64:
 
 
 def _nearest(boxes: Float64, points: Float64) -> Float64:
-    """Nearest position in each box to a point."""
+    """Position in each box that is nearest to the point."""
     return points.clip(boxes[..., :2], boxes[..., 2:])
 
 
 def shared(boxes: Float64, others: Float64) -> Float64:
-    """Intersection areas of boxes (m, 4) with boxes (n, 4), as (m, n)."""
+    """Areas, (m, n), of the intersections of boxes (m, 4) with boxes (n, 4)."""
     low = np.maximum(boxes[:, None, :2], others[:, :2])
     areas: Float64 = (np.minimum(boxes[:, None, 2:], others[:, 2:]) - low).clip(0).prod(axis=2)
     return areas
 
 
 def crossed(boxes: Float64, segments: Float64) -> NDArray[np.bool_]:
-    """True where a segment (n, 2, 2) passes through the inside of a box (m, 4), as (m, n).
+    """Mask (m, n), True where a segment (n, 2, 2) passes through the inside of a box (m, 4).
 
-    Segments are clipped edge by edge (Liang and Barsky).
+    Segments are clipped against each edge (Liang and Barsky).
     """
     start, move = segments[:, 0], segments[:, 1] - segments[:, 0]
     low, high = boxes[:, None, :2], boxes[:, None, 2:]
@@ -113,12 +113,12 @@ def crossed(boxes: Float64, segments: Float64) -> NDArray[np.bool_]:
 
 
 def _cross(segments: Float64, others: Float64) -> NDArray[np.bool_]:
-    """True where segments (m, 2, 2) and (n, 2, 2) properly cross each other, as (m, n)."""
+    """Mask (m, n), True where segments (m, 2, 2) and (n, 2, 2) properly cross each other."""
     through = _sides(segments, others[:, 0]) * _sides(segments, others[:, 1]) < 0
     return through & (_sides(others, segments[:, 0]) * _sides(others, segments[:, 1]) < 0).T
 
 
 def _sides(lines: Float64, points: Float64) -> Float64:
-    """Side of a line (m, 2, 2) on which a point (n, 2) lies, as (m, n): above 0 left of it, below 0 right of it."""
+    """Side of a line (m, 2, 2) on which a point (n, 2) lies, (m, n): positive on the left, negative on the right."""
     along, offsets = (lines[:, 1] - lines[:, 0])[:, None], points - lines[:, None, 0]
     return along[..., 0] * offsets[..., 1] - along[..., 1] * offsets[..., 0]

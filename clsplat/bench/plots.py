@@ -2,8 +2,8 @@
 """The two plots of `clsplat bench --plot`. They need matplotlib, the optional extra `plot`.
 
 The file name's ending selects SVG or PNG.
-Plots are legible at a width of 800 pixels: fonts of at least 10 points on 8 inches.
-The colours are the palette of Okabe and Ito, which is safe for colour-blind readers.
+Plots are legible at a width of 800 pixels, as fonts have at least 10 points on a width of 8 inches.
+The colours are the palette of Okabe and Ito, which colour-blind readers can distinguish.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from clsplat.files.atomic import atomic_writer
 
 PLOT_EXTENSIONS = (".svg", ".png")
 FIGURE_WIDTH_INCHES, LAYOUT_DPI = 8.0, 100
-"""Inches, and the layout's pixels per inch."""
+"""Width of a figure in inches, and pixels per inch for its layout."""
 FONT_SIZE_POINTS = 10
 """Font size in points."""
 OKABE_ITO_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000", "#666666")
 PLOT_BLUE, PLOT_ORANGE, _, PLOT_VERMILION, _, _, PLOT_BLACK, PLOT_GREY = OKABE_ITO_COLOURS
 CHARACTERS_PER_LINE = 92
-"""Characters of a line across the whole width."""
+"""Number of characters in a line of a figure's full width."""
 LEGEND_ABOVE_AXES = {
     "loc": "lower right",
     "bbox_to_anchor": (1, 1),
@@ -38,15 +38,15 @@ LEGEND_ABOVE_AXES = {
     "frameon": False,
     "fontsize": FONT_SIZE_POINTS,
 }
-"""Position of a legend above the axes, where it covers no point."""
+"""Settings of a legend above the axes, where it covers no point."""
 LABEL_PADDING_PX = 2.0
-"""Pixels of padding around a label."""
+"""Padding around a label in pixels."""
 
 Point = tuple[float, float]
 
 
 def check_plot(path: Path) -> None:
-    """Raise InputError if a plot cannot be written to `path`. Call it before the measurements that the plot shows."""
+    """Raise InputError if a plot cannot be written to `path`. Call this before the measurements that the plot shows."""
     if path.suffix.lower() not in PLOT_EXTENSIONS:
         raise InputError(f"{path}: has the extension {path.suffix or 'none'!r}, expected .svg or .png")
     if not path.parent.is_dir():
@@ -54,12 +54,12 @@ def check_plot(path: Path) -> None:
     try:
         import_module("matplotlib")
     except ImportError as error:
-        message = f"{path}: matplotlib is needed for a plot ({error}), install it with: pip install 'clsplat[plot]'"
+        message = f"{path}: plots need matplotlib ({error}); install it with: pip install 'clsplat[plot]'"
         raise InputError(message) from None
 
 
 def plot_files(path: Path) -> tuple[Path, Path]:
-    """Paths of the two plots, in the folder of `path`: exact switches, and approximate settings."""
+    """Paths of the plot of exact switches and of the plot of approximate settings, in the folder of `path`."""
     switches, error = (path.with_name(f"{path.stem}-{kind}{path.suffix}") for kind in ("switches", "error"))
     return switches, error
 
@@ -73,7 +73,7 @@ def plot_settings(path: Path, result: Mapping[str, Any], title: str) -> tuple[Pa
 
 
 def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
-    """Bar chart: time without each exact switch relative to the time with all of them, for a frame and a step."""
+    """Bar chart of the times of a frame and a step without each exact switch, relative to those with all switches."""
     exact = _exact_point(result)
     rows = []
     if exact is not None:
@@ -82,11 +82,11 @@ def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
                 ratios = [point[key] / exact[key] for key in ("frame_ms", "iteration_ms")]
                 rows.append((ratios, point["name"]))
     rows.sort(key=lambda row: row[0][0])
-    notes = ["Time without the switch over the time of exact, which has all of them. 1.00: no difference."]
+    notes = ["Time without the switch divided by the time of exact, which has all of them. 1.00: no difference."]
     if (faster := result["exact_switches_faster"]) is not None:
-        notes.append(f"All off: {faster['frame']:.2f} times for a frame, {faster['iteration']:.2f} times for a step.")
+        notes.append(f"With all off: {faster['frame']:.2f} for a frame, {faster['iteration']:.2f} for a step.")
     inches = max(0.42 * len(rows) + 0.2, 1.0)
-    figure, axes = _sheet(["What each exact switch is worth", title], notes, inches)
+    figure, axes = _sheet(["Gain of each exact switch", title], notes, inches)
     for index, (key, colour) in enumerate((("a frame", PLOT_BLUE), ("a training step", PLOT_ORANGE))):
         values = [ratios[index] for ratios, _ in rows]
         places = [row + 0.2 - 0.4 * index for row in range(len(rows))]
@@ -102,7 +102,7 @@ def _draw_switches(result: Mapping[str, Any], title: str) -> Any:
     ratios = [value for both, _ in rows for value in both]
     low, high = min([1.0, *ratios]), max([1.05, *ratios])
     axes.set_xlim(low - 0.02 * (high - low), high + 0.12 * (high - low))
-    axes.set_xlabel("times as long without it", fontsize=FONT_SIZE_POINTS)
+    axes.set_xlabel("time without the switch / time with it", fontsize=FONT_SIZE_POINTS)
     axes.grid(alpha=0.3, axis="x")
     if rows:
         axes.legend(**LEGEND_ABOVE_AXES)
@@ -123,13 +123,13 @@ def _draw_error(result: Mapping[str, Any], title: str) -> Any:
     known = result["exact_against_float64"]
     reference = f"The exact preset against the float64 reference, {width}x{height} pixels in the middle"
     notes = [
-        f"Error against {result['error_is_against']}; in brackets the largest absolute error.",
+        f"Error against {result['error_is_against']}. The largest absolute error is in brackets.",
         f"{reference}: {known['psnr']:.1f} dB, largest error {known['max_abs']:.2g}.",
     ]
     if same:
-        notes.append(f"Approximate, but the same bits as exact here: {', '.join(same)}.")
+        notes.append(f"Approximate settings that give the same bits as exact here: {', '.join(same)}.")
     figure, axes = _sheet(["Time against error of the approximate settings", title], notes, 5.0)
-    axes.set_xlabel("ms a frame, median", fontsize=FONT_SIZE_POINTS)
+    axes.set_xlabel("ms per frame, median", fontsize=FONT_SIZE_POINTS)
     axes.set_ylabel("PSNR, dB", fontsize=FONT_SIZE_POINTS)
     axes.grid(alpha=0.3)
     if not drawn:
@@ -178,13 +178,13 @@ def _exact_point(result: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 
 def _around(values: Sequence[float], below: float) -> tuple[float, float]:
-    """Axis limits: the values' range, a tenth of it above and the fraction `below` of it below."""
+    """Axis limits: the values' range, extended by a tenth of its length above and by `below` times its length below."""
     span = max(values) - min(values) or 1.0
     return min(values) - below * span, max(values) + 0.1 * span
 
 
 def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Best quality for each cost, as a staircase: level up to the next cost, then up."""
+    """Staircase of the best quality for each cost: horizontal up to the next cost, then vertical."""
     path = list(corners[:1])
     for (_, quality), (cost, better) in pairwise(corners):
         path += [(cost, quality), (cost, better)]
@@ -194,9 +194,9 @@ def _steps(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 def _label_points(
     figure: Any, axes: Any, points: Sequence[Point], texts: Sequence[str], lines: Sequence[tuple[Point, Point]]
 ) -> None:
-    """Write a text near each point, with a leader line if it is away from the point, and avoid crossing `lines`.
+    """Write a text near each point. It has a leader line if it is away from the point, and avoids crossing `lines`.
 
-    The axes must already have their position and limits.
+    The axes must already have their final position and limits.
     """
     to_pixels, to_figure = axes.transData.transform, figure.transFigure.inverted().transform
     bounds = axes.get_window_extent()
@@ -235,7 +235,7 @@ def _sheet(titles: Sequence[str], notes: Sequence[str], inches: float) -> tuple[
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write the figure without the date and random ids that matplotlib puts in an SVG: equal plots are equal files."""
+    """Write the figure without matplotlib's date and random ids in SVG, so that equal plots give equal files."""
     with import_module("matplotlib").rc_context({"svg.hashsalt": "clsplat"}):
         kind = path.suffix.lower()[1:]
         with atomic_writer(path) as file:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run time against error for every switch of the rasterizer: measurements and table of `clsplat bench --plot`."""
+"""Run time and error of every switch of the rasterizer: measurements and table for `clsplat bench --plot`."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ from clsplat.stages.device_gaussians import AnyGaussians, upload_gaussians
 REFERENCE_CROP_SIDE_PX = 192
 """Side in pixels of the central crop that is compared with the float64 reference. Smaller images are compared whole."""
 ALL_EXACT_SWITCHES_OFF = "all exact switches off"
-"""Setting without any exact switch. A switch with several values takes the one with the largest effect."""
+"""Name of the setting with all exact switches off. Of several values, it has the one with the largest effect."""
 MAX_PSNR_DB = 160.0
-"""PSNR in dB reported for equal images, whose PSNR is infinite."""
+"""PSNR in dB that is reported for equal images, whose PSNR is infinite."""
 APPROXIMATING_SETTINGS = ("sh_degree_limit", "sh_tolerance", "sh_storage", "alpha_min", "transmittance_min")
-"""Settings that approximate at any value but the `exact` preset's. `extent` approximates at 3sigma only."""
+"""Settings that approximate unless they have the `exact` preset's value. `extent` approximates only with 3sigma."""
 
 
 def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
-    """PSNR over all pixels and channels in dB, up to the limit for equal images, and largest absolute difference.
+    """PSNR in dB over all pixels and channels, at most MAX_PSNR_DB, and largest absolute difference.
 
-    Computed in float64, without clamping.
+    Both are computed in float64, without clamping.
     """
     difference = np.asarray(picture, np.float64) - np.asarray(wanted, np.float64)
     mse = float(np.mean(np.square(difference)))
@@ -54,7 +54,7 @@ def error_of(picture: NDArray[Any], wanted: NDArray[Any]) -> dict[str, float]:
 
 
 def settings() -> dict[str, BenchSwitches]:
-    """Settings to measure: presets, each switch off its default alone, and all exact switches together."""
+    """Settings to measure: presets, settings with a single switch changed, and one with all exact switches off."""
     named = {f"preset {name}": config.switches() for name, config in RASTERIZER_PRESETS.items()}
     flags = [switch.name for switch in fields(BenchSwitches) if switch.default is True]
     changes: dict[str, dict[str, Any]] = {
@@ -95,16 +95,17 @@ def compare(
     repeat: int = 5,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure run time against error of each setting.
+    """Measure run time and error of each setting.
 
-    Times are medians of a frame and of a training step, measured in turns.
-    Errors are differences from the float64 reference on a crop, and from the exact preset's frame on the whole image.
-    If the settings include exact and the one with all exact switches off, the result also has the ratio of their times.
+    Times are medians for a frame and for a training step. The settings are measured in turn in each round.
+    Errors are differences from the float64 reference in a crop, and from the exact preset's frame in the full image.
+    If the settings include exact and ALL_EXACT_SWITCHES_OFF, the result also has the ratio of their times.
     """
     say = progress or no_progress
     if subject.camera.model.along_rays:
         raise InputError(
-            f"{subject.name}: its pictures are drawn along rays, expected a model and a camera of the image's plane"
+            f"{subject.name}: is drawn along rays, which --plot does not support; expected a projected model and a "
+            "pinhole camera"
         )
     tried = {name: config.switches() for name, config in (candidates or settings()).items()}
     camera = subject.camera
@@ -173,7 +174,7 @@ class _Comparison:
         self._trainer.train_step()
 
     def times(self, repeat: int, say: Progress) -> dict[str, list[tuple[float, float]]]:
-        """Times of frame and step in ms, for each setting `repeat` times, the settings in turns."""
+        """Times in ms of a frame and a step, for each setting: `repeat` rounds in which the settings take turns."""
         times: dict[str, list[tuple[float, float]]] = {name: [] for name in self.rasterizers}
         for done in range(repeat):
             say("times", done / repeat)
@@ -190,9 +191,9 @@ def _points(
     differences: Mapping[str, Mapping[str, Mapping[str, float]]],
     against: str,
 ) -> dict[str, dict[str, Any]]:
-    """Record of each setting: median times, errors, and True for the settings on the Pareto front.
+    """Record of each setting: median times, errors, and whether the setting is on the Pareto front.
 
-    against: the difference that is the setting's error.
+    against: name of the difference that is used as the setting's error.
     """
     points: dict[str, dict[str, Any]] = {}
     for name, config in tried.items():
@@ -212,7 +213,7 @@ def _points(
 
 
 def _exact_switches_faster(points: Mapping[str, Mapping[str, Any]], exact: str | None) -> dict[str, float] | None:
-    """Ratios of times without and with all exact switches, None unless both were measured.
+    """Ratios of the times with all exact switches off to the times with all of them on; None unless both were measured.
 
     exact: name of the exact preset among the points.
     """
@@ -230,7 +231,7 @@ def front(points: list[tuple[float, float]]) -> list[bool]:
 
 
 def reference_crop(gaussians: Gaussians, camera: Camera, crop: tuple[int, int, int, int]) -> Float64:
-    """Crop of the frame by the float64 reference, over black, (height, width, 3).
+    """Crop (height, width, 3) of the frame that the float64 reference renders over black.
 
     Gaussians that do not reach the crop are skipped.
     """
@@ -259,6 +260,6 @@ def settings_table(result: dict[str, Any]) -> str:
     )
     lines = [*aligned(rows), "", note]
     if (faster := result["exact_switches_faster"]) is not None:
-        gain = f"a frame {faster['frame']:.2f} times faster, a training step {faster['iteration']:.2f} times"
-        lines.append(f"the exact switches together: {gain}")
+        gain = f"a frame {faster['frame']:.2f} times faster, and a training step {faster['iteration']:.2f} times"
+        lines.append(f"all exact switches together make {gain}")
     return "\n".join(lines)

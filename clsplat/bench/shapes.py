@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Search for the quickest kernel shape on a device.
+"""Search for the fastest kernel shape on a device.
 
-Each candidate runs in its own process, because a driver may abort.
+Each candidate runs in a separate process, because a driver may abort.
 `clsplat tune` saves the result (device/drivers/shapes.py).
-The search never starts by itself. Gradients have the same bits only within a shape.
-A trial disturbed by other load would thus change the results of a seed.
+The search never starts automatically: other load may disturb a trial and thus change which shape is chosen.
+Gradients have the same bits only within a shape, so the same seed would then give other results.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 TRIAL_WORKLOAD = (50_000, 640, 480)
 """Number of Gaussians, width and height of the trial's frame."""
 REPLACEMENT_TIME_RATIO = 0.97
-"""Largest ratio of times at which a shape replaces the default. A smaller gain may be noise of the trial."""
+"""Largest ratio of a shape's time to the default's at which the shape is preferred. Smaller gains may be noise."""
 
 
 @dataclass(frozen=True)
 class Trial:
     """Result of one candidate.
 
-    ms: time of a frame and its gradient; None if the driver failed or took too long.
+    ms: time in milliseconds of a frame and its gradient; None if the driver failed or took too long.
     """
 
     shape: Shape
@@ -45,7 +45,7 @@ class Trial:
 
 
 def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tuple[list[Trial], Shape]:
-    """Try the candidates on a device and save the quickest.
+    """Try the candidates on a device and save the fastest. Returns all trials, and the fastest shape.
 
     index: the device's index among all devices.
     Raises DriverError if no candidate works, and OSError.
@@ -57,8 +57,8 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
     if all(trial.ms is None for trial in trials):
         shapes = ", ".join(trial.shape.label for trial in trials)
         raise DriverError(
-            f"{device.name.strip()}: the driver aborted or hung in every shape that was tried, {shapes}; clsplat "
-            "selftest tells more"
+            f"{device.name.strip()}: the driver aborted or hung with every shape that was tried, {shapes}; run "
+            "clsplat selftest for details"
         )
     best = choose(trials)
     save_shape(device, None if best == default_shape(device) else best)
@@ -66,7 +66,7 @@ def tune(device: cl.Device, index: int, progress: Callable[[Shape], None]) -> tu
 
 
 def choose(trials: list[Trial]) -> Shape:
-    """The quickest shape, if it is clearly quicker than the first, which is the default; else the default."""
+    """The fastest shape if it is clearly faster than the default, which is the first trial; else the default."""
     default = trials[0]
     timed = [(trial.ms, trial.shape) for trial in trials if trial.ms is not None]
     if not timed:

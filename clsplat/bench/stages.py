@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat bench`: cost of each stage of a frame and of a training step, compared with the device's own limits.
+"""`clsplat bench`: cost of each stage of a frame and of a training step, compared with measured limits of the device.
 
 docs/performance.md explains each figure.
 """
@@ -36,7 +36,7 @@ from clsplat.training.trainer import Trainer
 FRAME_STAGES = ("transfers", "project", "duplicate", "ranges", "blend")
 """Stages measured in a frame. All others are measured in a training step."""
 TRAINING_BYTES_PER_GAUSSIAN = 4 * floats_of(16) * 4
-"""Bytes per Gaussian of SH degree 3 in a training step: parameters, gradients and two moments."""
+"""Bytes per Gaussian of SH degree 3 in a training step, for parameters, gradients and two moments."""
 
 
 def bench(
@@ -59,7 +59,7 @@ def bench(
     say("frame", None)
     trainer = trainer_of(subject, device, config)
     rasterizer, gaussians = trainer.rasterizer, trainer.parameters
-    if held_kind(config) != held_kind(RasterizerConfig()):  # for the frame only
+    if held_kind(config) != held_kind(RasterizerConfig()):  # only for the frame: the step uses the trainer's copy
         gaussians = upload_gaussians(device, subject.gaussians, held_sh(subject.gaussians, config))
 
     def draw() -> ForwardPass:
@@ -101,7 +101,7 @@ def bench(
 
 
 def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
-    """Numbers of a frame's (tile, Gaussian) pairs and (pixel, Gaussian) pairs, by kind."""
+    """Number of a frame's (tile, Gaussian) pairs, and of its contributing and evaluated (pixel, Gaussian) pairs."""
     pairs = contributing = evaluated = 0
     for band in frame.bands:
         listed = rasterizer.listed(frame, band)
@@ -113,7 +113,7 @@ def _pairs_of(rasterizer: Rasterizer, frame: ForwardPass) -> dict[str, int]:
 
 
 def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int) -> dict[str, dict[str, Any]]:
-    """Record of each stage with its rates, and their shares of the device's limits.
+    """Record of each stage with its rates, and with the rates' fractions of the device's limits.
 
     contributing: number of pairs that change a pixel.
     """
@@ -130,7 +130,7 @@ def _table(stages: Mapping[str, StageRecord], limits: Limits, contributing: int)
 
 
 def calls_of(device: Device, work: Callable[[], object]) -> Calls:
-    """Count the queue calls of `work`. It must have run before, so that kernels are built and memory is allocated."""
+    """Count the queue calls of `work`, which must have run before so that kernels are built and memory is allocated."""
     before = replace(device.calls)
     work()
     return device.calls.since(before)
@@ -141,8 +141,8 @@ class _Cost:
     """Cost of a frame or a training step. Times are medians.
 
     wall_ms, host_ms: wall time, and processor time of this thread.
-    calls: queue calls.
-    by_wall: True if the stages' times are wall times, as the driver's events carry none.
+    calls: numbers of queue calls.
+    by_wall: True if the stages' times are wall times, because the driver's events have no times.
     """
 
     wall_ms: float
@@ -155,7 +155,8 @@ class _Cost:
 def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
     """Measure the cost of `work`, in `repeat` rounds.
 
-    Each round runs plain, with events, and waiting between stages. Wall and processor time are of the plain run.
+    In each round, `work` runs three times: without recording, with events, and with waits between stages. Wall time and
+    processor time are those of the first.
     """
     for _ in range(2):
         work()
@@ -192,13 +193,13 @@ class _Picture(View):
 
     pixels: Float32 = field(kw_only=True)
 
-    # the pixels have one size
+    # width and height are ignored: the picture exists in one size only
     def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:  # noqa: ARG002
         return self.pixels
 
 
 def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:
-    """Trainer whose steps do all the work of training but leave the model unchanged: every learning rate is zero."""
+    """Trainer whose steps do all the work of training but keep the model unchanged, as all learning rates are zero."""
     camera = subject.camera
     photograph = subject.photograph
     if photograph is None:  # the mirrored frame: similar content, with a gradient everywhere
@@ -241,13 +242,13 @@ def table(result: dict[str, Any]) -> str:
         limit[name] * 1e-9 for name in ("pairs_per_second", "gradient_pairs_per_second", "copy_bytes_per_second")
     )
     seen = f"{result['gaussians']:,} Gaussians, SH degree {result['sh_degree']}, {result['visible']:,} visible"
-    most = f"{arithmetic:.2f} Gpairs/s of blending arithmetic, {gradient:.2f} of its gradient's"
-    of_pixels = f"{pairs['contributing']:,} that contribute, {pairs['evaluated']:,} evaluated"
+    most = f"{arithmetic:.2f} Gpairs/s for blending arithmetic, {gradient:.2f} Gpairs/s for its gradient"
+    of_pixels = f"{pairs['contributing']:,} contribute and {pairs['evaluated']:,} are evaluated"
     lines = [
         f"{result['device']}, {driver}, {limit['lanes']} lanes x {limit['items']} items",
         f"{result['source']}: {seen}, at {size}",
-        f"pairs: {pairs['listed']:,} of tiles; of pixels {of_pixels}",
-        f"limits: {most}, {copying:.1f} GB/s of copying",
+        f"pairs: {pairs['listed']:,} with tiles; with pixels, {of_pixels}",
+        f"limits: {most}, {copying:.1f} GB/s for copying",
         "",
     ]
     header = ("stage", "ms", "wall ms", "launches", "MB", "GB/s", "of copy", "Gpairs/s", "of arithmetic")
@@ -268,11 +269,11 @@ def table(result: dict[str, Any]) -> str:
             )
         )
     lines += aligned(rows)
-    note = "ms by events" if result["timer"] == "events" else "ms by wall time: the driver's events have none"
+    note = "ms from events" if result["timer"] == "events" else "ms from wall time, as the driver's events have none"
     times = f"frame {result['frame_ms']:.2f} ms, training step {result['iteration_ms']:.2f} ms"
     load = f"load average {result['load_average'] or 0:.1f}"
     counts = [("queue", *(name.replace("_", " ") for name in result["frame_calls"]), "host ms")]
     for what, key in (("frame", "frame"), ("training step", "iteration")):
         host = f"{result[f'{key}_host_ms']:.2f}"
         counts.append((what, *(str(count) for count in result[f"{key}_calls"].values()), host))
-    return "\n".join([*lines, "", *aligned(counts), "", f"{times}: medians of {result['repeat']}; {note}; {load}"])
+    return "\n".join([*lines, "", *aligned(counts), "", f"{times}: medians of {result['repeat']} runs; {note}; {load}"])

@@ -25,9 +25,9 @@ from clsplat.scenes.start.initialise import from_scene
 class Subject:
     """Subject of a measurement.
 
-    camera: the view that is rendered.
-    photograph: (H, W, 3) uint8, the target of a training step; None for one derived from the frame.
-    masks: use of masks. With masks the photograph is (H, W, 5), as from `View.load_masked`.
+    camera: camera for which frames are rendered.
+    photograph: (H, W, 3) uint8, the target of a training step; None to derive a target from the frame.
+    masks: use of masks. With masks, the photograph is (H, W, 5), as from `View.load_masked`.
     """
 
     name: str
@@ -38,7 +38,7 @@ class Subject:
 
 
 def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Subject:
-    """Synthetic scene, equal on every call.
+    """Synthetic scene. Every call returns the same scene.
 
     The default has 1.0 M (tile, Gaussian) pairs and 56 M (Gaussian, pixel) pairs.
     """
@@ -62,9 +62,9 @@ def synthetic(count: int = 200_000, width: int = 1024, height: int = 768) -> Sub
 def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Progress | None = None) -> Subject:
     """Load the subject at a path.
 
-    A run: its model, from the first view of its scene.
-    A model file: like a run if it is a run's model, else from a camera in front of it.
-    A scene: the Gaussians from which training starts.
+    For a run, it is the run's model, seen from the first view of its scene.
+    For a model file, it is the same if this is a run's model, else the model seen from a camera in front of it.
+    For a scene, it is the Gaussians with which training starts, seen from its first view.
     Raises InputError.
     """
     run = run_of(path)
@@ -98,7 +98,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
 
 
 def facing(gaussians: Gaussians, width: int, height: int) -> tuple[Gaussians, Camera]:
-    """The Gaussians with origin zero, and a camera with the world's axes that sees nine tenths of them."""
+    """Copy of the Gaussians with origin zero, and a camera with the world's axes that sees nine tenths of them."""
     low, middle, high = np.quantile(gaussians.means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
     focal = 0.9 * width
     half = np.maximum(high - middle, middle - low)

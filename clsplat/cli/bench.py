@@ -22,15 +22,15 @@ from clsplat.errors import InputError
 
 @dataclass(frozen=True)
 class BenchVerb(Verb):
-    """Measure each stage of a frame and of a training step, and the device's own limits in the same run.
+    """Measure each stage of a frame and of a training step, and the limits of the device in the same run.
 
     docs/performance.md explains the figures.
     """
 
     source: Annotated[Positional[Path | None], arg(metavar="SCENE|RUN|MODEL")] = None
-    """A scene, measured at the start of a training; a run, or a model file. If not given: a synthetic scene."""
+    """A scene, measured as at the start of training; a run; or a model file. If not given: a synthetic scene."""
     gaussians: int = 200_000
-    """Gaussians of the synthetic scene."""
+    """Number of Gaussians of the synthetic scene."""
     size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None
     """Size of the frame in pixels. If not given: the camera's, or 1024x768 for the synthetic scene."""
     repeat: int = 5
@@ -39,8 +39,8 @@ class BenchVerb(Verb):
     """Bundle of rasterizer settings: exact and default approximate nothing, fast approximates a little. A --rasterizer
     flag overrides it."""
     plot: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Measure every setting of the rasterizer too, and draw two plots, .svg or .png. For NAME.svg: NAME-switches.svg
-    with the gain of each exact switch, and NAME-error.svg with time against error of the approximate settings."""
+    """Also measure every setting of the rasterizer, and draw two plots (.svg or .png). For NAME.svg: NAME-switches.svg
+    with the gain of each exact switch, and NAME-error.svg with time and error of the approximate settings."""
     overwrite: Flag = False
     """Replace existing plots."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
@@ -49,13 +49,13 @@ class BenchVerb(Verb):
     rasterizer: BenchSwitches = field(default_factory=BenchSwitches)
 
     def completed(self, given: Collection[str]) -> BenchVerb:
-        """Take the rasterizer's settings from the preset, except for settings given as flags."""
+        """Take the rasterizer's settings from the preset, except for those specified by flags."""
         switches = RASTERIZER_PRESETS[self.preset].switches()
         return replace(self, rasterizer=with_given(switches, self.rasterizer, given, "rasterizer."))
 
 
 def run(verb: BenchVerb, services: Services) -> int:
-    """Measure. Errors in the command line are reported before the first measurement."""
+    """Measure and print. Errors in the command line are reported before the first measurement."""
     from clsplat.bench import settings as tradeoff
     from clsplat.bench import stages as bench_stages
     from clsplat.bench import workload as bench_subject
@@ -76,7 +76,7 @@ def run(verb: BenchVerb, services: Services) -> int:
     device = services.require(services.open_device(verb.device.selector, limit, profile=True))
     most = int(device.cl_device.global_mem_size) // bench_stages.TRAINING_BYTES_PER_GAUSSIAN
     if verb.source is None and verb.gaussians > most:
-        raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, which fill {device.name}'s memory")
+        raise InputError(f"--gaussians {verb.gaussians}: expected at most {most}, for which {device.name} has memory")
     if verb.source is None:
         subject = bench_subject.synthetic(verb.gaussians, *(size or (1024, 768)))
     else:

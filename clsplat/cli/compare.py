@@ -23,7 +23,7 @@ class CompareVerb(Verb):
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN")]
     """Folders of two or more runs."""
     output: OutputFile = None
-    """Also write a page with overlaid curves and time against error: one self-contained HTML file."""
+    """Also write one self-contained HTML page with overlaid curves and a chart of PSNR against time."""
     overwrite: Flag = False
     """Replace an existing page."""
     json: Flag = False

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 SILENT_WRITE_SECONDS = 2.0
 """Seconds that writing a file may take before progress is shown."""
 NEAR_PLANE_RELATIVE_TOLERANCE = 0.05
-"""Relative tolerance of near planes. A file that stores none gets one from its positions, which the format may have
-rounded."""
+"""Relative tolerance of near planes. If a format does not store the near plane, readers derive it from positions,
+which the format may round."""
 MAX_MATRIX_FILE_BYTES = 1 << 16
 """Size limit in bytes of a matrix file."""
 
@@ -61,7 +61,7 @@ class ViewComparison(TypedDict):
 
 
 class SceneComparison(TypedDict):
-    """Means over the views of --scene, and the least PSNR between the renders of a view."""
+    """Means over the views of --scene, and the lowest PSNR between the two renders of a view."""
 
     before: float
     after: float
@@ -71,10 +71,10 @@ class SceneComparison(TypedDict):
 
 
 class ConversionReport(TypedDict):
-    """The report of --json.
+    """The report that --json prints.
 
     errors: largest and mean error of each attribute (`difference.errors`).
-    scene: with --scene.
+    scene: comparison on the scene, if --scene is specified.
     """
 
     source: ModelFile
@@ -138,9 +138,9 @@ class ConvertVerb(Verb):
     """Measure PSNR on this scene's held-out views before and after, and between the two renders. For a run's own scene,
     masked-out pixels do not count."""
     test_every: int = TEST_EVERY
-    """Every n-th view of --scene by name is held out. 0: all its views are measured."""
+    """Every n-th view of --scene in name order is held out. 0: all views are measured."""
     resolution: int = 0
-    """Longest image side for --scene, in pixels. 0: the images' size up to 1600."""
+    """Longest image side in pixels, for --scene. 0: the images' size up to 1600."""
     background: Literal["black", "white"] = "black"
     """Background behind the Gaussians and behind images with alpha, for --scene."""
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
@@ -149,7 +149,7 @@ class ConvertVerb(Verb):
 
 
 def run(verb: ConvertVerb, services: Services) -> int:
-    """Read, edit, write and read back. Errors in the command line are reported before anything is written."""
+    """Convert the model, and compare it with the result. Errors in the command line are reported before any writing."""
     from clsplat.images import colour
     from clsplat.models import difference, edit
     from clsplat.models.formats import colour_space, format_of, format_of_name, load, save
@@ -170,21 +170,21 @@ def run(verb: ConvertVerb, services: Services) -> int:
     comments = () if space == colour.SRGB else (colour.comment(space),)
     save(verb.target, edited, comments=comments, progress=StageProgress(after=SILENT_WRITE_SECONDS), **options)
     if space != colour_space(verb.target):
-        warn(f"{verb.target}: {target_format.name} has no place for the colour space, which is {space}")
-    read = load(verb.target, doubts=False)  # without warnings: the same ones were printed for the source
+        warn(f"{verb.target}: {target_format.name} cannot store the colour space, which is {space}")
+    read = load(verb.target, doubts=False)  # without warnings, as they were printed for the source already
     if not isclose(read.near, edited.near, rel_tol=NEAR_PLANE_RELATIVE_TOLERANCE):
         warn(
-            f"{verb.target}: {target_format.name} has no place for the near plane, which is {edited.near:.4g}; readers "
-            f"will take {read.near:.4g}"
+            f"{verb.target}: {target_format.name} cannot store the near plane, which is {edited.near:.4g}; readers "
+            f"will use {read.near:.4g}"
         )
     if read.antialiased != edited.antialiased:
         warn(
-            f"{verb.target}: {target_format.name} has no place for antialiasing; readers will draw small or distant "
+            f"{verb.target}: {target_format.name} cannot store antialiasing; readers will draw small or distant "
             "Gaussians too thick"
         )
     if read.by_rays != edited.by_rays:
         warn(
-            f"{verb.target}: {target_format.name} has no place for drawing along rays; readers will show large "
+            f"{verb.target}: {target_format.name} cannot store drawing along rays; readers will show large "
             "Gaussians outside the picture as a haze"
         )
     written = edit.take(edited, target_format.order(edited)) if target_format.order else edited
@@ -204,13 +204,13 @@ def run(verb: ConvertVerb, services: Services) -> int:
     print(difference.table(result["errors"]))
     if verb.scene is not None:
         scene = result["scene"]
-        print(f"{len(scene['views'])} views  PSNR {scene['before']:.2f} dB before, {scene['after']:.2f} after; the "
-              f"renders against each other {scene['between']:.2f}, at least {scene['least_between']:.2f}")  # fmt: skip
+        print(f"{len(scene['views'])} views  PSNR {scene['before']:.2f} dB before, {scene['after']:.2f} after; between "
+              f"the renders {scene['between']:.2f}, at least {scene['least_between']:.2f}")  # fmt: skip
     return 0
 
 
 def _check(verb: ConvertVerb) -> None:
-    """Raise InputError for a number out of range, or a flag without its companion."""
+    """Raise InputError for a number out of range, or for a flag without another flag that it needs."""
     from clsplat.gaussians import MAX_SH_DEGREE
 
     rules: tuple[Rule, ...] = (
@@ -222,12 +222,12 @@ def _check(verb: ConvertVerb) -> None:
     )
     check_rules(verb, "--", rules)
     if (verb.prune_contribution is None) != (verb.cameras is None):
-        raise InputError("--prune-contribution and --cameras go together: contributions are to their pictures")
+        raise InputError("--prune-contribution and --cameras need each other: the cameras define the pictures")
     defaults = {field.name: field.default for field in fields(verb)}
     names = [name for name in ("test_every", "resolution", "background") if getattr(verb, name) != defaults[name]]
     if verb.scene is None and names:
         flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise InputError(f"{flags}: for measuring on a scene, expected --scene with it")
+        raise InputError(f"{flags}: has an effect only with --scene, expected that flag too")
 
 
 def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
@@ -245,7 +245,7 @@ def _described(path: Path, form: Format, gaussians: Gaussians) -> ModelFile:
 def _edited(
     verb: ConvertVerb, services: Services, source: NamedModel, others: Sequence[NamedModel], matrix: Float64 | None
 ) -> Gaussians:
-    """Apply all edits to the source, in the order that --help names. Raises InputError if no Gaussian is left."""
+    """Apply all edits to the source, in the order listed by --help. Raises InputError if no Gaussian remains."""
     from clsplat.models import edit
 
     gaussians = source[1]
@@ -260,7 +260,7 @@ def _edited(
 
 
 def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
-    """Options that the flags give for the target's format. Raises InputError for a flag of another format."""
+    """Options for the target's format from the flags. Raises InputError for a flag that is for another format."""
     flags = (
         ("up", verb.up and verb.up.upper(), "up_axis", "OpenUSD"),
         ("spz-version", verb.spz_version, "version", "SPZ"),
@@ -274,7 +274,7 @@ def _of_format(verb: ConvertVerb, target: Format) -> dict[str, Any]:
 
 
 def _sh_bits(text: str | None) -> tuple[int, int] | None:
-    """Parse "6" or "5,4" to the bits of band 1 and of the higher bands. Raises InputError."""
+    """Parse "6" or "5,4". Returns the bits of band 1 and of the higher bands. Raises InputError."""
     if text is None:
         return None
     words = [word.strip() for word in text.split(",")]
@@ -293,7 +293,7 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
     (path, other), (first_path, first) = merged, source
     space, expected = colour_space(path), colour_space(first_path)
     if space != expected:
-        warn(f"--merge {path}: its colours are {space}, and are taken for {expected}, the colours of {first_path}")
+        warn(f"--merge {path}: its colours are {space}, but are read as {expected}, the colour space of {first_path}")
     distance = float(np.linalg.norm(other.origin - first.origin))
     if len(other) and distance > edit.MAX_WORLD_OFFSET_SIZES * float(other.means.std(axis=0).max()):
         step = float(np.spacing(np.float32(distance)))
@@ -304,7 +304,7 @@ def _warn_of_mismatch(merged: NamedModel, source: NamedModel) -> None:
 
 
 def _similarity(verb: ConvertVerb) -> Float64 | None:
-    """Product of --transform, --rotate, --scale and --translate, in this order, as (4, 4); None without them.
+    """Matrix (4, 4) that applies --transform, --rotate, --scale and --translate, in this order; None without them.
 
     Raises InputError.
     """
@@ -342,12 +342,12 @@ def _numbers(flag: str, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not all(map(isfinite, values)):
-        raise InputError(f"--{flag} {text[:80]}: expected {count} numbers with commas")
+        raise InputError(f"--{flag} {text[:80]}: expected {count} numbers separated by commas")
     return values
 
 
 def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gaussians:
-    """Crop and prune. Raises InputError if no Gaussian is left."""
+    """Crop and prune. Raises InputError if no Gaussian remains."""
     from clsplat.models import edit
     from clsplat.rendering.contributions import largest_contributions
     from clsplat.shots import choose_shot
@@ -355,7 +355,7 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
     def keep(flag: str, rows: Any) -> None:
         nonlocal gaussians
         if not rows.any():
-            raise InputError(f"--{flag}: none of the {len(gaussians):,} Gaussians is left")
+            raise InputError(f"--{flag}: none of the {len(gaussians):,} Gaussians remains")
         gaussians = gaussians if rows.all() else edit.take(gaussians, rows)
 
     if verb.crop is not None:
@@ -380,9 +380,9 @@ def _thinned(verb: ConvertVerb, services: Services, gaussians: Gaussians) -> Gau
 def _measured(
     verb: ConvertVerb, services: Services, original: Gaussians, read: Gaussians, matrix: Float64 | None
 ) -> SceneComparison:
-    """PSNR in dB of the renders before and after conversion, against the photographs and against each other.
+    """PSNR in dB of the renders before and after conversion, with respect to the photographs and to each other.
 
-    The result has each view's values and their means. The converted model is rendered from cameras transformed like it.
+    The result has the values of each view and their means. For the converted model, cameras are transformed likewise.
     """
     import numpy as np
 

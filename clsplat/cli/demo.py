@@ -20,7 +20,7 @@ class DemoVerb(Verb):
     """Make photographs of a small scene, recover their cameras, train, evaluate and render a turntable."""
 
     output: Output
-    """Folder for all results: a new one, or one of an earlier demo, whose content is replaced."""
+    """Folder for all results: a new folder, or the folder of an earlier demo, whose content is replaced."""
     iterations: int = DEMO_ITERATIONS
     """Training steps. A few hundred are enough to test the pipeline, but show less of the scene."""
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)

@@ -28,7 +28,7 @@ class DoctorVerb(Verb):
     """List installed and missing packages, OpenCL drivers, devices and GPUs without a driver, with installation advice
     for this system.
 
-    The exit status is 1 if anything essential is missing. Drivers are loaded in processes of their own, so that a
+    The exit status is 1 if anything essential is missing. Each driver is loaded in a separate process, so that a
     driver that aborts can be named. `clsplat selftest` tests the results of a driver.
     """
 
@@ -49,13 +49,13 @@ def run(verb: DoctorVerb, _: Services) -> int:
         if line.advice:
             rows.append(("", "", f"-> {line.advice}"))
     print("\n".join(aligned(rows, left=range(3))))
-    verdict = f"{len(missing)} missing" if missing else "Everything that training needs is there"
+    verdict = f"{len(missing)} missing" if missing else "Everything that training needs is present"
     print(f"{verdict}. Advice is behind the arrows." if any(line.advice for line in everything) else f"{verdict}.")
     return 1 if missing else 0
 
 
 def lines() -> list[Diagnostic]:
-    """All findings on the installation."""
+    """All findings about the installation."""
     from clsplat.device.drivers.diagnostics import findings
 
     return [*_system(), *_packages(), *findings(), *_variables()]
@@ -74,7 +74,7 @@ def _system() -> list[Diagnostic]:
 
 
 def _packages() -> list[Diagnostic]:
-    """Findings on the packages that clsplat requires, and on the packages of each extra."""
+    """Findings about the packages that clsplat requires, and about the packages of each extra."""
     from clsplat.device.drivers.diagnostics import Diagnostic
 
     try:
@@ -87,7 +87,7 @@ def _packages() -> list[Diagnostic]:
         match = _REQUIREMENT.match(text)
         assert match is not None, text
         name, extra = match[1], match[2]
-        if name == "clsplat" or (";" in text and not extra):  # itself, or a package that only some systems need
+        if name == "clsplat" or (";" in text and not extra):  # clsplat itself, or a package that only some systems need
             continue
         version = _version(name)
         if extra:

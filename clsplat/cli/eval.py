@@ -36,11 +36,11 @@ class EvalVerb(Verb):
     """
 
     model: RunOrModel
-    """A run's folder or a model file. A file in a run's folder has that run's settings."""
+    """A run's folder or a model file. For a file in a run's folder, that run's settings apply."""
     scene: ScenePath = None
-    """Folder with the scene. If not given: the one that the run was trained on."""
+    """Folder with the scene. If not given: the scene on which the run was trained."""
     test_every: OptionalInt = None
-    """Every n-th view by name is held out and measured. If not given: the run's setting, else 8."""
+    """Every n-th view in the order of names is held out and measured. If not given: the run's setting, else 8."""
     resolution: OptionalInt = None
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
     missing: Annotated[Missing | None, arg(metavar="few|skip|error")] = None
@@ -57,7 +57,7 @@ class EvalVerb(Verb):
 
 
 def run(verb: EvalVerb, services: Services) -> int:
-    """Measure. A run's folder is locked meanwhile."""
+    """Evaluate the model. A run's folder is locked meanwhile."""
     from clsplat.runs.locks import locked
     from clsplat.runs.run import is_run
 
@@ -85,7 +85,7 @@ def _evaluate(verb: EvalVerb, services: Services) -> int:
     config = trained.config if trained else TrainConfig()
     source = verb.scene or (trained.scene if trained else None)
     if source is None:
-        raise InputError(f"{verb.model}: the scene it was trained on is not known, expected --scene SCENE")
+        raise InputError(f"{verb.model}: the scene on which it was trained is unknown, expected --scene SCENE")
     device = verb.device.open(services)
     scene, views = _held_out(verb, services, source, trained)
     device = services.require(device, FORWARD_STAGES)
@@ -141,7 +141,7 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
 def _warn_of_doubts(
     trained: Run | None, draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: list[View]
 ) -> None:
-    """Warn of views whose scores are not held-out scores of the run's scene, and of pictures that look wrong."""
+    """Warn of views whose scores are not held-out scores for the run's scene, and of pictures that look wrong."""
     from clsplat.runs import scene_record
     from clsplat.scenes.analysis import sanity_checks
 
@@ -162,7 +162,7 @@ def _print_result(result: Evaluation, *, as_json: bool) -> None:
 
 
 def tell_of_lpips() -> None:
-    """Print, before the work, the reason if LPIPS will be missing."""
+    """Print the reason if LPIPS will be missing. Called before the work begins."""
     from clsplat.evaluation.metrics import prepare_lpips
 
     if reason := prepare_lpips():

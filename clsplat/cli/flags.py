@@ -18,11 +18,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from tyro.conf import FlagCreatePairsOff, Positional, Suppress
 
 Groups = tuple[tuple[str, tuple[str, ...]], ...]
-"""Title of each group, and its flags by name or by a pattern that ends in `*`. A flag is listed in the first group that
-has it."""
+"""Title of each group, and the names of its flags, or patterns that end in `*`. A flag is listed in the first group
+that matches it."""
 OTHER_FLAGS_TITLE = "Others"
 HELP_TEXT_COLUMN = 24
-"""Column at which help texts begin. The text of a flag with a longer name begins on the next line."""
+"""Column at which help texts begin. If a flag's name is longer, its text begins on the next line."""
 MIN_FLAG_SIMILARITY = 0.75
 """Smallest similarity, 0 to 1, at which a known flag is suggested for an unknown one."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "STR"}
@@ -32,9 +32,9 @@ _METAVARS = {int: "INT", float: "FLOAT", str: "STR"}
 class Option:
     """A flag, or a positional argument.
 
-    names: its names on the command line; empty for a positional argument.
-    text: the docstring of its field.
-    off: name of the flag that switches it off, if there is one.
+    names: the flag's names on the command line; empty for a positional argument.
+    text: docstring of the dataclass field.
+    off: name of the flag that switches this one off, "" for none.
     """
 
     names: tuple[str, ...]
@@ -51,7 +51,7 @@ class Option:
 
     @property
     def told(self) -> str:
-        """Help text with the default, unless the default is nothing."""
+        """Help text with the default value, unless that is None, False or empty."""
         silent = self.default is None or self.default is False or self.default in ("", ())
         if self.required:
             return f"{self.text} (required)"
@@ -87,7 +87,7 @@ def options(kind: type, prefix: str = "") -> Iterator[Option]:
 def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None) -> str:
     """Help of a verb, with its flags in groups.
 
-    width: width of the lines; the terminal's if not given.
+    width: width of the lines; by default the terminal's.
     """
     width = min(width or shutil.get_terminal_size().columns, 100)
     every = list(options(kind))
@@ -98,7 +98,7 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
             OTHER_FLAGS_TITLE,
         )
         placed[title].append(option)
-    for title, names in groups:  # in the order of the table
+    for title, names in groups:  # sort flags in the order in which `groups` names them
         order = {option.key: index for index, name in enumerate(names) for option in every if option.key == name}
         placed[title].sort(key=lambda option: order.get(option.key, len(every)))
     wanted = [option for option in every if option.required]
@@ -111,7 +111,7 @@ def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None
 
 
 def unknown_flags(arguments: Sequence[str], kind: type, prog: str) -> str:
-    """One-line message on unknown flags in `arguments`, with the nearest names; empty if all are known."""
+    """One-line message about unknown flags in `arguments`, with similar names; empty if all flags are known."""
     known = ["--help", "--help-verbose"]
     for option in options(kind):
         known += [*option.names, option.off] if option.off else option.names
@@ -129,7 +129,7 @@ def near(word: str, known: Sequence[str]) -> str:
     """The known name that is most similar to the word; empty if none is similar enough."""
     plain = {name.lower().replace("_", "-").replace("colour", "color"): name for name in known}
     meant = word.lower().replace("_", "-").replace("colour", "color")
-    # part of a name, such as --shutter, or of a name with a dot, such as --fps
+    # the word may be the beginning of a name, such as --shutter, or the part after a dot, such as --fps
     parts = [name for name in plain if name.endswith(f".{meant[2:]}") or name.startswith(f"{meant}-")]
     found = parts or difflib.get_close_matches(meant, plain, 1, MIN_FLAG_SIMILARITY)
     return plain[found[0]] if found and len(meant.lstrip("-")) > 2 else ""
@@ -157,7 +157,7 @@ def _shown(value: object) -> str:
 
 
 def _marker(marked: Any) -> Any:
-    """The marker that tyro's annotation, such as Positional, adds to a type."""
+    """The marker that an annotation of tyro, such as Positional, adds to a type."""
     return get_args(marked[int])[1]
 
 
@@ -166,7 +166,7 @@ def _metadata(hint: Any) -> tuple[Any, ...]:
 
 
 def _conf(hint: Any) -> Any:
-    """Settings of a flag from tyro's `arg`; None without it."""
+    """Settings of a flag from tyro's `arg`; None if it has none."""
     return next((each for each in _metadata(hint) if hasattr(each, "metavar")), None)
 
 
@@ -187,7 +187,7 @@ def _metavar(bare: Any, name: str) -> str:
 
 
 def _docstrings(kind: type) -> dict[str, str]:
-    """Docstring of each field, from the class or its nearest base class; empty without source code."""
+    """Docstring of each field, from the class or its nearest base class; empty if there is no source code."""
     texts: dict[str, str] = {}
     for each in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(each):

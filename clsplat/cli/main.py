@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: from arguments to exit status.
 
-Exit status: 0 success, 1 the work failed, 2 wrong call or input, 130 interrupted.
-Another signal gives 128 plus its number (docs/interruptions.md).
-Errors are one line on standard error; CLSPLAT_DEBUG=1 adds the traceback.
-With --json an error is also an object on standard output: its message as "error", and the "status".
+Exit status: 0 for success, 1 if the work failed, 2 for a wrong call or input, 130 if interrupted by Ctrl-C.
+After another signal it is 128 plus the signal's number (docs/interruptions.md).
+Errors are reported in one line on standard error; CLSPLAT_DEBUG=1 adds the traceback.
+With --json, an error is also printed to standard output as an object with the keys "error" and "status".
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from clsplat.version import package_version
 
 
 def main(arguments: Sequence[str] | None = None, services: Services | None = None) -> int:
-    """Run one command line, `sys.argv` if none is given. Returns the exit status."""
+    """Run one command line, by default `sys.argv`. Returns the exit status."""
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments), services or Services())
-        sys.stdout.flush()  # here, because at interpreter exit a closed pipe would print a traceback
+        sys.stdout.flush()  # when the interpreter exits, it would print a traceback for a closed pipe
     except OSError as error:
-        if not reader_has_gone(error):  # otherwise standard output is a file that cannot be written
+        if not reader_has_gone(error):  # a closed pipe is no error, but a file that cannot be written is one
             tell(f"clsplat: error: standard output: {system_trouble(error)}")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -55,7 +55,7 @@ def _run(arguments: list[str], services: Services) -> int:
             with terminable():
                 verb = parse(arguments)
                 return int(verb_module(type(verb).__name__.removesuffix("Verb").lower()).run(verb, services))
-        except SystemExit as error:  # --help, or a wrong call that has been reported
+        except SystemExit as error:  # after --help, or after a wrong call was reported
             return error.code if isinstance(error.code, int) else 1
         except KeyboardInterrupt as error:
             if debug:
@@ -87,10 +87,10 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, OSError) and not isinstance(error, ClsplatError):
         return system_trouble(error)
     if isinstance(error, MemoryError) and not isinstance(error, ClsplatError):
-        return f"there is not enough main memory: {' '.join(str(error).split()) or 'the system gave no more'}"
+        return f"there is not enough main memory: {' '.join(str(error).split()) or 'the system has no more'}"
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def _show_warning(message: Warning | str, *_: Any) -> None:
-    """Print a warning on one line. Replaces `warnings.showwarning`, which prints the source line as well."""
+    """Print a warning in one line. This replaces `warnings.showwarning`, which also prints the source line."""
     print(f"clsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)

@@ -29,16 +29,15 @@ Settings = TypeVar("Settings")
 
 
 class Verb:
-    """Arguments of a verb (subcommand). Its module in `clsplat.cli` has the verb's name and a function `run`.
+    """Arguments of a verb (subcommand). The module in `clsplat.cli` with the verb's name has a function `run`.
 
-    groups: groups of its help, if it has too many flags for one list.
+    groups: groups of flags for the help, if the verb has too many flags for one list.
     """
 
     groups: ClassVar[Groups] = ()
 
     def completed(self, given: Collection[str]) -> Verb:
-        """The arguments, with the settings of a run or a preset for flags that are not in `given`. Raises
-        InputError."""
+        """The arguments. Flags that are not in `given` get the settings of a run or a preset. Raises InputError."""
         del given
         return self
 
@@ -111,7 +110,7 @@ class PageOptions:
 
 
 def with_given(settings: Settings, parsed: Settings, given: Collection[str], prefix: str = "") -> Settings:
-    """The settings of a run or a preset, with the command line's values for the flags in `given`."""
+    """The settings of a run or a preset, changed to the command line's values for the flags in `given`."""
     changes: dict[str, Any] = {}
     for field in fields(settings):  # type: ignore[arg-type]
         value, flag = getattr(settings, field.name), prefix + field.name

@@ -40,7 +40,7 @@ VERBS = {
     "convert": "Convert a model to the format of the output file's ending, with optional edits, and report the loss.",
     "info": "Describe a model file: format, count, SH, bounds, scales, opacities, colour space and values that are "
     "not finite.",
-    "bench": "Measure each stage of a frame and of a training step, and the device's own limits in the same run.",
+    "bench": "Measure each stage of a frame and of a training step, and the limits of the device in the same run.",
     "tune": "Find a device's quickest kernel shape by a short trial, and save it for later runs.",
     "selftest": "Test every device: build the kernels, run each stage on frozen scenes, compare with "
     "float64 and stored digests.",
@@ -51,7 +51,7 @@ Each verb is a module of `clsplat.cli`, with a class NAMEVerb and a function `ru
 verb is called.
 """
 _VERB_MODULES = {"render": "render.verb"}
-"""Modules of verbs that have a folder of their own."""
+"""Modules of the verbs that have separate folders."""
 
 
 def verb_module(name: str) -> Any:
@@ -71,7 +71,7 @@ def _listed(name: str) -> type:
 
 
 def parse(arguments: Sequence[str]) -> Verb:
-    """Parse a command line to its verb.
+    """Parse a command line. Returns the verb with its arguments.
 
     Raises InputError. Raises SystemExit after reporting an error in one line, or after printing the help.
     """
@@ -99,11 +99,11 @@ def parse(arguments: Sequence[str]) -> Verb:
 _TYRO_UNION_ERROR = re.compile(
     r"no type matching \{None\}\|.* could be instantiated from .*\. Got errors: .*- <class '\w+'>: "
 )
-"""Start of tyro's message on an optional number, before the actual error."""
+"""Beginning of tyro's message about an optional number, before the actual error."""
 
 
 def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> str:
-    """Message on a wrong call: unknown flags or verbs with suggestions, else tyro's message `said`."""
+    """Message about a wrong call: unknown flags or verbs with suggestions, or else tyro's message `said`."""
     said = _TYRO_UNION_ERROR.sub("", said)
     if called is not None:
         return unknown_flags(arguments[1:], called, f"clsplat {arguments[0]}") or said
@@ -115,10 +115,10 @@ def _trouble(arguments: Sequence[str], called: type[Verb] | None, said: str) -> 
 
 
 def _text_rules() -> tyro.constructors.ConstructorRegistry:
-    """Parsing rules for flags of one word.
+    """Parsing rules for flags whose value is one word.
 
-    Lists of steps are written 500,1000,2000, where tyro expects spaces.
-    An empty path is refused: it comes from an unset shell variable, and does not mean the working directory.
+    Lists of steps are written as 500,1000,2000, whereas tyro expects spaces.
+    An empty path is an error: it comes from an unset shell variable, and does not mean the working directory.
     """
     registry = tyro.constructors.ConstructorRegistry()
 
@@ -154,13 +154,13 @@ def _steps(text: str) -> tuple[int, ...]:
     try:
         steps = tuple(int(word) for word in text.split(",") if word.strip())
     except ValueError:
-        raise ValueError(f"{text!r} is not a list of steps, expected such as 500,1000,2000") from None
+        raise ValueError(f"{text!r} is not a list of steps, expected numbers such as 500,1000,2000") from None
     return steps
 
 
 @contextlib.contextmanager
 def _wide() -> Iterator[None]:
-    """Inside, the terminal seems wide, so that tyro does not wrap messages that are to be one line."""
+    """Simulate a wide terminal inside the context, so that tyro does not wrap messages that must be one line."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "10000"
     try:
@@ -172,7 +172,7 @@ def _wide() -> Iterator[None]:
 
 
 def _unboxed(report: str) -> str:
-    """The message in one of tyro's boxes, on one line, without the frame and without the advice below it."""
+    """Message of one of tyro's boxes in one line, without the frame and without the advice below a rule."""
     words: list[str] = []
     # if standard output is not UTF-8, the box is drawn without box characters, and its first rule is below the title
     titled = "╭" in report
@@ -191,7 +191,7 @@ def _unboxed(report: str) -> str:
 
 
 def report(message: str, status: int, arguments: Sequence[str]) -> None:
-    """Print an error on standard error. If the command line asks for JSON, also print it as an object on standard
+    """Print an error to standard error. If the command line has --json, also print it as an object to standard
     output."""
     tell(f"clsplat: error: {message}")
     if "--json" in arguments:
@@ -204,7 +204,7 @@ def as_json(message: str, status: int) -> str:
 
 
 def tell(line: str) -> None:
-    """Print a line on standard error, if that is possible. If not, the exit status still tells of the error."""
+    """Print a line to standard error, if possible. If not, the exit status still reports the error."""
     try:
         print(line, file=sys.stderr, flush=True)
     except OSError:  # text that stays in the stream would change the interpreter's exit status

@@ -21,7 +21,7 @@ from clsplat.errors import InputError, warn
 class ReportVerb(Verb):
     """Write a run's report: one self-contained HTML file with curves, pictures, figures and settings.
 
-    docs/report.md describes its content. A run that is not finished has a report too.
+    docs/report.md describes its content. Unfinished runs can have reports too.
     """
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]

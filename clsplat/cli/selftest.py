@@ -31,7 +31,7 @@ class SelftestVerb(Verb):
 
     The exit status is 1 if a driver cannot be trusted. train, eval, render, view, bench, demo and convert with
     rendering run a short form of this test the first time they use a device; CLSPLAT_TRUST_DRIVER=1 skips it. Kernel
-    shapes in which a driver failed are tried again here.
+    shapes with which a driver failed are tried again here.
     """
 
     device: Annotated[str | None, arg(metavar="DEVICE")] = "all"
@@ -39,14 +39,14 @@ class SelftestVerb(Verb):
     json: Flag = False
     """Print the result as JSON."""
     report: Annotated[Path | None, arg(metavar="FILE.json")] = None
-    """Write the result to a file for a bug report. It adds system, packages, limits of each device, digests, and the
-    shapes and kernels in which drivers failed."""
+    """Write the result to a file for a bug report, with system, packages, limits of each device, digests, and the
+    shapes and kernels with which drivers failed."""
     overwrite: Flag = False
     """Replace an existing file."""
 
 
 def run(verb: SelftestVerb, _: Services) -> int:
-    """Test the devices one after the other. Returns 1 if one of them cannot be trusted."""
+    """Test the devices one after the other. Returns 1 if any driver cannot be trusted."""
     from clsplat.selftest.driver_check import examine_device
 
     if verb.report is not None:
@@ -62,7 +62,7 @@ def run(verb: SelftestVerb, _: Services) -> int:
             print(table(report))
             print(f"This driver {report.verdict}.", flush=True)
             if report.remembered:
-                print(f"The shape is still not used: {report.remembered}.", flush=True)
+                print(f"Its kernel shape is still not used: {report.remembered}.", flush=True)
     records = [record(info, report) for info, report in zip(devices, reports, strict=True)]
     if verb.json:
         print(json.dumps(records, indent=2))
@@ -79,12 +79,12 @@ def run(verb: SelftestVerb, _: Services) -> int:
 
 
 def name_of(info: DeviceInfo) -> str:
-    """Name of device and driver."""
+    """Text with the names of a device and its driver."""
     return f"{info.name}, {info.version.split('  ')[0].strip()}"
 
 
 def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
-    """Entry of a device for --json."""
+    """Entry of a device in the output of --json."""
     stages = [{**asdict(result), "passed": result.passed} for result in report.results]
     return {
         **asdict(info),
@@ -98,7 +98,7 @@ def record(info: DeviceInfo, report: DriverReport) -> dict[str, object]:
 
 
 def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
-    """Content of a bug report: the results and facts on the installation."""
+    """Content of a bug report: the results and facts about the installation."""
     from clsplat.cli.doctor import lines
     from clsplat.device.context import all_devices, limits
     from clsplat.device.drivers.shapes import failures
@@ -109,7 +109,7 @@ def _bug_report(records: list[dict[str, object]]) -> dict[str, object]:
 
 
 def table(report: DriverReport) -> str:
-    """Table of all stages: each with its worst error, or with a note that it was not run."""
+    """Table of all stages, each with its worst error or with a note that it was not run."""
     rows: list[tuple[str, ...]] = [SELFTEST_TABLE_HEADER]
     if report.build_seconds is not None:
         rows.append(("build", "", "", "", "", f"{1e3 * report.build_seconds:.0f}", ""))

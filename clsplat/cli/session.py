@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions that verbs share: services of the package, the scene, and the devices."""
+"""Functions that several verbs use: services of the package, loading of the scene, and choice of devices."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def imported(name: str) -> Callable[..., Any]:
-    """Function that imports its target by dotted name when called, because --help must be quick."""
+    """Function that imports the function with this dotted name when it is called, so that --help is fast."""
     module, _, member = name.rpartition(".")
 
     def call(*arguments: Any, **named: Any) -> Any:
@@ -36,7 +36,7 @@ def imported(name: str) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class Services:
-    """Functions of the package that do the verbs' work. Tests pass replacements."""
+    """Functions of the package that do the verbs' work. Tests replace them."""
 
     load_scene: Callable[..., Scene] = imported("clsplat.scenes.loading.load_scene")
     findings: Callable[..., list[Finding]] = imported("clsplat.scenes.analysis.photo_findings.findings")

@@ -26,12 +26,12 @@ class SfmVerb(Verb):
     output: Output
     """Folder for the scene."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Match every pair of photos, or only neighbours by name, for video frames. auto: every pair up to 100 photos."""
+    """Match every pair of photos, or only neighbours in name order (for video). auto: every pair up to 100 photos."""
     camera_model: Annotated[str, arg(metavar="MODEL")] = "auto"
-    """Lens model to fit, by COLMAP's name. The scene's images are undistorted with it. auto is OPENCV for a camera
-    with 20 photos or more, else SIMPLE_RADIAL."""
+    """COLMAP's name of the lens model to fit, with which the scene's images are undistorted. auto is OPENCV for a
+    camera with 20 photos or more, else SIMPLE_RADIAL."""
     threads: OptionalInt = None
-    """Number of CPU threads. If not given: one for each core."""
+    """Number of CPU threads. If not given: one per core."""
     seed: int = 0
     """Random seed of matching and reconstruction. The same seed gives the same cameras, for up to 80 photos."""
     masks: Flag = False
@@ -54,7 +54,7 @@ def run(verb: SfmVerb, services: Services) -> int:
     if verb.threads is not None and verb.threads < 1:
         raise InputError(f"--threads {verb.threads}: expected at least 1")
     if verb.invert_masks and not verb.masks:
-        raise InputError("--invert-masks: no masks are used, expected --masks too")
+        raise InputError("--invert-masks: no masks are used without --masks, expected both flags")
     from clsplat.scenes.sfm.reconstruct import SFM_RECORD_FILE, SfmSettings
 
     masks = None

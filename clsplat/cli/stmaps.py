@@ -48,14 +48,14 @@ def run(verb: StmapsVerb, _: Services) -> int:
             pictures.setdefault(image.lens, []).append(image.name)
     if not pictures:
         raise InputError(
-            f"{verb.scene}: its lenses do not distort, expected the cameras of the photographs as they were taken"
+            f"{verb.scene}: its lenses have no distortion, expected the cameras of the original photographs"
         )
     if verb.output.exists() and not verb.output.is_dir():
-        raise InputError(f"{verb.output}: is a file, expected a folder to write STMaps to")
+        raise InputError(f"{verb.output}: is a file, expected a folder for the STMaps")
     try:
         verb.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{verb.output}: cannot be made: {reason_of(error)}") from None
+        raise InputError(f"{verb.output}: cannot be created: {reason_of(error)}") from None
     records = []
     for index, (lens, names) in enumerate(pictures.items(), 1):
         straight = lens.pinhole(np.eye(3), np.zeros(3))
@@ -74,7 +74,7 @@ def run(verb: StmapsVerb, _: Services) -> int:
         )
         if not verb.json:
             sizes = f"{lens.width}x{lens.height}, undistorted {straight.width}x{straight.height}"
-            print(f"{files[0]}, {files[1]}: {lens.model} {sizes}, of {examples(names)}")
+            print(f"{files[0]}, {files[1]}: {lens.model} {sizes}, for {examples(names)}")
     if verb.json:
         print(json.dumps(records, indent=2))
     return 0

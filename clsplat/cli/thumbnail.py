@@ -16,7 +16,7 @@ from clsplat.config.pictures import ColourConfig
 from clsplat.errors import InputError
 
 MIN_THUMBNAIL_SIDE_PX, MAX_THUMBNAIL_SIDE_PX = 16, 8192
-"""Limits of the side in pixels."""
+"""Smallest and largest side of a thumbnail in pixels."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class ThumbnailVerb(Verb):
     model: RunOrModel
     """A run's folder or a model file."""
     output: Annotated[Path | None, arg(aliases=("-o",), metavar="FILE")] = None
-    """Output picture: PNG, JPEG, TIFF or EXR. If not given: the model's name plus .png, in the working directory."""
+    """Output file: PNG, JPEG, TIFF or EXR. If not given: the model's name plus .png, in the working directory."""
     size: int = 512
     """Width and height in pixels."""
     up: Annotated[str | None, arg(metavar="AXIS|X,Y,Z")] = None
-    """Up direction: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. With it a run is drawn
-    from outside too. Write --up=-z if it begins with a minus."""
+    """Up direction: x, y, z, -x, -y, -z or three numbers; -y if not given, as in a COLMAP scene. With this flag, a run
+    is drawn from outside too. Write --up=-z if the value begins with a minus."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
     """Colour behind the Gaussians: black, white or three numbers from 0 to 1; black if not given."""
     alpha: Flag = False
@@ -57,8 +57,8 @@ def run(verb: ThumbnailVerb, services: Services) -> int:
     output = verb.output or Path(f"{verb.model.resolve().name}.png")
     check_format(str(output), ("rgb",))
     if FRAME_FIELD_PATTERN.search(str(output)) or UNKNOWN_FIELD_PATTERN.search(output.name):
-        raise InputError(f"{output}: has a place for frame numbers, expected the name of one picture after -o")
-    is_exr = output.suffix.lower() == ".exr"  # an EXR file keeps a model's linear colours, other files do not
+        raise InputError(f"{output}: is a pattern for frame numbers, expected the name of a single picture after -o")
+    is_exr = output.suffix.lower() == ".exr"  # only EXR files keep a model's linear colours
     frame = render.RenderVerb(
         verb.model,
         str(output),

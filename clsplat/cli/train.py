@@ -60,11 +60,11 @@ class TrainVerb(Verb):
     """Print the final evaluation as JSON on standard output."""
     preset: Preset = "default"
     """Bundle of settings. exact and default are the same and approximate nothing. fast takes less than half of the
-    time, and lost at most 0.3 dB of PSNR on the scenes it was tuned on. Flags override it."""
+    time, and lost at most 0.3 dB of PSNR on the scenes used for tuning. Flags override it."""
     schedule: Schedule | None = None
     """Bundle of learning rates and of the steps for scheduled actions. paper is made for 30,000 steps, short for
     about 7000. high-rates is for about 7000 steps too, with higher rates than short. It pays off below about 60 steps
-    a photograph. Flags override it. If not given: paper, but short with --preset fast."""
+    per photograph. Flags override it. If not given: paper, but short with --preset fast."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     given: Annotated[frozenset[str], Suppress] = field(default=frozenset(), compare=False)
     """Names of the settings given on the command line."""
@@ -89,7 +89,7 @@ class TrainVerb(Verb):
 
         for flag, value, usual in (("preset", self.preset, "default"), ("schedule", self.schedule, None)):
             if value != usual:
-                raise InputError(f"--{flag} {value} and --resume exclude each other: the run has its settings")
+                raise InputError(f"--{flag} {value} and --resume exclude each other: a resumed run keeps its settings")
         check_output(self.output, resume=True, overwrite=self.overwrite)
         return replace(self, config=with_given(Run.open(self.output).config, self.config, given))
 
@@ -99,8 +99,8 @@ def _check_used(config: TrainConfig, given: Collection[str]) -> None:
     for name, used, why, wanted in (
         ("depth_unit", config.depth == "maps", "no depth maps are used", "depth maps"),
         ("depth_weight", config.depth != "none", "no depths are used", "depth"),
-        ("pose_reach", config.refine_poses, "poses stay as given", "refine-poses"),
-        ("lens_reach", config.refine_lenses, "lenses stay as given", "refine-lenses"),
+        ("pose_reach", config.refine_poses, "poses are not refined", "refine-poses"),
+        ("lens_reach", config.refine_lenses, "lenses are not refined", "refine-lenses"),
         ("appearance_rate", config.appearance != "none", "no appearance is learnt", "appearance"),
     ):
         if name in given and not used and getattr(config, name) != getattr(TrainConfig, name):
@@ -127,7 +127,7 @@ def run(verb: TrainVerb, services: Services) -> int:
 def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     """Do the work of `run`.
 
-    locks: receives the lock of a new folder.
+    locks: stack to which the lock of a new folder is added.
     """
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
@@ -150,13 +150,13 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     if source is None:
         raise InputError("SCENE is missing, expected the folder of the scene to train on")
     if verb.resume and verb.auto:
-        raise InputError("--auto and --resume exclude each other: the run has its settings")
+        raise InputError("--auto and --resume exclude each other: a resumed run keeps its settings")
     devices = verb.device.open_all(services)
     scene, config = _looked_at(verb, services, source)
     if earlier is not None:
         check_steps_left(earlier, config, "--iterations")
-    if len(scene.points) == 1:  # a Gaussian's initial size comes from its neighbours, and a single point has none
-        warn(f"{source}: has a single point, training starts from one Gaussian of almost no size")
+    if len(scene.points) == 1:  # a Gaussian's initial size is derived from its neighbours
+        warn(f"{source}: has a single point, so that training starts with one Gaussian of almost no size")
     changed = earlier is not None and scene_record.check(
         earlier, scene, source, config.resolution, accept=verb.accept_changes
     )
@@ -179,7 +179,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
 
 
 def _stages(config: TrainConfig) -> tuple[str, ...]:
-    """Stages of the self-test that a training with these settings needs."""
+    """Stages of the self-test that training with these settings needs."""
     from clsplat.selftest.result import (
         APPEARANCE_STAGES,
         DEPTH_STAGES,
@@ -200,11 +200,11 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
 
 
 def _tell_of(scene: Scene, devices: Sequence[Device]) -> None:
-    """Print the sizes of the scene, the devices, and the reason if LPIPS will be missing."""
+    """Print the numbers of pictures and points, the devices, and the reason if LPIPS will be missing."""
     on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
     print(
-        f"{scene.name}: {len(scene.train_views)} pictures to train on, {len(scene.test_views)} held out, "
-        f"{len(scene.points):,} points; on {on} (the first steps may wait for kernels to be built)",
+        f"{scene.name}: {len(scene.train_views)} training pictures, {len(scene.test_views)} held out, "
+        f"{len(scene.points):,} points; on {on} (the first steps may take longer, while kernels are built)",
         file=sys.stderr,
     )
     if scene.test_views:
@@ -218,8 +218,8 @@ def _train_run(
     devices: Sequence[Device],
     page: Callable[[Scene, TrainConfig], AbstractContextManager[TrainingView]] | None,
 ) -> None:
-    """Train the run with a progress bar, and with a page if there is one. The message on an interruption tells how to
-    resume."""
+    """Train the run with a progress bar, and with the viewer's page if there is one. If training is interrupted, the
+    message says how to resume."""
     from clsplat.training.forecast import Forecast
 
     views = scene.train_views
@@ -252,7 +252,7 @@ def _train_run(
 
 
 def _looked_at(verb: TrainVerb, services: Services, source: Path) -> tuple[Scene, TrainConfig]:
-    """Load and check the scene, and print the findings on it. Returns the scene and its settings.
+    """Load and check the scene, and print the findings about it. Returns the scene and the settings for it.
 
     With --auto the settings are adapted to the findings.
     """
@@ -273,10 +273,10 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path) -> tuple[Scene
 
 
 def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
-    """Load the scene to train on, with its start points. Raises InputError if training would fail on it."""
+    """Load the training scene with its initial points. Raises InputError if training on it would fail."""
     from clsplat.training.preparation import prepared
 
-    if config.points:  # checked here, because structure from motion may come first and take long
+    if config.points:  # checked early, since structure from motion may follow and take long
         with open_input(Path(config.points), "a cloud of points"):
             pass
     scene = load_scene(
@@ -290,14 +290,14 @@ def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
 def _check_scene(scene: Scene) -> None:
     """Raise InputError for a scene on which training would fail later.
 
-    That is a scene with a view too small to measure, or with a truncated picture.
+    Such a scene has a held-out view that is too small to measure, or a picture that does not decode.
     """
     from clsplat.evaluation.metrics import SSIM_WINDOW_PX
 
     for view in scene.test_views:
         if min(view.camera.width, view.camera.height) < SSIM_WINDOW_PX:
             raise InputError(
-                f"{view.path}: is {view.camera.width} x {view.camera.height} at this --resolution, expected at least "
-                f"{SSIM_WINDOW_PX} pixels a side to measure SSIM"
+                f"{view.path}: has {view.camera.width}x{view.camera.height} pixels at this --resolution, expected at "
+                f"least {SSIM_WINDOW_PX} pixels per side to measure SSIM"
             )
     scene.check_pictures()

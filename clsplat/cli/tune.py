@@ -19,8 +19,8 @@ class TuneVerb(Verb):
     """Find a device's quickest kernel shape by a short trial, and save it for later runs.
 
     A shape sets how many pixels a work-item computes at once, and how many work-items share a tile. It also sets
-    whether they share the tile's pixels or its Gaussians for the gradient. A run that is resumed, or repeated for the
-    same bytes, needs its original shape. CLSPLAT_SHAPE=LANESxITEMS overrides the saved one.
+    whether they divide the tile's pixels or its Gaussians for the gradient. To resume a run, or to reproduce its bytes,
+    the shape must be the original one. CLSPLAT_SHAPE=LANESxITEMS overrides the saved shape.
     """
 
     device: Annotated[DeviceChoice, arg(name="")] = field(default_factory=DeviceChoice)
@@ -40,7 +40,7 @@ def run(verb: TuneVerb, _: Services) -> int:
     device = all_devices()[info.index]
     if verb.forget:
         save_shape(device, None)
-        print(f"{info.name} ({info.version.split('  ')[0]}): the default, {default_shape(device)}", file=sys.stderr)
+        print(f"{info.name} ({info.version.split('  ')[0]}): now the default, {default_shape(device)}", file=sys.stderr)
         return 0
     trials, best = tune(device, info.index, lambda shape: print(f"trying {shape.words}", file=sys.stderr))
     if verb.json:
@@ -51,7 +51,7 @@ def run(verb: TuneVerb, _: Services) -> int:
     width = max(len(trial.shape.words) for trial in trials)
     for trial in trials:
         text = "failed" if trial.ms is None else f"{trial.ms:8.2f} ms"
-        mark = "  <- kept" if trial.shape == best else ""
+        mark = "  <- saved" if trial.shape == best else ""
         print(f"{trial.shape.words:{width}}  {text}{mark}")
-    print(f"in {saved_path()}", file=sys.stderr)
+    print(f"saved in {saved_path()}", file=sys.stderr)
     return 0

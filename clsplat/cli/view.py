@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from clsplat.viewer.training_view import TrainingView
 
 WARM_UP_PICTURE_SIZE_PX = (640, 360)
-"""Size in pixels of the pictures rendered before the page opens, to build kernels and load the model."""
+"""Width and height in pixels of the pictures that are rendered before the page opens, to build kernels and load the
+model."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +39,14 @@ class ViewVerb(Verb):
     """
 
     model: RunOrModel
-    """A run's folder or a model file. A file in a run's folder has that run's settings."""
+    """A run's folder or a model file. For a file in a run's folder, that run's settings apply."""
     scene: ScenePath = None
-    """Folder with the scene, for its cameras and photos. If not given: the one that the run was trained on."""
+    """Folder with the scene, for its cameras and photos. If not given: the scene on which the run was trained."""
     background: Annotated[Literal["black", "white"] | None, arg(metavar="black|white")] = None
     """Background behind the Gaussians. If not given: the run's setting, else black."""
     appearance: Annotated[str | None, arg(metavar="PHOTO")] = None
     """Give the model the exposure and colours of this photograph of its scene, from the run's appearance.json, but not
-    its lens's vignette. If not given: the photographs' average."""
+    the vignette of its lens. If not given: the photographs' average."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
     device: Annotated[DeviceOptions, arg(name="")] = field(default_factory=DeviceOptions)
 
@@ -76,7 +77,7 @@ def run(verb: ViewVerb, services: Services) -> int:
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else None
     gaussians = Gaussians.load(file) if gains is None else exposed(Gaussians.load(file), gains)
     if not len(gaussians):
-        raise InputError(f"{file}: has no Gaussians, expected some to look at")
+        raise InputError(f"{file}: has no Gaussians, expected at least one")
     config = run.config if run else TrainConfig()
     scene = _scene(services, verb.scene or (run.scene if run else None), config, given=verb.scene is not None)
     device = verb.device.trusted(services, FORWARD_STAGES)
@@ -94,7 +95,7 @@ def run(verb: ViewVerb, services: Services) -> int:
     signals = handled((signal.SIGINT, *endings()), lambda *_: stopped.set())
     with signals, closing(Server(viewing, world, address)) as server:
         _print_address(server)
-        with suppress(TrialInterrupted):  # raised if a driver hung when the interruption came
+        with suppress(TrialInterrupted):  # raised if a driver hung at the interruption
             while not stopped.is_set():
                 if not viewing.work():
                     viewing.wait(MAX_SIGNAL_WAIT_SECONDS)
@@ -131,9 +132,9 @@ def training_view(options: PageOptions) -> Callable[[Scene, TrainConfig], Abstra
 
 
 def _scene(services: Services, path: Path | None, config: TrainConfig, *, given: bool) -> Scene | None:
-    """Load the scene, for its cameras and photos. None, with a warning, if the scene that the run names is gone.
+    """Load the scene for its cameras and photos. Warns and returns None if the scene that the run names is unreadable.
 
-    given: True if --scene names the scene; then an error is raised instead.
+    given: True if --scene names the scene. An unreadable scene then is an error.
     """
     if path is None:
         return None
@@ -149,10 +150,10 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
     except (InputError, OSError) as error:
         if given:
             raise
-        warn(f"no cameras and photos: {error}")
+        warn(f"cameras and photos are not shown: {error}")
         return None
 
 
 def _print_address(server: Server) -> None:
-    more = "" if server.address.local else " (anybody who reaches this machine can look)"
+    more = "" if server.address.local else " (visible to anybody who can reach this machine)"
     print(f"viewer at {server.url}{more}; Ctrl-C ends it", file=sys.stderr, flush=True)

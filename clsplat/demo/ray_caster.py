@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photographs of a small textured still life, rendered by a plain NumPy ray caster without splats.
 
-The demo and the tests of structure from motion need photos without licence and without known poses.
-No splat renderer may have been involved.
+The demo and the tests of structure from motion need photos that are free of licences, have no known poses, and were
+not made by a splat renderer.
 
 The scene is diffuse, apart from a mild highlight on the two balls.
 Its light (sun with soft shadows, sky) is therefore baked into one texture per object.
-A photo is a nearest hit and a texture look-up per ray.
+A photo needs only the nearest hit and a texture look-up for each ray.
 
-The world is z up, in metres: a paved floor inside a round wall that hides the sky from every photo.
-Sky would have no points to start from, and training might put Gaussians for it in front of another camera.
+In the world, z is up and units are metres. It is a paved floor inside a round wall that hides the sky from all photos.
+The sky would have no initial points, and training might put Gaussians for it in front of another camera.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class Noise:
         self._lattices = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, 24, 24, 24)).astype(np.float32)
 
     def __call__(self, points: Float32, wavelength: float, octaves: int, gain: float = 0.65) -> Float32:
-        """Sum of octaves at points (n, 3): (n,), about [-1, 1].
+        """Sum of octaves at points (n, 3). Returns values (n,) of about [-1, 1].
 
         wavelength: wavelength of the first octave, in metres.
-        A B-spline without prefilter removes frequencies that the lattice cannot represent: octaves are band limited.
+        A B-spline without prefilter removes frequencies that the lattice cannot represent, so octaves are band limited.
         """
         total, weight = np.zeros(len(points), np.float32), 1.0
         for octave in range(octaves):
@@ -64,7 +64,7 @@ class Noise:
             )
             total += np.float32(weight) * sample
             weight *= gain
-        # the B-spline's smoothing leaves about a third of the lattice's range
+        # smoothing by the B-spline leaves about a third of the lattice's range: amplify
         return np.asarray(np.tanh(2.2 * total).astype(np.float32))
 
 
@@ -81,7 +81,7 @@ def palette_colour(value: Float32, colours: Palette) -> Float32:
 
 
 def speckled(colour: Float32, points: Float32, noise: Noise, wavelength: float) -> Float32:
-    """Add soft dark and light specks to a colour (n, 3). SIFT finds and matches blobs of a few pixels."""
+    """Add soft dark and light specks to a colour (n, 3), since SIFT finds and matches blobs of a few pixels."""
     fine = noise(points + 11, wavelength, 2, gain=0.8)[:, None]
     dark, light = np.clip(-1.7 * fine - 0.5, 0, 1), np.clip(1.7 * fine - 0.5, 0, 1)
     return np.asarray(colour * (1 - 0.55 * dark) + (0.97 - colour) * (0.45 * light))
@@ -96,7 +96,7 @@ def dot(a: Float32, b: Float32) -> Float32:
 class Surface(ABC):
     """One object: its intersection with rays, its texture mapping and its baked colours.
 
-    rows, columns: texels of the texture. A texel is about a pixel wide in the photos.
+    rows, columns: size of the texture in texels. A texel is about a pixel wide in the photos.
     """
 
     rows: int
@@ -204,7 +204,7 @@ class Wall(Surface):
 
 @dataclass
 class Ball(Surface):
-    """Sphere, textured by longitude and polar angle, marbled in the palette."""
+    """Sphere with marbling in the palette's colours. Texture columns are longitudes, and rows are polar angles."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     radius: float = 1.0
@@ -238,7 +238,7 @@ class Ball(Surface):
 
 @dataclass
 class Box(Surface):
-    """Upright box, turned about z. Its six faces lie next to each other in the texture."""
+    """Upright box, rotated about z by `turn`. Its six faces lie next to each other in the texture."""
 
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     half: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -257,7 +257,7 @@ class Box(Surface):
         enter = np.full(len(direction), -np.inf, np.float32)
         leave = np.full(len(direction), np.inf, np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
-            for axis in range(3):  # a loop over three axes is much quicker than NumPy reductions over an axis of three
+            for axis in range(3):  # much faster than NumPy reductions over an axis of length three
                 one = (-half[axis] - start[..., axis]) / step[:, axis]
                 other = (half[axis] - start[..., axis]) / step[:, axis]
                 np.maximum(enter, np.minimum(one, other), out=enter)
@@ -270,7 +270,7 @@ class Box(Surface):
         axis = np.abs(local).argmax(axis=1)
         rows = np.arange(len(local))
         face = 2 * axis + (local[rows, axis] > 0)
-        # stay half a texel inside the face, so that bilinear look-ups do not bleed from its neighbour
+        # stay half a texel inside the face, so that bilinear look-ups do not read the neighbouring face
         margin = 1.0 - 6.0 / self.columns
         across = np.clip(local[rows, (axis + 1) % 3], -margin, margin)
         along = np.clip(local[rows, (axis + 2) % 3], -1, 1)
@@ -296,7 +296,7 @@ class Box(Surface):
 
 
 def still_life() -> list[Surface]:
-    """Objects of the scene, without textures."""
+    """Objects of the scene, before their textures are computed."""
     marble = ((0.10, 0.16, 0.34), (0.30, 0.46, 0.70), (0.80, 0.86, 0.90), (0.95, 0.94, 0.88))
     amber = ((0.45, 0.16, 0.05), (0.86, 0.46, 0.12), (0.98, 0.84, 0.48))
     red = ((0.26, 0.06, 0.07), (0.64, 0.18, 0.14), (0.90, 0.50, 0.34))
@@ -348,7 +348,7 @@ def bake_surface(surface: Surface, suns: Float32, blockers: Sequence[Surface], n
 
 
 def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
-    """Hand-held cameras: three in five on a low ring, the others on a high one. All look at the middle, with jitter."""
+    """Hand-held cameras that look at the middle, with jitter. Three in five are on a low ring, two on a high one."""
     generator = np.random.default_rng(seed + 1)
     focal = 0.5 * max(width, height) / np.tan(0.5 * FIELD_OF_VIEW_RADIANS)
     low = max(1, round(count * 0.6)) if count > 1 else count
@@ -368,7 +368,7 @@ def cameras(count: int, width: int, height: int, seed: int) -> list[Camera]:
 def render(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32:
     """Render one photo, (height, width, 3) in [0, 1].
 
-    samples: samples x samples rays a pixel are averaged.
+    samples: each pixel is the average of samples x samples rays.
     """
     columns = (np.arange(camera.width * samples, dtype=np.float32) + 0.5) / samples
     rows = (np.arange(camera.height * samples, dtype=np.float32) + 0.5) / samples
@@ -418,13 +418,13 @@ def write_photos(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> None:
-    """Write `count` photos `photo_000.jpg` ... into the folder, which is made if missing.
+    """Write `count` photos `photo_000.jpg` ... into the folder, which is created if missing.
 
     Equal seeds give equal photos.
     width, height: size of the picture in pixels.
-    progress: function that is called with a text and the fraction that is done.
+    progress: function that is called with a text and the completed fraction.
     Raises ClsplatError if a photo cannot be written.
-    Poses are neither returned nor written: the demo shows that they can be recovered.
+    Poses are neither returned nor written, since the demo shows that they can be recovered.
     """
     folder.mkdir(parents=True, exist_ok=True)
     progress("painting the scene", 0.0)

@@ -30,14 +30,14 @@ from clsplat.shots.generated import turntable
 DEMO_PHOTO_COUNT = 40
 TURNTABLE_FRAME_COUNT = 60
 DEMO_MARKER_FILE_NAME = ".clsplat-demo"
-"""Marker file of a folder whose content was made by a demo."""
+"""Marker file in a folder whose contents the demo has created."""
 DEMO_FOLDERS = ("photos", "scene", "run", "turntable")
 
 
 def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_ITERATIONS) -> Evaluation:
-    """Make photos/, scene/, run/ and turntable/ below `output`, and return the evaluation, as in eval.json.
+    """Create photos/, scene/, run/ and turntable/ below `output`. Returns the evaluation, as in eval.json.
 
-    Finished steps of an interrupted demo are reused.
+    Complete photos and cameras of an interrupted demo are reused.
     device: name of the device, as for `clsplat devices`.
     iterations: number of training steps.
     Raises InputError if the folder holds other files, and the errors of the steps.
@@ -46,7 +46,7 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
     with locked(output, "demo"):
         claim(output)
         start = time.monotonic()
-        # fail on a wrong device name before minutes of work
+        # so that a wrong device name fails before minutes of work
         opened = open_device(device)
         report = StageProgress()
         scene_folder = make_scene(output, report)
@@ -76,15 +76,15 @@ def run_demo(output: Path, *, device: str | None = None, iterations: int = DEMO_
 
 
 def claim(output: Path) -> None:
-    """Mark a folder as a demo's. Raises InputError if it is not marked and holds folders that a demo would replace."""
+    """Mark a folder as created by the demo. Raises InputError if it is not marked and has folders that the demo would
+    replace."""
     if is_file(output / DEMO_MARKER_FILE_NAME):
         return
     existing = [name for name in DEMO_FOLDERS if (output / name).exists() or (output / name).is_symlink()]
     if existing:
         raise InputError(
-            f"{output}: holds {examples(existing, len(DEMO_FOLDERS))}, which no demo has made and a demo would "
-            "replace; choose "
-            "another folder, or remove them"
+            f"{output}: holds {examples(existing, len(DEMO_FOLDERS))}, which the demo did not create but "
+            "would replace; choose another folder, or remove them"
         )
     atomic_write(
         output / DEMO_MARKER_FILE_NAME, b"This folder was made by clsplat demo, which may replace its content.\n"
@@ -92,7 +92,7 @@ def claim(output: Path) -> None:
 
 
 def make_scene(output: Path, progress: Progress = no_progress) -> Path:
-    """Make photos in output/photos and recover their scene in output/scene. Returns the scene's path.
+    """Create photos in output/photos and recover their scene in output/scene. Returns the scene's path.
 
     Complete results are reused. Raises InputError if output/photos holds other files.
     """
@@ -100,7 +100,7 @@ def make_scene(output: Path, progress: Progress = no_progress) -> Path:
     existing = sorted(path.name for path in photos.glob("[!.]*"))
     expected = [f"photo_{index:03d}.jpg" for index in range(DEMO_PHOTO_COUNT)]
     if not set(existing).issubset(expected):
-        raise InputError(f"{photos}: holds files that are not the demo's, expected a new folder")
+        raise InputError(f"{photos}: holds files that the demo did not create, expected a new folder")
     if existing != expected:
         write_photos(photos, count=DEMO_PHOTO_COUNT, progress=progress)
     # the ray caster's lens has no distortion: photos need no resampling

@@ -23,7 +23,7 @@ from clsplat.spherical_harmonics import SH_C0
 DEPTH_PICTURE_VIEWS = 3
 """Number of views that get a depth picture."""
 MIN_DEPTH_PICTURE_ALPHA = 0.5
-"""Smallest alpha at which a pixel has a depth."""
+"""Alpha above which a pixel has a depth."""
 DEPTH_GREY_QUANTILES = (0.02, 0.98)
 """Quantiles of the depths that map to white and to the darkest grey."""
 FARTHEST_DEPTH_GREY = 0.15
@@ -48,11 +48,11 @@ def depth_picture(depth: NDArray[Any], alpha: NDArray[Any]) -> Float32:
 
 
 def coloured(gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """The model with a grey for each Gaussian: its depth, scaled to 0 to 1 between the DEPTH_GREY_QUANTILES of the
-    depths ahead.
+    """Copy of the model in which each Gaussian's colour is a grey that encodes its depth. The DEPTH_GREY_QUANTILES of
+    the depths in front of the camera map to 0 and 1.
 
-    The depth is along the camera's axis; for fisheyes and panoramas it is the distance from the camera. A render of
-    this model has depth as its colour, and needs no other kernels than a normal frame.
+    Depths are measured along the camera's axis; for fisheyes and panoramas they are distances from the camera. A render
+    of this copy shows depth as its colour, with the same kernels as a normal frame.
     """
     offsets = gaussians.means + gaussians.origin - camera.position
     depths = camera.drawn_depths(offsets)
@@ -70,10 +70,10 @@ def keep_depths(
     records: Sequence[Mapping[str, Any]],
     folder: Path,
 ) -> None:
-    """Write the depth pictures as PNG under the views' names, and remove older ones.
+    """Write the depth pictures as PNG with the views' names, and remove earlier depth pictures.
 
-    render: image (H, W, 3) over black and alpha (H, W) of a model.
-    records: the views of eval.json, in the order of `views`.
+    render: function that returns a model's image (H, W, 3) over black, and its alpha (H, W).
+    records: records of the views in eval.json, in the order of `views`.
     """
     for earlier in folder.glob("**/*.png"):
         remove(earlier)

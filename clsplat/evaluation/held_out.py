@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Held-out views compared with their photographs: the numbers of eval.json and the pictures of test/."""
+"""Comparison of held-out views with their photographs: the scores in eval.json and the pictures in test/."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clsplat.scenes.scene import View
 
 
 class ViewScores(TypedDict):
-    """Record of a held-out view in eval.json. Optional scores are there if they were measured.
+    """Record of a held-out view in eval.json. Optional scores are present if they were measured.
 
     counted: fraction of the pixels that count, if the view has a mask.
     """
@@ -44,9 +44,9 @@ _AVERAGED_SCORES: tuple[_AveragedScore, ...] = ("psnr", "psnr_corrected", "psnr_
 class Evaluation(TypedDict):
     """Content of eval.json.
 
-    step, gaussians, seconds: of the model (`EvaluatedModel`).
-    mean: mean scores of the views, by name; empty without views.
-    lpips_missing: the reason if there is no LPIPS.
+    step, gaussians, seconds: those of the model (`EvaluatedModel`).
+    mean: mean over the views for each score's name; empty without views.
+    lpips_missing: the reason why LPIPS is missing, if it is.
     """
 
     step: int | None
@@ -59,7 +59,7 @@ class Evaluation(TypedDict):
 
 @dataclass(frozen=True)
 class EvaluatedModel:
-    """The model that is measured: its optimisation step and training time in seconds, if known, and its Gaussians."""
+    """The model that is measured: optimisation step and training time in seconds, if known, and number of Gaussians."""
 
     step: int | None
     gaussians: int
@@ -79,15 +79,15 @@ def evaluate(
 ) -> Evaluation:
     """Measure every view. Returns the content of eval.json.
 
-    render: a view's image (H, W, 3), float, over `background` (3,), at the size of `view.load()`.
-    save_dir: folder for the renders as sRGB PNG, under the views' names.
-    model: copied to the result.
-    space: the colour space of renders and photographs, in which they are compared.
+    render: function that returns a view's float image (H, W, 3) over `background` (3,), at the size of `view.load()`.
+    save_dir: folder for the renders, which are written as sRGB PNG with the views' names.
+    model: description of the model, which is copied to the result.
+    space: colour space of renders and photographs, in which they are compared.
     corrected: also measure PSNR after an affine fit of colours.
-    aligned: renders with the view's pose fitted to the model, whose PSNR is measured too.
+    aligned: function like `render`, but with the view's pose fitted to the model. PSNR of its images is also measured.
 
-    Masked pixels count in no score (`metrics.ssim`). Raises ClsplatError if a render is not finite. Raises InputError,
-    which names the view, if it is too small, and for an unknown colour space.
+    Masked pixels count in no score (`metrics.ssim`). Raises ClsplatError if a render is not finite. Raises InputError
+    that names the view if the view is too small. Also raises InputError for an unknown colour space.
     """
     records: list[ViewScores] = []
     names = picture_names([view.name for view in views])
@@ -126,7 +126,7 @@ def _scores(
 ) -> ViewScores:
     """Record of one view in eval.json.
 
-    image, truth: its render, and its photograph over the same background.
+    image, truth: the view's render, and its photograph over the same background.
     counts: (H, W), the pixels that count; None for all.
     """
     try:
@@ -150,7 +150,7 @@ def _scores(
 
 
 def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
-    """A view's pixels, and the mask (H, W) of pixels that count, or None without a mask.
+    """A view's pixels, and the mask (H, W) of the pixels that count. The mask is None if the view has none.
 
     Raises InputError if no pixel counts.
     """
@@ -164,12 +164,12 @@ def photograph_of(view: View) -> tuple[Image, NDArray[np.bool_] | None]:
 
 
 def picture_names(names: Sequence[str]) -> list[str]:
-    """Relative names of PNG files for views, in the views' sub-folders.
+    """Relative names of the views' PNG files, with the views' sub-folders.
 
-    ".png" replaces the view's extension. It is appended where two names would collide, also on a file system that
-    ignores case.
+    ".png" replaces the view's extension. If two names would then collide, also on a file system that ignores case,
+    ".png" is appended instead.
     """
     stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
-    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # the same names everywhere
+    keys = [identity(PurePosixPath(stem), ignores_case=True) for stem in stems]  # alike on all file systems
     uses = Counter(keys)
     return [(stem if uses[key] == 1 else name) + ".png" for stem, key, name in zip(stems, keys, names, strict=True)]

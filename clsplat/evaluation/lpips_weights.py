@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network weights of LPIPS: their path for torch, and their download."""
+"""The network weights of LPIPS: the path where torch expects them, and their download."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from clsplat.files.documents import is_file
 from clsplat.progress import StageProgress
 
 VGG16_WEIGHTS_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
-"""Address of VGG-16's weights, about 530 MB. The name has the first digits of the file's SHA-256."""
+"""Address of VGG-16's weights, about 530 MB. The file's name ends with the first digits of its SHA-256."""
 LPIPS_TIMEOUT_VARIABLE = "CLSPLAT_LPIPS_TIMEOUT"
 LPIPS_DOWNLOAD_SECONDS = 300.0
-"""Time limit of the download in seconds, unless LPIPS_TIMEOUT_VARIABLE sets another."""
+"""Default time limit of the download in seconds. The variable named by LPIPS_TIMEOUT_VARIABLE overrides it."""
 LPIPS_SERVER_SILENCE_SECONDS = 20.0
 """Seconds without a byte after which a server or proxy counts as silent."""
 
 
 def place() -> Path:
-    """The path at which torch expects the file."""
+    """Path where torch expects the file."""
     home = os.environ.get("TORCH_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "torch"
     return Path(home).expanduser() / "hub" / "checkpoints" / VGG16_WEIGHTS_URL.rpartition("/")[2]
 
@@ -40,7 +40,7 @@ def limit() -> float:
     except ValueError:
         seconds = math.nan
     if not 0 <= seconds < threading.TIMEOUT_MAX:
-        raise InputError(f"{LPIPS_TIMEOUT_VARIABLE} is {text!r}, expected seconds, or 0 to fetch nothing")
+        raise InputError(f"{LPIPS_TIMEOUT_VARIABLE} is {text!r}, expected seconds, or 0 for no download")
     return seconds
 
 
@@ -54,7 +54,7 @@ def fetch() -> None:
         return
     advice = f"curl --create-dirs -o {path} {VGG16_WEIGHTS_URL}"
     if seconds == 0:
-        raise ClsplatError(f"VGG-16's weights are not there: {advice}")
+        raise ClsplatError(f"VGG-16's weights are missing; download them: {advice}")
     transfer = _Transfer(daemon=True)  # a thread, since name resolution has no timeout
     progress = StageProgress()
     transfer.start()
@@ -62,14 +62,14 @@ def fetch() -> None:
     while transfer.is_alive() and time.monotonic() < until:
         transfer.join(min(0.5, max(until - time.monotonic(), 0.0)))
         progress(
-            f"fetching VGG-16's weights for LPIPS, for {seconds:g} s at most ({LPIPS_TIMEOUT_VARIABLE})",
+            f"downloading VGG-16's weights for LPIPS, for {seconds:g} s at most ({LPIPS_TIMEOUT_VARIABLE})",
             transfer.fraction,
         )
     transfer.cancelled = True
     if transfer.is_alive():
-        raise ClsplatError(f"VGG-16's weights did not come within {seconds:g} s ({LPIPS_TIMEOUT_VARIABLE}): {advice}")
+        raise ClsplatError(f"VGG-16's weights did not arrive in {seconds:g} s ({LPIPS_TIMEOUT_VARIABLE}): {advice}")
     if transfer.trouble is not None:
-        raise ClsplatError(f"VGG-16's weights could not be fetched ({transfer.trouble}): {advice}")
+        raise ClsplatError(f"VGG-16's weights could not be downloaded ({transfer.trouble}): {advice}")
 
 
 class _Transfer(threading.Thread):
@@ -100,4 +100,4 @@ class _Transfer(threading.Thread):
                     self.fraction = min(done / total, 0.99) if total else None
                 wanted = VGG16_WEIGHTS_URL.rpartition("-")[2].partition(".")[0]
                 if not digest.hexdigest().startswith(wanted):
-                    raise ClsplatError(f"what came has another digest than {wanted}")
+                    raise ClsplatError(f"the SHA-256 of the download does not begin with {wanted}")

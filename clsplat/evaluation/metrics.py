@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Similarity of a render to its photograph: PSNR, SSIM, and LPIPS if the optional extra is installed.
 
-Images are (H, W, 3), clamped to [0, 1] and compared in float64. Colour-corrected images are clamped at the photograph's
+Images are (H, W, 3), clamped to [0, 1] and compared in float64. Colour-corrected images are clamped to the photograph's
 brightest value.
 """
 
@@ -22,7 +22,7 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.evaluation import lpips_weights
 
 MIN_SQUARED_ERROR = 1e-12
-"""Equal images would have an infinite PSNR, which JSON cannot hold. This floor makes it 120 dB."""
+"""Minimum of the squared error. Equal images get 120 dB: their PSNR would be infinite, which JSON cannot store."""
 SSIM_WINDOW_PX = 11
 
 Image = NDArray[Any]
@@ -42,7 +42,7 @@ def psnr(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) ->
 def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
     """PSNR of the image after `corrected`, with a peak of 1.
 
-    Values are clamped to 0 and to the photograph's largest value, or to 1 if that is smaller.
+    Values are clamped to the range from 0 to the photograph's largest value, or to 1 if that is larger.
     counts: (H, W), the pixels that count.
     """
     most = max(1.0, float(truth.max() if counts is None else truth[counts].max(initial=1.0)))
@@ -53,7 +53,7 @@ def psnr_corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None 
 
 
 def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> Image:
-    """The image (H, W, 3) after the affine colour transform that fits it best to the truth, by least squares.
+    """The image (H, W, 3) after the affine colour transform that fits it to the truth with least squared error.
 
     counts: (H, W), the pixels that count.
     """
@@ -66,7 +66,7 @@ def corrected(image: Image, truth: Image, counts: NDArray[np.bool_] | None = Non
 
 
 def ssim(image: Image, truth: Image, counts: NDArray[np.bool_] | None = None) -> float:
-    """Mean structural similarity: the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5, mean of the channels.
+    """Mean structural similarity of pixels and channels, with the 11x11 Gaussian window of Wang et al. 2004, sigma 1.5.
 
     counts: (H, W), the pixels that count. Other pixels are black in both images, and the mean is over windows around
     pixels that count.
@@ -100,7 +100,7 @@ def lpips(image: Image, truth: Image) -> float | None:
 
 
 def lpips_missing() -> str | None:
-    """The reason that LPIPS is not available, in a few words, or None."""
+    """Short text with the reason why LPIPS is not available, or None if it is."""
     model = _lpips_model()
     return model if isinstance(model, str) else None
 
@@ -109,7 +109,7 @@ def lpips_missing() -> str | None:
 def prepare_lpips() -> str | None:
     """Prepare LPIPS without loading it: download the network's weights if they are missing.
 
-    Returns None, or the reason that LPIPS cannot be used, with advice.
+    Returns None, or the reason why LPIPS cannot be used, with advice.
     """
     for name in ("lpips", "torch"):
         if find_spec(name) is None:
@@ -123,7 +123,7 @@ def prepare_lpips() -> str | None:
 
 @functools.cache
 def _lpips_model() -> Callable[[Image, Image], float] | str:
-    """The metric as a function of two images, or the reason that it is not available."""
+    """The metric as a function of two images, or the reason why it is not available."""
     if reason := prepare_lpips():
         return reason
     try:
@@ -143,7 +143,7 @@ def _lpips_model() -> Callable[[Image, Image], float] | str:
 
 
 def _pair(image: Image, truth: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both images clamped, in float64."""
+    """Convert both images to float64 and clamp them to [0, 1]."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
-        raise ValueError(f"image {image.shape} and truth {truth.shape}: expected (H, W, 3) both")
+        raise ValueError(f"image has the shape {image.shape} and truth {truth.shape}, expected (H, W, 3) for both")
     return np.clip(image.astype(np.float64), 0, 1), np.clip(truth.astype(np.float64), 0, 1)

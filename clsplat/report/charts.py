@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts as inline SVG, coloured by the page's style sheet.
+"""Charts as inline SVG. The page's style sheet defines their colours.
 
-Text is escaped. Lines carry their data, which the page's script shows.
+Text is escaped. Elements of lines contain their data, which the page's script displays.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ Points = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class ChartSeries:
-    """Points sorted by x, and their way of drawing.
+    """Points sorted by x, and the kind of drawing.
 
     line: a line.
-    faint: a line behind others.
+    faint: a faint line behind the others.
     dots: a line with dots.
     area: stacked areas, the first series lowest; all series have the same x.
     bars: x is the lower edge of a bin, and the last point ends the last bin.
@@ -47,9 +47,9 @@ class ChartSeries:
 
 @dataclass(frozen=True)
 class Axis:
-    """Axis that maps the values low to high to the pixels start to end.
+    """Axis that maps values from `low` to `high` to pixels from `start` to `end`.
 
-    ticks: value and label of each.
+    ticks: value and label of each tick.
     """
 
     low: float
@@ -73,7 +73,7 @@ def chart(
     powers: bool = False,
     note: str = "",
 ) -> Markup:
-    """Figure with a legend, a title and axis labels; "" if no points remain.
+    """Figure with a legend, a title and axis labels; "" if there are no points to draw.
 
     log_y: logarithmic y axis. Values that are not positive are left out.
     from_zero: y begins at zero.
@@ -107,8 +107,9 @@ def chart(
             y=y,
             powers=powers,
             note=note,
-            label=f"{title}: {y} by {x}. " + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
-            # draw in front: means over faint curves, and lower areas of a stack
+            label=f"{title}: {y} against {x}. "
+            + " ".join(_described(curve) for curve in drawn if curve.kind != "faint"),
+            # shapes drawn later are in front: means over faint curves, and the lower areas of a stack
             shapes=sorted(shapes[:: -1 if drawn[0].kind == "area" else 1], key=lambda shape: shape["kind"] != "faint"),
             width=CHART_WIDTH_PX,
             height=CHART_HEIGHT_PX,
@@ -119,7 +120,7 @@ def chart(
 
 @cache
 def templates() -> Environment:
-    """Environment of the page templates, which escape everything that is not Markup."""
+    """Environment of the page templates. Templates escape everything that is not Markup."""
     return Environment(
         loader=PackageLoader("clsplat.report", "templates"),
         autoescape=True,
@@ -139,7 +140,7 @@ def short(value: float) -> str:
 
 
 def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
-    """Thin out points to about `limit`. The lowest and highest of each interval stay, so no peak is lost."""
+    """Thin out points to about `limit`. The lowest and highest of each interval are kept, so that no peak is lost."""
     if len(points) <= limit:
         return points
     stretch = math.ceil(2 * len(points) / limit)
@@ -151,13 +152,13 @@ def thinned(points: Points, limit: int = MAX_LINE_POINTS) -> Points:
 
 
 def _kept(curve: ChartSeries, log_y: bool) -> Points:
-    """Points that can be drawn; for lines no more than are visible."""
+    """Points that can be drawn. Lines are thinned to the visible resolution."""
     points = [point for point in curve.points if all(map(math.isfinite, point)) and (not log_y or point[1] > 0)]
     return points if curve.kind in FILLED_KINDS else thinned(points)
 
 
 def _heights(drawn: Sequence[ChartSeries], log_y: bool) -> list[list[float]]:
-    """Positions of each series' points on the y axis. Areas are stacked."""
+    """Values at which each series' points are drawn on the y axis. Areas are stacked."""
     heights = [[math.log10(y) if log_y else y for _, y in curve.points] for curve in drawn]
     stacked: list[list[float]] = np.cumsum(heights, axis=0).tolist() if drawn[0].kind == "area" else heights
     return stacked
@@ -183,7 +184,7 @@ def _power(value: float) -> str:
 
 
 def _step(span: float, count: int) -> float:
-    """Tick distance, 1, 2 or 5 times a power of ten, for about `count` ticks in the span."""
+    """Distance between ticks for about `count` ticks in the span. It is 1, 2 or 5 times a power of ten."""
     rough = span / count
     power = 10.0 ** math.floor(math.log10(rough))
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
@@ -192,7 +193,7 @@ def _step(span: float, count: int) -> float:
 def _shape(curve: ChartSeries, pixels: Points, floor: float) -> dict[str, Any]:
     """Template data of a series.
 
-    shown: values that the page's script shows, in the order of `places`.
+    shown: values that the page's script displays, in the order of `places`, the pixels of the points along x.
     """
     step = "H{:.1f}V{:.1f}" if curve.kind == "bars" else "L{:.1f} {:.1f}"
     path = "M{:.1f} {:.1f}".format(*pixels[0]) + "".join(step.format(*pixel) for pixel in pixels[1:])
@@ -212,5 +213,5 @@ def _shape(curve: ChartSeries, pixels: Points, floor: float) -> dict[str, Any]:
 def _described(curve: ChartSeries) -> str:
     if curve.kind == "bars":
         top = max(curve.points, key=lambda point: point[1])
-        return f"{curve.name}: most, {short(top[1])}, from {short(top[0])} on."
-    return f"{curve.name}: {short(curve.points[0][1])} at first, {short(curve.points[-1][1])} at last."
+        return f"{curve.name}: the largest bin has {short(top[1])} and begins at {short(top[0])}."
+    return f"{curve.name}: {short(curve.points[0][1])} at first, {short(curve.points[-1][1])} in the end."

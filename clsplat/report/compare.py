@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of runs: scores, Gaussians, times, differing settings, overlaid curves, and time against error."""
+"""Comparison of runs: scores, numbers of Gaussians, times, settings that differ, curves, and PSNR against time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_COMPARED_VIEWS = 100
 
 @dataclass
 class Comparison:
-    """Runs by unique labels.
+    """The compared runs. The keys of `runs` are unique labels.
 
     notes: reasons why the numbers are hard to compare.
     """
@@ -39,7 +39,7 @@ class Comparison:
 
     @property
     def differing(self) -> dict[str, list[Any]]:
-        """Settings that differ between the runs: values of each run, by flag."""
+        """Settings that differ between the runs: for each flag, the values of all runs."""
         settings = [dict(settings_of(numbers.run.config)) for numbers in self.runs.values()]
         values = {name: [setting[name] for setting in settings] for name in settings[0]}
         return {name: listed for name, listed in values.items() if any(value != listed[0] for value in listed)}
@@ -66,7 +66,7 @@ class Comparison:
 
 
 def compare_runs(runs: Sequence[Run]) -> Comparison:
-    """Read the runs. Raises InputError like `read_run_numbers`, and for too many runs."""
+    """Read the runs. Raises InputError like `read_run_numbers`, and if there are too many runs."""
     if len(runs) > MAX_COMPARED_RUNS:
         raise InputError(f"{len(runs)} runs: expected at most {MAX_COMPARED_RUNS} to compare")
     all_numbers = [read_run_numbers(run, describe=False) for run in runs]
@@ -76,17 +76,17 @@ def compare_runs(runs: Sequence[Run]) -> Comparison:
         notes += [f"{label}: {note}" for note in numbers.notes if note.startswith(("Not finished", "eval.json"))]
     scenes = {numbers.run.scene.name for numbers in all_numbers if numbers.run.scene is not None}
     if len(scenes) > 1:
-        notes.append(f"The runs are of different scenes: {examples(sorted(scenes))}.")
+        notes.append(f"The runs have different scenes: {examples(sorted(scenes))}.")
     held_out = {
         frozenset(view["name"] for view in numbers.evaluation["views"]) for numbers in all_numbers if numbers.evaluation
     }
     if len(held_out) > 1:
-        notes.append("The runs do not hold out the same views: their scores are not of the same pictures.")
+        notes.append("The runs do not hold out the same views: their scores are for different pictures.")
     for name in ("resolution", "background"):
         if len({getattr(numbers.run.config, name) for numbers in all_numbers}) > 1:
-            notes.append(f"--{name} differs: scores are not of the same pictures.")
+            notes.append(f"--{name} differs: scores are for different pictures.")
     if len({numbers.sessions[-1].get("device") for numbers in all_numbers if numbers.sessions}) > 1:
-        notes.append("The runs are of different devices: their times are not of one machine.")
+        notes.append("The runs used different devices: their times are hard to compare.")
     return comparison
 
 
@@ -114,7 +114,7 @@ def comparison_page(comparison: Comparison) -> str:
 
 
 def charts(comparison: Comparison) -> list[Markup]:
-    """Charts: time against error first, then the curves of a run's own page, by step."""
+    """Charts: PSNR against time first, then the curves of a run's report, against the step."""
     drawn = []
     for x, title, x_label in (
         ("seconds", "Time against error", "seconds of training"),
@@ -145,7 +145,7 @@ def charts(comparison: Comparison) -> list[Markup]:
 
 
 def view_rows(comparison: Comparison) -> list[tuple[str, list[float | None], float | None]]:
-    """Rows of the views that at least two runs share: name, PSNR in each run, best PSNR."""
+    """Rows for the views that at least two runs share: name, PSNR in each run, best PSNR."""
     views = [numbers.evaluation["views"] if numbers.evaluation else [] for numbers in comparison.runs.values()]
     scores = [{view["name"]: view.get("psnr") for view in listed} for listed in views]
     rows = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""report.html: a run on one self-contained page, which needs neither other files nor a network."""
+"""report.html: the report of a run on one page, which needs neither other files nor a network."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MAX_EMBEDDED_RECORDS = 2000
 MAX_TABLE_VIEWS = 200
 """Largest number of views in the table."""
 MAX_COLOURED_STAGES = 7
-"""Largest number of stages with a colour of their own. The smaller stages are drawn together."""
+"""Largest number of stages with separate colours. The smaller stages are drawn together."""
 SCORE_TITLES = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS (VGG)"}
 
 
@@ -55,9 +55,9 @@ def write_report(
     model: Gaussians | None = None,
     views: int = MAX_PICTURED_VIEWS,
 ) -> RunNumbers:
-    """Write the page atomically to `path`, or into the run's folder. Returns its numbers.
+    """Write the page atomically to `path`, or into the run's folder. Returns the run's numbers.
 
-    scene: the run's scene, or the reason why there is none; looked up if not given.
+    scene: the run's scene, or the reason why there is none. By default, the scene is loaded if it is needed.
     model: content of model.ply, if already loaded.
     views: largest number of held-out views with pictures.
     Raises InputError if metrics cannot be read, and OSError if the page cannot be written.
@@ -69,7 +69,7 @@ def write_report(
 
 
 def write_last(run: Run, scene: Scene, model: Gaussians) -> None:
-    """Write the report of a finished training. A failure is only a warning: a page must not fail hours of training."""
+    """Write the report of a finished training. Any failure only causes a warning, so that no hours of training fail."""
     try:
         write_report(run, scene=scene, model=model)
     except Exception as error:  # noqa: BLE001
@@ -93,7 +93,7 @@ def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: in
         masks, masked_count = masked_photographs(scene, only_files=use.alpha == "blend")
     if listed and views > 0:
         if isinstance(scene, str):
-            notes.append(f"There are renders without photographs: {scene}.")
+            notes.append(f"Renders are shown without photographs: {scene}.")
         names = [view["name"] for view in listed]
         wanted = thumbnails.chosen([view.get("psnr") for view in listed], views)
         background = background_colour(numbers.run.config.background)
@@ -106,7 +106,7 @@ def report_page(numbers: RunNumbers, scene: Scene | str | None = None, views: in
             if view.depth
         ]
         if len(shown) < len(wanted):
-            notes.append(f"{len(wanted) - len(shown)} renders of held-out views are not in test/, or cannot be read.")
+            notes.append(f"{len(wanted) - len(shown)} renders of held-out views are missing in test/ or unreadable.")
     scores = {view["name"]: view for view in listed}
     defaults = dict(settings_of(TrainConfig()))
     places = {view.name: place for place, view in enumerate(shown, 1)}
@@ -153,10 +153,11 @@ def render_page(name: str, **values: Any) -> str:
 
 
 def charts(numbers: RunNumbers) -> list[Markup]:
-    """Charts of loss, PSNR, Gaussians, stage times and training time, by step, and of PSNR by training time."""
+    """Charts of loss, PSNR, number of Gaussians, stage times and training time against the step, and of PSNR against
+    training time."""
     curves, steps = numbers.curves, numbers.curves["step"]
     around = max(len(steps) // 50, 5)
-    note = f"each tenth step, of one view; the line is the mean of {around} records" if len(steps) > 20 else ""
+    note = f"every tenth step, for one view; the line is the mean of {around} records" if len(steps) > 20 else ""
     made = []
     for title, name, label in (("Loss", "loss", "loss"), ("PSNR", "psnr", "PSNR, dB")):
         series = [ChartSeries("training view", list(zip(steps, curves[name], strict=True)))]
@@ -178,7 +179,7 @@ def charts(numbers: RunNumbers) -> list[Markup]:
 
 
 def stage_chart(numbers: RunNumbers) -> Markup:
-    """Stacked chart of milliseconds per stage, with the small stages together. Empty with fewer than two
+    """Stacked chart of milliseconds per stage, with the small stages together. Empty if there are fewer than two
     measurements."""
     if len(numbers.stages) < 2:
         return Markup("")
@@ -186,7 +187,7 @@ def stage_chart(numbers: RunNumbers) -> Markup:
     named = names if len(names) <= MAX_COLOURED_STAGES + 1 else names[:MAX_COLOURED_STAGES]
     groups = [(name, [name]) for name in named]
     if rest := names[len(named) :]:
-        groups.append((f"{len(rest)} smaller ones", rest))
+        groups.append((f"{len(rest)} smaller stages", rest))
     series = []
     for color, (label, members) in enumerate(groups):
         times = [(float(record["step"]), sum(record["ms"].get(n, 0.0) for n in members)) for record in numbers.stages]
@@ -221,14 +222,14 @@ def histograms(numbers: RunNumbers) -> list[Markup]:
     if "contribution" in bars:
         record = numbers.histograms["contribution"]
         views = f"{record['views']} of {record['of']} training views"
-        note = f"largest to one of {views}; {record['none']:,} contribute to none"
+        note = f"largest contribution to any of {views}; {record['none']:,} contribute to none"
         series = [ChartSeries("contribution", bars["contribution"], "bars", 3)]
         made.append(chart("Contribution", series, "pixels", "Gaussians", powers=True, note=note))
     return made
 
 
 def setting_text(value: object) -> str:
-    """Text of a setting for readers. Lists have spaces, so that lines can wrap."""
+    """Text of a setting's value. Lists have spaces, so that lines can wrap."""
     if isinstance(value, tuple):
         return ", ".join(map(str, value)) or "none"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -245,7 +246,7 @@ def duration(seconds: float | None) -> str:
 
 
 def score(value: float, name: str) -> str:
-    """Score with its significant digits."""
+    """Text of a score with its significant digits."""
     return f"{value:.2f}" if name == "psnr" else f"{value:.4f}"
 
 
@@ -256,7 +257,7 @@ def _mask_words(use: MaskUse) -> list[str]:
 
 
 def _data(numbers: RunNumbers) -> dict[str, Any]:
-    """Data of the page for programs: the numbers, unrounded."""
+    """Data for programs that read the page: the numbers before rounding."""
     length = len(numbers.curves["step"])
     every = -(-length // MAX_EMBEDDED_RECORDS) or 1
     kept: Sequence[int] = sorted({*range(0, length, every), *([length - 1] if length else [])})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs in a report: their masks, and their learnt exposures."""
+"""Parts of a report about photographs: their masks, and their learnt exposures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from clsplat.scenes.scene import Scene, View
 MAX_MASKED_PHOTOGRAPHS = 6
 """Largest number of masked photographs that are shown."""
 SMALL_PICTURE_SIDE_PX = 320
-"""Pixels of the longer side of small pictures."""
+"""Longer side of small pictures in pixels."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class MaskedPhotograph:
 
 
 def masked_photographs(scene: Scene, *, only_files: bool) -> tuple[list[MaskedPhotograph], int]:
-    """Evenly chosen photographs with masks, and the number of all of them. Unreadable photographs are skipped.
+    """Evenly spaced photographs with masks, and the number of all photographs with masks. Skips unreadable ones.
 
     only_files: do not count alpha channels as masks.
     """
@@ -65,7 +65,7 @@ def _shown(view: View, space: str) -> MaskedPhotograph:
 
 
 def exposure_chart(run: Run) -> Markup:
-    """Chart of the photographs' learnt gains, by name; "" if there are none."""
+    """Chart of the photographs' learnt gains, in the order of names; "" if there are none."""
     path = run.appearance_path
     if not path.exists():
         return Markup("")
@@ -79,16 +79,16 @@ def exposure_chart(run: Run) -> Markup:
         ChartSeries(name, [(float(place), row[channel]) for place, row in enumerate(rows, 1)], color=color)
         for channel, (name, color) in enumerate((("red", 1), ("green", 2), ("blue", 0)))
     ]
-    note = "what the model's colours are multiplied by; +1 is twice as bright as the mean" + corners
+    note = "log2 of the factors of the model's colours; +1 is twice as bright as the mean" + corners
     return chart("Exposure of the photographs", series, "training photograph, by name", "gain, stops", note=note)
 
 
 def _corners(photographs: Mapping[str, Any]) -> str:
-    """Text on the light that remains in the corners with the learnt vignettes; "" without any."""
+    """Text on the fraction of light in the corners according to the learnt vignettes; "" if there are none."""
     vignettes = {tuple(_three(row["vignette"])) for row in photographs.values() if "vignette" in row}
     octaves = sorted(min(sum(vignette), 16.0) for vignette in vignettes if any(vignette))
     left = dict.fromkeys(f"{2.0**value:.0%}" for value in octaves)
-    return f". Corners have {examples(left)} of the light of the middle" if left else ""
+    return f". Corners get {examples(left)} of the light in the middle" if left else ""
 
 
 def _gains(record: Any) -> Sequence[float]:

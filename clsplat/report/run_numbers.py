@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers of a run, read from its files. Nothing is measured again; missing or damaged files become notes."""
+"""Numbers of a run, read from its files. Nothing is measured again. Missing or damaged files are reported as notes."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ SCORE_NAMES = ("psnr", "ssim", "lpips")
 CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 """Keys of every record in metrics.jsonl."""
 MAX_NAME_CHARACTERS = 200
-"""Largest number of characters that are shown of the name of a view, a stage or a device."""
+"""Largest number of displayed characters of the name of a view, a stage or a device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""Limits for foreign files; clsplat itself writes fewer entries. The last samples and sessions are kept."""
+"""Limits for files that clsplat did not write: its own have fewer entries. The last samples and sessions are kept."""
 MAX_DRAWN_VALUE = 1e30
 
 
@@ -32,14 +32,14 @@ MAX_DRAWN_VALUE = 1e30
 class RunNumbers:
     """Numbers of a run, from its files.
 
-    curves: lists of equal length, by the key of the records.
-    stages: step, and milliseconds by stage.
-    evaluations: held-out scores during training and at its end, by step.
+    curves: for each key of the records, the list of its values; all lists have equal length.
+    stages: records of a step and the milliseconds of each of its stages.
+    evaluations: held-out scores during training and at its end, in the order of steps.
     evaluation: content of eval.json.
     sessions: start, device, driver and versions of each training session.
     elapsed: seconds of wall time.
     model: description of model.ply, without its Gaussians.
-    histograms: edges and counts, by name.
+    histograms: edges and counts of each histogram, with its name as the key.
     notes: sentences on missing or damaged data, and other caveats.
     """
 
@@ -69,7 +69,7 @@ class RunNumbers:
 
     @property
     def gaussians(self) -> int | None:
-        """Number of Gaussians in the model, from model.ply, else eval.json, else the last step."""
+        """Number of Gaussians in the model: from model.ply, else from eval.json, else from the last record."""
         for record in (self.model, self.evaluation):
             if record is not None and record["gaussians"] is not None:
                 return int(record["gaussians"])
@@ -77,7 +77,7 @@ class RunNumbers:
         return None if last is None else int(last)
 
     def held_out(self, x: str) -> list[tuple[float, float]]:
-        """PSNR of the held-out views against `x` (seconds or step), where both are known."""
+        """Points (x, PSNR of the held-out views) of the evaluations that have both. `x` is "seconds" or "step"."""
         points = [(evaluation.get(x), evaluation.get("psnr")) for evaluation in self.evaluations]
         return [(float(at), psnr) for at, psnr in points if at is not None and psnr is not None]
 
@@ -93,7 +93,7 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
 
     model: content of model.ply, if already loaded.
     describe: True to read and describe the model.
-    Raises InputError if metrics.jsonl cannot be read. Anything else missing or damaged becomes a note.
+    Raises InputError if metrics.jsonl cannot be read. Other missing or damaged data is reported as a note.
     """
     records = [
         record for record in run.read_metrics() if all(number(record.get(name)) is not None for name in CURVE_KEYS)
@@ -119,16 +119,16 @@ def read_run_numbers(run: Run, model: Gaussians | None = None, *, describe: bool
     _add_gate(numbers, records)
     iterations = run.config.iterations
     if numbers.step < iterations:
-        numbers.notes.insert(0, f"Not finished: at step {numbers.step:,} of {iterations:,}.")
+        numbers.notes.insert(0, f"Not finished: the run is at step {numbers.step:,} of {iterations:,}.")
     if not records:
         numbers.notes.append("metrics.jsonl has no records: there are no curves.")
     elif not numbers.sessions:
-        numbers.notes.append("A run of an earlier version: device, times of stages and contributions are not known.")
+        numbers.notes.append("An earlier version wrote this run: device, stage times and contributions are unknown.")
     else:
         if not numbers.stages:
             numbers.notes.append("The time of each stage was not measured (--stages-every 0).")
         if "contribution" not in numbers.histograms and numbers.step >= iterations:
-            numbers.notes.append("Contributions were not measured: --no-report, or the device's memory is limited.")
+            numbers.notes.append("Contributions were not measured: --no-report was set, or device memory was limited.")
     return numbers
 
 
@@ -140,7 +140,7 @@ def number(value: object) -> float | None:
 
 
 def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """The name of the flag and the value of each setting."""
+    """Yield the name of the flag and the value of each setting."""
     for setting in fields(config):  # type: ignore[arg-type]  # every caller passes a dataclass
         value, name = getattr(config, setting.name), prefix + setting.name.replace("_", "-")
         if is_dataclass(value):
@@ -150,7 +150,7 @@ def settings_of(config: object, prefix: str = "--") -> Iterator[tuple[str, Any]]
 
 
 def smooth(values: list[float], count: int) -> list[float]:
-    """Moving average over `count` values, fewer at the ends."""
+    """Moving average over `count` values, or over fewer values at both ends."""
     sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, np.float64))])
     at = np.arange(len(values))
     low, high = np.maximum(at - count // 2, 0), np.minimum(at + count // 2 + 1, len(values))
@@ -169,7 +169,7 @@ def _numbers(values: Mapping[str, Any], limit: int) -> dict[str, float]:
 
 
 def _evaluation(value: object) -> Record | None:
-    """Validate an evaluation in the format of eval.json; None for anything else."""
+    """Valid parts of an evaluation in the format of eval.json; None for anything else."""
     if not isinstance(value, dict) or not isinstance(value.get("views"), list):
         return None
     views = []
@@ -219,14 +219,14 @@ def _elapsed(records: list[Record]) -> float | None:
 def _add_evaluation(numbers: RunNumbers) -> None:
     run = numbers.run
     if not run.eval_path.exists():
-        numbers.notes.append("eval.json is not there: no held-out view has been measured at the end.")
+        numbers.notes.append("eval.json is missing: the held-out views were not measured at the end.")
         return
     try:
         evaluation = _evaluation(parse_json(read_document(run.eval_path, "the evaluation of a run")))
     except (InputError, ValueError):
         evaluation = None
     if evaluation is None:
-        numbers.notes.append("eval.json is damaged, and left out.")
+        numbers.notes.append("eval.json is damaged and was ignored.")
         return
     numbers.evaluation = evaluation
     if not evaluation["views"]:
@@ -237,13 +237,13 @@ def _add_evaluation(numbers: RunNumbers) -> None:
     numbers.evaluations = sorted([*others, {**_summary(evaluation), "step": step}], key=lambda record: record["step"])
     last = numbers.curves["step"][-1] if numbers.curves["step"] else None
     if last is not None and step != last:
-        numbers.notes.append(f"eval.json is of step {step:,}, metrics.jsonl goes to step {int(last):,}.")
+        numbers.notes.append(f"eval.json belongs to step {step:,}, but metrics.jsonl ends at step {int(last):,}.")
 
 
 def _add_model(numbers: RunNumbers, model: Gaussians | None) -> None:
     path: Path = numbers.run.model_path
     if not path.exists():
-        numbers.notes.append("model.ply is not there: there is no model to describe.")
+        numbers.notes.append("model.ply is missing: the model cannot be described.")
         return
     try:
         model = model or Gaussians.load(path)
@@ -279,18 +279,18 @@ def _add_contributions(numbers: RunNumbers, records: list[Record]) -> None:
 
 
 def _add_gate(numbers: RunNumbers, records: list[Record]) -> None:
-    """Add a note if the refinement of cameras was ended early."""
+    """Add a note if the refinement of cameras ended early, because held-out views became worse."""
     gates = (gate for record in reversed(records) if isinstance(gate := record.get("gate"), dict))
     gate = next(gates, {})
     if (ended := number(gate.get("ended"))) is not None and (best := number(gate.get("best"))) is not None:
         numbers.notes.append(
-            f"Refined cameras did not suit the held-out views: refinement ended at step {ended:,.0f}, and the cameras "
-            f"are those of step {best:,.0f}."
+            f"Refining the cameras made held-out views worse: refinement ended at step {ended:,.0f}, and the cameras "
+            f"of step {best:,.0f} are used."
         )
 
 
 def _list(value: object) -> list[float]:
-    """The value as a list of numbers; empty if it is anything else."""
+    """The value as a list of numbers; empty if it is not one."""
     listed = value if isinstance(value, list) else []
     numbers = [known for item in listed if (known := number(item)) is not None]
     return numbers if len(numbers) == len(listed) else []

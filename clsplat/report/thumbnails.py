@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Held-out photographs, renders and error pictures as data URIs, small enough to embed in a page."""
+"""Held-out photographs, renders and error pictures as data URIs that are small enough to embed in a page."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.scenes.supervision.masks import after_sfm
 
 MAX_PICTURE_SIDE_PX = 640
-"""Most pixels of the longer side of a picture in a page."""
+"""Maximum longer side in pixels of a picture in a page."""
 MAX_PNG_SIDE_PX = 160
-"""Largest side of a picture that is stored as PNG and shown with its pixels as squares."""
+"""Maximum longer side in pixels of a picture that is stored as PNG and displayed with square pixels."""
 REPORT_JPEG_QUALITY = 85
 MAX_COLOURED_ERROR = 0.25
 """Mean absolute error of a pixel's channels at which the colour map ends."""
 INFERNO_RGB = np.array(
     [(0, 0, 0), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (250, 193, 39)], np.float32
 )
-"""Colour map of the error, from zero to its end, in even steps of lightness: matplotlib's inferno."""
+"""Colour map of the error, from 0 to MAX_COLOURED_ERROR: matplotlib's inferno in even steps of lightness."""
 
 
 @dataclass(frozen=True)
 class Shown:
     """Pictures of a view as data URIs.
 
-    photo, error: None without a photograph.
+    photo, error: None if there is no photograph.
     trouble: reason why the photograph cannot be read.
     depth: None if no depth picture was kept.
     """
@@ -63,7 +63,7 @@ class Shown:
 
     @property
     def small(self) -> bool:
-        """True for a picture with few pixels, which are shown as squares."""
+        """True for a small picture, whose pixels are displayed as squares."""
         return max(self.width, self.height) <= MAX_PNG_SIDE_PX
 
 
@@ -78,7 +78,7 @@ def scene_of(run: Run) -> Scene | str:
             source = source.resolve()
             source = source.with_name(f"{source.name}_colmap")
             if not source.is_dir():
-                return "the scene is a folder of photos, and what was reconstructed of it is gone"
+                return "the scene is a folder of photos, and its reconstruction no longer exists"
             masks = after_sfm(masks, source)
         return load_scene(
             source,
@@ -93,7 +93,7 @@ def scene_of(run: Run) -> Scene | str:
 
 
 def chosen(scores: Sequence[float | None], limit: int) -> list[int]:
-    """Indices of at most `limit` views to show, ascending: the worst, the best, and others evenly by score."""
+    """Indices of at most `limit` views to show, ascending: the worst, the best, and others evenly spaced in rank."""
     if len(scores) <= limit:
         return list(range(len(scores)))
     order = sorted(range(len(scores)), key=lambda index: (scores[index] is None, scores[index] or 0.0, index))
@@ -109,13 +109,13 @@ def show(
     background: ArrayLike,
     side: int = MAX_PICTURE_SIDE_PX,
 ) -> list[Shown]:
-    """Pictures of the views `names[index]` for the wanted indices, if their render is in the run's test/.
+    """Pictures of the views `names[index]` for the indices in `wanted`, if their renders are in the run's test/.
 
-    side: most pixels of the longer side.
+    side: maximum longer side in pixels.
     """
     try:
         paths = picture_names(names)
-    except ValueError:  # an impossible file name, such as ""
+    except ValueError:  # a name that no file can have, such as ""
         return []
     views = {view.name: view for view in scene.views} if scene is not None else {}
     space = photos_space(view.path for view in views.values())
@@ -148,7 +148,7 @@ def error_colors(error: Float32) -> Float32:
 
 
 def data_uri(image: NDArray[Any]) -> str:
-    """Encode (H, W, 3) floats, clipped to [0, 1], as JPEG, or as PNG if small. Raises ClsplatError."""
+    """Encode an image (H, W, 3), clipped to [0, 1], as JPEG, or as PNG if it is small. Raises ClsplatError."""
     height, width = image.shape[:2]
     small = max(width, height) <= MAX_PNG_SIDE_PX
     kind = "png" if small else "jpeg"

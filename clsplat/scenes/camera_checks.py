@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of images, and one-line warnings about implausible ones, from their intrinsics, poses and visible points."""
+"""Cameras of images, and one-line warnings about implausible intrinsics, poses and numbers of visible points."""
 
 from __future__ import annotations
 
@@ -27,41 +27,43 @@ MIN_CHECKED_POSES = 4
 MAX_CHECKED_POSES = 40
 """Maximum number of cameras whose poses are checked, evenly spaced."""
 MAX_POSE_CHECK_POINTS = 1000
-"""Maximum number of points that are checked, evenly spaced. With fewer than MIN_POSE_CHECK_POINTS, only the cameras are
-used."""
+"""Maximum number of points that are checked, evenly spaced. If there are fewer than MIN_POSE_CHECK_POINTS, only the
+cameras are used."""
 MIN_POSE_CHECK_POINTS = 30
 MIN_VISIBLE_POINT_FRACTION, MIN_VISIBLE_POINT_GAIN = 0.25, 4.0
-"""Another reading of the poses is reported if at least this mean fraction of the points is in view, and this many times
-the fraction with the poses as given.
+"""Another convention of the poses is suggested if, with it, views show at least this fraction of the points on average,
+and at least this many times the fraction with the poses as given.
 
-Each picture of an aerial survey shows about 1 % of the points in either reading.
+Each picture of an aerial survey shows about 1 % of the points with either convention.
 """
 BLIND_VIEW_POINT_FRACTION, MIN_BLIND_VIEW_FRACTION = 0.01, 0.2
-"""Fraction of the points below which a view is blind, and fraction of blind views that makes the poses doubtful.
+"""Fraction of visible points below which a view is blind, and fraction of blind views that makes the poses doubtful.
 
-Another reading of the poses is then reported if it has no blind views. In the captures tried, each view shows at least
-a quarter of the points.
+Another convention of the poses is then suggested if it has no blind views. In the captures tried, each view shows at
+least a quarter of the points.
 """
 MAX_CONVERGING_FRACTION_AS_GIVEN, MIN_CONVERGING_FRACTION_INVERTED = 0.2, 0.9
-"""Inverted poses are reported if at most the first fraction of the cameras face a common point as given, and at least
-the second fraction does with inverted poses."""
+"""Inverted poses are reported if at most the first fraction of the cameras faces a common point with the poses as
+given, and at least the second fraction does after inverting them."""
 PARALLEL_MEAN_AXIS_LENGTH = 0.7
-"""Length of the mean optical axis above which the cameras look the same way, as along a facade or from a drone.
+"""Length of the mean optical axis above which the cameras look in the same direction, as along a facade.
 
-There, inverted poses converge by chance.
+Inverted poses of such cameras may converge by chance.
 """
 CENTRE_RATIO_TOLERANCE = 0.02
-"""Relative tolerance between cx / width and cy / height. They agree if the principal point belongs to another size."""
+"""Relative tolerance between cx / width and cy / height. If these agree away from 1/2, (cx, cy) is the centre of
+another size."""
 FACING_COSINE = np.cos(np.deg2rad(20.0))
 """Cosine of the maximum angle between the optical axis and a point that a camera faces."""
 MAX_EDGE_DISTORTION = 0.5
-"""Maximum plausible shift by a lens at the picture's edge, as a fraction of half the width or height."""
+"""Maximum plausible distortion at the picture's edge, as a fraction of half the width or height."""
 OPENGL_AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
 """Signs that convert between COLMAP's and OpenGL's camera axes."""
 
 
 def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Cameras of the images by name, at full size, from `Lens.camera`. Warns of implausible cameras."""
+    """Cameras of the images at full size, from `Lens.camera`. The keys are the images' names. Warns of implausible
+    cameras."""
     by_lens = {
         lens: lens.camera(np.eye(3), np.zeros(3), lenses) for lens in dict.fromkeys(image.lens for image in images)
     }
@@ -76,7 +78,7 @@ def cameras_of(images: Sequence[PosedImage], lenses: Lenses = "undistort") -> di
 
 
 def camera_checks(views: Sequence[Named], points: Float64 | None = None) -> list[str]:
-    """Warnings about cameras at any size.
+    """Warnings about implausible cameras. The pictures may have any size.
 
     views: names, cameras and lenses.
     points: (N, 3), world coordinates.
@@ -97,8 +99,8 @@ def _focal(views: Sequence[Named]) -> str:
         return ""
     lens = short[0][1]
     return (
-        f"the focal length of {examples(name for name, _ in short)} is {lens.focal:g} pixels in {lens.width} x "
-        f"{lens.height}, which no lens has: is it in millimetres, or a part of the width? Give it in pixels"
+        f"the focal length of {examples(name for name, _ in short)} is {lens.focal:g} pixels for a picture of "
+        f"{lens.width}x{lens.height}, too short for any lens: is it in millimetres or widths? Give it in pixels"
     )
 
 
@@ -114,8 +116,8 @@ def _corner(views: Sequence[Named]) -> str:
         return ""
     _, x, y, lens = odd[0]
     return (
-        f"the principal point (cx cy) of {examples(name for name, *_ in odd)} lies at {x:g} {y:g} of {lens.width} x "
-        f"{lens.height} pixels: is it the distance from the middle, or a part? Give pixels from the upper left corner"
+        f"the principal point (cx cy) of {examples(name for name, *_ in odd)} is {x:g} {y:g} in a picture of "
+        f"{lens.width}x{lens.height}: is it relative to the middle, or a fraction? Give pixels from the top left corner"
     )
 
 
@@ -131,17 +133,17 @@ def _another_size(views: Sequence[Named]) -> str:
     lens = odd[0][1]
     x, y = lens.centre
     return (
-        f"the principal point (cx cy) of {examples(name for name, _ in odd)}, {x:g} {y:g}, is the middle of {2 * x:g} "
-        f"x {2 * y:g} pixels, and 'w' and 'h' are {lens.width} x {lens.height}: are they of another size than the "
-        "focal lengths? Give all of one size"
+        f"the principal point (cx cy) of {examples(name for name, _ in odd)}, {x:g} {y:g}, is the middle of a picture "
+        f"of {2 * x:g}x{2 * y:g} pixels, but 'w' and 'h' are {lens.width}x{lens.height}: do the intrinsics belong to "
+        "another size? Give all for one size"
     )
 
 
 def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
-    """Warn if the poses look as if they follow another convention.
+    """Warning if the poses seem to follow another convention, else "".
 
-    With points, the test is the fraction of them in view under each reading of the poses. If no other reading fits
-    better, blind views are reported. Without points, the test is the fraction of cameras that face a common point.
+    With points, the test is the fraction of points in view with each convention. If no other convention fits better,
+    blind views are reported. Without points, the test is the fraction of cameras that face a common point.
     """
     flat = [camera for _, camera in views[:: -(-len(views) // MAX_CHECKED_POSES) or 1]]
     if len(flat) < MIN_CHECKED_POSES:
@@ -157,7 +159,7 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         if best < MIN_VISIBLE_POINT_FRACTION or (best < MIN_VISIBLE_POINT_GAIN * given and not some_blind):
             return _blind(views, points)
         evidence = (
-            f"the pictures show {100 * given:.0f} % of the points, and {100 * best:.0f} % if the poses are {words}"
+            f"the pictures show {100 * given:.0f} % of the points, but {100 * best:.0f} % if the poses have {words}"
         )
     else:
         if np.linalg.norm(np.mean([camera.rotation[2] for camera in flat], axis=0)) > PARALLEL_MEAN_AXIS_LENGTH:
@@ -169,13 +171,13 @@ def _poses(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         if meeting < MIN_CONVERGING_FRACTION_INVERTED or _facing(flat) > MAX_CONVERGING_FRACTION_AS_GIVEN:
             return ""
         evidence = (
-            f"the cameras face nothing in common, and {100 * meeting:.0f} % face one place if the poses are {words}"
+            f"the cameras face no common point, but {100 * meeting:.0f} % face one place if the poses have {words}"
         )
-    return f"{evidence}: is that how they were exported? Export them again, or correct the file"
+    return f"{evidence}: were they exported like that? Export them again, or correct the file"
 
 
 def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
-    """Warn of views that show almost none of the points where the others show many."""
+    """Warning about views that show almost no points while the others show many, else ""."""
     shares = _shares([camera for _, camera in views], points)
     blind = shares < BLIND_VIEW_POINT_FRACTION
     if (
@@ -186,8 +188,8 @@ def _blind(views: Sequence[tuple[str, Camera]], points: Float64) -> str:
         return ""
     names = examples(name for (name, _), none in zip(views, blind, strict=True) if none)
     return (
-        f"{blind.sum():,} of {len(views):,} pictures show none of the points, or nearly, where the others show about "
-        f"{100 * usual:.0f} % ({names}): their poses are in doubt; correct them, or leave them out"
+        f"{blind.sum():,} of {len(views):,} pictures show almost none of the points, while the others show about "
+        f"{100 * usual:.0f} % ({names}): their poses are doubtful; correct them, or leave out these pictures"
     )
 
 
@@ -205,7 +207,7 @@ def _flipped(camera: Camera) -> Camera:
 
 
 def _inverted_opengl(camera: Camera) -> Camera:
-    """Pose of a camera whose matrix in OpenGL's axes was inverted by mistake."""
+    """Camera with the correct pose if its matrix in OpenGL's axes was inverted by mistake."""
     turned = _inverted(camera)
     return replace(
         turned,
@@ -215,12 +217,12 @@ def _inverted_opengl(camera: Camera) -> Camera:
 
 
 def _of_places(camera: Camera) -> Camera:
-    """Camera whose position was given in place of its translation."""
+    """Camera with the correct pose if its position was given in place of its translation."""
     return replace(camera, translation=-camera.rotation @ camera.translation)
 
 
 def _of_last_w(camera: Camera) -> Camera:
-    """Camera whose quaternion was given as x y z w and read as w x y z."""
+    """Camera with the correct pose if its quaternion was given as x y z w and read as w x y z."""
     return replace(camera, rotation=rotation_from_quaternion(np.roll(quaternion_of(camera.rotation), 1)))
 
 
@@ -234,35 +236,36 @@ def _transposed_in_place(camera: Camera) -> Camera:
 
 
 def _transposed_opengl(camera: Camera) -> Camera:
-    """Camera like `_transposed_in_place`, for a matrix in OpenGL's axes."""
+    """Like `_transposed_in_place`, for a matrix in OpenGL's axes."""
     turn = OPENGL_AXIS_SIGNS[:, None] * camera.rotation.T * OPENGL_AXIS_SIGNS
     return replace(camera, rotation=turn, translation=-turn @ camera.position)
 
 
-INVERTED_POSES = "inverted (camera from world in place of world from camera, or the other way round)"
-TRANSPOSED_ROTATIONS = (
-    "of transposed rotations (camera from world in place of world from camera, or the other way round)"
-)
+INVERTED_POSES = "inverted matrices (camera from world in place of world from camera, or the other way round)"
+TRANSPOSED_ROTATIONS = "transposed rotations (camera from world in place of world from camera, or the other way round)"
 POSE_MISREADINGS: tuple[tuple[str, Callable[[Camera], Camera]], ...] = (
     (INVERTED_POSES, _inverted),
     (INVERTED_POSES, _inverted_opengl),
-    ("in the other camera axes (COLMAP's and OpenCV's have y down and z ahead, OpenGL's y up and z back)", _flipped),
-    ("of the cameras' places where translations are expected", _of_places),
-    ("of quaternions in the order x y z w (COLMAP's is w x y z)", _of_last_w),
+    ("the other camera axes (y is down and z ahead in COLMAP and OpenCV, y up and z back in OpenGL)", _flipped),
+    ("camera positions in place of translations", _of_places),
+    ("quaternions in the order x y z w (COLMAP's order is w x y z)", _of_last_w),
     (TRANSPOSED_ROTATIONS, _transposed),
     (TRANSPOSED_ROTATIONS, _transposed_in_place),
     (TRANSPOSED_ROTATIONS, _transposed_opengl),
 )
-"""Common misreadings of poses: their description, and the change of the camera that corrects them."""
+"""Common misreadings of poses: description of the poses in the file, and function that corrects a camera."""
 
 
 def _shares(cameras: Sequence[Camera], points: Float64) -> Float64:
-    """Fraction of the points in each view, (cameras,)."""
+    """Fraction of the points that each camera sees, (cameras,)."""
     return np.array([pixels_of(points, camera)[2].mean() for camera in cameras])
 
 
 def _facing(cameras: Sequence[Camera]) -> float:
-    """Fraction of the cameras that face the point nearest to all optical axes, from at least half their spread away."""
+    """Fraction of the cameras that face the point nearest to all optical axes.
+
+    Cameras count only if the point is at least half the spread of the cameras away from them.
+    """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -278,7 +281,7 @@ def _facing(cameras: Sequence[Camera]) -> float:
 
 
 def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
-    """Warning about lenses with implausible distortion, "" for none. lenses: with the names of their pictures."""
+    """Warning about lenses with implausible distortion, or "". `lenses` has pairs of a picture's name and its lens."""
     bend = {lens: _bends(lens) for lens in {lens for _, lens in lenses}}
     bent = [(name, lens) for name, lens in lenses if bend[lens]]
     if not bent:
@@ -286,15 +289,15 @@ def absurd(lenses: Sequence[tuple[str, Lens]]) -> str:
     lens = bent[0][1]
     params = " ".join(f"{value:g}" for value in lens.params)
     return (
-        f"the lens of {examples(name for name, _ in bent)} bends the picture beyond reason ({lens.model} {params}): "
-        "check its coefficients, and their order"
+        f"the lens of {examples(name for name, _ in bent)} distorts the picture implausibly ({lens.model} {params}): "
+        "check its coefficients and their order"
     )
 
 
 def _bends(lens: Lens) -> bool:
-    """True if the lens shifts pixels at the picture's edge by a large part of it, compared with a pinhole camera.
+    """True if the lens distorts the picture's edge by more than MAX_EDGE_DISTORTION, compared with a pinhole camera.
 
-    False for fisheyes and similar models, which do so by design.
+    False for fisheyes and similar models, which distort by design.
     """
     if lens.is_pinhole or lens.is_bent_by_design:
         return False

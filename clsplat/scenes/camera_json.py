@@ -15,11 +15,11 @@ from clsplat.errors import InputError
 from clsplat.files.documents import parse_json, read_document
 from clsplat.scenes.dataset import MAX_COORDINATE, MAX_IMAGE_SIDE_PX
 
-EXPORT_AGAIN_ADVICE = "export the data set anew or add it"
+EXPORT_AGAIN_ADVICE = "export the data set again or add the value"
 
 
 class Keys:
-    """Values of one frame or camera. A value that it lacks comes from the file's top level.
+    """Values of one frame or camera. Values that the frame lacks are taken from the file's top level.
 
     where: beginning of every error message.
     Each method raises InputError for an invalid value.

@@ -26,23 +26,23 @@ from clsplat.images.alpha import associate, unassociate
 from clsplat.images.reading import downscale
 from clsplat.process import undisturbed
 
-with undisturbed():  # its import reports Ctrl-C as "not installed", and sets a SIGTERM handler that prints its stack
+with undisturbed():  # importing pycolmap reports Ctrl-C as "not installed"; its SIGTERM handler prints a stack trace
     import pycolmap
 
 
 MAX_IMAGE_SIDE_PX = 1 << 20
-"""Maximum width or height in pixels. A larger one means a damaged file; width times height stays far from overflow."""
+"""Maximum width or height in pixels. Larger values indicate a damaged file, and width times height could overflow."""
 MAX_COORDINATE = 1e30
-"""Exclusive limit of coordinates. Larger ones mean a damaged file; squares of smaller ones are finite."""
+"""Coordinates must be smaller than this, so that their squares are finite. Larger ones indicate a damaged file."""
 MIN_FOCAL_PER_SIDE = 1 / 20
 """Minimum plausible focal length, as a fraction of the longer side. A fisheye of 220 degrees has 1/4."""
 MIN_CENTRE_CHECK_SIDE_PX = 16
-"""Minimum shorter side, pixels, of pictures whose principal point cannot plausibly lie in the first pixel."""
+"""Minimum shorter side in pixels. Only in smaller pictures may the principal point plausibly lie in the first pixel."""
 
 
 @cache
 def models() -> dict[int, tuple[str, int]]:
-    """Name and number of parameters of each camera model that pycolmap knows, by COLMAP's id."""
+    """Name and number of parameters of each camera model that pycolmap knows. The keys are COLMAP's ids."""
     known = {}
     for name, member in pycolmap.CameraModelId.__members__.items():
         if int(member) >= 0:
@@ -53,7 +53,7 @@ def models() -> dict[int, tuple[str, int]]:
 
 @cache
 def lens_models() -> dict[str, tuple[LensModel, CameraModel]]:
-    """The lenses of the camera models by name, each with its camera model."""
+    """Lenses of all camera models, each with its camera model. The keys are the names of the lenses."""
     return {lens.name: (lens, model) for model in CAMERA_MODELS for lens in model.lenses}
 
 
@@ -61,10 +61,10 @@ def lens_models() -> dict[str, tuple[LensModel, CameraModel]]:
 class Lens:
     """Intrinsics of the camera that took a picture.
 
-    model: COLMAP's name.
-    width, height: pixels.
-    params: COLMAP's, in its order; focal lengths and principal point in pixels. The first pixel's centre is at (0.5,
-        0.5).
+    model: COLMAP's name of the camera model.
+    width, height: size of the picture in pixels.
+    params: COLMAP's parameters in COLMAP's order. Focal lengths and principal point are in pixels; the centre of the
+        first pixel is at (0.5, 0.5).
     """
 
     model: str
@@ -74,14 +74,14 @@ class Lens:
 
     @property
     def native(self) -> CameraModel | None:
-        """The camera model that renders like the lens, without undistortion; None for a pinhole, and if there is
-        none."""
+        """Camera model that renders through this lens without undistortion. None if no model does, and for a pinhole
+        lens."""
         camera_model = lens_models().get(self.model, (None, None))[1]
         return camera_model if camera_model is not None and not camera_model.is_pinhole else None
 
     @property
     def is_colmap(self) -> bool:
-        """True if COLMAP has the model. Other models have the formulas of their camera model in `clsplat.cameras`."""
+        """True if COLMAP has this model. The formulas of all other models are in `clsplat.cameras`."""
         return self.model not in lens_models() or lens_models()[self.model][0].is_colmap
 
     @property
@@ -91,12 +91,12 @@ class Lens:
 
     @property
     def is_bent_by_design(self) -> bool:
-        """True for fisheyes, panoramas and similar models, which shift pixels even if their coefficients are 0."""
+        """True for fisheyes, panoramas and similar models, which bend straight lines even if all coefficients are 0."""
         return self.native is not None or self.model in ("FOV", "EUCM") or "FISHEYE" in self.model
 
     @property
     def is_pinhole(self) -> bool:
-        """True if pictures need no undistortion. Distorted models whose coefficients are all 0 count too."""
+        """True if pictures need no undistortion: also for a distortion model whose coefficients are all 0."""
         if self.model in ("PINHOLE", "SIMPLE_PINHOLE"):
             return True
         camera = self._camera()
@@ -154,7 +154,7 @@ class Lens:
         return Camera(self.width, self.height, *focal, *centre, rotation, translation)
 
     def resized(self, width: int, height: int) -> Lens:
-        """Same lens on another pixel grid. If width and height scale differently, its model has two focal lengths."""
+        """Same lens on another pixel grid. The result has two focal lengths if width and height scale differently."""
         if self.is_panorama:
             return Lens(self.model, width, height, (float(width), float(height)))
         sx, sy = width / self.width, height / self.height
@@ -210,7 +210,7 @@ class PosedImage:
     path: the file, if the data set names it.
     split: "train", "test", or None if the data set has no split of its own.
     mask, depth: files of the mask and the depth map, if the data set names them.
-    listed: the name in the data set, if the file has another.
+    listed: the name in the data set, if it differs from the file's name.
     """
 
     name: str
@@ -225,7 +225,7 @@ class PosedImage:
 
     @property
     def rank(self) -> str:
-        """Name that sorts the image for the split."""
+        """Name by which images are sorted before they are split into training and test images."""
         return self.listed or self.name
 
 
@@ -237,7 +237,7 @@ class DataSet:
     colors: (N, 3) float32 in [0, 1].
     box: corners (low, high) of instant-ngp's volume, world units, or None.
     missing: names of listed pictures that do not exist and are left out.
-    clouds: point files that the data set does not name. The first is used if there are no points.
+    clouds: point files that the data set does not name. The first one is used if `points` is empty.
     """
 
     images: list[PosedImage]
@@ -261,27 +261,29 @@ def check_lens(lens: Lens, where: str) -> Lens:
         )
     if not (0 < lens.width <= MAX_IMAGE_SIDE_PX and 0 < lens.height <= MAX_IMAGE_SIDE_PX):
         raise InputError(
-            f"{where}: image size {lens.width} x {lens.height}, expected 1 to {MAX_IMAGE_SIDE_PX} pixels a side"
+            f"{where}: the image size is {lens.width}x{lens.height}, expected 1 to {MAX_IMAGE_SIDE_PX} pixels a side"
         )
     if lens.is_panorama:
         if list(lens.params) != [lens.width, lens.height]:
             sides = f"{lens.width} {lens.height}"
             raise InputError(
-                f"{where}: parameters {list(lens.params)}, expected its size, {sides}, of a whole panorama"
+                f"{where}: the parameters are {list(lens.params)}, expected the size of a full panorama, {sides}"
             )
         return lens
     camera = lens._camera()  # noqa: SLF001
     focal = [lens.params[index] for index in camera.focal_length_idxs()]
     if not all(math.isfinite(value) for value in lens.params) or min(focal) <= 0:
-        raise InputError(f"{where}: parameters {list(lens.params)}, expected finite ones, focal lengths above 0")
+        raise InputError(
+            f"{where}: the parameters are {list(lens.params)}, expected finite ones, focal lengths above 0"
+        )
     return lens
 
 
 def in_pixels(lens: Lens) -> tuple[Lens, bool]:
     """Convert a lens to pixels if it was given in fractions of the picture's width and height.
 
-    A principal point in the first pixel is implausible for a photograph, whereas 0.5 0.5 is the middle in fractions.
-    Focal lengths then are fractions too if they are under MIN_FOCAL_PER_SIDE of the longer side.
+    A principal point in the first pixel is implausible for a photograph, so it is read as fractions of the size. Focal
+    lengths are then read as fractions too if they are below MIN_FOCAL_PER_SIDE times the longer side.
     Returns the lens, and True if it was converted.
     """
     camera = lens._camera()  # noqa: SLF001
@@ -293,7 +295,7 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
     if all(params[index] < MIN_FOCAL_PER_SIDE * max(sides) for index in focal):
         given = [params[index] for index in focal]
         alike = len(given) == 2 and abs(given[0] / given[1] - 1) < abs(given[0] * sides[0] / given[1] / sides[1] - 1)
-        by = (sides[0],) * 2 if alike else sides  # both are fractions of the width, as pixels are square
+        by = (sides[0],) * 2 if alike else sides  # if alike: both are fractions of the width, as pixels are square
         for index, side in zip(focal, by if len(focal) == 2 else (max(sides),), strict=True):
             params[index] *= side
     for index, side in zip(centre, sides, strict=True):
@@ -302,10 +304,10 @@ def in_pixels(lens: Lens) -> tuple[Lens, bool]:
 
 
 def given_in_parts(names: Iterable[object]) -> str:
-    """Warning about cameras of these names whose lenses `in_pixels` converted."""
+    """Warning that `in_pixels` has converted the lenses of these cameras."""
     return (
-        f"the principal point (cx cy) of {examples(names)} is given in parts of the picture's width and height and not "
-        "in pixels; it is read so, and focal lengths of under a twentieth of the picture with it"
+        f"the principal point (cx cy) of {examples(names)} is given as fractions of the picture's width and height, "
+        "not in pixels; it is read as fractions, and so are focal lengths below a twentieth of the longer side"
     )
 
 
@@ -316,8 +318,8 @@ def pixels_of(
 
     points: (N, 3), world coordinates.
     lens: needed if the camera is not a pinhole camera.
-    Returns the rows and columns of the points in front of the camera and in its picture, and `inside` (N,), True for
-    them.
+    Returns the rows and columns of the points that lie in front of the camera and in its picture, and `inside` (N,),
+    which is True for these points.
     """
     local = points @ camera.rotation.T + camera.translation
     if lens is not None and not camera.is_pinhole:
@@ -347,10 +349,10 @@ def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: 
 def undistort(image: Float32, lens: Lens, camera: Camera) -> Float32:
     """Resample a picture (H, W, C) taken through `lens` to a camera at the same position.
 
-    A cubic spline interpolates, clipped to the picture's range of values. If `camera` is less than 3/4 as wide as the
-    lens's own pinhole camera, interpolation is bilinear at the latter's scale, followed by an area average. Alpha is
-    straight in input and output. Pixels outside the picture repeat its border. `Lens.pinhole` has no such pixels,
-    except for extreme fisheyes.
+    Interpolation is by cubic spline, clipped to the picture's range of values. If `camera` is less than 3/4 as wide as
+    `lens.pinhole`, the picture is interpolated bilinearly to the size of `lens.pinhole` and then averaged over areas.
+    Alpha is straight in input and output. Pixels outside the picture repeat its border. `Lens.pinhole` has no such
+    pixels, except for extreme fisheyes.
     """
     natural = lens.pinhole(camera.rotation, camera.translation)
     shrinks = camera.width < 0.75 * natural.width

@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 DEPTH_FOLDERS = ("depths", "depth")
 """Names of the depth map folder, next to the photographs' folder or inside it."""
 MIN_DEPTH_FIT_POINTS = 10
-"""Minimum number of points in a photograph whose relative depth map is fitted to them."""
+"""Minimum number of a photograph's points to which its relative depth map can be fitted."""
 MIN_TRACKED_POINTS_IN_VIEW = 0.1
-"""Minimum fraction of tracked points that lie in their photographs.
+"""Minimum fraction of tracked points that the scene's cameras project into the photographs of their tracks.
 
-An undistorted fisheye of 200 degrees keeps 0.4. Cameras in another coordinate frame kept 0.001.
+The fraction is 0.4 for an undistorted fisheye of 200 degrees. It was 0.001 for cameras in another coordinate frame.
 """
 MAX_DEPTH_SCALE_RATIO = 5.0
 """Largest factor by which the scale fitted to a relative depth map may differ from the median scale of all maps."""
 
 
 def with_depths(scene: Scene, use: DepthUse) -> Scene:
-    """Scene whose training views have their known depths; `scene` itself if it has them already.
+    """Copy of the scene with known depths in its training views; `scene` itself if it already has them.
 
     Warns of photographs without known depths. Raises InputError for points without tracks. Also raises it for maps that
     are missing, do not decode, have another shape than their photograph, or fit no photograph.
@@ -60,7 +60,7 @@ def with_depths(scene: Scene, use: DepthUse) -> Scene:
 
 
 def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
-    """Points that COLMAP observed in each photograph, weighted by their error e in pixels: 1/(1 + e^2)."""
+    """Points that COLMAP observed in each photograph. Their weight is 1/(1 + e^2), with the error e in pixels."""
     model = None if scene.source is None else colmap.find_model(scene.source)
     if model is None:
         raise InputError(f"{scene.name}: {asked} needs to know which photographs show a point, expected a COLMAP model")
@@ -74,16 +74,16 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
     known = {name: KnownDepth(tracks.points[which], weights[which]) for name, which in rows.items()}
     if not known:
         raise InputError(
-            f"{model}: has photographs such as {examples(sorted(tracked))}, and none of the scene's "
-            f"({examples([view.name for view in scene.train_views])}), expected the same; {asked} goes by their points"
+            f"{model}: has photographs such as {examples(sorted(tracked))} but none of the scene's "
+            f"({examples([view.name for view in scene.train_views])}), expected the same; {asked} uses their points"
         )
     _check_frame(scene, known, model)
     return known
 
 
 def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> None:
-    """Raise InputError if hardly any tracked point lies in its photographs, as the cameras then have another world
-    frame."""
+    """Raise InputError if hardly any tracked point is projected into its photographs: the cameras then have another
+    world frame."""
     seen = whole = 0
     for view in scene.train_views:
         if view.name in known:
@@ -92,8 +92,8 @@ def _check_frame(scene: Scene, known: Mapping[str, KnownDepth], model: Path) -> 
             whole += len(known[view.name].points)
     if seen < MIN_TRACKED_POINTS_IN_VIEW * whole:
         raise InputError(
-            f"{model}: of {whole:,} points that its photographs show {seen:,} are in these by the scene's cameras, "
-            "expected most of them: take cameras and points of one model"
+            f"{model}: the scene's cameras project {seen:,} of {whole:,} tracked points into their photographs, "
+            "expected most of them; take cameras and points from the same model"
         )
 
 
@@ -103,8 +103,8 @@ def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
     files = {**_beside(scene.views, told, strict=not scene.missing), **told}
     if not files:
         raise InputError(
-            f"{scene.name}: --depth maps, and there are none; expected depths/IMAGE.png, .exr or .npy beside images/, "
-            "or 'depth_file_path' in transforms.json"
+            f"{scene.name}: has no depth maps for --depth maps; expected depths/IMAGE.png, .exr or .npy beside "
+            "images/, or 'depth_file_path' in transforms.json"
         )
     nothing = (np.empty((0, 3)), np.empty(0))
     lenses, known = {view.name: view.lens for view in scene.views}, {}
@@ -120,14 +120,14 @@ def _mapped(scene: Scene, use: DepthUse) -> dict[str, KnownDepth]:
 def _check_shape(path: Path, width: int, height: int, lens: Lens) -> None:
     if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height):
         raise InputError(
-            f"{path}: the depth map is {width} x {height} pixels, expected the shape of its photograph's "
-            f"{lens.width} x {lens.height}; make it of that shape"
+            f"{path}: the depth map has {width}x{height} pixels, expected the aspect ratio of its photograph, "
+            f"{lens.width}x{lens.height}; make it again with that ratio"
         )
 
 
 def _fitted(scene: Scene, known: dict[str, KnownDepth]) -> dict[str, KnownDepth]:
-    """Fit relative maps, which grow with nearness, to the points of each photograph. Scale and offset come from
-    medians.
+    """Fit relative maps, whose values grow with nearness, to the points of their photographs. Scale and offset come
+    from medians.
 
     Maps with few points, or with a scale far from the others, are left out; `with_depths` warns of them.
     """
@@ -149,7 +149,7 @@ def _fitted(scene: Scene, known: dict[str, KnownDepth]) -> dict[str, KnownDepth]
     if not good_fits:
         raise InputError(
             f"{scene.name}: no relative depth map agrees with the points, expected values that grow with nearness "
-            "(disparity); --depth-maps metric takes them for depths"
+            "(disparity); if the values are depths, use --depth-maps metric"
         )
     return {name: replace(known[name], fit=fit) for name, fit in good_fits.items()}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of data sets: the kind of a folder, its pictures, and which of them are held out or missing."""
+"""Layouts of data sets: the kind of a folder, its pictures, and those that are held out or missing."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ Kind = Literal["colmap", "blender", "transforms", "photos"]
 COLMAP_IMAGE_FOLDER = "images"
 """Name of the picture folder of a COLMAP model."""
 OTHER_IMAGE_FOLDERS = ("input", "inputs", "image", "img", "imgs", "rgb", "color", "frames", "photos", "pictures")
-"""Names of the picture folder in other programs' data sets, in the order tried. 3DGS' convert.py reads input/."""
+"""Names of the picture folder in other programs' data sets, in order of precedence. 3DGS' convert.py reads input/."""
 MODEL_FOLDERS = ("sparse", "colmap", "distorted")
-"""Names of folders with a model and no pictures, which may be given instead of the scene's folder."""
+"""Names of folders with a model but without pictures. Users may specify them instead of the scene's folder."""
 HELD_OUT_LIST_FILE = "test.txt"
-"""File with the names of the held-out pictures, one a line.
+"""File with the names of the held-out pictures, one per line.
 
 It lies next to a COLMAP model (3DGS authors' code, hierarchical-3d-gaussians) or a transforms.json (LichtFeld).
 """
 MAX_HELD_OUT_LIST_BYTES = 64 << 20
-"""Maximum size of this file in bytes."""
+"""Maximum size of HELD_OUT_LIST_FILE in bytes."""
 
 
 def detect(path: Path) -> Kind:
-    """Layout of a scene's folder or transforms.json. Raises InputError that lists the known layouts if it has none."""
+    """Layout of a scene's folder or transforms.json. Raises InputError that lists the known layouts if none fits."""
     path = Path(path)
     if path.is_file():
         if path.suffix.lower() != ".json":
@@ -49,7 +49,7 @@ def detect(path: Path) -> Kind:
     if (path / "transforms_train.json").is_file():
         return "blender"
     model = colmap.find_model(path)
-    # nerfstudio keeps the COLMAP model behind its transforms.json below colmap/; that model has larger pictures
+    # a model in colmap/ is that from which nerfstudio made transforms.json; its pictures are larger, so it is not used
     if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
         return "colmap"
     if (path / "transforms.json").is_file():
@@ -63,7 +63,7 @@ def detect(path: Path) -> Kind:
 
 
 def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tuple[DataSet, list[Path]]:
-    """Read a COLMAP model, and find the folders of downscaled pictures that may replace its pictures. Raises
+    """Read a COLMAP model, and find folders with downscaled pictures that may be used instead of its pictures. Raises
     InputError."""
     model_path = colmap.find_model(path)
     assert model_path is not None  # detect has found it
@@ -94,7 +94,7 @@ def read_colmap(path: Path, chosen: str | Path | None, missing: Missing) -> tupl
 
 
 def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: Missing, *, masks: bool) -> DataSet:
-    """Read the data set of one transforms.json, or of Blender's two. Raises InputError."""
+    """Read the data set of one transforms.json, or of Blender's two files for training and test. Raises InputError."""
     folder = path.parent if path.is_file() else path
     images = None if chosen is None else folder / chosen
     if images is not None and not images.is_dir():
@@ -114,11 +114,11 @@ def read_transforms(path: Path, kind: Kind, chosen: str | Path | None, missing: 
 
 
 def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, images: Sequence[PosedImage]) -> Path:
-    """Folder of a COLMAP model's pictures: images/, a downscaled copy, another known name, or the scene's folder
-    itself.
+    """Folder of a COLMAP model's pictures: images/, its downscaled copy, one with another known name, or the scene's
+    folder itself.
 
-    Folders that hold one of the listed pictures come first. Warns if the folder is not images/. Raises InputError if
-    there is none.
+    If images/ has no pictures, folders with a listed picture come first. Warns if the folder is not images/. Raises
+    InputError if there is none.
     """
     if chosen is not None:
         if not (folder := path / chosen).is_dir():
@@ -137,7 +137,7 @@ def _picture_folder(path: Path, chosen: str | Path | None, model_path: Path, ima
     listed = [folder for folder in found if any(is_file(folder / image.name) for image in images)]
     if listed or found:
         folder = (listed or found)[0]
-        warn(f"{model_path}: the pictures are taken from {folder}, as there are none in {usual[0]}")
+        warn(f"{model_path}: the pictures are read from {folder}, as there are none in {usual[0]}")
         return folder
     if not (empty := [folder for folder in usual if folder.is_dir()]):
         raise InputError(f"{usual[0]}: no such folder, expected the {len(images)} images of {model_path}")
@@ -151,7 +151,7 @@ def _warn_of_unlisted(present: Iterable[Path], data: DataSet, listed_in: Path, f
     known = companions(unlisted, pictures, folder) if unlisted else set()
     if unlisted := [path for path in unlisted if path not in known]:
         warn(
-            f"{listed_in}: does not list {len(unlisted):,} image(s) that are there, and they are not used: "
+            f"{listed_in}: does not list {len(unlisted):,} image(s) of its folder, which are not used: "
             f"{examples(unlisted)}"
         )
 
@@ -169,17 +169,17 @@ def _held_out(data: DataSet, path: Path) -> list[PosedImage]:
     names = list(dict.fromkeys(line for line in lines if line and not line.startswith("#")))
     found = match(names, [*(image.name for image in data.images), *data.missing])
     if lost := [legible(name) for name in names if name not in found.names]:
-        none = ", so that it is not used" if not found.names else ""
-        warn(f"{path}: lists {examples(lost)} to hold out, and no picture is called so{none}")
+        none = "; the list is not used" if not found.names else ""
+        warn(f"{path}: lists {examples(lost)} to hold out, but no picture has such a name{none}")
     held_out = set(found.names.values())
     if not held_out:
         return data.images
     if held_out <= set(data.missing):
-        warn(f"{path}: all pictures that it holds out are missing, so that none is measured")
+        warn(f"{path}: all pictures that it holds out are missing; held-out quality will not be measured")
     images = [replace(image, split="test" if image.name in held_out else "train") for image in data.images]
     if all(image.split == "test" for image in images):
         raise InputError(
-            f"{path}: holds out all {len(images)} pictures, expected some to train on; remove it for a split of "
+            f"{path}: holds out all {len(images)} pictures, expected some to train on; remove it to split with "
             "--test-every"
         )
     return images

@@ -32,14 +32,14 @@ from clsplat.scenes.supervision.masks import after_sfm, for_sfm, masks_of
 DEFAULT_MAX_SIDE_PX = 1600
 """Default maximum of the longest side in pixels."""
 MAX_ASPECT_RATIO_CHANGE = 1.5
-"""Maximum ratio between the aspect ratios of a picture and its camera; from 4:3 to 16:9 it is 1.33.
+"""Maximum ratio between the aspect ratios of a picture and its camera. For 4:3 and 16:9 the ratio is 1.33.
 
-Beyond it, or if rotated, the file is another picture.
+A file with a larger ratio, or one that is rotated, is taken as another picture.
 """
 SIDE_ROUNDING_PX = 2.5
-"""Maximum difference in pixels, at the camera's size, that is taken for rounding of the sides."""
+"""Maximum difference in pixels, at the camera's size, that rounding of the sides may cause."""
 BLENDER_CUBE_HALF_SIDE = 1.3
-"""Half the side of the cube for random points in the synthetic scenes: the authors' value."""
+"""Half the side of the cube for random points in the synthetic scenes. This is the 3DGS authors' value."""
 
 
 def load_scene(
@@ -57,16 +57,16 @@ def load_scene(
     """Read a scene's cameras, points and picture headers. `View.load` reads the pixels.
 
     path: a folder in a layout that `detect` knows, or a transforms.json.
-    resolution: longest side of the views in pixels, never larger than the pictures; 0 keeps their size up to 1600.
-    test_every: each n-th view by name is held out, 0 for none. The data set's own split takes precedence.
-    images: another folder of the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
-        images_8 of a COLMAP scene replace larger pictures if they have exactly the wanted size. Any of them is used if
-        there are no other pictures.
+    resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
+    test_every: every n-th view in the order of names is held out, 0 for none. A split in the data set takes precedence.
+    images: another folder with the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
+        images_8 of a COLMAP scene is used instead of larger pictures if its pictures have exactly the requested size.
+        Such a folder of any size is used if there are no other pictures.
     lenses: "undistort" turns fisheyes into pinhole cameras, "native" keeps them.
     work_dir: output of structure from motion, by default NAME_colmap next to `path`.
     progress: function that is called with a text and a fraction or None.
     masks: the meaning of masks and alpha channels (`clsplat.scenes.supervision.masks`). With masks, downscaled pictures
-        are not used, and structure from motion finds no features in left-out pixels.
+        are not used, and structure from motion finds no features in masked pixels.
     missing: how many listed pictures may be missing, "few" (a tenth), "skip" (any number but not all) or "error"
         (none).
 
@@ -88,7 +88,7 @@ def load_scene(
     kind = detect(path)
     if images is not None and kind == "photos":
         raise InputError(
-            f"{path}: is a folder of photos, a folder of images can be chosen only where there are cameras"
+            f"{path}: is a folder of photos; another folder of images can be chosen only for a scene with cameras"
         )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -106,8 +106,8 @@ def load_scene(
 class _SceneFiles:
     """A data set, before its pictures' headers are read.
 
-    source: the folder that it was read from. For photographs it is the result of structure from motion.
-    smaller: folders of downscaled pictures that may replace its pictures.
+    source: the folder from which the data set was read. For photographs it is the result of structure from motion.
+    smaller: folders of downscaled pictures that may be used instead of the data set's pictures.
     masks: the meaning of the masks in `source`.
     """
 
@@ -126,7 +126,7 @@ def _read(
     work_dir: Path | None,
     progress: Progress | None,
 ) -> _SceneFiles:
-    """Read the data set of the layout; photographs go through structure from motion first."""
+    """Read a data set of this layout. For photographs, run structure from motion first."""
     if kind in ("blender", "transforms"):
         return _SceneFiles(read_transforms(path, kind, images, missing, masks=masks.masks != "none"), path, (), masks)
     folder = path
@@ -140,7 +140,7 @@ def _read(
 
 
 def _views(files: _SceneFiles, path: Path, resolution: int, test_every: int, lenses: Lenses) -> list[View]:
-    """Views of the data set, by name, with the split and the masks. Warns of copies and of uneven sizes."""
+    """Views of the data set, sorted by name, with the split and the masks. Warns of copies and of uneven scaling."""
     data = files.data
     posed = sorted(data.images, key=lambda image: image.name)
     of_pictures = masks_of(files.masks, posed, path, strict=not data.missing)
@@ -158,7 +158,7 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_every: int, len
 
 
 def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Scene:
-    """Scene of the views, with its points, and with bounds for random ones. Warns of outliers and of no points."""
+    """Scene of the views, with points, and with bounds for random points. Warns of outliers and of a lack of points."""
     data = files.data
     cube = np.full(3, BLENDER_CUBE_HALF_SIDE)
     name = path.resolve().name if path.is_dir() else path.resolve().parent.name
@@ -167,7 +167,7 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
     if len(scene.points) == 0:
         scene = with_cloud_beside(scene)
         if not len(scene.points) and kind in ("colmap", "photos"):
-            warn(f"{path}: has no points, training starts from random ones")
+            warn(f"{path}: has no points; training starts from random points")
     if kind != "blender":
         near = [view.camera for view in views if view.name not in scene.stray_cameras]
         scene.bounds = camera_bounds(near, data.box)
@@ -175,13 +175,12 @@ def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Sce
 
 
 def without_strays(scene: Scene) -> Scene:
-    """Scene without outlier points. Warns of outlier points and outlier cameras."""
+    """Copy of a scene without outlier points. Warns of outlier points and outlier cameras."""
     if scene.stray_cameras:
         warn(
-            f"{scene.name}: {len(scene.stray_cameras):,} camera(s) stand over {OUTLIER_DISTANCE_RATIO:g} times as "
-            "far off as the "
-            f"others ({examples(sorted(scene.stray_cameras))}): the scene's size is that of the others; if their poses "
-            "are wrong, correct them or leave them out"
+            f"{scene.name}: {len(scene.stray_cameras):,} camera(s) stand over {OUTLIER_DISTANCE_RATIO:g} times as far "
+            f"off as the others ({examples(sorted(scene.stray_cameras))}) and do not affect the scene's size; if their "
+            "poses are wrong, correct them or leave these photographs out"
         )
     kept = without_stray_points(scene.points, scene, scene.name)
     return scene if kept.all() else replace(scene, points=scene.points[kept], point_colors=scene.point_colors[kept])
@@ -190,9 +189,9 @@ def without_strays(scene: Scene) -> Scene:
 def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = None) -> tuple[Float64, Float64]:
     """Cube (low, high) for random points, around the point that the cameras face, large enough to hold the cameras.
 
-    The centre is the point nearest to all optical axes. A weak pull towards a point ahead of the cameras decides where
-    the axes are parallel. If the cameras face away from it (outward from one place), the cube is three times as large.
-    The cube is clipped to `box` where they overlap.
+    The centre is the point nearest to all optical axes. If these are parallel, a weak pull towards a point ahead of the
+    cameras determines it. If the cameras face away from the centre (outward from one place), the cube is three times as
+    large. The cube is clipped to `box` if they overlap.
     """
     centres = np.stack([camera.position for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
@@ -215,7 +214,7 @@ def camera_bounds(cameras: list[Camera], box: tuple[Float64, Float64] | None = N
 
 
 def _warn_of_copies(views: list[View]) -> None:
-    """Warn of held-out pictures that are also trained on: their scores do not show how good the model is elsewhere."""
+    """Warn of held-out pictures that are also training pictures: their scores do not measure other viewpoints."""
     by_size: dict[int, list[View]] = {}
     for view in views:
         by_size.setdefault(view.path.stat().st_size, []).append(view)
@@ -227,8 +226,8 @@ def _warn_of_copies(views: list[View]) -> None:
             copies += [f"{name} is {other}" for name, other in held_out if other is not None]
     if copies:
         warn(
-            f"{len(copies)} of the held-out pictures are trained on too, as copies under another name, so that their "
-            f"scores say little: {examples(sorted(copies))}; remove the copies"
+            f"{len(copies)} of the held-out pictures are also training pictures, with another name, so that their "
+            f"scores mean little: {examples(sorted(copies))}; remove the copies"
         )
 
 
@@ -252,9 +251,9 @@ def _view(image: PosedImage, split: Split, resolution: int, smaller: Sequence[Pa
 
 
 def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None:
-    """Warn of pictures that were resized by different factors across and down.
+    """Warn of pictures that were resized by different factors in width and height.
 
-    They are used with both factors, as in gsplat. But such a picture may also belong to another camera.
+    Both factors are applied to the camera, as in gsplat. However, such a picture may also belong to another camera.
     """
     uneven = []
     for image, view in zip(images, views, strict=True):
@@ -265,13 +264,14 @@ def _warn_of_uneven(images: Sequence[PosedImage], views: Sequence[View]) -> None
     if uneven:
         _, across, down = uneven[0]
         warn(
-            f"{examples(name for name, *_ in uneven)}: {across:.4g} times as wide and {down:.4g} times as high as the "
-            "camera's size, and taken as resized so; are these the pictures the cameras were computed from?"
+            f"{examples(name for name, *_ in uneven)}: has {across:.4g} times the width and {down:.4g} times the "
+            "height of its camera, which is scaled likewise; do the cameras belong to these pictures?"
         )
 
 
 def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
-    """True if a downscaled picture has exactly the wanted size. Tools round the shorter side up or down."""
+    """True if a downscaled picture has the requested size. Its shorter side may differ by 1, as tools round it up or
+    down."""
     size = image_size(path, orient=False)
     near = abs(size[0] - width) <= 1 and abs(size[1] - height) <= 1
     return near and max(size) == max(width, height) and max(size) < max(lens.width, lens.height)
@@ -280,8 +280,8 @@ def _stands_in(path: Path, width: int, height: int, lens: Lens) -> bool:
 def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
     """Lens at the file's size, and True if the picture must be rotated upright. Raises InputError that names the path.
 
-    COLMAP, instant-ngp and nerfstudio use the pixels as stored. If only the rotated picture has the camera's
-    proportions, another tool rotated it, so it is rotated here too.
+    COLMAP, instant-ngp and nerfstudio use the pixels as stored. If only the rotated picture has the camera's aspect
+    ratio, the cameras are from a tool that rotates pictures, so it is rotated here too.
     """
     stored = image_size(path, orient=False)
     if stored == (lens.width, lens.height):
@@ -296,6 +296,6 @@ def _fit(path: Path, lens: Lens) -> tuple[Lens, bool]:
     if 1 / MAX_ASPECT_RATIO_CHANGE <= stored[0] / lens.width / (stored[1] / lens.height) <= MAX_ASPECT_RATIO_CHANGE:
         return lens.resized(*stored), False
     raise InputError(
-        f"{path}: is {stored[0]} x {stored[1]} pixels, expected its camera's {lens.width} x {lens.height} or the same "
-        "in another scale; are these the pictures the cameras were computed from?"
+        f"{path}: has {stored[0]}x{stored[1]} pixels, expected its camera's size, {lens.width}x{lens.height}, or "
+        "that aspect ratio; are these the pictures from which the cameras were computed?"
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Outliers: cameras and points so far from the others that a scene size computed from all of them is meaningless."""
+"""Outliers: cameras and points so far from the others that a scene size computed with them is meaningless."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from clsplat.camera import Camera
 OUTLIER_GAP_RATIO = 2.0
 """Minimum ratio between successive distances from the middle at which outliers may begin.
 
-In captures without outliers the ratio is at most 1.7, at their edge.
+In captures without outliers the ratio is at most 1.7, near the farthest places.
 """
 OUTLIER_DISTANCE_RATIO = 5.0
-"""Minimum distance of an outlier from the middle, relative to the farthest place that is not one.
+"""Minimum distance of an outlier from the middle, relative to the farthest place that is not an outlier.
 
-A training of 24 photographs whose scene size includes an outlier loses 1.2 dB at 5, 2.7 at 8, 4 at 12 and 7 at 30.
+If the scene size includes an outlier at 5, 8, 12 or 30 times that distance, a training on 24 photographs loses
+1.2, 2.7, 4 or 7 dB.
 """
 MAX_OUTLIER_CAMERA_FRACTION = 0.25
 """Maximum fraction of the cameras that can be outliers. If more are far away, they belong to the capture."""
@@ -30,14 +31,15 @@ MAX_OUTLIER_POINT_FRACTION = 0.01
 def strays(places: Float64, most: float, least: float = 0.0, middle: Float64 | None = None) -> NDArray[np.bool_]:
     """Mark the outliers (N,) among places (N, 3).
 
-    Distances are measured from `middle` (3,), by default the median of each axis, and sorted. Places behind the first
-    gap of a factor GAP are outliers if they are OUTLIER_DISTANCE_RATIO times as far as the last place before it.
+    Distances are measured from `middle` (3,), by default the median of each axis, and sorted. The first gap is
+    where a distance is more than OUTLIER_GAP_RATIO times the one before it. Places beyond it are outliers if they are
+    more than OUTLIER_DISTANCE_RATIO times as far away as the last place before the gap.
     most: maximum fraction of outliers.
-    least: minimum distance that both factors apply to, such as the distance of the points that the cameras see. Without
-        it, places that coincide except for a few have no size to compare with, and no outliers.
+    least: minimum of the distances to which others are compared, such as the distance of the points that the cameras
+        see. Without it, no place is an outlier if all places but a few coincide.
     """
     found = np.zeros(len(places), np.bool_)
-    first = len(places) - int(most * len(places))  # the nearest ones, which cannot be outliers
+    first = len(places) - int(most * len(places))  # number of nearest places, which cannot be outliers
     if not 0 < first < len(places):
         return found
     distances = np.linalg.norm(places - (np.median(places, axis=0) if middle is None else middle), axis=1)

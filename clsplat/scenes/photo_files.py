@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of the pictures that a data set lists: under the listed or other names, in other folders, or missing."""
+"""Search for the files of listed pictures. They may have other names, be in other folders, or be missing."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from clsplat.images.reading import companions, find_images
 from clsplat.scenes.photo_names import legible, match, nearest, slashed
 
 DOWNSCALED_FOLDER_FACTORS = (2, 4, 8)
-"""Factors of the folders of downscaled pictures (images_2 and so on) that are used if their size is asked for."""
+"""Factors of the folders of downscaled pictures (images_2 and so on) that are used if their size is requested."""
 FALLBACK_FOLDER_FACTORS = range(2, 65)
 """Factors of the folders of downscaled pictures that are used if there are no other pictures."""
 MAX_MISSING_FRACTION = 0.1
-"""Maximum fraction of the pictures that may be missing by default, as users delete some, or do not copy all.
+"""Maximum fraction of the pictures that may be missing by default: users delete some, or do not copy all.
 
-If more are missing, the folder may be the wrong one.
+If more pictures are missing, the folder may be the wrong one.
 """
 
 
@@ -35,13 +35,14 @@ def find_pictures(
     """Find the file of each listed picture; None for pictures that are missing and left out.
 
     listed: names in the data set.
-    exact: the files of these names, None for a file that must not be opened.
-    folder: searched for pictures of other names (`photo_names`).
+    exact: the files with these names, None for a file that must not be opened.
+    folder: folder that is searched for pictures with other names (`photo_names`).
     listed_in: the file with the list, for messages.
-    missing: "error" leaves no picture out, "skip" any number but not all, "few" up to MAX_MISSING_FRACTION of them.
+    missing: how many pictures may be left out: "error" none, "skip" any number but not all, "few" up to
+        MAX_MISSING_FRACTION.
     present: the pictures in `folder`, if known.
-    Warns of other names and of pictures that are left out. Raises InputError that names the missing pictures and the
-    ones found instead.
+    Warns of other names and of pictures that are left out. Raises InputError that names the missing pictures and those
+    found instead.
     """
     files = [path if path is not None and is_file(path) else None for path in exact]
     lost = [index for index, path in enumerate(files) if path is None]
@@ -56,7 +57,7 @@ def find_pictures(
         if listed[index] in found.names:
             files[index] = there[found.names[listed[index]]]
     if found.how:
-        names = f"{len(found.names):,} picture(s) are there under other names than listed, and are used"
+        names = f"{len(found.names):,} picture(s) have other names than listed, and are used"
         warn(f"{listed_in}: {names}: {'; '.join(found.how)}")
     if gone := [index for index in lost if files[index] is None]:
         shown = examples(legible(str(exact[index] or listed[index])) for index in gone)
@@ -65,7 +66,7 @@ def find_pictures(
         if len(gone) > allowed:
             others = len(find_images(folder) if present is None else present)
             close = nearest(listed[gone[0]], sorted(set(free).difference(found.names.values())))
-            text += f"; of other names there is {close}" if close else f"; {others:,} others are in {folder}"
+            text += f"; similar names are {close}" if close else f"; {others:,} others are in {folder}"
             usual = next((path.parent for path in exact if path is not None), folder)
             copies = [
                 copy
@@ -73,7 +74,7 @@ def find_pictures(
                 if has_pictures(copy := usual.with_name(f"{usual.name}_{factor}"))
             ]
             text += f"; smaller ones are in {copies[0]}" if copies else ""
-            some = "; train and eval go on with the others by --missing skip"
+            some = "; to train and evaluate with the others, add --missing skip"
             raise InputError(text + ("" if len(gone) == len(listed) else some))
         warn(f"{text}; the other {len(listed) - len(gone):,} are used")
     return files
@@ -94,8 +95,8 @@ def called(listed: str, exact: Path | None, file: Path | None, folder: Path) -> 
 
 
 def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> dict[str, Path]:
-    """Pictures by their paths below a folder, without companions such as masks and depth maps, and without downscaled
-    copies."""
+    """Pictures without companions, such as masks and depth maps, and without downscaled copies. The keys are paths
+    relative to `folder`."""
     aside = companions(present, used, folder)
     copies = {path for path in {path.parent for path in present} if is_smaller_copy(path)}
     kept = (path for path in present if path not in aside and not copies.intersection(path.parents))
@@ -103,7 +104,7 @@ def by_name(folder: Path, present: Collection[Path], used: Sequence[Path]) -> di
 
 
 def is_smaller_copy(folder: Path) -> bool:
-    """True for images_2 and the like if images/ next to it has pictures."""
+    """True for a folder such as images_2 if images/ next to it has pictures."""
     base, _, factor = folder.name.rpartition("_")
     return factor in map(str, FALLBACK_FOLDER_FACTORS) and bool(base) and has_pictures(folder.with_name(base))
 
@@ -114,7 +115,7 @@ def has_pictures(folder: Path) -> bool:
 
 
 def or_smaller(folder: Path) -> Path:
-    """Folder itself, or its largest downscaled copy (such as images_2) if only the copy has pictures."""
+    """The folder itself, or its largest downscaled copy (such as images_2) if only copies have pictures."""
     if has_pictures(folder):
         return folder
     copies = (folder.with_name(f"{folder.name}_{factor}") for factor in FALLBACK_FOLDER_FACTORS)

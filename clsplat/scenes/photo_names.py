@@ -39,7 +39,7 @@ SOURCE_EXTENSIONS = (
 """Extensions of photographs before conversion."""
 NAME_ENCODINGS = ("utf-8", "gb18030", "cp932", "cp949", "big5", "cp1252", "cp1250", "cp1251", "cp1253", "cp1254",
                   "cp1255", "cp1256", "cp437", "cp850", "cp866", "mac_roman", "latin-1")  # fmt: skip
-"""Encodings of names, in the order tried."""
+"""Encodings of names, in the order in which they are tried."""
 DRIVE_PREFIX = re.compile(r"\A[A-Za-z]:(?=/)")
 FOLDER_STEP_LABEL = "folder"
 """Prefix of the labels of the steps that ignore folders."""
@@ -50,8 +50,8 @@ Key = Callable[[str], str]
 class Found:
     """Result of `match`.
 
-    names: present names by listed name.
-    how: the ignored difference of each step that found names, with its first example.
+    names: present name for each listed name.
+    how: for each step that found names, the difference that it ignores and a first example.
     """
 
     names: dict[str, str]
@@ -61,12 +61,12 @@ class Found:
 def match(listed: Sequence[str], present: Iterable[str], settled: Iterable[str] = ()) -> Found:
     """Match listed names to present names, both with folders, if the match is unambiguous.
 
-    Each step is looser than the one before it and takes the remaining names. A listed name matches a present one if
-    neither resembles another remaining name.
+    Matching has several steps, each for the names that remain and looser than the step before. In a step, a listed name
+    matches a present one if each is the only match of the other.
 
-    A change of folder applies to all pictures of a listed folder or to none. If one of them is found in place, or a
-    name of `settled` is in that folder, the others are missing. Names with surrogates (`os.fsdecode`) are bytes of an
-    unknown encoding.
+    A change of folder applies to all pictures of a listed folder or to none. If one of these pictures is found in that
+    folder, or a name of `settled` is in it, no picture of the folder is searched elsewhere. Surrogates in names
+    (`os.fsdecode`) stand for bytes of an unknown encoding.
     """
     there = dict.fromkeys(present)
     found = {name: name for name in listed if name in there}
@@ -114,7 +114,7 @@ def slashed(name: str) -> str:
 
 
 def legible(name: str) -> str:
-    """Name as printable text. Bytes of an unknown encoding are decoded by the first that makes them printable."""
+    """Name as printable text. Bytes of an unknown encoding are decoded with the first encoding that gives such text."""
     return next((text for text in _decoded(name) if text.isprintable()), ascii(name))
 
 
@@ -142,9 +142,9 @@ def _decoded(name: str) -> Iterator[str]:
 
 
 def _steps(names: Iterable[str]) -> Iterator[tuple[str, Key]]:
-    """Steps of `match`: a label for the ignored difference, and its key.
+    """Steps of `match`: a label for the ignored difference, and the function that makes a name's key.
 
-    Names with equal keys match. An empty key matches no other.
+    Names with equal keys match. An empty key matches none.
     """
     yield "slashes or Unicode form", slashed
     for encoding in NAME_ENCODINGS[1:]:
@@ -152,7 +152,7 @@ def _steps(names: Iterable[str]) -> Iterator[tuple[str, Key]]:
     yield "case", _lower
     yield "extension", _without_extension
     deepest = max((slashed(name).count("/") for name in names), default=0)
-    for count in range(deepest, 0, -1):  # the longest ending that fits comes first
+    for count in range(deepest, 0, -1):  # longer endings come first
         yield FOLDER_STEP_LABEL, partial(_ending, count, _lower)
         yield f"{FOLDER_STEP_LABEL} and extension", partial(_ending, count, _without_extension)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds in files: PLY, LAS and LAZ, and the names of clouds that programs store next to a scene."""
+"""Reading of point clouds (PLY, LAS and LAZ), and names of the clouds that programs store with a scene."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ PLY_COLOUR_PROPERTIES = (
     ("scalar_red", "scalar_green", "scalar_blue"),
     ("color_red", "color_green", "color_blue"),
 )
-"""Names of a PLY's colour properties, in any case. The first set that is present is used."""
+"""Possible names of a PLY's colour properties, in any case. The first set that is present is used."""
 UNCOLOURED_GREY = 0.5
 """Grey value of points from a file without colours."""
 LAS_EXTENSIONS = (".las", ".laz")
 START_CLOUD_NAMES = ("points3d.ply", "sparse_pc.ply", "init.ply", "point_cloud.ply", "pointcloud.ply", "points.ply")
-"""Names of clouds that programs start from by default, in lower case, in order of precedence.
+"""Names of clouds from which programs start training by default, in lower case, in order of precedence.
 
-They are used by the 3DGS authors, nerfstudio, Brush and others.
+The programs are those of the 3DGS authors, nerfstudio, Brush and others.
 """
 
 
@@ -57,8 +57,8 @@ def clouds_beside(folders: Iterable[Path]) -> list[Path]:
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read a PLY (ascii or binary, points or Gaussians), LAS or LAZ. Raises InputError for other files and for no
-    points."""
+    """Read a PLY (ascii or binary, points or Gaussians), LAS or LAZ. Raises InputError for other files and for files
+    without points."""
     if path.suffix.lower() in LAS_EXTENSIONS:
         cloud = _read_las(path)
     else:
@@ -77,7 +77,7 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def of_one_colour(colors: Float32) -> bool:
-    """True if several points (N, 3) all have the same colour, as after reading a file without colours."""
+    """True if there are several points, all with the same colour (N, 3), as after reading a file without colours."""
     return len(colors) > 1 and bool((colors == colors[0]).all())
 
 
@@ -88,7 +88,7 @@ def point_colours(levels: NDArray[Any]) -> Float32:
 
 
 def count_points(path: Path) -> int:
-    """Number of points in a PLY's header. Raises InputError."""
+    """Number of points according to a PLY's header. Raises InputError."""
     with open_input(path, "a PLY of points") as file:
         return ply_file.read_header(file, path).vertex.count
 
@@ -103,7 +103,7 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
         header = ply_file.read_header(file, path)
         vertex = header.elements[0] if header.elements else None
         if vertex is None or vertex.name != "vertex" or vertex.has_list:
-            raise InputError(f"{path}: begins with no plain vertices, expected a point cloud")
+            raise InputError(f"{path}: does not begin with vertices without list properties, expected a point cloud")
         kinds = dict(vertex.properties)
         if missing := [name for name in "xyz" if name not in kinds]:
             raise InputError(f"{path}: PLY has no property {missing[0]!r}, expected x, y and z")
@@ -117,7 +117,7 @@ def read_point_cloud(path: Path) -> tuple[Float64, Float32]:
             points = np.stack([block[name] for name in "xyz"], axis=1).astype(np.float64)
             levels: NDArray[Any] = np.full(points.shape, UNCOLOURED_GREY, np.float32)
             if coloured:
-                with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, left out below
+                with np.errstate(over="ignore"):  # a double beyond float32 becomes inf, and is left out below
                     levels = np.stack([block[name] for name in coloured], axis=1).astype(np.float32)
             parts.append((points, levels))
     points, levels = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -136,11 +136,11 @@ def _read_las(path: Path) -> Cloud:
     """Read a LAS or LAZ with laspy."""
     with open_input(path, "a cloud of points") as file:
         if file.read(4) != b"LASF":
-            raise InputError(f"{path}: is not a LAS or LAZ, expected one by its name")
+            raise InputError(f"{path}: is not a LAS or LAZ file, although it has such an extension")
     try:
         import laspy
     except ImportError:
-        raise InputError(f"{path}: LAS needs laspy, expected it installed: pip install 'clsplat[las]'") from None
+        raise InputError(f"{path}: reading LAS needs laspy; install it: pip install 'clsplat[las]'") from None
     try:
         las: Any = laspy.read(path)
         points = np.stack([np.asarray(las[axis], np.float64) for axis in "xyz"], axis=1)
@@ -165,5 +165,5 @@ def _warn_of_left_out(path: Path, good: NDArray[np.bool_]) -> None:
     bad = int(np.count_nonzero(~good))
     found = f"{path}: {bad:,} of {len(good):,} points have a position or colour that is not finite"
     if bad == len(good):
-        raise InputError(f"{found}, expected some that are")
+        raise InputError(f"{found}, expected some finite points")
     warn(f"{found}, and are left out")

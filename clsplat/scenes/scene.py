@@ -31,19 +31,19 @@ Split = Literal["train", "test"]
 T = TypeVar("T")
 
 FAR_ORIGIN_RATIO = 64.0
-"""Distance of a scene from the world's origin, in scene sizes, from which its means are relative to its middle.
+"""Distance of a scene from the world's origin, in scene sizes, from which means are stored relative to its middle.
 
-At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pixel for a scene 2600 pixels wide.
+At this distance float32 resolves 64 * 2^-24 of the scene's size, or 1 % of a pixel if the scene is 2600 pixels wide.
 """
 MIN_POINTS_IN_FAR_VIEW, MIN_POINT_SPREAD_IN_FAR_VIEW = 10, 0.08
-"""Minimum number of points in the picture of a distant camera, and their standard deviation as a fraction of a side.
+"""Minimum number of points in the picture of a distant camera that is no outlier, and their minimum standard deviation
+as a fraction of the width or height.
 
-With at least so many points, spread at least so far, the picture shows the same as the others from further away, or
-another reconstructed part. Points all over the picture have a standard deviation of 0.29. The picture of an outlier
-shows no points, or has every point in one pixel.
+Such a picture shows the scene from further away, or another reconstructed part of it. Points all over the picture have
+a standard deviation of 0.29. The picture of an outlier shows no points, or has every point in one pixel.
 """
 MIN_FAR_GROUP_NEIGHBOURS = 2
-"""Minimum number of other cameras near a distant one that form a group with it. Wrong poses are scattered."""
+"""Minimum number of other cameras near a distant camera that form a group with it. Wrong poses are scattered."""
 SAME_PLACE_TOLERANCE = 1e-12
 """Distance between cameras, relative to their largest coordinate, up to which they count as in the same place."""
 
@@ -53,13 +53,13 @@ class View:
     """A photograph and its camera.
 
     name: name in the data set, with extension, unique in the scene.
-    camera: its camera at the working size.
-    path: the file.
+    camera: the photograph's camera at the working size.
+    path: the photograph's file.
     split: "train" or "test".
     lens: the lens that took the file, at the file's size.
     upright: True if the camera belongs to the picture rotated by its EXIF orientation, not as stored.
-    mask: marks the pixels that count, None for all.
-    depth_file: the depth map that the data set names.
+    mask: mask of the pixels that count, None if all count.
+    depth_file: the depth map that the data set names, if any.
     depth: known depths for training.
     """
 
@@ -76,17 +76,17 @@ class View:
     def load(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read the undistorted pixels at the camera's size: float32 (H, W, 3), or (H, W, 4) with straight alpha.
 
-        width, height: another size.
-        Reads the file each time. Pixels that a mask leaves out are black, or transparent. Raises InputError if the file
-        does not decode or has changed its size.
+        width, height: size to use instead.
+        Reads the file in every call. Pixels that a mask leaves out are black or transparent. Raises InputError if the
+        file does not decode or its size has changed.
         """
         image = self.load_masked(width, height)
         return image if image.shape[2] < 5 else np.ascontiguousarray(image[:, :, : 3 + _has_alpha(image)])
 
     def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:
-        """Read like `load`. If pixels are left out, a fifth channel is 1 for pixels that count, else 0.
+        """Read like `load`. If pixels are left out, there is a fifth channel: 1 for pixels that count, else 0.
 
-        A pixel counts if at least half of its area counts. Its colour is the mean over that part of its area only.
+        A pixel counts if at least half of its area counts. Its colour is the mean over the part that counts.
         """
         width, height = width or self.camera.width, height or self.camera.height
         image = self._read()
@@ -122,8 +122,8 @@ class View:
     def _read(self) -> Float32:
         image = read_image(self.path, orient=self.upright)
         if image.shape[:2] != (self.lens.height, self.lens.width):
-            actual = f"{image.shape[1]} x {image.shape[0]}"
-            raise InputError(f"{self.path}: is {actual} pixels now, expected {self.lens.width} x {self.lens.height}")
+            actual = f"{image.shape[1]}x{image.shape[0]}"
+            raise InputError(f"{self.path}: now has {actual} pixels, expected {self.lens.width}x{self.lens.height}")
         return image
 
 
@@ -135,12 +135,12 @@ class Scene:
     views: sorted by name.
     points: (N, 3) float64, world coordinates; N may be 0.
     point_colors: (N, 3) float32 in [0, 1].
-    bounds: corners (low, high), each (3,) float64, world units, of the box for random initial points.
-    warnings: one line each, for the user.
-    start: how the points were chosen (`scenes.start`).
-    colourless: (N,), True for points that take their colours from the photographs; None if no point does.
-    source: the folder that the scene was read from.
-    depth_use: how known depths were chosen (`scenes.depth_sources`).
+    bounds: corners (low, high) of the box for random initial points, each (3,) float64, in world units.
+    warnings: messages for the user, one line each.
+    start: choice of the initial points (`scenes.start`).
+    colourless: (N,), True for points that get their colours from photographs; None if no point does.
+    source: the folder from which the scene was read.
+    depth_use: choice of known depths (`scenes.depth_sources`).
     clouds: point files next to the scene that are not used.
     missing: names of listed pictures that do not exist.
     """
@@ -160,12 +160,12 @@ class Scene:
 
     @cached_property
     def train_views(self) -> list[View]:
-        """Training views, by name."""
+        """Training views, sorted by name."""
         return [view for view in self.views if view.split == "train"]
 
     @cached_property
     def test_views(self) -> list[View]:
-        """Held-out views, by name."""
+        """Held-out views, sorted by name."""
         return [view for view in self.views if view.split == "test"]
 
     def require_training_views(self) -> list[View]:
@@ -176,10 +176,10 @@ class Scene:
         return self.train_views
 
     def check_pictures(self) -> None:
-        """Decode every picture once, so that a truncated one is reported before training. Fills `digests` and
+        """Decode every picture once, so that a truncated one is reported before training. Sets `digests` and
         `glances`.
 
-        Raises InputError for the first picture, by name, that does not decode.
+        Raises InputError for the first picture in the order of names that does not decode.
         """
         found = self._of_each(lambda view: (_digest(view), view.check()))
         self.__dict__["digests"] = {name: digest for name, (digest, _) in found.items()}
@@ -187,12 +187,12 @@ class Scene:
 
     @cached_property
     def glances(self) -> dict[str, Thumbnail]:
-        """Thumbnail of each picture, by view name. Raises InputError like `check_pictures`."""
+        """Thumbnail of each view's picture. The keys are the views' names. Raises InputError like `check_pictures`."""
         return self._of_each(View.check)
 
     @cached_property
     def digests(self) -> dict[str, str | None]:
-        """Digest of each view's file, mask and known depths, by view name."""
+        """Digest of each view's file, mask and known depths. The keys are the views' names."""
         return self._of_each(_digest)
 
     def _of_each(self, work: Callable[[View], T]) -> dict[str, T]:
@@ -204,10 +204,10 @@ class Scene:
 
     @cached_property
     def origin(self) -> Float64:
-        """Origin (3,) in the world for the means of a model of this scene: 0 unless the scene is far from the world's
-        origin.
+        """Point (3,) in the world to which the means of a model of this scene are relative.
 
-        Otherwise it is the middle of the cameras without outliers, rounded to a multiple of about the scene's size.
+        It is 0 unless the scene is far from the world's origin. Then it is the middle of the cameras without outliers,
+        rounded to a multiple of about the scene's size.
         """
         centres = np.stack([view.camera.position for view in self.views if view.name not in self.stray_cameras])
         middle = centres.mean(axis=0)
@@ -223,8 +223,8 @@ class Scene:
     def stray_cameras(self) -> frozenset[str]:
         """Names of the views whose cameras are outliers, far from the other cameras and from the points.
 
-        A view is not an outlier if points spread over a fair part of its picture, or if it is in a group of nearby
-        cameras.
+        A view is no outlier if its picture shows points over a fair part. In scenes without points, it is no outlier if
+        other cameras are near it.
         """
         centres = np.stack([view.camera.position for view in self.views])
         middle = np.median(centres, axis=0)
@@ -235,8 +235,8 @@ class Scene:
 
     @cached_property
     def spread(self) -> tuple[Float64, float, float]:
-        """Middle of the training cameras without outliers, distance of the farthest from it, and their largest
-        coordinate."""
+        """Middle of the training cameras without outliers, distance of the farthest camera from it, and largest
+        coordinate of the cameras."""
         near = [view for view in self.train_views if view.name not in self.stray_cameras]
         centres = np.stack([view.camera.position for view in near or self.train_views or self.views])
         middle: Float64 = centres.mean(axis=0)
@@ -252,8 +252,8 @@ class Scene:
     def extent(self) -> float:
         """The authors' cameras_extent in world units, which scales the learning rates.
 
-        It is 1.1 times the distance of the farthest training camera from their mean, without outliers. If all cameras
-        are in one place, it is the median distance of the points from there, or 1 without points.
+        It is 1.1 times the distance of the farthest training camera from the cameras' mean, without outliers. If all
+        cameras are in one place, it is the median distance of the points from there, or 1 without points.
         """
         middle, spread, _ = self.spread
         if not self.in_one_place:
@@ -269,8 +269,8 @@ class Scene:
 def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:
     """True if a distant camera is part of the capture, for example in another room.
 
-    Its picture must show points over a fair part of it. Without points, MIN_FAR_GROUP_NEIGHBOURS other cameras must be
-    nearer to it than half of all cameras are to their middle.
+    The picture must show points over a fair part of its area. Without points, at least MIN_FAR_GROUP_NEIGHBOURS other
+    cameras must be nearer to the camera than the median distance of all cameras from their middle.
     """
     if len(points):
         rows, columns, _ = pixels_of(points, view.camera, view.lens)

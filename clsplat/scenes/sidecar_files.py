@@ -30,10 +30,10 @@ class Named(Protocol):
 
 
 def bases_of(images: Sequence[Named]) -> list[Path]:
-    """Base folders of the photographs. Sidecar folders are searched inside them and next to them.
+    """Folders that contain all photographs. Sidecar folders are searched inside these folders and next to them.
 
-    The last is the folder that the names are relative to. A first folder shared by all names comes before it, as in
-    transforms.json. Each base contains all photographs.
+    The last folder of the list is the one that the photographs' names are relative to. If all names begin with the
+    same sub-folder, as is usual in transforms.json, the list begins with this sub-folder.
     """
     top = images[0].path
     for _ in PurePosixPath(images[0].name).parts:
@@ -44,7 +44,7 @@ def bases_of(images: Sequence[Named]) -> list[Path]:
 
 
 def beside(base: Path, names: Sequence[str]) -> Path | None:
-    """Folder with one of these names, in any case, inside a photograph folder or next to it; possibly outside the
+    """Folder inside the folder `base` or next to it that has one of these names, in any case. It may lie outside the
     scene."""
     return next((at for parent in (base, base.parent) if (at := inside(parent, names)) is not None), None)
 
@@ -74,17 +74,17 @@ def owned(
 ) -> dict[str, Path]:
     """Match the files of a folder to photographs.
 
-    known: photographs by the names that their files may have, without the file's extension.
-    what: word for such a file, for messages.
+    known: photograph for each name that its sidecar file may have, without the file's extension.
+    what: word for a sidecar file, for messages.
     example: name of a photograph, for messages.
     without: files to skip.
     strict: raise InputError for a file that fits no photograph; otherwise it is skipped.
-    numbered: match mask_0007.png to image_0007.png if no name fits otherwise, and files and photographs are one series
-        each.
+    numbered: match mask_0007.png to image_0007.png if no other match is found. The names of all files must differ only
+        in their numbers, and so must those of all photographs.
 
-    Exact names are matched first. The remaining ones may differ in case, then in the photograph's extension, then in
-    folders, if exactly one photograph fits. Raises InputError for two files of one photograph; if not strict, only for
-    exact names.
+    Exact names are matched first. The remaining files may differ from a name in case, then in the photograph's
+    extension, then in folders, if exactly one photograph fits. Raises InputError for two files of one photograph. If
+    not `strict`, it does so only if both names are exact.
     """
     found: dict[str, Path] = {}
     passed = {path.resolve() for path in without}
@@ -118,8 +118,8 @@ def owned(
 
 
 def _series(names: Iterable[str]) -> dict[int, str]:
-    """Names by the number at their end, before extensions; empty unless two or more names differ in the number
-    alone."""
+    """Name for each number at the end of a name, before extensions. Empty unless there are several names, which differ
+    only in this number."""
     texts, numbers = set(), {}
     names = sorted(names)
     for name in names:
@@ -141,11 +141,11 @@ _NAME_KEYS: tuple[Callable[[str], str], ...] = (
     lambda name: _INNER_EXTENSION.sub("", _loose(name)),
     lambda name: _INNER_EXTENSION.sub("", _loose(name)).rpartition("/")[2],
 )
-"""Keys of a name for successive steps, from the whole name to its last part without a photograph's extension."""
+"""Functions that reduce names to keys for the successive steps of matching, each ignoring more of the name."""
 
 
 def _unambiguous(known: Mapping[str, str], step: Callable[[str], str]) -> dict[str, str]:
-    """Photographs by the step's key of their files' possible names, for keys that belong to one photograph."""
+    """Photograph for each key that `step` makes of the names in `known`, without keys that fit several photographs."""
     if step is str:
         return dict(known)
     owners: dict[str, set[str]] = {}

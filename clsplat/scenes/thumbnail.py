@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Thumbnails of photographs, which findings about the scene are based on (`clsplat.scenes.analysis`)."""
+"""Thumbnails of photographs. Findings about the scene are based on them (`clsplat.scenes.analysis`)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def glance_at(image: Float32) -> Thumbnail:
 
 
 def reduced(image: Float32, side: int) -> Float32:
-    """Downscale by means over whole squares of pixels, so that the longer side has at most `side` pixels."""
+    """Downscale by an integer factor, by averaging squares of pixels. The longer side gets at most `side` pixels."""
     factor = -(-max(image.shape[:2]) // side)
     if factor == 1:
         return image
@@ -59,8 +59,8 @@ def sharpness_of(grey: NDArray[np.float32]) -> float:
     """Mean gradient of a grey picture (H, W), divided by the mean gradient of a copy SHARPNESS_SCALE_RATIO times
     smaller.
 
-    1 / SHARPNESS_SCALE_RATIO for a smooth picture, and larger for a sharper one, nearly independent of content and
-    brightness. 1 for a featureless picture.
+    It is 1 / SHARPNESS_SCALE_RATIO for a smooth picture and larger for a sharper picture, nearly independent of content
+    and brightness. It is 1 for a featureless picture.
     """
     coarse = reduced(grey[:, :, None], max(max(grey.shape) // SHARPNESS_SCALE_RATIO, 1))[:, :, 0]
     if min(coarse.shape) < 2:

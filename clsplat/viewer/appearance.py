@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Appearance of a model on a page: edits of the Gaussians, display channel and colour map. No OpenCL, no viser."""
+"""Appearance of a model on a page: edits of the Gaussians, display channel and colour map. Uses no OpenCL or viser."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Box = tuple[float, float, float, float, float, float]
 """Smallest x, y, z in the world, then largest x, y, z."""
 
 MAX_EDITED_OPACITY = 0.999
-"""Upper limit of an opacity that was raised: the logit of 1 is infinite."""
+"""Upper limit of a raised opacity, as the logit of 1 is infinite."""
 SIZE_FACTOR_RANGE = (0.05, 2.0)
 OPACITY_FACTOR_RANGE = (0.0, 3.0)
 VIRIDIS_RGB = np.array(
@@ -42,8 +42,8 @@ class Look:
 
     mode: the displayed channel.
     degree: highest SH degree used.
-    size, opacity: factors on scales and opacities.
-    crop: box outside of which Gaussians are hidden; None without one.
+    size, opacity: factors of all scales and opacities.
+    crop: box outside of which Gaussians are hidden; None for no box.
     """
 
     mode: Mode = "colour"
@@ -53,7 +53,7 @@ class Look:
     crop: Box | None = None
 
     def changes(self, degree: int) -> Look | None:
-        """The settings that edit a model of this SH degree, without the mode; None if they change nothing."""
+        """Settings that edit a model of this SH degree, with the default mode; None if they do not change the model."""
         asked = replace(self, mode="colour", degree=min(self.degree, degree))
         return None if asked == Look(degree=degree) else asked
 
@@ -107,20 +107,20 @@ def depth_picture(depth: Float32, alpha: Float32) -> tuple[Image, str]:
     """Depth as a picture (H, W, 3) uint8, and a text with its range. Near is bright, transparent is black."""
     seen = alpha > 0.5
     if not seen.any():
-        return np.zeros((*depth.shape, 3), np.uint8), "nothing is seen"
+        return np.zeros((*depth.shape, 3), np.uint8), "nothing is visible"
     near, far = (float(value) for value in np.quantile(depth[seen], [0.02, 0.98]))
     shade = (far - depth.astype(np.float64)) / ((far - near) or 1.0)
     return _shaded(shade, alpha), f"depth {near:.3g} (bright) to {far:.3g}"
 
 
 def count_picture(count: NDArray[np.int32]) -> tuple[Image, str]:
-    """Number of Gaussians a pixel as a picture (H, W, 3) uint8, bright for many, and a text with its range."""
+    """Number of Gaussians per pixel as a picture (H, W, 3) uint8, bright for many, and a text with its range."""
     most = max(float(np.quantile(count, 0.995)), 1.0)
-    return _shaded(count / most, None), f"0 to {most:,.0f} Gaussians a pixel (bright), {int(count.max()):,} at most"
+    return _shaded(count / most, None), f"0 to {most:,.0f} Gaussians per pixel (bright), maximum {int(count.max()):,}"
 
 
 def _shaded(shade: NDArray[np.float64], alpha: Float32 | None) -> Image:
-    """Map values from 0 to 1 to the colour map, scaled by alpha if given."""
+    """Convert values in [0, 1] to colours of the colour map, multiplied by alpha if there is one."""
     at = np.clip(np.nan_to_num(shade), 0, 1)
     stops = np.linspace(0, 1, len(VIRIDIS_RGB))
     table = np.stack([np.interp(np.linspace(0, 1, 256), stops, column) for column in VIRIDIS_RGB.T], axis=1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models that the viewer shows: a fixed one, or one in training. `clsplat.rendering.rasterizer` renders them.
 
-Only the thread that created a model may ask it for pictures, because a device has one queue.
+Only the thread that created a model may render its pictures, because a device has one queue.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from clsplat.viewer.appearance import Image, Look, alpha_picture, colour_picture
 from clsplat.viewer.pose import MAX_PAGE_PICTURE_PIXELS
 
 MAX_MODELS_ON_DEVICE = 2
-"""Number of models kept on the device: the file's, and one edited by a look."""
+"""Maximum number of models on the device: the model of the file, and one that is edited by a look."""
 CHANNEL_FLOATS_PER_GAUSSIAN = 3
-"""Floats per Gaussian that the channels need at least, in addition to colour."""
+"""Minimum number of floats per Gaussian that the channels need besides colour."""
 
 
 def draft(config: RasterizerConfig) -> RasterizerConfig:
-    """Rasterizer settings for pictures in motion: approximate where that is quick, with the same SH settings."""
+    """Rasterizer settings for pictures in motion: approximations that save time, but the same SH settings."""
     fast = RASTERIZER_PRESETS["fast"]
     return replace(
         config,
@@ -41,10 +41,10 @@ def draft(config: RasterizerConfig) -> RasterizerConfig:
 
 
 class HeldModel:
-    """Model from a file. The device holds it unchanged, and edited by the last look."""
+    """Model from a file. The device stores it unchanged and as edited by the last look."""
 
     version = 0
-    """Version number of the model: it never changes."""
+    """Version number of the model. It is constant, as the model does not change."""
 
     def __init__(
         self,
@@ -65,12 +65,12 @@ class HeldModel:
         return min(MAX_PAGE_PICTURE_PIXELS, frame_pixels(self.device, CHANNEL_FLOATS_PER_GAUSSIAN))
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
-        """Render a picture (H, W, 3) uint8, with a remark on it. Raises CapacityError and InputError."""
+        """Render a picture (H, W, 3) uint8. Returns it with a remark. Raises CapacityError and InputError."""
         key = look.changes(self.gaussians.sh_degree)
         try:
             return self._picture(key, camera, look, exact=exact)
         except CapacityError:
-            self._held = {key: (self._held[key][0], {})}  # drops all other models to free memory
+            self._held = {key: (self._held[key][0], {})}  # frees the memory of all other models
             return self._picture(key, camera, look, exact=exact)
 
     def _picture(self, key: Look | None, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:
@@ -87,7 +87,7 @@ class HeldModel:
 
 
 class LiveModel:
-    """Model in training, shown between two steps. It uses the trainer's memory without disturbing a step's data."""
+    """Model in training, shown between two steps. Rendering uses the trainer's memory but keeps the step's data."""
 
     def __init__(self, trainer: Trainer, background: Sequence[float]) -> None:
         self.trainer, self.background = trainer, background
@@ -107,8 +107,8 @@ class LiveModel:
         return max(view.camera.width * view.camera.height for view in self.trainer.views)
 
     def picture(self, camera: Camera, look: Look, *, exact: bool) -> tuple[Image, str]:  # noqa: ARG002  # always exact
-        """Render a picture, with a remark on it. Raises InputError if a training with limited memory leaves too
-        little."""
+        """Render a picture. Returns it with a remark. Raises InputError if a training with limited memory leaves too
+        little memory."""
         trainer = self.trainer
         trainer.settle()
         degree = round(trainer.parameters.coefficients**0.5) - 1
@@ -116,7 +116,7 @@ class LiveModel:
         if (key is not None or look.mode in ("depth", "count")) and (
             trainer.device.memory.limit is not None or any(trainer.plan.pieces)
         ):
-            raise InputError("this training has just the memory that it needs: only colour and alpha can be shown")
+            raise InputError("the training leaves no memory for this: only unedited colour and alpha can be shown")
         if key is None:
             local = trainer.local(camera)
             return render_picture(self._renderer, trainer.parameters, local, look, self.background, self.space)
@@ -137,9 +137,9 @@ def render_picture(
     background: Sequence[float],
     space: str,
 ) -> tuple[Image, str]:
-    """Render a picture and its remark, of a model on the host or on the device."""
+    """Render a picture of a model on the host or on the device. Returns it with a remark."""
     if isinstance(model, Gaussians) and not len(model):
-        raise InputError("nothing of the model is left: the crop box holds no Gaussian")
+        raise InputError("nothing remains of the model: the crop box contains no Gaussian")
     if look.mode in ("depth", "count"):
         frame, channels = renderer.render_channels(model, camera, background=background, contiguous=False)
         if look.mode == "depth":

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page of the viewer: its controls and their actions, by viser. `appearance` defines their meaning."""
+"""One page of the viewer: its controls and their actions, made with viser. `appearance` applies the settings."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ DEFAULT_PICTURE_SIZE_PX = (1280, 720)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Data that every page starts with.
+    """Data with which every page starts.
 
-    origin: (3,), subtracted from world positions for the browser, which computes in float32.
+    origin: (3,), point that is subtracted from world positions for the browser, which computes in float32.
     box: two corners (3,), the range of the crop sliders.
     degree: the model's SH degree.
     """
@@ -69,11 +69,11 @@ class World:
 
 
 COARSE_PICTURE_REMARK = "coarse"
-"""Remark on a picture that is not exact: in motion, or during refinement."""
+"""Remark on a picture that is not exact, because the camera moves or refinement is in progress."""
 
 
 class ViserPage:
-    """One viewer's page with its controls. The device's thread calls the methods that render."""
+    """One viewer's page with its controls. The thread that owns the device calls the methods that render."""
 
     def __init__(self, client: Any, viewing: Viewing, world: World, paths: Path | None) -> None:
         self.client, self.viewing, self.world, self.paths = client, viewing, world, paths
@@ -87,7 +87,7 @@ class ViserPage:
         """Show a picture (H, W, 3) with a remark."""
         self.client.scene.set_background_image(image, format="jpeg", jpeg_quality=level.quality)
         self._shown += 1
-        if self._shown == 2:  # controls keep a browser busy, so the first picture comes before them
+        if self._shown == 2:  # controls keep a browser busy, so they are added after the first picture
             self._build()
         height, width = image.shape[:2]
         self._say(
@@ -101,7 +101,7 @@ class ViserPage:
         self._say(plain(message))
 
     def _build(self) -> None:
-        """Make the controls, unless they exist."""
+        """Create the controls if they do not exist yet."""
         if self._status is not None:
             return
         gui, scene = self.client.gui, self.client.scene
@@ -146,15 +146,15 @@ class ViserPage:
 
     def _add_up(self, gui: Any) -> None:
         up = gui.add_dropdown(
-            "Up", UP_CHOICES, initial_value=UP_CHOICES[0], hint="What is up while the camera goes around."
+            "Up", UP_CHOICES, initial_value=UP_CHOICES[0], hint="Direction that stays up when the camera orbits."
         )
-        roll = gui.add_slider("Roll", -180.0, 180.0, 1.0, 0.0, hint="Degrees clockwise, about where the camera looks.")
+        roll = gui.add_slider("Roll", -180.0, 180.0, 1.0, 0.0, hint="Degrees clockwise about the viewing direction.")
 
         async def changed(_: Any) -> None:
             camera = self.client.camera
             axis = self.world.start.up if up.value == UP_CHOICES[0] else np.array(parse_up(up.value))
             if (leant := leaning(axis, camera.look_at - camera.position, roll.value)) is None:
-                self.client.add_notification("clsplat", "the camera looks straight up or down there")
+                self.client.add_notification("clsplat", "with this up direction, the camera looks straight up or down")
             else:
                 camera.up_direction = leant
 
@@ -174,13 +174,13 @@ class ViserPage:
             "Cameras",
             CAMERA_DISPLAY_CHOICES,
             initial_value=CAMERA_DISPLAY_CHOICES[0],
-            hint="Blue: trained on; orange: held out. A click goes there.",
+            hint="Blue: training; orange: held out. Click a camera to look through it.",
         )
 
-        def changed(_: Any) -> None:  # in one of viser's threads: reading photos takes a while
+        def changed(_: Any) -> None:  # runs in one of viser's threads, since reading photos takes a while
             self._drawing += 1
             mine = self._drawing
-            with self._drawn:  # only the latest request is drawn to the end
+            with self._drawn:  # only the latest request draws all cameras; earlier ones stop
                 if mine == self._drawing:
                     self._clear("/cameras")
                 for index, view in enumerate(self.world.views):
@@ -232,7 +232,7 @@ class ViserPage:
         def add() -> None:
             if (pose := self.viewer.pose) is not None:
                 add_key(self.keys, pose)
-                # thin lines: the camera still stands there, and its frustum would frame the page
+                # thin lines, as the camera is still at this pose, and the frustum's lines surround the page
                 name = f"/keys/{len(self.keys) - 1}"
                 self._add_frustum(name, pose, "key", thickness=2.0, thickness_units="screen")
 
@@ -256,7 +256,7 @@ class ViserPage:
         button("Clear keys", clear)
         count = gui.add_markdown("no keys")
         apart = gui.add_number("Seconds between keys", 2.0, min=0.05, max=3600.0, step=0.05)
-        fps = gui.add_number("Frames a second", DEFAULT_VIDEO_FPS, min=1.0, max=240.0, step=1.0)
+        fps = gui.add_number("Frames per second", DEFAULT_VIDEO_FPS, min=1.0, max=240.0, step=1.0)
         loop = gui.add_checkbox("Closed loop", initial_value=False)
         width, height = self._add_size(gui)
         button("Download path", download)
@@ -294,7 +294,7 @@ class ViserPage:
         return add_side("Width", DEFAULT_PICTURE_SIZE_PX[0]), add_side("Height", DEFAULT_PICTURE_SIZE_PX[1])
 
     def screenshot(self, model: Model, size: tuple[int, int]) -> None:
-        """Send an exact picture of this size, equal to `clsplat render`'s. Raises InputError."""
+        """Send an exact picture of this size, equal to the one from `clsplat render`. Raises InputError."""
         pose = self.viewer.pose
         if pose is None:
             return
@@ -305,7 +305,7 @@ class ViserPage:
             and width * height <= 4 * MAX_PAGE_PICTURE_PIXELS
         ):
             raise InputError(
-                f"a screenshot of {width} x {height}: expected at most {4 * MAX_PAGE_PICTURE_PIXELS:,} pixels"
+                f"the screenshot has {width}x{height} pixels, expected at most {4 * MAX_PAGE_PICTURE_PIXELS:,}"
             )
         image, _ = model.picture(pose.camera(width, height), self.viewer.look, exact=True)
         self.client.send_file_download("screenshot.png", png(image), save_immediately=True)
@@ -317,7 +317,7 @@ class ViserPage:
         except ClsplatError as error:
             self.tell(str(error))
         except OSError as error:
-            self.tell(re.sub(r": '.*'$", "", str(error)))  # without this machine's paths
+            self.tell(re.sub(r": '.*'$", "", str(error)))  # without paths of this machine
 
 
 def png(image: Image) -> bytes:
@@ -329,7 +329,7 @@ def png(image: Image) -> bytes:
 
 @cache
 def thumbnail(view: View) -> Image | None:
-    """Small picture (H, W, 3) of a photograph, red and blue where its masks act; None if the file cannot be read."""
+    """Small picture (H, W, 3) of a photograph, with masked areas in red and blue; None if the file cannot be read."""
     camera = view.camera
     scale = min(PAGE_PHOTO_SIDE_PX / max(camera.width, camera.height), 1.0)
     try:

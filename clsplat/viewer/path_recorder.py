@@ -21,7 +21,7 @@ MAX_PATH_FILES = 10_000
 
 
 class KeyFrame(TypedDict):
-    """A key of a camera file. fov_y: degrees."""
+    """A key frame in a camera file. fov_y: in degrees."""
 
     frame: int
     position: list[float]
@@ -30,7 +30,7 @@ class KeyFrame(TypedDict):
 
 
 class CameraFileHead(TypedDict):
-    """Head of a camera file. loop_frames: frames until the path is at its first key again, if it returns there."""
+    """Head of a camera file. loop_frames: number of frames until a closed path is back at its first key."""
 
     clsplat_cameras: int
     width: int
@@ -62,18 +62,18 @@ def path_document(
 ) -> str:
     """Camera file of the key frames.
 
-    size: width and height of its frames.
+    size: width and height of the frames.
     apart: seconds between keys, rounded to whole frames.
-    loop: return to the first key after the last.
-    Raises InputError without keys, and for numbers that make no path.
+    loop: return to the first key after the last one.
+    Raises InputError if there are no keys, and for numbers out of range.
     """
     width, height = size
     if not keys:
         raise InputError("no key frames are recorded yet")
     if not (1 <= width <= 1 << 15 and 1 <= height <= 1 << 15):
-        raise InputError(f"size {width} x {height}: expected 1 to {1 << 15} pixels a side")
+        raise InputError(f"the size is {width}x{height}, expected 1 to {1 << 15} pixels per side")
     if not (math.isfinite(apart) and math.isfinite(fps) and 0 < fps <= 1000 and 0 < apart <= 3600):
-        raise InputError(f"{apart} seconds at {fps} frames a second: expected up to 3600 and up to 1000")
+        raise InputError(f"{apart} seconds at {fps} frames per second: expected at most 3600 and at most 1000")
     step = max(round(apart * fps), 1)
     head: CameraFileHead = {"clsplat_cameras": 1, "width": width, "height": height, "fps": fps}
     if loop and len(keys) > 1:
@@ -92,7 +92,7 @@ def path_document(
 
 
 def save_path(folder: Path, document: str) -> Path:
-    """Write the document to the first free name of path-001.json, path-002.json, ...: a page cannot choose a name.
+    """Write the document to the first unused name of path-001.json, path-002.json, ... A page cannot choose the name.
 
     Raises OSError, and InputError if no name is free.
     """

@@ -18,13 +18,13 @@ from clsplat.scenes.outliers import stray_cameras
 from clsplat.shots.viewpoints import COLMAP_UP, extent_of, focus_point, look_at, up_axis
 
 MAX_PAGE_PICTURE_PIXELS = 4096 * 2304
-"""Largest number of pixels of a picture on a page, whatever size the browser asks for."""
+"""Largest number of pixels of a picture on a page, whatever size the browser requests."""
 MAX_PAGE_SIDE_PX = MAX_VIDEO_SIDE_PX
-"""Largest side in pixels of a page and its pictures: a video's, which a recorded path may become."""
+"""Largest side in pixels of a page and its pictures: that of a video, since a recorded path may become one."""
 DEFAULT_FOV_Y_RADIANS = math.radians(60)
-"""Vertical field of view without a scene camera that defines one, in radians."""
+"""Vertical field of view in radians if no camera of the scene defines it."""
 MAX_START_FOV_Y_RADIANS = math.radians(120)
-"""Largest vertical field of view in radians at the start of a narrow page. A larger one adds only top and bottom."""
+"""Largest vertical field of view in radians at the start of a narrow page. More would only add top and bottom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Pose:
 
     rotation: (3, 3), world from camera (x right, y down, z forward).
     position: (3,), in the world.
-    fov: vertical field of view, radians.
+    fov: vertical field of view in radians.
     width, height: size of the page in pixels.
     """
 
@@ -44,9 +44,10 @@ class Pose:
     height: int
 
     def camera(self, width: int | None = None, height: int | None = None) -> Camera:
-        """The camera for the page's size or another, with the field of view of `angle`.
+        """Camera for the page's size or another one. `angle` defines its field of view.
 
-        It equals bit for bit the camera that a camera file stores (`path_document`), as a quaternion and degrees.
+        It has the same bits as the camera that is read from a camera file (`path_document`), which stores a quaternion
+        and degrees.
         """
         across, down = width or self.width, height or self.height
         focal = focal_length(math.radians(math.degrees(self.angle(across, down))), down)
@@ -55,10 +56,10 @@ class Pose:
         return Camera(across, down, focal, focal, across / 2, down / 2, turn, -turn @ self.position)
 
     def angle(self, width: int, height: int) -> float:
-        """Vertical field of view in radians for a picture of this size: usually the page's.
+        """Vertical field of view in radians for a picture of this size. It is usually that of the page.
 
-        On an upright page, a picture wider than the page keeps the horizontal field of view.
-        A picture wider than high has this angle as its vertical field of view.
+        On an upright page, a picture with a larger aspect ratio than the page's keeps the horizontal field of view
+        instead. The picture's aspect ratio counts as 1 if it is larger.
         """
         page, picture = self.width / self.height, min(width / height, 1.0)
         return self.fov if page >= picture else 2 * math.atan(math.tan(0.5 * self.fov) * page / picture)
@@ -76,12 +77,12 @@ def read_pose(
     size: tuple[int, int],
     origin: Float64,
 ) -> Pose | None:
-    """Check a pose that a browser sent. None for values that no camera can have: a browser may send anything.
+    """Check a pose that a browser sent, as it may send anything. Returns None for values that no camera can have.
 
     wxyz: quaternion of the rotation from the camera's axes (COLMAP's) to the world's.
-    position: relative to `origin` (3,).
-    fov: vertical field of view, radians.
-    size: width and height.
+    position: camera position relative to `origin` (3,).
+    fov: vertical field of view in radians.
+    size: width and height of the page in pixels.
     """
     try:
         turn, place = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
@@ -102,7 +103,7 @@ def read_pose(
 class Start:
     """Start of a page: camera position, orbit centre and up direction in the world.
 
-    aspect: width / height of the content to be seen at the vertical field of view `fov`.
+    aspect: width / height of the picture that shall be visible, whose vertical field of view is `fov`.
     """
 
     position: Float64
@@ -114,7 +115,7 @@ class Start:
     def fov_on(self, width: int, height: int) -> float:
         """Vertical field of view on a page of this size.
 
-        It is the start's, or larger on a narrow page, such as an upright phone's, to show the whole width.
+        It is `fov`, or larger on a narrow page, such as that of an upright phone, to show the whole width.
         """
         return wide_enough(self.fov, self.aspect, width, height)
 
@@ -124,16 +125,16 @@ def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
 
     fov: vertical field of view of the picture.
     aspect: its width / height.
-    The result is at least `fov`, and has an upper limit for narrow pages.
+    The result is at least `fov`, and at most MAX_START_FOV_Y_RADIANS if `fov` is smaller.
     """
     more = aspect * height / max(width, 1)
     return max(fov, min(2 * math.atan(math.tan(0.5 * fov) * more), MAX_START_FOV_Y_RADIANS)) if more > 1 else fov
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
-    """Start at the first camera that is no outlier, orbiting the cameras' common focus point.
+    """Start at the first camera that is no outlier. It orbits a point at the depth of the cameras' common focus.
 
-    Without cameras: in front of the points (N, 3), y down, looking along z as in a COLMAP scene.
+    Without cameras, the start is in front of the points (N, 3), with y down, looking along z as in a COLMAP scene.
     All vectors are in world coordinates.
     """
     if cameras:
@@ -155,9 +156,10 @@ def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
 
 
 def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
-    """Up direction (3,), of unit length, for a camera that looks `ahead` and is rolled clockwise as seen from behind.
+    """Up direction (3,), of unit length, for a camera that looks `ahead` and is rolled clockwise by `degrees`.
 
-    It is `up` rotated about the viewing direction. None for a camera that looks along `up`.
+    It is `up` rotated about the viewing direction. Clockwise is as seen from behind. None for a camera that looks along
+    `up`.
     """
     length = float(np.linalg.norm(ahead) * np.linalg.norm(up))
     if not float(np.linalg.norm(np.cross(ahead, up))) > 1e-3 * length:
@@ -167,12 +169,12 @@ def leaning(up: Float64, ahead: Float64, degrees: float) -> Float64 | None:
 
 
 def looking(start: Start, size: tuple[int, int]) -> Pose:
-    """Pose of the start on a page of this size."""
+    """Pose at the start of a page of this size."""
     rotation, _ = look_at(start.position, start.target, start.up)
     return Pose(rotation.T, start.position, start.fov_on(*size), *size)
 
 
 def fitted(width: int, height: int, scale: float, most: float = MAX_PAGE_PICTURE_PIXELS) -> tuple[int, int]:
-    """Width and height of a picture at this scale of the page, with at most `most` pixels."""
+    """Width and height of a picture that has the page's size times `scale`, and at most `most` pixels."""
     scale = min(scale, math.sqrt(most / (width * height)))
     return max(1, round(width * scale)), max(1, round(height * scale))

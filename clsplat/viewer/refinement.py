@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refinement of a viewer's pictures: coarse in motion, exact at rest, within a fraction of a training's time.
+"""Refinement of a viewer's pictures, which are coarse in motion and exact at rest, and use a fraction of training time.
 
-No OpenCL, no viser. Times are seconds of any monotonic clock.
+This module uses neither OpenCL nor viser. Times are seconds of any monotonic clock.
 """
 
 from __future__ import annotations
@@ -10,29 +10,29 @@ import math
 from dataclasses import dataclass
 
 SETTLE_SECONDS_RANGE = (0.2, 1.0)
-"""Seconds without a change before refinement: minimum, and maximum for a slow browser whose camera moves in jumps."""
+"""Seconds without a change before refinement: minimum, and maximum, for a slow browser whose camera moves in jumps."""
 FIRST_SETTLE_SECONDS = 0.5
 """Seconds before the first refinement, while the browser gets ready to show pictures."""
 REST_INTERVAL_RATIO = 3.0
-"""A camera is at rest if it has not changed for this many of its usual intervals between changes."""
+"""A camera is at rest if it has not changed for this many times the usual interval between its changes."""
 MOTION_PICTURE_SECONDS = 0.04
-"""Time budget in seconds of a picture in motion, encoding included. The browser's own time is not included."""
+"""Time budget in seconds of a picture in motion, with encoding but without the browser's time."""
 MAX_UNPREPARED_EXACT_SECONDS = 0.6
-"""Seconds of an exact picture beyond which intermediate pictures of growing size are shown first."""
+"""If an exact picture takes more seconds than this, intermediate pictures of growing size are shown first."""
 MIN_MOTION_SCALE = 1 / 8
-"""Smallest scale relative to the page. A coarser picture would be unrecognisable."""
+"""Smallest size of a picture relative to the page. A coarser picture would be unrecognisable."""
 PAGE_JPEG_QUALITIES = (60, 95)
 """JPEG quality in motion and at rest."""
 VIEWER_TIME_FRACTIONS = (0.2, 0.05)
-"""Fractions of a training's time that pictures may take: while a viewer moves, and while all viewers are at rest."""
+"""Fractions of a training's time that pictures may take while a viewer moves, and while all viewers are at rest."""
 
 
 @dataclass(frozen=True)
 class Level:
     """The next picture to render.
 
-    scale: its size relative to the page.
-    exact: True for the last one, which is exact.
+    scale: size of the picture relative to the page.
+    exact: True for the last picture of a refinement, which is exact.
     """
 
     scale: float
@@ -47,14 +47,14 @@ class Level:
 def next_scale(scale: float, seconds: float) -> float:
     """Next scale of pictures in motion, after a picture of `scale` took `seconds`.
 
-    It approaches the time budget step by step, because some of the time does not depend on the number of pixels.
+    Scales approach the time budget step by step, because part of the time does not depend on the number of pixels.
     """
     factor = math.sqrt(MOTION_PICTURE_SECONDS / max(seconds, 1e-4))
     return min(max(scale * min(max(factor, 0.6), 1.2), MIN_MOTION_SCALE), 1.0)
 
 
 class Refinement:
-    """State of one viewer's refinement: coarse in motion, finer at rest, exact in the end."""
+    """State of one viewer's refinement. Pictures are coarse in motion, finer at rest, and exact in the end."""
 
     def __init__(self, now: float) -> None:
         self.scale = 0.25
@@ -68,11 +68,11 @@ class Refinement:
 
     @property
     def moving(self) -> bool:
-        """True if the picture shown is older than the last change."""
+        """True if the displayed picture is older than the last change."""
         return self._shown != self.changes
 
     def changed(self, now: float) -> None:
-        """Note a change of the camera or the look."""
+        """Record a change of the camera or the look."""
         apart = now - self._at
         usual = REST_INTERVAL_RATIO * apart if self.changes > 1 and apart < SETTLE_SECONDS_RANGE[1] else 0.0
         before = self._settle if self.changes > 1 else 0.0
@@ -81,7 +81,7 @@ class Refinement:
         self._at = now
 
     def due(self, now: float, model: int = 0) -> Level | None:
-        """The next picture, if its time has come.
+        """The next picture, if it is due now; else None.
 
         model: version number of the model, which changes in training.
         """
@@ -94,7 +94,7 @@ class Refinement:
         return Level(2 * self._level.scale, exact=False)
 
     def wait(self, now: float, model: int = 0) -> float | None:
-        """Seconds until a picture is due; None if none will be due without a change."""
+        """Seconds until a picture is due; None if no picture is due until something changes."""
         if self.moving:
             return 0.0
         if self._level.exact and self._model == model:
@@ -102,9 +102,9 @@ class Refinement:
         return max(0.0, self._at + self._settle - now)
 
     def shown(self, begun: int, level: Level, seconds: float, now: float, model: int = 0) -> None:
-        """Note that a picture was sent after `seconds`.
+        """Record that a picture was sent, after `seconds` of work.
 
-        begun: the number of `changes` when its rendering began.
+        begun: the value of `changes` when its rendering began.
         """
         if level.exact:
             self._exact_takes = seconds
@@ -114,7 +114,7 @@ class Refinement:
 
 
 class Share:
-    """Limiter that keeps pictures to a fraction of a training's time."""
+    """Limiter of the fraction of a training's time that pictures take."""
 
     def __init__(self, shares: tuple[float, float] = VIEWER_TIME_FRACTIONS) -> None:
         self._moving, self._still = shares
@@ -126,5 +126,5 @@ class Share:
         return now - self._end >= self._seconds * (1 - share) / share
 
     def spent(self, now: float, seconds: float) -> None:
-        """Note that a picture took `seconds` and ended at `now`."""
+        """Record that a picture took `seconds` and was finished at `now`."""
         self._end, self._seconds = now, seconds

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scheduler for all viewers on one thread: the order of pictures, and other requests. No OpenCL, no viser.
+"""Scheduler for all viewers on one thread: order of pictures, and other requests. Uses neither OpenCL nor viser.
 
 Any thread may report a viewer's changes. Only `work` renders, on the thread that owns the device.
 """
@@ -33,7 +33,7 @@ class Page(Protocol):
 class Viewer:
     """One viewer: page, refinement, look and pose.
 
-    trouble: the error message that the page showed last, empty after a picture.
+    trouble: the last error message on the page; "" after a picture was shown.
     """
 
     page: Page
@@ -46,7 +46,7 @@ class Viewer:
 class Viewing:
     """All viewers of a model.
 
-    model: None until it exists.
+    model: the model; None until it exists.
     """
 
     def __init__(self, model: Model | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
@@ -72,7 +72,7 @@ class Viewing:
             self._viewers.remove(viewer)
 
     def moved(self, viewer: Viewer, pose: Pose) -> None:
-        """Set a viewer's pose; equal poses are no change."""
+        """Set a viewer's pose. An equal pose does not count as a change."""
         with self._news:
             if not pose.same(viewer.pose):
                 if viewer.pose is not None:
@@ -81,7 +81,7 @@ class Viewing:
                 self.wake()
 
     def looks(self, viewer: Viewer, look: Look) -> None:
-        """Set a viewer's look at the model."""
+        """Set the look with which a viewer displays the model."""
         with self._news:
             if look != viewer.look:
                 viewer.look = look
@@ -89,7 +89,7 @@ class Viewing:
                 self.wake()
 
     def ask(self, viewer: Viewer, job: Callable[[Model], None]) -> None:
-        """Run a job on the device's thread. The page shows its ClsplatError or OSError."""
+        """Schedule a job for the thread that owns the device. The page shows its ClsplatError or OSError."""
         with self._news:
             self._jobs.append((viewer, job))
             self.wake()
@@ -113,9 +113,9 @@ class Viewing:
             self._is_news = False
 
     def work(self, share: Share | None = None) -> bool:
-        """Do one job, or render one picture for the viewer whose turn it is. True if there was work.
+        """Do one job, or render one picture for the viewer that has waited longest. Returns True if there was work.
 
-        share: limit on the fraction of a training's time, which must not be exceeded.
+        share: limiter of the fraction of a training's time that pictures take.
         """
         if (model := self.model) is None or not (self._viewers or self._jobs):
             return False
@@ -131,7 +131,7 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
-        """The viewer with a picture due that has waited longest, and the picture's level; None if none is due."""
+        """Viewer that has waited longest among those for whom a picture is due, and the picture's level; else None."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None
@@ -148,9 +148,8 @@ class Viewing:
         try:
             image, text = model.picture(camera, look, exact=level.exact)
             if viewer in self._viewers:
-                moved_on = (
-                    level.exact and viewer.refinement.changes != begun
-                )  # the picture is outdated: the view changed meanwhile
+                # the view may have changed meanwhile, so that the picture is outdated
+                moved_on = level.exact and viewer.refinement.changes != begun
                 viewer.page.show(image, Level(level.scale, exact=False) if moved_on else level, text)
             viewer.trouble = ""
         except ClsplatError as error:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer's server, by viser (the extra `view`): connections of viewers, and everything that they have in common.
+"""The viewer's server, made with viser (the extra `view`): connections of viewers, and everything that they share.
 
-It serves viser's own page and its web socket messages, and no path of this machine.
+It serves viser's own page and its web socket messages, but no files of this machine.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from clsplat.viewer.pose import read_pose
 from clsplat.viewer.scheduler import Viewer, Viewing
 
 LOCAL_HOST_PATTERN = r"(?i:localhost|127(\.\d+){3}|\[::1\])(:\d+)?"
-"""Pattern of host names that a server for this machine alone accepts."""
+"""Pattern of the host names that a server accepts if only this machine can reach it."""
 VISER_FAR_PLANE = 1000.0
-"""viser's own far plane, for the cameras and boxes that it draws itself."""
+"""viser's default far plane. It applies to the cameras and boxes that viser draws."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Address that the server listens at.
+    """Address at which the server listens.
 
     paths: folder for saved camera paths; None if saving is off.
     """
@@ -58,14 +58,14 @@ class Address:
         except ImportError:
             raise InputError("the viewer needs viser: pip install 'clsplat[view]'") from None
         if not 0 <= self.port <= 65535:
-            raise InputError(f"--port {self.port}: expected 0 to 65535; 0 is any that is free")
+            raise InputError(f"--port {self.port}: expected 0 to 65535; 0 takes any free port")
         if self.paths is not None and not self.paths.is_dir():
-            raise InputError(f"--paths {self.paths}: no such folder, expected one to save camera paths in")
+            raise InputError(f"--paths {self.paths}: no such folder, expected one for saved camera paths")
         try:
             addresses = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
             family, kind, protocol, _, address = addresses[0]
             with socket.socket(family, kind, protocol) as probe:
-                if os.name == "posix":  # as asyncio does; on Windows it would take over the port of another server
+                if os.name == "posix":  # like asyncio; on Windows it would take over another server's port
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 probe.listen()
@@ -73,7 +73,7 @@ class Address:
             reason = getattr(error, "strerror", None) or str(error)
             raise InputError(
                 f"--host {self.host} --port {self.port}: cannot listen there ({reason}), expected an address of this "
-                "machine and a port that no other program has; --port 0 takes any"
+                "machine and a port that no other program uses; --port 0 takes any free port"
             ) from None
 
     @property
@@ -88,9 +88,9 @@ class Address:
 
 
 class Server:
-    """Server of the pages, until closed. Raises InputError if it cannot listen.
+    """Server of the pages, which runs until `close`. Raises InputError if it cannot listen.
 
-    training: add controls to pause a training.
+    training: True to add controls that pause a training.
     """
 
     def __init__(self, viewing: Viewing, world: World, address: Address, *, training: bool = False) -> None:
@@ -98,14 +98,14 @@ class Server:
         import viser
 
         self.viewing, self.world, self.address = viewing, world, address
-        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # viewers that left
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # of viewers that have left
         with _quiet(), _guarded(address):
             self._server: Any = viser.ViserServer(host=address.host, port=address.port, label="clsplat", verbose=False)
         server = self._server
-        server.request_share_url = lambda *_, **__: None  # a page may not open a tunnel out of this machine
+        server.request_share_url = lambda *_, **__: None  # pages must not open a tunnel from this machine
         server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
         server.scene.set_up_direction(world.start.up)
-        # the scene has nothing to light: a filtered sky and shadows would slow down a browser without a GPU
+        # nothing in the scene needs light: an environment map and shadows would only slow down browsers without a GPU
         server.scene.configure_environment_map(hdri=None)
         server.scene.configure_default_lights(cast_shadow=False)
         begin, start = server.initial_camera, world.start
@@ -126,7 +126,7 @@ class Server:
             async def moved(camera: Any) -> None:
                 nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
-                # on a resized page, adapt the start's angle; a camera that the user clicked keeps its own
+                # if the page is resized, adapt the start's field of view; keep that of a camera that the user clicked
                 if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
                     fov = camera.fov = start.fov_on(*size)
                 before = size
@@ -146,7 +146,7 @@ class Server:
 
     @property
     def url(self) -> str:
-        """URL for a browser on this machine, or with the host's name if the server listens at another address."""
+        """URL for a browser: with localhost if only this machine can reach the server, else with the host's name."""
         host = self.address.host
         name = "localhost" if self.address.local else f"[{host}]" if ":" in host else host
         return f"http://{name}:{self._server.get_port()}"
@@ -184,15 +184,15 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _guarded(address: Address) -> Iterator[None]:
-    """Make servers that start inside the context refuse foreign pages, which a browser here may have open.
+    """Make servers that start inside the context refuse requests from other servers' pages in a local browser.
 
-    A nonsensical message ends its connection, with one line on standard error.
-    viser has no setting for either, but the library that it listens with has.
+    An invalid message ends its connection, with one line on standard error.
+    viser has no setting for either, but its websocket library has.
     """
     from websockets.asyncio import server
 
     usual = server.serve
-    # a logger of its own: the usual one prints tracebacks for malformed requests
+    # a separate logger, since the default one prints tracebacks for malformed requests
     log = logging.getLogger("clsplat.viewer")
     log.propagate = False
     log.addHandler(logging.NullHandler())
@@ -207,7 +207,7 @@ def _guarded(address: Address) -> Iterator[None]:
             asyncio.get_running_loop().set_exception_handler(_tell)
             try:
                 await handler(connection)
-            except Exception as error:  # noqa: BLE001  # any error that a message has caused
+            except Exception as error:  # noqa: BLE001  # a message may cause any error
                 _tell(None, {"exception": error})
                 await connection.close(1007)
 
@@ -232,15 +232,15 @@ def refused(headers: Any, *, local: bool) -> str:
     """Reason why a request is refused; '' if it is accepted.
 
     A request from another server's page is refused.
-    A server for this machine alone also refuses other host names, as after DNS rebinding.
-    Host and origin must have equal ports, but any port is accepted: a tunnel (ssh -L) may have changed it.
+    A server that only this machine can reach also refuses other host names, as after DNS rebinding.
+    Host and origin must have equal ports. Any port is accepted, since a tunnel (ssh -L) may change it.
     A request without an origin does not come from a page.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     if len(hosts) != 1 or len(origins) > 1:
         return "expected one Host, and at most one Origin"
     if local and not re.fullmatch(LOCAL_HOST_PATTERN, hosts[0]):
-        return "this server only answers its own machine, as localhost"
+        return "this server only answers requests to localhost"
     if origins and re.sub("^https?://", "", origins[0].lower()) != hosts[0].lower():
         return "pages of other servers are refused"
     return ""

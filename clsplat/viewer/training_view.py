@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Page of a training: renders pictures between training steps, within a fraction of the training's time."""
+"""Viewer of a training. It renders pictures between training steps, within a fraction of the training's time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TrainingView:
         self._told_at = -math.inf
 
     def __call__(self, trainer: Trainer, interrupted: Callable[[], bool]) -> None:
-        """Render a picture that is due, and wait while paused. Returns at once without viewers, unless paused."""
+        """Render a picture if it is due, and wait while paused. Returns at once without viewers, unless paused."""
         viewing = self.viewing
         if viewing.model is None:
             viewing.model = LiveModel(trainer, self.background)

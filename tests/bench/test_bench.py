@@ -413,7 +413,7 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
     assert result["points"][1]["max_abs"] == 0.0
     assert result["exact_switches_faster"] == {"frame": 3.0, "iteration": 2.1}
     text = tradeoff.settings_table(result)
-    assert "a frame 3.00 times faster, a training step 2.10 times" in text
+    assert "a frame 3.00 times faster, and a training step 2.10 times" in text
     assert "step ms" in text
 
 
@@ -515,7 +515,7 @@ def test_plots_are_written(tmp_path: Path, result: dict[str, object], name: str)
     ]
     assert names == ["no early-stop", "tile-test square"]  # the axis runs upwards: what is worth most is on top
     assert {"1.05", "1.50", "a frame", "a training step", "a title"} <= set(switches)
-    assert "All off: 4.25 times for a frame, 4.13 times for a step." in switches
+    assert "With all off: 4.25 for a frame, 4.13 for a step." in switches
     assert {"fast (0.02)", "fast again (0.021)", "slow (0.03)", "exact: 40.0 ms", "a title"} <= set(error)
     notes = " ".join(error)
     for words in (

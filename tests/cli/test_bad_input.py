@@ -25,7 +25,7 @@ from clsplat.cli.main import main
         ("trian", "trian"),
         ("train S", "--output"),
         ("train S -o R --iterations many", "many"),
-        ("train S -o R --eval-at 1,x", "'1,x' is not a list of steps, expected such as 500,1000,2000"),
+        ("train S -o R --eval-at 1,x", "'1,x' is not a list of steps, expected numbers such as 500,1000,2000"),
         ("train S -o R --background green", "green"),
         ("train S -o R --nosuch 3", "--nosuch"),
         ("render M -o R", "--cameras"),

@@ -215,7 +215,7 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
     assert convert(source, tmp_path / "same.ply", "--scene", scene, "--test-every", 0, "--background", "white") == 0
     said = capsys.readouterr().out
     assert f"{len(cameras())} views" in said
-    assert "against each other 120.00" in said, "the same numbers give the same frames"
+    assert "between the renders 120.00" in said, "the same numbers give the same frames"
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--crop", "1,2,3"], "--crop 1,2,3: expected 6 numbers"),
         (["--crop=0,0,0,1,-1,1"], "expected X0 <= X1"),
         (["--crop=0,0,0,1,nan,1"], "expected 6 numbers"),
-        (["--crop=90,90,90,91,91,91"], "--crop: none of the 300 Gaussians is left"),
+        (["--crop=90,90,90,91,91,91"], "--crop: none of the 300 Gaussians remains"),
         (["--crop-sphere", "0,0,0,-1"], "--crop-sphere: none of the 300"),
         (["--transform", "1,2"], "expected 16 numbers"),
         (["--transform", "1,0,0,0,0,2,0,0,0,0,1,0,0,0,0,1"], "not a similarity"),
@@ -233,8 +233,8 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
         (["--drop-sh", "4"], "--drop-sh 4: expected 0 to 3"),
         (["--prune-opacity", "-0.1"], "--prune-opacity -0.1: expected 0 to 1"),
         (["--prune-opacity", "1"], "--prune-opacity: none of the 300"),
-        (["--prune-contribution", "1"], "--prune-contribution and --cameras go together"),
-        (["--cameras", "x"], "--prune-contribution and --cameras go together"),
+        (["--prune-contribution", "1"], "--prune-contribution and --cameras need each other"),
+        (["--cameras", "x"], "--prune-contribution and --cameras need each other"),
         (["--merge", "nowhere.ply"], "nowhere.ply: no such file"),
         (["--rotate", "90"], "--rotate 90: expected 3 numbers"),
         (["--translate", "1,2,inf"], "--translate 1,2,inf: expected 3 numbers"),
@@ -352,7 +352,7 @@ def test_the_colour_space_goes_along_or_is_told(model: Path, capsys: Capture) ->
         assert colour.recorded_space(target) == "lin_rec709"
     assert not capsys.readouterr().err
     assert convert(model, model.with_suffix(".splat")) == 0
-    assert "splat has no place for the colour space, which is lin_rec709" in capsys.readouterr().err
+    assert "splat cannot store the colour space, which is lin_rec709" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("suffix", sorted(s for s in formats.suffixes(writable=True) if s.startswith(".")))
@@ -493,7 +493,7 @@ def test_models_that_do_not_go_together(model: Path, tmp_path: Path, capsys: Cap
     placed.save(near)
     assert convert(model, tmp_path / "a.ply", "--merge", light) == 0
     assert (
-        f"warning: --merge {light}: its colours are {colour.LINEAR}, and are taken for sRGB, the colours of {model}"
+        f"warning: --merge {light}: its colours are {colour.LINEAR}, but are read as sRGB, the colour space of {model}"
         in capsys.readouterr().err
     )
     assert convert(model, tmp_path / "b.ply", "--merge", far) == 0
@@ -513,7 +513,7 @@ def test_a_near_plane_that_a_format_does_not_keep(model: Path, tmp_path: Path, c
     assert convert(model, tmp_path / "a.ply") == 0
     assert capsys.readouterr().err == ""
     assert convert(model, tmp_path / "a.splat") == 0
-    said = "splat has no place for the near plane, which is 0.2; readers will take 0.01"
+    said = "splat cannot store the near plane, which is 0.2; readers will use 0.01"
     assert said in capsys.readouterr().err
 
 
@@ -543,4 +543,4 @@ def test_pictures_of_sh_that_are_no_more(tmp_path: Path) -> None:
 @pytest.mark.parametrize("flags", [("--resolution", 200), ("--background", "white"), ("--test-every", 4)])
 def test_flags_of_a_scene_without_one(model: Path, flags: tuple[object, ...], capsys: Capture) -> None:
     assert convert(model, model.with_name("a.splat"), *flags) == 2
-    assert f"{flags[0]}: for measuring on a scene, expected --scene with it" in error_line(capsys)
+    assert f"{flags[0]}: has an effect only with --scene, expected that flag too" in error_line(capsys)

@@ -165,7 +165,7 @@ def test_a_scene_without_points_and_with_alpha(tmp_path: Path, capfd: Capture) -
     config = short(iterations=5, random_points=50, background="white")
     assert train(scene, tmp_path / "run", config) == 0
     captured = capfd.readouterr()
-    assert "has no points, training starts from random ones" in captured.err
+    assert "has no points; training starts from random points" in captured.err
     assert "50 Gaussians" in captured.out
 
 
@@ -176,7 +176,7 @@ def test_a_scene_of_one_point(tmp_path: Path, capfd: Capture) -> None:
     assert train(scene, tmp_path / "run", short(iterations=2, warmup=())) == 0
     warned = [line for line in capfd.readouterr().err.splitlines() if "warning" in line]
     assert warned == [
-        f"clsplat: warning: {scene}: has a single point, training starts from one Gaussian of almost no size"
+        f"clsplat: warning: {scene}: has a single point, so that training starts with one Gaussian of almost no size"
     ]
 
 
@@ -257,7 +257,7 @@ def test_ctrl_c_before_the_first_step(
     message = f"clsplat: interrupted before the first checkpoint; go on with: clsplat train -o {run} --resume"
     looked, started, *_, interrupted = capfd.readouterr().err.splitlines()
     assert looked.startswith("inspected 10 photographs: ")
-    assert started.startswith(f"{scene.name}: 8 pictures to train on, 2 held out, 40 points; on ")
+    assert started.startswith(f"{scene.name}: 8 training pictures, 2 held out, 40 points; on ")
     assert interrupted == message
     assert main(["train", "-o", str(run), "--resume", "--iterations", "3"]) == 0
 

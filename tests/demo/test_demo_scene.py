@@ -23,7 +23,7 @@ def surfaces():
 def test_a_folder_of_somebody_else_is_no_demos(tmp_path, name):
     (tmp_path / name).mkdir()
     (tmp_path / name / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match=f"holds {name}, which no demo has made .* choose another folder"):
+    with pytest.raises(InputError, match=f"holds {name}, which the demo did not create .* choose another folder"):
         demo.run_demo(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [name]
 

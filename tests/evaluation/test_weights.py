@@ -86,7 +86,7 @@ def test_they_are_fetched_once(server: str, monkeypatch: pytest.MonkeyPatch, cap
     assert lpips_weights.place().read_bytes() == BODY
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert "fetching VGG-16's weights for LPIPS, for 300 s at most (CLSPLAT_LPIPS_TIMEOUT)" in captured.err
+    assert "downloading VGG-16's weights for LPIPS, for 300 s at most (CLSPLAT_LPIPS_TIMEOUT)" in captured.err
     monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"http://127.0.0.1:9/{NAME}")
     lpips_weights.fetch()
     assert capsys.readouterr().err == ""
@@ -101,12 +101,12 @@ def test_a_silent_server_has_a_limit(seconds: str, server: str, monkeypatch: pyt
         lpips_weights.fetch()
     assert time.monotonic() - start < 2
     assert f"curl --create-dirs -o {lpips_weights.place()} {server}/silent/{NAME}" in str(caught.value)
-    assert ("did not come within 0.3 s" in str(caught.value)) == (seconds != "0")
+    assert ("did not arrive in 0.3 s" in str(caught.value)) == (seconds != "0")
 
 
 def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/other/{NAME}")
-    with pytest.raises(ClsplatError, match=r"could not be fetched \(what came has another digest"):
+    with pytest.raises(ClsplatError, match=r"could not be downloaded \(the SHA-256 of the download"):
         lpips_weights.fetch()
     assert not list(lpips_weights.place().parent.iterdir())
 
@@ -138,7 +138,7 @@ def test_train_says_once_what_is_missing(
     captured = capsys.readouterr()
     told = [line for line in captured.err.splitlines() if line.startswith("no LPIPS: ")]
     assert len(told) == 1
-    assert told[0].startswith("no LPIPS: VGG-16's weights did not come within 0.2 s (CLSPLAT_LPIPS_TIMEOUT): curl")
+    assert told[0].startswith("no LPIPS: VGG-16's weights did not arrive in 0.2 s (CLSPLAT_LPIPS_TIMEOUT): curl")
     assert captured.err.index("no LPIPS") < captured.err.index("step 2/2"), "before the work"
     result = json.loads(captured.out)
     assert result["lpips_missing"] == told[0].removeprefix("no LPIPS: ")

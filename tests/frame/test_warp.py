@@ -349,7 +349,7 @@ def test_stmaps_of_cameras_that_do_not_bend(shot: list[str], tmp_path: Path, cap
     (tmp_path / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 90 90 48 32\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 photo.png\n\n")
     assert main(["stmaps", str(tmp_path), "-o", str(tmp_path / "maps")]) == 2
-    assert "its lenses do not distort" in error_line(capsys)
+    assert "its lenses have no distortion" in error_line(capsys)
     assert main(["stmaps", shot[2], "-o", str(tmp_path / "maps")]) == 2
     assert "has no lenses of photographs" in error_line(capsys)
     assert not (tmp_path / "maps").exists()

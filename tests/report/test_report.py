@@ -218,7 +218,7 @@ def test_no_picture_outside_of_the_run_is_shown(copied: Path) -> None:
         (copied / "eval.json").write_text(json.dumps(evaluation))
         html = report(copied)
         assert "<img" not in html, name
-        assert "1 renders of held-out views are not in test/" in notes(html)
+        assert "1 renders of held-out views are missing in test/" in notes(html)
 
 
 # What is missing
@@ -245,15 +245,20 @@ def test_the_worst_and_the_best_views_are_shown() -> None:
 def test_an_unfinished_run_has_a_report(scene: Path, tmp_path: Path, copied: Path, capfd: Capture) -> None:
     run = Run.create(tmp_path / "new", CONFIG, scene=scene)
     said = notes(report(run.path))
-    for text in ("Not finished: at step 0 of 40", "eval.json is not there", "model.ply is not there", "no records"):
+    for text in (
+        "Not finished: the run is at step 0 of 40",
+        "eval.json is missing",
+        "model.ply is missing",
+        "no records",
+    ):
         assert text in said
-    assert "Not finished: at step 0 of 40" in capfd.readouterr().err
+    assert "Not finished: the run is at step 0 of 40" in capfd.readouterr().err
     (copied / "eval.json").unlink()
     (copied / "model.ply").unlink()
     lines = (copied / "metrics.jsonl").read_text().splitlines(keepends=True)
     (copied / "metrics.jsonl").write_text("".join(lines[:2]) + '{"step": 30, "lo')
     html = report(copied)
-    assert "Not finished: at step 20 of 40" in notes(html)
+    assert "Not finished: the run is at step 20 of 40" in notes(html)
     assert figures_of(parse(html))["curves"]["step"] == [10, 20]
 
 
@@ -287,7 +292,7 @@ def test_without_the_scene_there_are_renders_alone(copied: Path) -> None:
     text = (copied / "config.toml").read_text()
     (copied / "config.toml").write_text(re.sub(r"(?m)^scene = .*$", 'scene = "/nowhere/gone"', text))
     html = report(copied)
-    assert "renders without photographs: the scene cannot be read (gone: no such folder" in notes(html)
+    assert "shown without photographs: the scene cannot be read (gone: no such folder" in notes(html)
     assert len(parse(html).all("img")) == 2
     assert "nowhere" not in html
 
@@ -328,7 +333,7 @@ def test_wrong_calls_are_one_line(reported: Path, tmp_path: Path, capsys: Captur
         (["report", str(reported), "-o", str(tmp_path)], "is a folder, expected the name of a file"),
         (
             ["report", str(reported), "-o", str(tmp_path / "x.txt")],
-            "x.txt: its ending is .txt, expected .html or .htm: a page is written",
+            "x.txt: its ending is .txt, expected .html or .htm for a web page",
         ),
         (["report", str(reported), "-o", str(tmp_path / "page")], "page: its ending is none, expected .html or .htm"),
         (

@@ -54,7 +54,7 @@ def test_the_page_has_the_runs_figures(runs: list[Path], tmp_path: Path) -> None
     best = max(runs[:2], key=lambda run: evaluation(run)["mean"]["psnr"])
     marked = [row.one("th").words for row in rows if "best" in row.all("td")[1].attributes["class"]]
     assert marked == [f"{best.parent.name}/run"]
-    assert "c/run: Not finished: at step 20 of 40" in root.one("ul", id="notes").words
+    assert "c/run: Not finished: the run is at step 20 of 40" in root.one("ul", id="notes").words
     assert [each["run"] for each in figures_of(root)["runs"]] == ["a/run", "b/run", "c/run"]
     views = {row.all("td")[0].words: row.values for row in rows_of(root, "views")}
     for index, name in enumerate(("00.png", "08.png")):

@@ -83,15 +83,15 @@ def test_exposures_are_a_chart(reported: Path, tmp_path: Path) -> None:
     drawn = charts_of(parse((run / "report.html").read_text("utf-8")))["Exposure of the photographs"]
     assert drawn["red"] == [(1.0, 0.0), (2.0, 0.5), (3.0, 1.0)]
     assert drawn["blue"] == [(1.0, -0.25), (2.0, -0.25), (3.0, -0.25)]
-    assert "Corners have" not in (run / "report.html").read_text("utf-8")
+    assert "Corners get" not in (run / "report.html").read_text("utf-8")
     gains["00.png"]["vignette"] = [-0.5, 0.0, -0.5]
     (run / "appearance.json").write_text(json.dumps({"kind": "ppisp", "photographs": gains}))
     assert main(["report", str(run)]) == 0
-    assert "Corners have 50% of the light of the middle" in (run / "report.html").read_text("utf-8")
+    assert "Corners get 50% of the light in the middle" in (run / "report.html").read_text("utf-8")
     gains["00.png"]["vignette"] = [0.0, 0.0, 0.0]  # of a panorama
     (run / "appearance.json").write_text(json.dumps({"kind": "ppisp", "photographs": gains}))
     assert main(["report", str(run)]) == 0
-    assert "Corners have" not in (run / "report.html").read_text("utf-8")
+    assert "Corners get" not in (run / "report.html").read_text("utf-8")
     bad = '{"photographs": {"a": {"log2_gains": [1, 2, 3], "vignette": 1}}}'
     for text in ("{}", '{"photographs": {"a": {"log2_gains": [1, 2]}}}', bad, "no JSON"):
         (run / "appearance.json").write_text(text)

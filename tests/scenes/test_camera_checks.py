@@ -45,12 +45,12 @@ def test_parts_of_the_picture_are_read_as_such(keys: dict[str, Any], tmp_path: P
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
     (warning,) = scene.warnings
     assert "the principal point (cx cy) of images/view00.png, images/view01.png, " in warning
-    assert "in parts of the picture's width and height" in warning
+    assert "as fractions of the picture's width and height" in warning
 
 
 def test_those_of_a_colmap_model_too(tmp_path: Path) -> None:
     write_colmap(tmp_path, camera=f"PINHOLE {WIDTH} {HEIGHT} {FOCAL / WIDTH} {FOCAL / HEIGHT} 0.5 0.5")
-    with pytest.warns(UserWarning, match="of camera 1 is given in parts of the picture"):
+    with pytest.warns(UserWarning, match="of camera 1 is given as fractions of the picture"):
         camera = next(iter(read_cameras(tmp_path).values()))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
 
@@ -58,12 +58,12 @@ def test_those_of_a_colmap_model_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ({"fl_x": 2.0, "fl_y": 2.0}, "and 17 more is 2 pixels in 48 x 32"),  # in millimetres
-        ({"fl_x": 0.83, "fl_y": 0.83, "cx": None, "cy": None}, "is 0.83 pixels in 48 x 32"),
-        ({"cx": 0.0, "cy": 0.0}, "lies at 0 0 of 48 x 32 pixels"),  # from the middle
-        ({"cx": -0.4, "cy": 1.2}, "lies at -0.4 1.2"),
-        ({"cx": 0.5}, "lies at 0.5 16 of 48 x 32 pixels"),  # a part, of one alone
-        ({"fl_x": 10.0, "fl_y": 10.0, "cx": 6.0, "cy": 4.0}, "6 4, is the middle of 12 x 8 pixels"),
+        ({"fl_x": 2.0, "fl_y": 2.0}, "and 17 more is 2 pixels for a picture of 48x32"),  # in millimetres
+        ({"fl_x": 0.83, "fl_y": 0.83, "cx": None, "cy": None}, "is 0.83 pixels for a picture of 48x32"),
+        ({"cx": 0.0, "cy": 0.0}, "is 0 0 in a picture of 48x32"),  # from the middle
+        ({"cx": -0.4, "cy": 1.2}, "is -0.4 1.2 in"),
+        ({"cx": 0.5}, "is 0.5 16 in a picture of 48x32"),  # a part, of one alone
+        ({"fl_x": 10.0, "fl_y": 10.0, "cx": 6.0, "cy": 4.0}, "6 4, is the middle of a picture of 12x8 pixels"),
     ],
 )  # fmt: skip
 def test_intrinsics_that_no_lens_has_are_told(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_the_same_lens_without_them(tmp_path: Path) -> None:
 
 
 def test_terms_that_are_not_known_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'k5' or 'k6' of a fisheye, expected k1 to k4"):
+    with pytest.raises(InputError, match="'k5' or 'k6' for a fisheye, expected k1 to k4"):
         load_scene(write_transforms(tmp_path, is_fisheye=True, k5=0.1))
 
 
@@ -154,9 +154,12 @@ def transposed(matrix: list[list[float]]) -> list[list[float]]:
 
 
 WRONG = {
-    "inverted": ([inverted(matrix_of(pose)) for pose in poses()], "inverted (camera from world"),
-    "inverted, in OpenCV's axes": ([inverted(opencv(matrix_of(pose))) for pose in poses()], "inverted (camera from"),
-    "in OpenCV's axes": ([opencv(matrix_of(pose)) for pose in poses()], "in the other camera axes"),
+    "inverted": ([inverted(matrix_of(pose)) for pose in poses()], "inverted matrices (camera from world"),
+    "inverted, in OpenCV's axes": (
+        [inverted(opencv(matrix_of(pose))) for pose in poses()],
+        "inverted matrices (camera from",
+    ),
+    "in OpenCV's axes": ([opencv(matrix_of(pose)) for pose in poses()], "the other camera axes"),
 }
 
 
@@ -166,7 +169,7 @@ def test_poses_that_are_taken_the_wrong_way_are_told(kind: str, tmp_path: Path) 
     matrices, words = WRONG[kind]
     write_transforms(tmp_path, matrices=matrices, ply_file_path="a.ply")
     write_cloud(tmp_path / "a.ply", *points())
-    (warning,) = [text for text in load_scene(tmp_path).warnings if "the poses are" in text]
+    (warning,) = [text for text in load_scene(tmp_path).warnings if "the poses have" in text]
     assert words in warning
     assert "% of the points" in warning
 
@@ -176,16 +179,16 @@ def test_transposed_rotations_are_told(world: int, tmp_path: Path) -> None:
     matrices = [transposed(matrix_of(pose)) for pose in elsewhere(world)]
     write_transforms(tmp_path, matrices=matrices, ply_file_path="a.ply")
     write_cloud(tmp_path / "a.ply", *cloud_there(world))
-    assert [text for text in load_scene(tmp_path).warnings if "if the poses are of transposed rotations" in text]
+    assert [text for text in load_scene(tmp_path).warnings if "if the poses have transposed rotations" in text]
 
 
 @pytest.mark.parametrize("kind", ["inverted", "inverted, in OpenCV's axes"])
 def test_without_points_by_the_cameras_alone(kind: str, tmp_path: Path) -> None:
     write_transforms(tmp_path, matrices=WRONG[kind][0])
-    found = [text for text in load_scene(tmp_path).warnings if "the poses are inverted" in text]
+    found = [text for text in load_scene(tmp_path).warnings if "the poses have inverted" in text]
     assert len(found) == 1
-    assert "face nothing in common, and 100 % face one place" in found[0]
-    with pytest.warns(UserWarning, match="the poses are inverted"):
+    assert "face no common point, but 100 % face one place" in found[0]
+    with pytest.warns(UserWarning, match="the poses have inverted"):
         read_poses(tmp_path / "transforms.json")
 
 
@@ -193,7 +196,7 @@ def test_without_points_by_the_cameras_alone(kind: str, tmp_path: Path) -> None:
 def test_inverted_poses_of_a_colmap_model_are_told(cloud: Any, tmp_path: Path) -> None:
     turned = [(rotation.T, -rotation.T @ translation) for rotation, translation in poses()]
     scene = load_scene(write_colmap(tmp_path, posed=turned, cloud=cloud))
-    assert [text for text in scene.warnings if "if the poses are inverted" in text]
+    assert [text for text in scene.warnings if "if the poses have inverted" in text]
 
 
 @pytest.mark.brings("editors of transforms.json", "some poses wrong, the others right", "named")
@@ -205,19 +208,17 @@ def test_pictures_that_show_none_of_the_points_are_named(rows: list[int], tmp_pa
     write_transforms(tmp_path, matrices=matrices, ply_file_path="a.ply")
     write_cloud(tmp_path / "a.ply", *points())
     (warning,) = [text for text in load_scene(tmp_path).warnings if "poses" in text]
-    assert (
-        f"{len(rows)} of 20 pictures show none of the points, or nearly, where the others show about 100 %" in warning
-    )
+    assert f"{len(rows)} of 20 pictures show almost none of the points, while the others show about 100 %" in warning
     assert f"images/view{rows[0]:02}.png" in warning
 
 
 WRONG_COLMAP = {
-    "of the cameras' places": lambda rotation, translation: (rotation, -rotation.T @ translation),
-    "of quaternions in the order x y z w": lambda rotation, translation: (
+    "camera positions in place of": lambda rotation, translation: (rotation, -rotation.T @ translation),
+    "quaternions in the order x y z w": lambda rotation, translation: (
         Rotation.from_quat(np.roll(Rotation.from_matrix(rotation).as_quat(), -1)).as_matrix(),
         translation,
     ),
-    "of transposed rotations": lambda rotation, translation: (rotation.T, translation),
+    "transposed rotations": lambda rotation, translation: (rotation.T, translation),
 }
 
 
@@ -228,7 +229,7 @@ WRONG_COLMAP = {
 def test_poses_of_a_colmap_model_that_mean_something_else_are_told(kind: str, world: int, tmp_path: Path) -> None:
     how, cloud, right = WRONG_COLMAP[kind], cloud_there(world), elsewhere(world)
     scene = load_scene(write_colmap(tmp_path, posed=[how(*pose) for pose in right], cloud=cloud))
-    assert [text for text in scene.warnings if f"if the poses are {kind}" in text]
+    assert [text for text in scene.warnings if f"if the poses have {kind}" in text]
     plain = load_scene(write_colmap(tmp_path / "right", posed=right, cloud=cloud))
     assert not [text for text in plain.warnings if "poses" in text]
 
@@ -312,5 +313,5 @@ def test_the_verbs_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         assert main(words) == 0
         told = capsys.readouterr().err
         assert "lies at 0 0" in told, words[0]
-        assert "the poses are inverted" in told, words[0]
+        assert "the poses have inverted" in told, words[0]
     assert json.loads((wrong / "transforms.json").read_text())["cx"] == 0

@@ -94,7 +94,7 @@ def test_text_without_the_lines_of_observations(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"images\.txt: line 5 does not read as IMAGE_ID QW"):
         read_model(tmp_path)
     (tmp_path / "images.txt").write_text("\n".join([*lines[:3], seen[:-4], lines[4]]))
-    with pytest.raises(InputError, match=r"images\.txt: line 4 does not read as X Y POINT3D_ID, again and again, or"):
+    with pytest.raises(InputError, match=r"images\.txt: line 4 does not read as repeated X Y POINT3D_ID, or"):
         read_model(tmp_path)
 
 
@@ -106,10 +106,10 @@ def test_text_that_is_cut_at_the_end_of_a_line_is_told(tmp_path: Path, stem: str
     lines = path.read_text().splitlines(keepends=True)
     path.write_text("\ufeff" + "".join(lines[:kept]), "utf-8")
     counts = {"images": (3, 2), "points3D": (5, 4)}[stem]
-    told = f"{path}: its header announces {counts[0]}, and it holds {counts[1]}; is it cut, or edited since?"
+    told = f"{path}: its header announces {counts[0]} records, but it has {counts[1]}; was it truncated or edited?"
     assert warnings_of(lambda: read_model(tmp_path / "txt")) == [told]
     if stem == "images":
-        with pytest.warns(UserWarning, match="its header announces 3, and it holds 2"):
+        with pytest.warns(UserWarning, match="its header announces 3 records, but it has 2"):
             read_cameras(tmp_path / "txt")
 
 
@@ -134,7 +134,7 @@ def test_text_that_was_edited_beside_a_binary_file_is_told(tmp_path: Path) -> No
     for stem in ("images", "points3D"):
         os.utime(folder / f"{stem}.txt", (2000, 2000))
     read, newer = "images.bin, points3D.bin", "images.txt, points3D.txt"
-    told = f"{folder}: {read} is read and not the newer {newer}; remove the one that is not meant"
+    told = f"{folder}: {read} is read, and the newer {newer} is not; remove the one that is not wanted"
     assert warnings_of(lambda: read_model(folder)) == [told]
 
 
@@ -194,7 +194,7 @@ def test_unknown_camera_models_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cameras\.txt: camera 1: unknown camera model KALEIDOSCOPE, expected one of"):
         read_model(tmp_path / "txt")
     text.write_text("1 EQUIRECTANGULAR 48 32 48 30\n")
-    with pytest.raises(InputError, match=r"parameters \[48.0, 30.0\], expected its size, 48 32, of a whole panorama"):
+    with pytest.raises(InputError, match=r"parameters are \[48.0, 30.0\], expected the size of a full panorama, 48 32"):
         read_model(tmp_path / "txt")
     text.write_text("1 PINHOLE 48 32 1 2 3\n")
     with pytest.raises(InputError, match="PINHOLE has 3 parameters, expected 4"):
@@ -209,7 +209,7 @@ def test_unknown_camera_models_are_refused_by_name(tmp_path: Path) -> None:
     [
         ("1 1 0 0 0 0 0 0 2 a.png\n\n", "camera 2, which is not in the model"),
         ("1 1 0 0 0 0 0 0 1 ../..\n\n", "expected a path inside"),
-        ("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 a.png\n\n", "a.png is there twice"),
+        ("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 0 0 0 1 a.png\n\n", "a.png occurs twice"),
         ("1 0 0 0 0 0 0 0 1 a.png\n\n", "expected a unit quaternion"),
         ("1 1 0 0 0 nan 0 0 1 a.png\n\n", "expected a unit quaternion, finite numbers"),
         ("# nothing\n", "holds no images"),
@@ -251,7 +251,7 @@ def test_read_cameras(tmp_path: Path) -> None:
 def test_an_absurd_lens_is_told_where_cameras_alone_are_read(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 48 32 40 24 16 5\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n")
-    with pytest.warns(UserWarning, match=r"a\.png bends the picture beyond reason \(SIMPLE_RADIAL 40 24 16 5\)"):
+    with pytest.warns(UserWarning, match=r"a\.png distorts the picture implausibly \(SIMPLE_RADIAL 40 24 16 5\)"):
         read_cameras(tmp_path)
 
 

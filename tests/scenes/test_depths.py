@@ -210,7 +210,7 @@ def test_a_scene_of_nerfstudio_names_its_maps(tmp_path: Path) -> None:
 
 def test_what_is_refused(folder: Path) -> None:
     scene = load_scene(folder)
-    with pytest.raises(InputError, match=r"--depth maps, and there are none; expected depths/IMAGE\.png"):
+    with pytest.raises(InputError, match=r"has no depth maps for --depth maps; expected depths/IMAGE\.png"):
         with_depths(scene, MAPS)
     with pytest.raises(InputError, match="no point has a track"):
         with_depths(scene, POINTS)
@@ -225,7 +225,7 @@ def test_what_is_refused(folder: Path) -> None:
         with_depths(scene, MAPS)
     (maps / "00_depth.png").unlink()
     write_levels(maps / "03.png", np.ones((HEIGHT, WIDTH // 2), np.uint16))
-    with pytest.raises(InputError, match=r"03\.png: the depth map is 24 x 40 pixels, expected the shape"):
+    with pytest.raises(InputError, match=r"03\.png: the depth map has 24x40 pixels, expected the aspect ratio"):
         with_depths(scene, MAPS)
     (maps / "03.png").write_bytes(b"no picture")
     with pytest.raises(InputError, match=r"03\.png"):

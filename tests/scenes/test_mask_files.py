@@ -62,13 +62,15 @@ def test_a_mask_of_another_size(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene")
     (scene / "masks").mkdir()
     write_image(scene / "masks" / "03.png", mask_of(24, 20))
-    with pytest.raises(InputError, match=r"03\.png: the mask is 24 x 20 pixels, expected its photograph's 48 x 40"):
+    with pytest.raises(
+        InputError, match=r"03\.png: the mask has 24x20 pixels, expected the size of its photograph, 48x40"
+    ):
         load_scene(scene, masks=IGNORE)
 
 
 def test_no_masks_at_all_and_some_missing(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene")
-    with pytest.raises(InputError, match="--masks ignore, and there are none; expected masks/"):
+    with pytest.raises(InputError, match="has no masks for --masks ignore; expected masks/"):
         load_scene(scene, masks=IGNORE)
     (scene / "masks").mkdir()
     write_image(scene / "masks" / "03.png", mask_of())
@@ -257,11 +259,14 @@ def test_white_may_be_what_moves(tmp_path: Path) -> None:
     read = load_scene(scene, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * VIEWS
     (told,) = [text for text in read.warnings if "dynamic_masks" in text]
-    assert "white is taken for what counts, as in all masks; if it is what moves there, give --invert-masks" in told
+    assert (
+        "white pixels are the ones that count, as in all masks; if white marks moving objects there, add --invert-masks"
+        in told
+    )
     inverted = load_scene(scene, masks=MaskUse("ignore", invert=True))
     assert not [text for text in inverted.warnings if "dynamic_masks" in text]
     paths = sorted((scene / "images").iterdir())
-    with pytest.warns(UserWarning, match="white is taken for what counts"):
+    with pytest.warns(UserWarning, match="white pixels are the ones that count"):
         reconstruct._masks(scene / "images", paths, IGNORE)
 
 
@@ -379,7 +384,7 @@ def test_masks_beside_the_photographs_are_found_and_used(tmp_path: Path) -> None
     for index in range(VIEWS):
         write_image(scene / "images" / f"{index:02d}.png.mask.png", mask_of())
     text = next(each.text for each in findings(load_scene(scene)) if each.kind == "masks")
-    assert f"there are masks for {VIEWS} of {VIEWS} photographs" in text
+    assert f"{VIEWS} of {VIEWS} photographs have masks" in text
     read = load_scene(scene, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * VIEWS
     assert not any("does not list" in text for text in read.warnings)

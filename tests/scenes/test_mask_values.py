@@ -50,13 +50,13 @@ def test_a_mask_of_0_and_1_in_colour_and_in_alpha(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("levels", "told"),
     [
-        (np.array([[0, 64]], np.uint8), "0 and 64, all of them dark, expected 0 and 255"),
+        (np.array([[0, 64]], np.uint8), "0 and 64, all below a half, expected 0 and 255"),
         (np.array([[0, 127]], np.uint8), "0 and 127, all"),
-        (np.array([[0, 255]], np.uint16), "0 and 255, all of them dark, expected 0 and 65535"),
+        (np.array([[0, 255]], np.uint16), "0 and 255, all below a half, expected 0 and 65535"),
         (np.array([[64, 64]], np.uint8), "64, all"),
         (np.array([[1, 2]], np.uint8), "1 and 2, all"),
         (np.array([[0, 1, 2, 7, 20]], np.uint8), "5 from 0 to 20, all"),
-        (np.array([[[0, 0, 0], [255, 0, 0]]], np.uint8), r"\(0, 0, 0\) and \(255, 0, 0\), all of them dark"),
+        (np.array([[[0, 0, 0], [255, 0, 0]]], np.uint8), r"\(0, 0, 0\) and \(255, 0, 0\), all below a half"),
         (np.array([[[0, 0, 0], [128, 0, 0]]], np.uint8), r"\(0, 0, 0\) and \(128, 0, 0\), all"),
         (
             np.array([[[0, 40, 0], [0, 0, 90], [9, 9, 9]]], np.uint8),
@@ -123,7 +123,7 @@ def test_small_things_with_void_are_told_by_the_other_masks(tmp_path: Path) -> N
     """The borders of a small thing are more than itself; a folder of black and white has a few pixels of 1 by noise."""
     save_levels(tmp_path / "small.png", labels_with_void(20, 5))
     with pytest.raises(
-        InputError, match=r"small\.png: the mask's values are 0, 1 and 255, labels of 0 and 1 with void, or"
+        InputError, match=r"small\.png: the mask's values are 0, 1 and 255, either labels 0 and 1 with void or"
     ):
         read_mask(tmp_path / "small.png", orient=False, invert=False)
     save_levels(tmp_path / "large.png", labels_with_void(20, 90))

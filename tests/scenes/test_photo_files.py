@@ -78,7 +78,7 @@ def test_pictures_are_found_under_other_names(kind: str, tmp_path: Path) -> None
     listed, files, told = LOOSE[kind]
     scene = load_scene(write_colmap(tmp_path, listed, files))
     (warning,) = scene.warnings
-    assert "20 picture(s) are there under other names than listed, and are used: " in warning
+    assert "20 picture(s) have other names than listed, and are used: " in warning
     assert told in warning
     assert_each_has_its_picture(scene)
     assert len(scene.test_views) == 3
@@ -100,7 +100,7 @@ def test_a_name_that_could_be_two_pictures_is_missing(tmp_path: Path) -> None:
     (warning, unlisted) = load_scene(tmp_path).warnings
     assert "lists 1 image(s) that are missing: " in warning
     assert "does not list 2 image(s)" in unlisted
-    with pytest.raises(InputError, match=r"VIEW00\.png; of other names there is View00\.png; train and eval"):
+    with pytest.raises(InputError, match=r"VIEW00\.png; similar names are View00\.png; to train and evaluate"):
         load_scene(tmp_path, missing="error")
 
 
@@ -210,7 +210,9 @@ def test_many_missing_pictures_are_an_error_that_says_what_to_give(kind: str, tm
     write_colmap(tmp_path) if kind == "colmap" else write_transforms(tmp_path)
     for index in range(1, 8):
         (tmp_path / "images" / NAMES[index]).unlink()
-    with pytest.raises(InputError, match=r"lists 7 image.*; train and eval go on with the others by --missing skip$"):
+    with pytest.raises(
+        InputError, match=r"lists 7 image.*; to train and evaluate with the others, add --missing skip$"
+    ):
         load_scene(tmp_path)
     scene = load_scene(tmp_path, missing="skip")
     assert_each_has_its_picture(scene, tuple(range(1, 8)))
@@ -255,7 +257,7 @@ def test_smaller_copies_are_taken_where_there_is_nothing_else(
     (tmp_path / "images").rmdir()
     scene = load_scene(tmp_path)
     (warning,) = scene.warnings
-    assert f"the pictures are taken from {tmp_path / f'images_{min(factors)}'}" in warning
+    assert f"the pictures are read from {tmp_path / f'images_{min(factors)}'}" in warning
     assert_each_has_its_picture(scene)
     assert scene.views[0].camera.width == WIDTH // min(factors)
     assert scene.views[0].camera.fx == pytest.approx(40 / min(factors))
@@ -279,7 +281,7 @@ def test_folders_of_other_names(images: str, model: str, tmp_path: Path) -> None
     """RealityScan writes model and pictures into one."""
     scene = load_scene(write_colmap(tmp_path, images=images, model=model))
     assert_each_has_its_picture(scene)
-    assert [text for text in scene.warnings if "the pictures are taken from" in text] == scene.warnings
+    assert [text for text in scene.warnings if "the pictures are read from" in text] == scene.warnings
     assert len(scene.warnings) == 1
 
 
@@ -328,7 +330,7 @@ def test_uneven_pictures(camera: str, focal: tuple[float, float], tmp_path: Path
     write_pictures(tmp_path / "images", size=(WIDTH, 24))
     scene = load_scene(tmp_path)
     (warning,) = scene.warnings
-    assert "1 times as wide and 0.75 times as high as the camera's size" in warning
+    assert "has 1 times the width and 0.75 times the height of its camera" in warning
     seen = scene.views[0].camera
     assert (seen.width, seen.height, seen.fx, seen.fy, seen.cx, seen.cy) == (WIDTH, 24, *focal, 24, 12)
     assert_each_has_its_picture(scene)
@@ -385,11 +387,11 @@ def test_a_list_of_others_is_told_and_not_used(tmp_path: Path) -> None:
     path = tmp_path / "sparse" / "0" / "test.txt"
     path.write_text("notes\n")
     scene = load_scene(tmp_path)
-    assert scene.warnings == [f"{path}: lists notes to hold out, and no picture is called so, so that it is not used"]
+    assert scene.warnings == [f"{path}: lists notes to hold out, but no picture has such a name; the list is not used"]
     assert [view.name for view in scene.test_views] == ["view00.png", "view08.png", "view16.png"]
     path.write_text("view02.png\nview99.png\n")
     scene = load_scene(tmp_path)
-    assert scene.warnings == [f"{path}: lists view99.png to hold out, and no picture is called so"]
+    assert scene.warnings == [f"{path}: lists view99.png to hold out, but no picture has such a name"]
     assert [view.name for view in scene.test_views] == ["view02.png"]
     path.write_text("")
     assert len(load_scene(tmp_path).test_views) == 3
@@ -406,4 +408,6 @@ def test_a_list_of_what_is_missing_holds_out_the_rest(tmp_path: Path) -> None:
     (tmp_path / "images" / "view10.png").unlink()
     scene = load_scene(tmp_path)
     assert scene.test_views == []
-    assert scene.warnings[-1].endswith("test.txt: all pictures that it holds out are missing, so that none is measured")
+    assert scene.warnings[-1].endswith(
+        "test.txt: all pictures that it holds out are missing; held-out quality will not be measured"
+    )

@@ -170,7 +170,7 @@ def test_few_steps() -> None:
     for steps, expected in ((2399, ["few steps"]), (2400, []), (1000, ["few steps"]), (999, []), (0, [])):
         assert [finding.kind for finding in findings(scene, iterations=steps)] == expected, steps
     (finding,) = findings(scene, iterations=2000)
-    assert finding.text.startswith("2,000 steps are 50.0 for each of 40 photographs")
+    assert finding.text.startswith("2,000 steps are 50.0 per training photograph (40)")
     many = made(200)
     assert findings(many, iterations=10_001) == [], "nothing is known of longer trainings"
     assert [finding.kind for finding in findings(many, iterations=10_000)] == ["few steps"]
@@ -198,7 +198,7 @@ def test_a_sky() -> None:
         changed(scene, index, pixels=pixels)
     (found,) = findings(scene)
     assert found.kind == "sky"
-    assert found.text.startswith("32 photographs have a sky without points, 14 % of each")
+    assert found.text.startswith("32 photographs have a sky without points, 14 % of their area")
 
 
 def test_points_without_colours_say_nothing_of_exposures() -> None:
@@ -281,7 +281,7 @@ def test_masks_that_are_not_used(tmp_path: Path, part: float, kind: str) -> None
     write_image(folder / "masks" / "stranger.png", mask)
     (found,) = (finding for finding in findings(load_scene(folder)) if "mask" in finding.kind)
     assert found.kind == "strange masks"
-    assert found.text.startswith(f"there are masks for {VIEWS} of {VIEWS} photographs, which cannot be used (")
+    assert found.text.startswith(f"{VIEWS} of {VIEWS} photographs have masks, which cannot be used (")
     assert "fit no photograph (stranger.png): expected names such as 00.png" in found.text
     for path in (folder / "masks").iterdir():
         if path.stem != "stranger":
@@ -306,12 +306,12 @@ def test_answers_that_do_not_go_together() -> None:
     answers, config = answered(found, TrainConfig(), given={"appearance"})
     assert (config.appearance, config.masks) == ("none", "transparent")
     text = paragraph(answers, 3, auto=False)
-    assert "a (--appearance is given)" in text
-    assert text.endswith("c: leave them out where others show the same. --auto would take --masks transparent")
+    assert "a (you set --appearance)" in text
+    assert text.endswith("c: leave them out if other photographs show the same. --auto would take --masks transparent")
     transparent = TrainConfig(masks="transparent")
     answers, config = answered(found[:1], transparent)
     assert config == transparent
-    assert "does not go with the other settings" in answers[0].words
+    assert "is incompatible with the other settings" in answers[0].words
 
 
 def test_few_views_are_trained_for_fewer_steps() -> None:
@@ -353,7 +353,7 @@ def test_few_steps_are_trained_with_high_rates() -> None:
         (TrainConfig(), {"schedule"}, "--schedule is given"), (stopped, {"density.stop"}, "--density.stop is given"),
         (late, {"density.start"}, "--density.start is given"),
         (TrainConfig(), {"sh_degree_every", "sh_degree"}, "--sh-degree-every is given"),
-        (bundled("fast", None, 7000), {"preset"}, "--schedule high-rates does not go with the other settings"),
+        (bundled("fast", None, 7000), {"preset"}, "--schedule high-rates is incompatible with the other settings"),
     ):  # fmt: skip
         (answer,), config = answered(few, mine, given)
         assert (answer.words, config) == (f"a ({words})", mine)

@@ -109,7 +109,7 @@ def test_a_cloud_elsewhere_is_one_error(scene: Scene, move: object, said: str) -
     with pytest.raises(InputError, match=said) as caught:
         check_place(move(points), scene, Path("fused.ply"))  # type: ignore[operator]
     assert "fused.ply" in str(caught.value)
-    assert "scene's frame" in str(caught.value)
+    assert "axes, scale and origin of the scene's cameras" in str(caught.value)
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
@@ -176,5 +176,5 @@ def test_the_sky_is_above_the_points(scene: Scene) -> None:
     assert (np.linalg.norm(points - middle, axis=1) > 5 * scene.extent).all()
     joined = with_points(bare, StartPoints(sky=300))
     np.testing.assert_array_equal(joined.points[400:], points)
-    with pytest.raises(InputError, match="no points to tell the sky by"):
+    with pytest.raises(InputError, match="--sky needs points to find the sky above them"):
         sky_points(replace(scene, points=np.empty((0, 3)), point_colors=np.empty((0, 3), np.float32)), 10)

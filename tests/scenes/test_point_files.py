@@ -125,7 +125,7 @@ def test_points_that_are_no_numbers_are_left_out(kind: str, tmp_path: Path) -> N
 
 def test_those_of_text_too_and_points_of_places_alone(tmp_path: Path) -> None:
     folder = write_points(tmp_path, ["1 1 2 3", "2 nan 5 6", "3 7 8 9"])
-    with pytest.warns(UserWarning, match="1 of 3 points are not numbers, and are left out"):
+    with pytest.warns(UserWarning, match="1 of 3 points have NaN values and are left out"):
         model = read_model(folder)
     np.testing.assert_array_equal(model.points, [[1, 2, 3], [7, 8, 9]])
     assert (model.colors == model.colors[0]).all()
@@ -171,7 +171,7 @@ def test_a_cloud_beside_a_scene_without_points_is_taken(kind: str, name: str, tm
     scene = load_scene(tmp_path)
     np.testing.assert_array_equal(scene.points, XYZ.astype(np.float32))
     np.testing.assert_allclose(scene.point_colors, RGB / 255, atol=1e-6)
-    assert f"{path}: its 60 points are the scene's, which names none" in scene.warnings
+    assert f"{path}: its 60 points are used, as the scene names no points" in scene.warnings
     assert not [text for text in sanity_checks.of_scene(scene, "black") if "not used" in text]
 
 
@@ -182,7 +182,7 @@ def test_of_several_the_first_by_name_is_taken_and_the_others_told(tmp_path: Pat
     scene = load_scene(tmp_path)
     assert len(scene.points) == 60
     (told,) = [text for text in sanity_checks.of_scene(scene, "black") if "--points" in text]
-    assert told.startswith(f"{tmp_path / 'init.ply'} (50 points) is not used, as the scene has points of its own")
+    assert told.startswith(f"{tmp_path / 'init.ply'} (50 points) is not used, as the scene itself has points")
 
 
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
@@ -228,7 +228,7 @@ def test_a_cloud_that_does_not_read_or_lies_elsewhere_is_told_and_passed_over(tm
     assert len(scene.points) == 0
     assert len(scene.warnings) == 2
     assert "points3d.ply" in scene.warnings[0]
-    assert "sparse_pc.ply: its points are 1e+06 from the cameras that see them" in scene.warnings[1]
+    assert "at a distance of 1e+06 from the cameras that see them" in scene.warnings[1]
     assert all(text.endswith("; it is not used") for text in scene.warnings)
     assert not [text for text in sanity_checks.of_scene(scene, "black") if "points of its own" in text]
 
@@ -250,7 +250,7 @@ def test_very_many_points_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     scene = load_scene(write_colmap(tmp_path))
     monkeypatch.setattr(sanity_checks, "MANY_START_POINTS", 399)
     (told,) = [text for text in sanity_checks.of_scene(scene, "black") if "--points-limit" in text]
-    assert told.startswith("400 points to start from are a Gaussian each")
+    assert told.startswith("each of 400 initial points becomes a Gaussian")
     monkeypatch.setattr(sanity_checks, "MANY_START_POINTS", 400)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

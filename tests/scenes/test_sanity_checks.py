@@ -55,7 +55,7 @@ def test_points_behind_all_cameras_are_told_after_a_hundred_steps_and_at_the_end
     density = {"start": 100, "opacity_reset_every": 100}
     found = told(behind, default_device, iterations=6, density=density)
     assert [text.partition(": ")[0] for text in found] == ["step 4", "step 6"]
-    assert all("no Gaussian is seen by any of the 8 training views" in text for text in found)
+    assert all("no Gaussian is visible in any of the 8 training views" in text for text in found)
     assert found[0].endswith("check that both have the same axes, scale and origin")
 
 
@@ -66,7 +66,7 @@ def test_pictures_of_one_colour_are_told(scene: Path) -> None:
         shape = (camera.height, camera.width)
         return np.full((*shape, 3), 0.5, np.float32), np.ones(shape, np.float32)
 
-    assert "are of one colour, and the photographs are not" in sanity_checks.of_pictures(draw, views)
+    assert "has a single colour, but the photographs do not" in sanity_checks.of_pictures(draw, views)
 
 
 def test_photographs_of_one_colour_may_be_learnt(tmp_path: Path) -> None:
@@ -83,8 +83,8 @@ def test_coincident_points_are_told(scene: Path) -> None:
         point_colors=np.concatenate([loaded.point_colors, np.repeat(loaded.point_colors[:1], 10, axis=0)]),
     )
     (text,) = sanity_checks.of_scene(doubled, "black")
-    assert text.startswith("10 of 50 points lie where another one does")
-    assert text.endswith("leave doubles out of the cloud")
+    assert text.startswith("10 of 50 points coincide with another point")
+    assert text.endswith("remove duplicate points from the cloud")
 
 
 def test_a_principal_point_far_outside_is_told(scene: Path) -> None:
@@ -100,7 +100,7 @@ def test_absurd_distortion_is_told(k1: float, absurd: bool, tmp_path: Path) -> N
     found = [text for text in sanity_checks.of_scene(loaded, "black") if "lens" in text]
     assert len(found) == absurd
     if absurd:
-        assert f"and 6 more bends the picture beyond reason (SIMPLE_RADIAL 40 24 16 {k1:g}): check its" in found[0]
+        assert f"and 6 more distorts the picture implausibly (SIMPLE_RADIAL 40 24 16 {k1:g}): check its" in found[0]
 
 
 def test_cameras_in_one_place_are_told(tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def test_of_many_missing_pictures_three_are_named(tmp_path: Path) -> None:
     assert str(caught.value).count("/images/") == 3
     assert " and 14 more; " in str(caught.value)
     assert str(caught.value).endswith(
-        f"3 others are in {tmp_path / 'images'}; train and eval go on with the others by --missing skip"
+        f"3 others are in {tmp_path / 'images'}; to train and evaluate with the others, add --missing skip"
     )
 
 
@@ -180,7 +180,7 @@ def test_depths_and_normals_beside_the_pictures_are_silent(tmp_path: Path) -> No
     for index in range(30, 70):
         shutil.copy(tmp_path / "test" / "r_0.png", tmp_path / "test" / f"r_{index}.png")
     (warning,) = load_scene(tmp_path).warnings
-    assert "does not list 40 image(s) that are there" in warning
+    assert "does not list 40 image(s) of its folder" in warning
     assert warning.endswith("r_32.png and 37 more")
 
 
@@ -247,7 +247,7 @@ def test_pictures_that_are_held_out_and_trained_on_are_told(tmp_path: Path) -> N
     held_out, trained = scene.test_views[0], scene.train_views[0]
     shutil.copy(trained.path, held_out.path)
     (warning,) = load_scene(tmp_path).warnings
-    assert warning.startswith("1 of the held-out pictures are trained on too")
+    assert warning.startswith("1 of the held-out pictures are also training pictures")
     assert f"{held_out.name} is {trained.name}" in warning
     assert load_scene(tmp_path, test_every=0).warnings == []
 

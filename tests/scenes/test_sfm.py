@@ -144,7 +144,7 @@ def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos,
     output, _ = scene
     before = (output / "sparse/0/images.bin").stat().st_mtime_ns
     assert sfm.reconstruct(photos, output, PINHOLE) == output
-    with pytest.raises(InputError, match="other photos or settings"):
+    with pytest.raises(InputError, match="with other settings or from other photos"):
         sfm.reconstruct(photos, output, sfm.SfmSettings(camera_model="SIMPLE_PINHOLE", max_features=100))
     assert (output / "sparse/0/images.bin").stat().st_mtime_ns == before
 
@@ -160,7 +160,7 @@ def test_a_result_that_has_changed_since_is_not_used_again(scene, photos, tmp_pa
         picture.unlink()
     else:
         picture.write_bytes(picture.read_bytes()[:-100])
-    with pytest.raises(InputError, match=r"scene: images/view_03\.jpg are gone or changed since .* --overwrite"):
+    with pytest.raises(InputError, match=r"scene: images/view_03\.jpg were removed or changed after .* --overwrite"):
         sfm.reconstruct(photos, copy, PINHOLE)
 
 
@@ -210,7 +210,9 @@ def test_photos_that_lose_their_alpha_are_named(pictures, tmp_path):
         alpha[:20] = 255 if index else 128  # one of them has a transparent part, the others only could have
         write_png(tmp_path / f"photos/{index:02d}.png", np.concatenate([picture, alpha], axis=2))
     (message,) = warnings_of(lambda: sfm.reconstruct(tmp_path / "photos", tmp_path / "scene"))
-    wanted = "photos: 1 photo(s) (00.png) lost their alpha when their lens was undone: the scene's images are opaque"
+    wanted = (
+        "photos: 1 photo(s) (00.png) lost their alpha when they were undistorted: their images in the scene are opaque"
+    )
     assert wanted in message
     assert oiio.ImageInput.open(str(tmp_path / "scene/images/00.png")).spec().nchannels == 3
     # without distortion there is nothing to undo: pycolmap copies the files
@@ -254,13 +256,13 @@ def test_bad_folders(tmp_path, photos):
         sfm.reconstruct(tmp_path / "missing", tmp_path / "out")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty/a.webp").write_bytes(b"")
-    with pytest.raises(InputError, match=r"empty: no photos found, only 1 of a kind not supported such as a\.webp"):
+    with pytest.raises(InputError, match=r"empty: no photos found, only 1 of an unsupported kind such as a\.webp"):
         sfm.reconstruct(tmp_path / "empty", tmp_path / "out")
     (tmp_path / "few").mkdir()
     shutil.copy(photos / "view_00.jpg", tmp_path / "few")
     with pytest.raises(InputError, match=r"few: only 1 photo\(s\) found, expected at least 3"):
         sfm.reconstruct(tmp_path / "few", tmp_path / "out")
-    with pytest.raises(InputError, match="is not empty and not a result of sfm"):
+    with pytest.raises(InputError, match="is neither empty nor a result of sfm"):
         sfm.reconstruct(photos, tmp_path)
     with pytest.raises(InputError, match="is a file"):
         sfm.reconstruct(photos, tmp_path / "few/view_00.jpg")
@@ -318,9 +320,11 @@ def test_what_is_no_photo_is_left_out_with_a_line(photos, tmp_path, monkeypatch)
     tasks = task_of(monkeypatch)
     messages = warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "out"))
     assert sorted(tasks[0]["groups"][0]) == [f"view_{index:02d}.jpg" for index in range(COUNT)]
-    masks = "12 photo(s) (masks/view_00.png, masks/view_01.png, masks/view_02.png and 9 more) left out: by their names "
+    masks = (
+        "12 photo(s) (masks/view_00.png, masks/view_01.png, masks/view_02.png and 9 more) left out: their names mark "
+    )
     assert messages[-1].startswith(f"{folder}: {masks}")
-    assert messages[:-1] == ([f"{folder}: 1 photo(s) (gone.jpg) left out: links that lead nowhere"] if broken else [])
+    assert messages[:-1] == ([f"{folder}: 1 photo(s) (gone.jpg) left out: broken links"] if broken else [])
 
 
 def test_a_folder_of_photos_that_cannot_be_read_is_named(photos, tmp_path, monkeypatch):
@@ -424,7 +428,7 @@ def test_features_under_masks_are_left_out_and_masks_are_undistorted(photos, tmp
 
 
 def test_masks_that_are_asked_for_and_not_there(photos, tmp_path):
-    with pytest.raises(InputError, match="there are no masks, expected masks/"):
+    with pytest.raises(InputError, match="has no masks, expected masks/"):
         sfm.reconstruct(photos, tmp_path / "out", masks=MaskUse("ignore"))
 
 
@@ -466,5 +470,5 @@ def test_alpha_that_undistortion_loses_is_kept_as_masks(pictures, tmp_path):
 
 
 def test_two_meanings_of_photos_without_cameras(photos):
-    with pytest.raises(InputError, match="--masks ignore and --alpha transparent: expected one meaning of both"):
+    with pytest.raises(InputError, match="--masks ignore and --alpha transparent: expected the same meaning"):
         load_scene(photos, masks=MaskUse("ignore", "transparent"))

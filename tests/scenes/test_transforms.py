@@ -139,7 +139,7 @@ def test_keys_that_are_missing_or_wrong_are_named(tmp_path: Path, keys: dict[str
         ({"file_path": 7}, "frame 1: 'file_path' is 7, expected text"),
         ({"transform_matrix": None}, "frame 1: has no 'transform_matrix'"),
         ({"transform_matrix": [[1, 2], [3]]}, r"frame 1: 'transform_matrix' is \[\[1, 2\], \[3\]\], expected 4 x 4"),
-        ({"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "has no rotation in it"),
+        ({"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "contains no rotation"),
         ({"file_path": "images/0.png"}, "lists images/0.png twice"),
         ({"file_path": "images/gone"}, "lists 1 image.* missing: .*images/gone"),
     ],
@@ -220,7 +220,7 @@ def test_a_split_that_makes_no_sense(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'val_filenames' is 'images', expected a list of file names"):
         read_transforms(make(tmp_path, val_filenames="images"))
     path = make(tmp_path, test_filenames=["images/1.png", "a.png", "b.png", "c.png", "d.png"])
-    told = f"{path}: 'test_filenames' lists a.png, b.png, c.png and 1 more, and no frame has that as its 'file_path'"
+    told = f"{path}: 'test_filenames' lists a.png, b.png, c.png and 1 more, but no frame has such a 'file_path'"
     assert warnings_of(lambda: read_transforms(path)) == [told]
 
 
@@ -246,9 +246,9 @@ def test_an_angle_that_contradicts_the_focal_length_is_told(tmp_path: Path) -> N
     path = make(tmp_path, 5, camera_angle_x=math.pi / 2)
     change_frame(path, fl_x=20.0)  # of this frame alone, and the angle of the others
     pictures = ", ".join(f"images/{n}.png (10, not 6)" for n in (0, 2, 3))
-    told = f"{path}: 'fl_x' is used, 'camera_angle_x' says otherwise of {pictures} and 1 more"
+    told = f"{path}: 'fl_x' is used; it contradicts 'camera_angle_x' for {pictures} and 1 more"
     assert warnings_of(lambda: read_transforms(path)) == [told]
-    with pytest.warns(UserWarning, match="'camera_angle_x' says otherwise"):
+    with pytest.warns(UserWarning, match="it contradicts 'camera_angle_x'"):
         read_poses(path)
 
 
@@ -259,7 +259,7 @@ def test_a_rolling_shutter_is_told(tmp_path: Path) -> None:
 
 
 def test_an_absurd_lens_is_told_where_cameras_alone_are_read(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match=r"images/0\.png, images/1\.png bends the picture beyond reason \(OPENCV"):
+    with pytest.warns(UserWarning, match=r"images/0\.png, images/1\.png distorts the picture implausibly \(OPENCV"):
         read_poses(make(tmp_path, k1=5.0))
 
 

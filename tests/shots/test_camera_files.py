@@ -84,7 +84,7 @@ def test_camera_path_of_other_cameras(tmp_path: Path) -> None:
         ({"render_height": 10.5}, "'render_height' is 10.5, expected a whole number of pixels"),
         ({"camera_path": [{"fov": 50}]}, "key 0: has no 'camera_to_world'"),
         ({"camera_path": [{"camera_to_world": [1, 2]}]}, "key 0: 'camera_to_world' is [1, 2], expected 4 x 4"),
-        ({"camera_path": [{"camera_to_world": [0] * 16}]}, "key 0: 'camera_to_world' has no rotation in it"),
+        ({"camera_path": [{"camera_to_world": [0] * 16}]}, "key 0: 'camera_to_world' contains no rotation"),
         (
             {"camera_path": [{"camera_to_world": np.transpose(POSE).ravel().tolist(), "fov": 50}]},
             "row [1.0, 2.0, 3.0, 1.0], expected 0 0 0 1, with the position in the last column; it is written column by",
@@ -135,7 +135,9 @@ def test_transforms_without_their_pictures(tmp_path: Path) -> None:
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((20, 20, 20, 10))
     sizeless = write(tmp_path / "transforms_test.json", transforms())
     assert read_shot(sizeless, size=(80, 30)).cameras[0].fx == pytest.approx(40)
-    with pytest.raises(InputError, match=r"frame 0: has no 'w' and 'h', nor is its picture there: .*images/b; give"):
+    with pytest.raises(
+        InputError, match=r"frame 0: has no 'w' and 'h', and its picture .*images/b does not exist; give"
+    ):
         read_shot(sizeless, size=(80, None))
     (tmp_path / "images").mkdir()
     write_image(tmp_path / "images" / "b.png", np.zeros((6, 12, 3), np.float32))

@@ -109,13 +109,13 @@ def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: C
         capsys.readouterr()
         assert main(["convert", str(run), str(tmp_path / name)]) == 0
         assert load(tmp_path / name).antialiased
-        assert "no place for antialiasing" not in capsys.readouterr().err
+        assert "cannot store antialiasing" not in capsys.readouterr().err
         assert main(["info", str(tmp_path / name), "--json"]) == 0
         assert json.loads(capsys.readouterr().out)["antialiased"] is True
     assert main(["info", str(run / "model.ply")]) == 0
     assert "antialiased" in capsys.readouterr().out
     assert main(["convert", str(run), str(tmp_path / "model.splat")]) == 0
-    assert "splat has no place for antialiasing" in capsys.readouterr().err
+    assert "splat cannot store antialiasing" in capsys.readouterr().err
 
 
 def test_models_that_are_drawn_differently_do_not_merge(tmp_path: Path, scene: Scene, capsys: Capture) -> None:

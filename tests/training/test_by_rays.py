@@ -100,7 +100,7 @@ def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: C
     assert main(["info", str(run / "model.ply")]) == 0
     assert "along rays" in capsys.readouterr().out
     assert main(["convert", str(run), str(tmp_path / "model.splat")]) == 0
-    assert "splat has no place for drawing along rays" in capsys.readouterr().err
+    assert "splat cannot store drawing along rays" in capsys.readouterr().err
     assert (
         main(["render", str(run), "--cameras", str(folder), "-o", str(tmp_path / "{name}.exr"), "--frames", "1"]) == 0
     )

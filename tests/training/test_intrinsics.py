@@ -147,7 +147,7 @@ def test_a_fisheye_is_undistorted_unless_asked(tmp_path: Path) -> None:
 def test_a_panorama_of_another_size_is_named(tmp_path: Path) -> None:
     folder = write_lens_scene(tmp_path / "scene", "panorama")
     (folder / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 96 48 96 40\n")
-    with pytest.raises(InputError, match="expected its size, 96 48, of a whole panorama"):
+    with pytest.raises(InputError, match="expected the size of a full panorama, 96 48"):
         load_scene(folder)
 
 

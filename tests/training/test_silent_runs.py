@@ -136,7 +136,7 @@ def test_photographs_of_one_colour_are_told(tmp_path: Path) -> None:
         pixels[:, :, 3] = 0
         write_image(path, pixels)
     found = sanity_checks.of_scene(load_scene(folder), "black")
-    assert any("are of one colour, or transparent" in text for text in found)
+    assert any("has a single colour or is transparent" in text for text in found)
 
 
 def test_settings_that_come_to_nothing_are_told(scene: Path, default_device: Device) -> None:
@@ -182,7 +182,7 @@ def test_an_evaluation_of_a_model_that_is_not_seen_says_so(run: Path, capfd: Cap
     model.means += 1e4
     model.save(run / "model.ply")
     assert main(["eval", str(run)]) == 0
-    assert "no Gaussian is seen by any of the 2 held-out views" in capfd.readouterr().err
+    assert "no Gaussian is visible in any of the 2 held-out views" in capfd.readouterr().err
 
 
 LATE = {

@@ -175,7 +175,7 @@ def test_a_training_in_little_memory_shows_what_it_can(default_device: Device, p
     model, page = watched(photographs, fresh)
     assert same(model, alone)
     assert page.shown >= CONFIG.iterations // 3
-    assert "only colour and alpha" in page.told[0]
+    assert "only unedited colour and alpha" in page.told[0]
 
 
 def test_a_picture_of_a_training_is_the_models(default_device: Device, photographs: Scene, tmp_path: Path) -> None:

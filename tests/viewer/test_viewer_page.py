@@ -176,9 +176,9 @@ def test_orbit_depth_and_a_path_that_is_rendered(
         depth = picture(page, kept(tmp_path, "depth.png"))
         assert np.abs(depth - second).mean() > 0.02
         choose(page, "Show", "count")
-        page.get_by_text("Gaussians a pixel").wait_for()
+        page.get_by_text("Gaussians per pixel").wait_for()
         choose(page, "Show", "alpha")
-        page.get_by_text("Gaussians a pixel").wait_for(state="detached")
+        page.get_by_text("Gaussians per pixel").wait_for(state="detached")
         alpha = picture(page, kept(tmp_path, "alpha.png"))
         np.testing.assert_allclose(alpha[:, :, 0], alpha[:, :, 2], atol=2 / 255)  # grey
         choose(page, "Show", "colour")

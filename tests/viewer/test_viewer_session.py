@@ -373,7 +373,7 @@ def test_pictures() -> None:
     assert text == "depth 1.04 (bright) to 2.96"
     nothing, text = depth_picture(depth, np.zeros_like(alpha))
     assert (nothing == 0).all()
-    assert text == "nothing is seen"
+    assert text == "nothing is visible"
 
     counts, text = count_picture(np.array([[0, 5, 10]], np.int32))
     assert counts[0, 0].tolist() == VIRIDIS_RGB[0].tolist()

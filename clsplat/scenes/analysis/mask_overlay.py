@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Overlays that show which parts of a photograph its masks leave out."""
+"""Pictures that show the parts of a photograph that its masks leave out."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ MASK_OVERLAY_OPACITY = 0.6
 class Masked:
     """A photograph and the parts that its masks leave out.
 
-    photograph: (H, W, 3), without its masks.
-    ignored, clear: (H, W, 1), the fraction of each pixel that is ignored or transparent, 0 to 1.
+    photograph: (H, W, 3), before masks are applied.
+    ignored, clear: (H, W, 1), the fractions of each pixel that are ignored and transparent, 0 to 1.
     """
 
     photograph: Float32

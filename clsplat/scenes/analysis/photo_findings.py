@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Findings about a scene before training: problems of its photographs, and the settings that answer them.
+"""Findings about a scene before training: problems of its photographs, and settings that mitigate them.
 
 They are based on thumbnails, cameras and points, and need no device.
 """
@@ -40,7 +40,7 @@ Kind = Literal[
 EXPOSURE_SPREAD_STOPS = 0.2
 """Standard deviation of a channel's brightness over the photographs, in stops, from which exposures count as varying.
 
-With locked exposure, occlusion and highlights alone cause up to 0.1. Learnt gains improve a model from about 0.2.
+With locked exposure, occlusion and highlights cause up to 0.1. From about 0.2, learnt gains improve a model.
 """
 DISTANCE_SPREAD_RATIO = 4.0
 """Ratio of the 90th to the 10th percentile of distance / focal length that counts as a wide range.
@@ -48,65 +48,65 @@ DISTANCE_SPREAD_RATIO = 4.0
 At 4, a Gaussian one pixel wide in one photograph is a quarter of a pixel, or four pixels, wide in another.
 """
 CUT_OUT_BORDER_FRACTION = 0.9
-"""Minimum fraction of the border pixels that masks leave out, to count as cutting an object out of its background."""
+"""Masks cut an object out of its background if they leave out at least this fraction of the border pixels."""
 SAMPLED_MASKS = 12
 """Number of masks that are sampled to recognise cut-outs. The sample may be up to twice as large."""
 TRANSPARENT_PIXEL_FRACTION = 0.02
-"""Minimum fraction of transparent pixels in a photograph whose alpha has a meaning. Seams and corners cover less."""
+"""Minimum fraction of transparent pixels in a photograph for its alpha to be reported. Seams and corners cover less."""
 WIDE_FISHEYE_DEGREES = 100.0
-"""Field of view of a fisheye in degrees from which undistortion loses much: pinhole pictures grow with the tangent."""
+"""Field of view of a fisheye in degrees above which undistortion loses much: the pinhole picture would be too large."""
 FEW_TRAINING_VIEWS = 16
 """Number of training photographs below which they hardly constrain the depth of a scene.
 
-Published trainings on 12 photographs are 8 dB below those on 100 photographs; on 24, about 3 dB.
+In publications, training on 12 photographs is 8 dB below training on 100 photographs, and training on 24 about 3 dB.
 """
 SPARSE_TRAINING_VIEWS = 30
 """Number of training photographs below which unlimited growth overfits (docs/quality.md)."""
 MAX_GAUSSIANS_PER_POINT, MIN_PIXELS_PER_GAUSSIAN = 12, 64
 """Maximum number of Gaussians per point, and minimum number of pixels per Gaussian, for scenes with few photographs.
 
-A Gaussian has up to 59 parameters, and a pixel three values, most of which its neighbours repeat. 25 photographs of
-bonsai do best with 64 to 85 pixels per Gaussian, and the 50 photographs of fox with 7 Gaussians per point
-(docs/quality.md, Few photographs and Growth).
+A Gaussian has up to 59 parameters. A pixel has three values, and most of these resemble its neighbours'. The results
+are best with 64 to 85 pixels per Gaussian for 25 photographs of bonsai, and with 7 Gaussians per point for the 50
+photographs of fox (docs/quality.md, Few photographs and Growth).
 """
 SUPPORTED_GAUSSIANS_PER_POINT = 1.5
-"""Number of Gaussians per point that few photographs support even if they have few pixels, as small photographs repeat
-less."""
+"""Number of Gaussians per point that few photographs support even if they have few pixels: in small photographs,
+neighbouring pixels differ more."""
 FEW_STEPS_PER_VIEW = 60
 """Steps per training photograph below which high learning rates give better models
 (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
-"""Lengths of training in steps for which high learning rates are recommended. They were measured from 2000 to 7000."""
+"""Numbers of training steps for which high learning rates are recommended. Trainings of 2000 to 7000 were measured."""
 BLUR_SHARPNESS_RATIO = 0.72
 """Sharpness, relative to the scene's median, below which a photograph counts as blurred.
 
 A blur of 1.5 pixels gives this ratio. The content of a photograph changes the ratio by 0.1 to 0.2.
 """
 BLUR_OUTLIER_SIGMAS = 3.5
-"""A blurred photograph must also lie below the median log sharpness by this many standard deviations, from
-quartiles."""
+"""The log sharpness of a blurred photograph must also lie this many standard deviations below the median. The standard
+deviation is estimated from quartiles."""
 DUPLICATE_RMS = 1.5 / 255
 """Maximum RMS difference of two thumbnails that count as the same picture. JPEG rounding causes half of it."""
 FEATURELESS_THUMBNAIL_STD = 8 / 255
 """Standard deviation of a thumbnail up to which it is featureless and never counts as a duplicate."""
 MIN_SKY_PIXEL_FRACTION, MIN_SKY_VIEW_FRACTION = 0.06, 0.3
-"""Minimum fraction of a photograph that its sky covers, and minimum fraction of the photographs that have a sky."""
+"""Minimum fraction of a photograph that a sky covers, and minimum fraction of photographs with a sky for a finding."""
 MAX_SKY_POINT_DENSITY_RATIO = 0.1
 """Maximum density of points in a sky, relative to the mean density in the photograph."""
 MAX_SKY_PIXEL_STEP, MIN_SKY_LUMA = 0.025, 0.45
-"""Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma."""
+"""Maximum luma difference of neighbouring thumbnail pixels in a sky, and minimum luma of a sky."""
 MIN_SKY_BLUE_EXCESS = 0.02
-"""Minimum of blue minus red in a blue sky; a wall under lamps is below 0. A white sky must be over MAX_EXPOSURE_COLOUR
-instead."""
+"""Minimum of blue minus red in a blue sky. For a wall in lamplight it is below 0. The luma of a white sky must exceed
+MAX_EXPOSURE_COLOUR instead."""
 
 
 @dataclass(frozen=True)
 class Finding:
     """A finding about the photographs.
 
-    kind: identifies the check.
+    kind: the check that made the finding.
     text: a clause for the report.
-    options: settings that answer the finding, best first, if they depend on the photographs.
+    options: alternative settings that mitigate the problem, best first, if they depend on the photographs.
     """
 
     kind: Kind
@@ -150,8 +150,8 @@ def _exposure(looked: VisiblePoints) -> Finding | None:
     low, high = (list(gains)[index] for index in (grey.argmin(), grey.argmax()))
     return Finding(
         "exposure",
-        f"exposures or colours differ by {spread:.2f} stops from photograph to photograph, {np.ptp(grey):.1f} from "
-        f"{low} to {high}",
+        f"exposures or colours have a standard deviation of {spread:.2f} stops, and {low} and {high} differ by "
+        f"{np.ptp(grey):.1f} stops",
     )
 
 
@@ -166,7 +166,7 @@ def _scales(looked: VisiblePoints) -> Finding | None:
     near, far = np.quantile(distances, (0.1, 0.9))
     if far < DISTANCE_SPREAD_RATIO * near:
         return None
-    return Finding("scales", f"distances of the photographs differ by a factor of {far / near:.0f}, from near to far")
+    return Finding("scales", f"distances to the subject differ by a factor of {far / near:.0f} between photographs")
 
 
 def _masks(scene: Scene, use: MaskUse) -> Finding | None:
@@ -182,7 +182,7 @@ def _masks(scene: Scene, use: MaskUse) -> Finding | None:
         return None
     kept = [(mask.mean(), np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()) for mask in masks]
     inside, border = np.mean(kept, axis=0)
-    text = f"there are masks for {len(found):,} of {len(scene.views):,} photographs, and they are not used"
+    text = f"{len(found):,} of {len(scene.views):,} photographs have masks, which are not used"
     if border <= 1 - CUT_OUT_BORDER_FRACTION and inside < 0.5:
         return Finding("cut out", f"{text}; they cut out an object that covers {100 * inside:.0f} % of the pictures")
     return Finding("masks", f"{text}; they leave out {100 - 100 * inside:.0f} % of the pictures")
@@ -196,7 +196,7 @@ def _strange_masks(scene: Scene, reason: str) -> Finding | None:
         return None
     if not count:
         return None
-    text = f"there are masks for {count:,} of {len(scene.views):,} photographs, which cannot be used ({reason})"
+    text = f"{count:,} of {len(scene.views):,} photographs have masks, which cannot be used ({reason})"
     return Finding("strange masks", text)
 
 
@@ -207,7 +207,7 @@ def _alpha(scene: Scene, use: MaskUse) -> Finding | None:
     if (shares >= TRANSPARENT_PIXEL_FRACTION).mean() < 0.5:
         return None
     part = f"{100 * shares.mean():.0f} %"
-    return Finding("alpha", f"{part} of the photographs' area is transparent, and shows the background")
+    return Finding("alpha", f"{part} of the photographs' area is transparent and shows the background")
 
 
 def _undistorted(scene: Scene) -> Finding | None:
@@ -220,7 +220,7 @@ def _undistorted(scene: Scene) -> Finding | None:
         return None
     return Finding(
         "undistorted",
-        f"{len(wide):,} photographs were taken by fisheyes of up to {most:.0f} degrees, and are undistorted",
+        f"{len(wide):,} photographs were taken with fisheyes of up to {most:.0f} degrees and are undistorted",
     )
 
 
@@ -228,7 +228,7 @@ def _few(scene: Scene) -> Finding | None:
     count = len(scene.train_views)
     if count >= FEW_TRAINING_VIEWS:
         return None
-    return Finding("few views", f"only {count} photographs to train on, so that views from elsewhere will show fog")
+    return Finding("few views", f"there are only {count} training photographs, so that other views will show fog")
 
 
 def _some(scene: Scene, iterations: int) -> Finding | None:
@@ -239,9 +239,9 @@ def _some(scene: Scene, iterations: int) -> Finding | None:
     points = len(scene.points)
     most = min(pixels // MIN_PIXELS_PER_GAUSSIAN, MAX_GAUSSIANS_PER_POINT * points or pixels)
     most = max(most, int(SUPPORTED_GAUSSIANS_PER_POINT * points), 1)
-    why = f"{count} photographs to train on, with {points:,} points and {pixels / 1e6:.1f} million pixels"
+    why = f"{count} training photographs, with {points:,} points and {pixels / 1e6:.1f} million pixels"
     sparse, bound = {"thinning": 0.2, "penalty": 0.02}, {"density.max_gaussians": most}
-    early = {"eval_at": (iterations // 3,)} if scene.test_views and iterations >= 3 else {}  # to tell of overfitting
+    early = {"eval_at": (iterations // 3,)} if scene.test_views and iterations >= 3 else {}  # to reveal overfitting
     options = ({**sparse, **bound, **early}, {**sparse, **bound}, sparse, {"thinning": 0.2})
     return Finding("some views", f"{why}, support about {most:,} Gaussians", options)
 
@@ -251,7 +251,7 @@ def _few_steps(scene: Scene, iterations: int) -> Finding | None:
     if iterations not in SHORT_TRAINING_STEPS or iterations >= FEW_STEPS_PER_VIEW * count:
         return None
     each = iterations / count
-    text = f"{iterations:,} steps are {each:.1f} for each of {count:,} photographs to train on, so higher rates pay"
+    text = f"{iterations:,} steps are {each:.1f} per training photograph ({count:,}): higher learning rates are better"
     return Finding("few steps", text)
 
 
@@ -262,7 +262,7 @@ def _sky(looked: VisiblePoints) -> Finding | None:
     if len(with_sky) < max(3, MIN_SKY_VIEW_FRACTION * len(parts)) or not len(scene.points):
         return None
     return Finding(
-        "sky", f"{len(with_sky):,} photographs have a sky without points, {100 * np.mean(with_sky):.0f} % of each"
+        "sky", f"{len(with_sky):,} photographs have a sky without points, {100 * np.mean(with_sky):.0f} % of their area"
     )
 
 

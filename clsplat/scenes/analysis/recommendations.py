@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training settings that answer findings about a scene."""
+"""Recommended training settings for the findings about a scene."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clsplat.errors import InputError
 from clsplat.scenes.analysis.photo_findings import Finding, Kind
 
 SCHEDULE_SETTING = "schedule"
-"""Key of a schedule, which is a bundle of settings, in an answer."""
+"""Key of a schedule in the settings of an answer. A schedule is a bundle of settings."""
 SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
     "exposure": ({"appearance": "exposure"},),
     "scales": ({"antialiased": True},),
@@ -29,31 +29,31 @@ SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
             "penalty": 0.02,
             SCHEDULE_SETTING: "high-rates",
             "iterations": 2000,
-            "optimiser.sh_rest_rate": 4e-4,  # few photographs constrain view-dependent colour least
+            "optimiser.sh_rest_rate": 4e-4,  # few photographs hardly constrain view-dependent colour
         },
         {"thinning": 0.2, "penalty": 0.02},
         {"thinning": 0.2},
     ),
 }
-"""Settings that answer each kind of finding, best first. The first option compatible with the other settings is used.
+"""Alternative settings for each kind of finding, best first. The first one compatible with the other settings is used.
 """
 SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
-"""Settings that a schedule changes, apart from the number of steps."""
+"""Settings that a schedule changes, except for the number of steps."""
 ADVICE_BY_FINDING: Mapping[Kind, str] = {
-    "sky": "--sky 1000 starts with points far away for it",
-    "strange masks": "rename or remove files that are no masks",
-    "blur": "leave them out where others show the same",
+    "sky": "--sky 1000 adds distant initial points for the sky",
+    "strange masks": "rename or remove files that are not masks",
+    "blur": "leave them out if other photographs show the same",
     "duplicates": "remove the copies",
 }
-"""Advice on findings that no setting answers."""
+"""Advice for findings for which SETTINGS_BY_FINDING has no settings."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A finding and the settings that answer it.
+    """A finding and the settings recommended for it.
 
-    settings: empty if no setting answers the finding, or none is compatible with the other settings.
-    given: name of a setting that the user has given, and that takes precedence; "" for none.
+    settings: empty if there are none for the finding, or if none is compatible with the other settings.
+    given: name of a setting that the user has specified, which takes precedence; "" for none.
     """
 
     finding: Finding
@@ -62,9 +62,9 @@ class Answer:
 
     @property
     def words(self) -> str:
-        """Finding with its answer, such as "exposures differ by 0.40 stops (--appearance exposure)".
+        """Text of the finding and its settings, such as "the photographs have masks (--masks ignore)".
 
-        Advice that --auto does not apply follows a colon.
+        Advice that --auto does not apply comes after a colon.
         """
         kind = self.finding.kind
         if advice := ADVICE_BY_FINDING.get(kind):
@@ -72,8 +72,8 @@ class Answer:
         answer = flags(self.settings)
         if (options := _options(self.finding)) and not self.settings:
             wanted = flags(options[0])
-            given = f"--{self.given.replace('_', '-')} is given"
-            answer = given if self.given else f"{wanted} does not go with the other settings"
+            given = f"you set --{self.given.replace('_', '-')}"
+            answer = given if self.given else f"{wanted} is incompatible with the other settings"
         return f"{self.finding.text} ({answer})" if answer else self.finding.text
 
 
@@ -89,7 +89,7 @@ def flags(settings: Mapping[str, Any]) -> str:
 def answered(
     found: Sequence[Finding], config: TrainConfig, given: Collection[str] = ()
 ) -> tuple[list[Answer], TrainConfig]:
-    """Answer each finding. Returns the answers, and the configuration with all of them applied.
+    """Choose settings for each finding. Returns the answers, and the configuration with all their settings.
 
     given: names of settings that must not change.
     """
@@ -111,12 +111,12 @@ def answered(
 
 
 def _options(finding: Finding) -> Sequence[Mapping[str, Any]]:
-    """Settings that answer a finding, best first; empty if there are none."""
+    """Alternative settings for a finding, best first; empty if there are none."""
     return finding.options or SETTINGS_BY_FINDING.get(finding.kind, ())
 
 
 def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
-    """First setting in `given`, by name, that an option or its schedule would change; "" for none."""
+    """First setting of `given`, in the order of names, that `option` or its schedule would change; "" for none."""
     names = {*option, *((*SCHEDULED_SETTINGS, "density.start") if SCHEDULE_SETTING in option else ())}
     return min((name for name in given if name in names or name.partition(".")[0] in names), default="")
 
@@ -131,7 +131,7 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
     if (name := changes.pop(SCHEDULE_SETTING, None)) is not None:
         paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED_SETTINGS)
         if values(config) != values(paper):
-            raise InputError(f"--schedule {name}: the run has settings of its own in place of the paper's schedule")
+            raise InputError(f"--schedule {name}: the run has settings that differ from the paper's schedule")
         changes = dict(zip(SCHEDULED_SETTINGS, values(scheduled(name, config.iterations)), strict=True)) | changes
     for each, value in changes.items():
         config = changed(config, each, value)
@@ -146,10 +146,10 @@ def changed(config: TrainConfig, name: str, value: Any) -> TrainConfig:
 
 
 def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:
-    """Report of the findings and their answers.
+    """Report of the findings and the settings for them.
 
     looked: number of photographs.
-    auto: True if the answers are applied.
+    auto: True if the settings are applied.
     """
     if not answers:
         return f"inspected {looked:,} photographs: no setting needs to change"

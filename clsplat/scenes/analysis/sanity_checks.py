@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sanity checks for scenes on which training would fail without an error.
+"""Checks for scenes on which training would give bad results without an error.
 
-Some inspect the scene before the first step, others the rendered pictures after some steps. Each warning is one line
-that says how to correct the problem.
+Some checks inspect the scene before the first step, others the rendered pictures after some steps. Each warning is one
+line that says how to correct the problem.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ MANY_START_POINTS = 1_000_000
 Published models of rooms and gardens grow to 1 to 6 million Gaussians from 50,000 to 200,000 points.
 """
 MAX_COINCIDENT_FRACTION = 0.05
-"""Fraction of the points that may coincide with others."""
+"""Maximum fraction of the points that may coincide with others without a warning."""
 PRINCIPAL_POINT_MARGIN = 0.5
 """Maximum distance of a principal point outside the picture, as a fraction of its width or height."""
 WHITE_LEVEL, BLACK_LEVEL = 0.98, 0.02
-"""Minimum of each channel in a white pixel, and maximum in a black one."""
+"""Minimum of each channel in a white pixel, and maximum of each channel in a black pixel."""
 BACKGROUND_BORDER_FRACTION = 0.9
-"""Minimum fraction of the photographs' border pixels with the background's colour, to count as having that
-background."""
+"""Photographs count as having a white or black background if at least this fraction of their border pixels has that
+colour."""
 
 
 def of_scene(scene: Scene, background: Background) -> list[str]:
@@ -67,22 +67,22 @@ def of_scene(scene: Scene, background: Background) -> list[str]:
 def of_pictures(
     draw: Callable[[Camera], tuple[NDArray[Any], NDArray[Any]]], views: Sequence[View], kind: str = "training"
 ) -> str:
-    """Warning about a model's pictures of these views, "" for none.
+    """Warning about a model's pictures of these views; "" if there is nothing to report.
 
-    draw: renders the image (H, W, 3) and alpha (H, W) of a camera.
-    kind: the views' name in the message.
+    draw: function that renders the image (H, W, 3) and alpha (H, W) of a camera.
+    kind: name of the kind of views, for the message.
     """
     looked = spread(views, MAX_CHECKED_VIEWS)
     drawn = [draw(_small(view.camera)) for view in looked]
     if not any(alpha.any() for _, alpha in drawn):
         return (
-            f"no Gaussian is seen by any of the {len(looked)} {kind} views that were checked: the points do not "
-            "lie before the cameras; check that both have the same axes, scale and origin"
+            f"no Gaussian is visible in any of the {len(looked)} {kind} views that were checked: the points do not "
+            "lie in front of the cameras; check that both have the same axes, scale and origin"
         )
     if all(_is_flat(image) for image, _ in drawn) and not all(_is_flat(_pixels(view)) for view in looked):
         return (
-            f"the pictures of all {len(looked)} {kind} views that were checked are of one colour, and the "
-            "photographs are not: check that cameras and points belong together, and settings other than the defaults"
+            f"each picture of the {len(looked)} {kind} views that were checked has a single colour, but the "
+            "photographs do not: check that cameras and points belong together, and settings other than the defaults"
         )
     return ""
 
@@ -110,8 +110,8 @@ def _many_points(scene: Scene) -> str:
     if len(scene.points) <= MANY_START_POINTS:
         return ""
     return (
-        f"{len(scene.points):,} points to start from are a Gaussian each, which takes memory and time from the first "
-        "step on: --points-limit 200000 keeps as many, evenly"
+        f"each of {len(scene.points):,} initial points becomes a Gaussian, which takes memory and time from the first "
+        "step on: --points-limit 200000 thins them evenly to that number"
     )
 
 
@@ -123,11 +123,11 @@ def _other_clouds(scene: Scene) -> str:
     others = [f"{path} ({count:,} points)" for path, count in counts.items() if count not in (0, len(scene.points))]
     if not others:
         return ""
-    return f"{examples(others)} is not used, as the scene has points of its own: --points FILE starts from it"
+    return f"{examples(others)} is not used, as the scene itself has points: to start from a file, add --points FILE"
 
 
 def _count(path: Path) -> int:
-    """Number of points in a cloud's header; 0 if it cannot be read."""
+    """Number of points according to a cloud's header; 0 if the file cannot be read."""
     try:
         return count_points(path)
     except InputError:
@@ -140,8 +140,8 @@ def _coincident(scene: Scene) -> str:
     if lost <= MAX_COINCIDENT_FRACTION * count:
         return ""
     return (
-        f"{lost:,} of {count:,} points lie where another one does: their Gaussians start with almost no size, or "
-        "as copies; leave doubles out of the cloud"
+        f"{lost:,} of {count:,} points coincide with another point: their Gaussians start with almost no size, or "
+        "as copies; remove duplicate points from the cloud"
     )
 
 
@@ -157,10 +157,10 @@ def _principal_points(scene: Scene) -> str:
     if not views:
         return ""
     camera = views[0].camera
-    where = f"{camera.cx:g} {camera.cy:g} in {camera.width} x {camera.height} pixels"
+    where = f"{camera.cx:g} {camera.cy:g} for a picture of {camera.width}x{camera.height}"
     return (
         f"the principal point of {examples(view.name for view in views)} lies far outside the picture, at {where}: "
-        "check cx and cy, which are pixels from the upper left corner at the cameras' size"
+        "check cx and cy, which are in pixels from the upper left corner at the cameras' size"
     )
 
 
@@ -168,8 +168,8 @@ def _one_place(scene: Scene) -> str:
     if len(scene.views) < 2 or not scene.in_one_place:
         return ""
     return (
-        f"all {len(scene.train_views):,} training cameras stand in one place, from where nothing has a depth: check "
-        "the translations of the poses; of photographs that were taken so, views from elsewhere cannot be learnt"
+        f"all {len(scene.train_views):,} training cameras stand in one place, so that no depth can be recovered: "
+        "check the translations of the poses; if they are right, views from elsewhere cannot be learnt"
     )
 
 
@@ -178,8 +178,8 @@ def _empty(views: Sequence[View], pictures: Sequence[NDArray[np.float32]], backg
     if not all(_is_flat(composite(pixels, colour)) for pixels in pictures):
         return ""
     return (
-        f"the {len(views)} training photographs that were checked are of one colour, or transparent, so that there "
-        f"is nothing to learn: check {examples(view.name for view in views)}"
+        f"each of the {len(views)} training photographs that were checked has a single colour or is "
+        f"transparent, so that there is nothing to learn: check {examples(view.name for view in views)}"
     )
 
 
@@ -194,7 +194,7 @@ def _background(pictures: Sequence[NDArray[np.float32]], background: Background)
         other = "random" if background == "random" else {"white": "black", "black": "white"}[background]
         if part.mean() >= BACKGROUND_BORDER_FRACTION and background != name and (name == "white" or other == "black"):
             return (
-                f"{100 * part.mean():.0f} % of the photographs' border is {name}, and the background is {background}: "
-                f"use --background {name}, else Gaussians have to cover it"
+                f"{100 * part.mean():.0f} % of the photographs' border is {name}, but the background is {background}: "
+                f"use --background {name}, or else Gaussians have to cover the background"
             )
     return ""

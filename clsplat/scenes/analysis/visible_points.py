@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Visible scene points in the photographs' thumbnails, and the exposures that their colours imply."""
+"""Scene points that are visible in the photographs' thumbnails, and exposures estimated from their colours."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from clsplat.scenes.scene import Scene, View
 MAX_SAMPLED_SCENE_POINTS = 4000
 """Maximum number of scene points that are sampled. A larger sample changes a median brightness by less than 0.01."""
 THUMBNAIL_OCCLUSION_DEPTH_RATIO = 1.15
-"""Depth relative to the nearest point of the cell, above which a point counts as occluded."""
+"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
 THUMBNAIL_OCCLUSION_CELL_PX = 8
 """Side of an occlusion cell in thumbnail pixels."""
 MIN_POINTS_PER_VIEW = 40
-"""Minimum number of points in a photograph to judge its brightness or scale."""
+"""Minimum number of points in a photograph for measuring its brightness or scale."""
 MIN_EXPOSURE_COLOUR, MAX_EXPOSURE_COLOUR = 0.06, 0.94
-"""Range of colour values that are used to measure exposure. Outside it they are noise or clipped."""
+"""Range of colour values that are used to measure exposure. Smaller ones are noisy, and larger ones may be clipped."""
 COLOUR_NOISE_FLOOR = 1 / 255
-"""Colour value up to which its logarithm is noise: one 8-bit step.
+"""Colour value up to which the logarithm is mostly noise: one 8-bit step.
 
-A higher limit would drop the darkest points of a dark photograph, so that the photograph would seem brighter.
+A higher limit would exclude the darkest points of a dark photograph, which would then seem brighter.
 """
 EXPOSURE_IRLS_ITERATIONS, MIN_EXPOSURE_RESIDUAL_STOPS = 10, 0.02
 """Iterations of reweighted least squares, and the residual in stops below which all points have the same weight."""
@@ -47,7 +47,7 @@ class VisiblePoints:
 
     @cached_property
     def places(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]]:
-        """By view name: indices of the visible points, their rows and columns in the thumbnail, and their depths.
+        """For each view's name: indices of the visible points, their rows and columns in the thumbnail, and depths.
 
         Panoramas and fisheyes are left out.
         """
@@ -73,7 +73,7 @@ class VisiblePoints:
 
     @cached_property
     def gains(self) -> dict[str, Float64]:
-        """log2 gain (3,) of each view: brightness relative to the points' own colours, minus the median over the views.
+        """log2 gain (3,) of each view: brightness relative to the scene's point colours, minus the median of all views.
 
         Only points that have colours are used.
         """
@@ -89,13 +89,13 @@ class VisiblePoints:
 
     @cached_property
     def exposures(self) -> dict[str, Float64]:
-        """log2 exposure (3,) of each photograph relative to the others.
+        """log2 exposure (3,) of each photograph relative to the others. The keys are the views' names.
 
         Each point is assumed to have the same colour in all photographs, so that differences are due to exposure. The
-        fit minimises absolute differences by iteratively reweighted least squares. It does not use the points' colours
-        in the scene. Photographs with fewer than MIN_POINTS_PER_VIEW shared points are left out.
+        fit minimises absolute differences by iteratively reweighted least squares. It does not use the point colours
+        stored in the scene. Photographs with fewer than MIN_POINTS_PER_VIEW shared points are left out.
         """
-        if len(self.points) < MIN_POINTS_PER_VIEW:  # avoids loading any thumbnail
+        if len(self.points) < MIN_POINTS_PER_VIEW:  # so that no thumbnail is loaded
             return {}
         seen = {name: self._logs(name) for name in self.places}
         counts = np.bincount(np.concatenate([np.empty(0, np.int64), *(which for which, _ in seen.values())]))
@@ -111,7 +111,7 @@ class VisiblePoints:
         return dict(zip(shared, relative_exposures(points, views, colors), strict=True))
 
     def _logs(self, name: str) -> tuple[NDArray[np.int64], Float64]:
-        """Points (n,) that a view shows neither dark nor clipped, and log2 of their colours in it (n, 3)."""
+        """Points (n,) that are neither too dark nor clipped in a view, and log2 of their colours there, (n, 3)."""
         which, rows, columns, _ = self.places[name]
         pixels = self.scene.glances[name].pixels
         seen, most = (
@@ -125,11 +125,11 @@ class VisiblePoints:
 def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs: Float64) -> Float64:
     """Estimate the exposures (V, 3) of views from the colours of shared points.
 
-    points, views: (M,) indices, each pair once.
+    points, views: (M,) indices; each pair occurs once.
     logs: (M, 3), log2 colours of these points in these views.
 
-    Each log colour is modelled as the view's exposure plus the point's colour, with the least sum of absolute
-    residuals. In each group of views that points connect, the weighted mean exposure is 0.
+    Each log colour is modelled as the view's exposure plus the point's colour. The sum of absolute residuals is
+    minimised. In each group of views that are connected by points, the weighted mean exposure is 0.
     """
     points = np.unique(points, return_inverse=True)[1]
     sizes, weights, found = (points.max() + 1, views.max() + 1), np.ones(len(points)), np.empty(0)
@@ -147,5 +147,5 @@ def relative_exposures(points: NDArray[np.int64], views: NDArray[np.int64], logs
 
 
 def _sums(places: NDArray[np.int64], weights: Float64, values: Float64) -> Float64:
-    """Sums (places, 3) of the weighted values (M, 3) by place."""
+    """Sum of weighted values (M, 3) for each place, (places, 3)."""
     return np.stack([np.bincount(places, weights * column) for column in values.T], axis=1)

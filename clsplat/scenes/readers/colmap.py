@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading of COLMAP models: cameras, images and points3D, binary or text (https://colmap.github.io/format.html).
 
-`pycolmap.Reconstruction` is not used, because 4.2.1 does not handle damaged files. It fails without naming the file,
-asks for all memory, or accepts a truncated cameras.bin and goes on with unread data. This reader accounts for every
-byte.
+`pycolmap.Reconstruction` is not used, because version 4.2.1 does not handle damaged files. It fails without naming the
+file, allocates all memory, or accepts a truncated cameras.bin and goes on with uninitialised data. This reader accounts
+for every byte.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from clsplat.scenes.photo_names import is_legible, legible, slashed
 COLMAP_FILE_STEMS = ("cameras", "images", "points3D")
 COLMAP_COUNT = struct.Struct("<Q")
 OBSERVATION_BYTES = 24  # x, y, id of the point
-TRACK_BYTES = 8  # ids of the image and of the observation in it
+TRACK_BYTES = 8  # id of the image, index of the observation in it
 MAX_NAME_BYTES = 4096
 MAX_LINE_CHARACTERS = 1 << 26
 """Maximum characters of a text line. The observations of a picture and the track of a point are one line each."""
@@ -66,8 +66,8 @@ COLMAP_FILE_KIND = "a file of a COLMAP model"
 def find_model(folder: Path) -> Path | None:
     """Folder of the model that belongs to `folder`, or None.
 
-    Looks in the folder itself, sparse/ and colmap/sparse/, each with numbered sub-folders such as sparse/0 first. Of
-    several numbered models, the one with the most images is used, as COLMAP's first one may be a fragment.
+    The folder itself, sparse/ and colmap/sparse/ are searched, and in each, numbered sub-folders such as sparse/0 come
+    first. Of several numbered models, the one with the most images is used: COLMAP's first model may be a fragment.
     """
     for candidate in (folder, folder / "sparse", folder / "colmap" / "sparse"):
         numbered = [path for path in candidate.glob("[0-9]*") if _is_model(path)]
@@ -83,9 +83,9 @@ def find_model(folder: Path) -> Path | None:
 def read_model(folder: Path) -> DataSet:
     """Read the model in `folder`: each of the three files as .bin if it exists, else as .txt.
 
-    Without points3D there are no points. Raises InputError that names the file if one is missing, truncated, longer
-    than its contents, damaged, or has an unknown camera model. Warns of text with less than its header announces, and
-    of text newer than the binary file that is read.
+    Without points3D there are no points. Raises InputError that names the file if a file is missing, truncated, longer
+    than its contents, damaged, or has an unknown camera model. Warns of text files with fewer records than their
+    headers announce, and of text files newer than the binary file that is read.
     """
     images = _read_posed_images(folder)
     return DataSet(images, *_read_points(folder)) if _file(folder, "points3D") else DataSet(images)
@@ -97,10 +97,11 @@ def _read_posed_images(folder: Path) -> list[PosedImage]:
 
 
 def read_cameras(folder: Path, lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Cameras of a model by image name, sorted. Points and pictures are not read.
+    """Cameras of a model, sorted by image name. The keys are the image names. Points and pictures are not read.
 
-    folder: the model's own or the scene's, as for `find_model`.
-    lenses: distorted cameras become full-size pinhole cameras, as for training (`Lens.camera`).
+    folder: the folder of the model or of the scene, as for `find_model`.
+    lenses: treatment of distorted cameras, as for training (`Lens.camera`). By default they become full-size pinhole
+        cameras.
     Raises InputError and warns like `read_model`. Also warns of implausible lenses.
     """
     return cameras_of(read_images(folder), lenses)
@@ -123,7 +124,7 @@ class Tracks:
 
     points: (N, 3) float64, world coordinates.
     errors: (N,), mean reprojection errors in pixels.
-    by_image: rows (k,) of both arrays by image name, ascending and unique.
+    by_image: for each image name, the indices (k,) of its points in both arrays, ascending and unique.
     """
 
     points: Float64
@@ -132,7 +133,7 @@ class Tracks:
 
 
 def read_tracks(folder: Path) -> Tracks:
-    """Read the tracks of the model in `folder`, without those in unknown images. Raises InputError like
+    """Read the tracks of the model in `folder`, without observations in unknown images. Raises InputError like
     `read_model`."""
     path = _require(folder, "images")
     rows = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
@@ -161,9 +162,9 @@ def safe_name(name: str) -> bool:
 
 
 def _named(path: Path, name: str) -> str:
-    """Name of a picture, without its drive or root and without ".."; such pictures are found by the end of their path.
+    """Name of a picture, without a drive, root or "..". Pictures with these are found by the end of their path.
 
-    Raises InputError for a name that is not a path inside the images' folder even then.
+    Raises InputError if the remaining name is not a path inside the images' folder.
     """
     inner = name if safe_name(name) else "/".join(part for part in slashed(name).split("/") if part != "..")
     if not safe_name(inner):
@@ -202,11 +203,11 @@ class _Binary:
         if len(raw) == min(MAX_NAME_BYTES, self.left):
             raise corrupt(self.path, f"{self.doing} has a name without an end")
         self.left -= len(raw) + 1
-        return raw.decode("utf-8", "surrogateescape")  # the system's code page on Windows: `photo_names`
+        return raw.decode("utf-8", "surrogateescape")  # COLMAP on Windows writes the code page: see `photo_names`
 
 
 def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
-    """Yield the reader at each of the records that the file announces, which have at least `least` bytes each."""
+    """Yield a reader at the beginning of each record that the file announces. Records have at least `least` bytes."""
     with open_input(path, COLMAP_FILE_KIND) as opened:
         file = _Binary(path, opened)
         (number,) = map(int, file.read(COLMAP_COUNT))
@@ -222,7 +223,7 @@ def _records(path: Path, what: str, least: int) -> Iterator[_Binary]:
 
 def corrupt(path: Path, trouble: str) -> InputError:
     """Error for invalid contents of a model's file."""
-    return InputError(f"{path}: truncated or corrupt: {trouble}; copy the file again or export the model anew")
+    return InputError(f"{path}: truncated or corrupt: {trouble}; copy the file again or export the model again")
 
 
 def _is_model(folder: Path) -> bool:
@@ -243,12 +244,12 @@ def _file(folder: Path, stem: str) -> Path | None:
 def _require(folder: Path, stem: str) -> Path:
     path = _file(folder, stem)
     if path is None:
-        raise InputError(f"{folder}: has no {stem}.bin or {stem}.txt, expected a COLMAP model, cameras and images")
+        raise InputError(f"{folder}: has no {stem}.bin or {stem}.txt, expected a COLMAP model with cameras and images")
     return path
 
 
 def _claimed_images(folder: Path) -> int:
-    """Number of images that a model announces; -1 without a file of images."""
+    """Number of images that a model announces; -1 if it has no images file."""
     path = _file(folder, "images")
     if path is None:
         return -1
@@ -267,11 +268,12 @@ def _warn_of_newer_text(folder: Path) -> None:
             edited.append(stem)
     if edited:
         read, not_read = (", ".join(stem + extension for stem in edited) for extension in (".bin", ".txt"))
-        warn(f"{folder}: {read} is read and not the newer {not_read}; remove the one that is not meant")
+        warn(f"{folder}: {read} is read, and the newer {not_read} is not; remove the one that is not wanted")
 
 
 def _check_count(path: Path, count: int) -> None:
-    """Warn of a text file that is truncated at the end of a line, which no other check detects."""
+    """Warn of a text file with fewer records than announced. Truncation at the end of a line is not detected
+    elsewhere."""
     if path.suffix != ".txt":
         return
     announced = 0
@@ -280,7 +282,7 @@ def _check_count(path: Path, count: int) -> None:
             if match := RECORD_COUNT_COMMENT.match(line.lstrip(b"\xef\xbb\xbf").decode("utf-8", "replace")):
                 announced = int(match[1])
     if count < announced:
-        warn(f"{path}: its header announces {announced:,}, and it holds {count:,}; is it cut, or edited since?")
+        warn(f"{path}: its header announces {announced:,} records, but it has {count:,}; was it truncated or edited?")
 
 
 def _read_cameras(folder: Path) -> dict[int, Lens]:
@@ -289,7 +291,7 @@ def _read_cameras(folder: Path) -> dict[int, Lens]:
     in_parts = []
     for key, lens in _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path):
         if key in lenses:
-            raise corrupt(path, f"camera {key} is there twice")
+            raise corrupt(path, f"camera {key} occurs twice")
         lenses[key], parts = in_pixels(check_lens(lens, f"{path}: camera {key}"))
         in_parts += [key] if parts else []
     if in_parts:
@@ -326,7 +328,7 @@ def _read_images(folder: Path, lenses: dict[int, Lens]) -> list[PosedImage]:
             raise corrupt(path, f"image {given[:80]!r} has the camera {camera}, which is not in the model")
         name = _named(path, given)
         if name in images:
-            raise corrupt(path, f"image {name} is there twice")
+            raise corrupt(path, f"image {name} occurs twice")
         quaternion, translation = np.array(pose[:4], np.float64), np.array(pose[4:], np.float64)
         norm = math.hypot(*pose[:4])
         if not (0.5 < norm < 2 and (np.abs(translation) < MAX_COORDINATE).all()):
@@ -361,13 +363,14 @@ def _image_lines(path: Path) -> Iterator[tuple[int, str, str]]:
             yield (
                 number,
                 line,
-                f"X Y POINT3D_ID, again and again, or as {IMAGE_LINE_FIELDS}" if after_pose else IMAGE_LINE_FIELDS,
+                f"repeated X Y POINT3D_ID, or as {IMAGE_LINE_FIELDS}" if after_pose else IMAGE_LINE_FIELDS,
             )
             after_pose = True
 
 
 def _are_observations(line: str) -> bool:
-    """True if a line's words come in threes and end with a number. The first line of an image ends with a name."""
+    """True if the number of words is a multiple of three and the last word is a number. An image's first line ends with
+    a name."""
     words = line.split()
     try:
         float(words[-1])
@@ -385,14 +388,14 @@ def _text_images(path: Path) -> Iterator[tuple[int, str, int, tuple[float, ...]]
 
 def _read_points(folder: Path) -> tuple[Float64, Float32]:
     path = _require(folder, "points3D")
-    values = array("d")  # a list of tuples would take six times the memory
+    values = array("d")  # a list of tuples would need six times the memory
     for row in _binary_points(path) if path.suffix == ".bin" else _text_points(path):
         values.extend(row)
     table = np.frombuffer(values, np.float64).reshape(-1, 6) if values else np.empty((0, 6))
     _check_count(path, len(table))
     known = ~np.isnan(table).any(axis=1)
     if not known.all() and known.any():
-        warn(f"{path}: {np.count_nonzero(~known):,} of {len(table):,} points are not numbers, and are left out")
+        warn(f"{path}: {np.count_nonzero(~known):,} of {len(table):,} points have NaN values and are left out")
         table = table[known]
     near = (np.abs(table[:, :3]) < MAX_COORDINATE).all(axis=1)
     good = near & ((table[:, 3:] >= 0) & (table[:, 3:] <= 65535)).all(axis=1)
@@ -419,12 +422,12 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
         with _parsing(path, number, POINT_LINE_FIELDS):
             _, x, y, z, red, green, blue, *others = _with_colours(line)  # some tools leave error and track out
             if len(others) == 2 and len(others[1].split()) % 2:
-                raise ValueError("a track is of pairs")
+                raise ValueError("a track consists of pairs")
             yield float(x), float(y), float(z), float(red), float(green), float(blue)
 
 
 def _with_colours(line: str) -> list[str]:
-    """Fields of a point's line, with its track as one field; grey if there is only a position."""
+    """Fields of a point's line, with the track as one field. Grey is added if there is only a position."""
     words = line.split(maxsplit=8)
     return [*words, "128", "128", "128"] if len(words) == 4 else words
 
@@ -471,4 +474,4 @@ def _parsing(path: Path, number: int, expected: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, IndexError, OverflowError):
-        raise InputError(f"{path}: line {number} does not read as {expected}; is the file cut or damaged?") from None
+        raise InputError(f"{path}: line {number} does not read as {expected}; is the file damaged?") from None

@@ -16,9 +16,9 @@ from clsplat.scenes.dataset import Lens
 
 
 def write_model(folder: Path, images: Sequence[tuple[str, Lens, Camera]], points: Float64, colors: Float32) -> None:
-    """Write cameras.txt, images.txt and points3D.txt into the folder, which is created.
+    """Create the folder and write cameras.txt, images.txt and points3D.txt into it.
 
-    images: names, the lenses that took their files, and cameras that give the poses.
+    images: for each image its name, the lens of its file, and a camera with its pose.
     points: (N, 3), world coordinates.
     colors: (N, 3) in [0, 1].
     There are no observations: tracks are empty, and errors are 0.

@@ -41,7 +41,7 @@ from clsplat.scenes.point_files import clouds_beside, read_point_cloud
 
 COLMAP_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
-"""Default scale and offset of instant-ngp: its position is scale times the file's, plus offset."""
+"""Default scale and offset of instant-ngp, whose positions are scale * p + offset for positions p of the file."""
 LAST_ROW_TOLERANCE = 1e-6
 """Maximum deviation of a pose's last row from 0 0 0 1. Products of float32 matrices deviate by less."""
 FOCAL_ANGLE_TOLERANCE = 0.02
@@ -58,10 +58,10 @@ def read_transforms(
 
     docs/conventions.md (Scenes) lists the keys that are read, in the file or in each frame. `file_path` is relative to
     the file. nerfstudio's `ply_file_path`, `train_filenames`, `val_filenames` and `test_filenames` are honoured.
-    Pictures in the last two, or not in the first of the three lists, are held out.
+    Pictures are held out if `val_filenames` or `test_filenames` lists them, or if `train_filenames` does not.
 
-    masks: True if masks are used; otherwise a warning says that the file's masks are ignored.
-    images: another folder of the same pictures.
+    masks: True if masks are used. If False, a warning says that the file's masks are ignored.
+    images: another folder with the same pictures.
     missing: as for `find_pictures`.
     Warns of ignored keys and of contradictions. Raises InputError that names the file and the key for invalid JSON, for
     a key that is missing or has the wrong type, and for missing pictures.
@@ -87,7 +87,7 @@ def read_transforms(
             data.clouds = [other for other in data.clouds if not other.samefile(file)]
         else:
             instead = data.clouds[0].name if data.clouds else "random ones"
-            warn(f"{path}: its points 'ply_file_path' are missing: {file}; using {instead}")
+            warn(f"{path}: the points of its 'ply_file_path' are missing: {file}; using {instead}")
     return data
 
 
@@ -98,10 +98,10 @@ def _clouds_below(folder: Path) -> list[str]:
 
 
 def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Missing) -> list[Path | None]:
-    """Picture of each frame, None for pictures that are left out.
+    """Picture of each frame; None for pictures that are left out.
 
-    Warns and raises InputError like `find_pictures`. Also raises it for a name that leads out of the folder and matches
-    no picture in it.
+    Warns and raises InputError like `find_pictures`. Also raises InputError for a name that leads out of the folder and
+    matches no picture in the folder.
     """
     listed, folder = [_plain(keys.text("file_path")) for keys in readers], path.parent
     if images is not None:
@@ -110,7 +110,7 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
     lost = [file for file in exact if file is not None and not is_file(file)]
     if lost and (copies := _smaller_folders(lost, folder)):
         for usual, copy in copies.items():
-            warn(f"{path}: the pictures are taken from {copy}, as there are none in {usual}")
+            warn(f"{path}: the pictures are read from {copy}, as there are none in {usual}")
         exact = [_moved(file, copies) for file in exact]
     try:
         return find_pictures(listed, exact, folder, path, missing)
@@ -122,7 +122,7 @@ def _pictures(path: Path, readers: list[Keys], images: Path | None, missing: Mis
 
 
 def _smaller_folders(lost: list[Path], folder: Path) -> dict[Path, Path]:
-    """Folders of missing pictures that have no pictures at all, and their downscaled copies."""
+    """Downscaled copy for each folder of missing pictures that has no pictures at all but has such a copy."""
     names = {parent for file in lost for parent in file.parents if folder in parent.parents}
     found = {name: or_smaller(name) for name in sorted(names)}
     return {name: copy for name, copy in found.items() if copy != name}
@@ -135,7 +135,7 @@ def _moved(file: Path | None, copies: dict[Path, Path]) -> Path | None:
 
 
 def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses = "undistort") -> dict[str, Camera]:
-    """Cameras of a transforms.json by image name, in its order, as for `cameras_of`.
+    """Cameras of a transforms.json in the order of the file, as from `cameras_of`. The keys are the image names.
 
     Pictures need not exist if the file has `w` and `h`. Otherwise a missing picture is assumed to have `size`, (width,
     height). Raises InputError like `read_transforms`. Warns of contradictions and of implausible lenses.
@@ -144,9 +144,9 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
 
 
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
-    """Images of a transforms.json, in its order. Pictures need not exist, as for `read_poses`."""
+    """Images of a transforms.json, in the order of the file. Pictures need not exist, as for `read_poses`."""
     readers = _readers(path, load_document(path))
-    with warnings.catch_warnings():  # warnings about pictures, which are not needed here
+    with warnings.catch_warnings():  # of missing pictures: they are not needed here
         warnings.simplefilter("ignore")
         try:
             files = _pictures(path, readers, None, "skip")
@@ -156,7 +156,7 @@ def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedIm
 
 
 def _within(keys: Keys) -> Path:
-    """Path of a file that may not exist: as listed, or without ".." and drive if that leads out of the folder."""
+    """Path of a picture that may not exist: as listed, or without ".." and drive if it leads out of the folder."""
     listed = keys.text("file_path")
     if not listed.isprintable():
         _inside(keys.path.parent, listed, keys.where)
@@ -190,7 +190,7 @@ def _images(
         in_parts += [name] if parts else []
         rotation, translation, _ = opengl_pose(keys.frame.get("transform_matrix"), keys.where, "'transform_matrix'")
         if name in images:
-            raise InputError(f"{path}: lists {name} twice, expected each picture once; remove one of the frames")
+            raise InputError(f"{path}: lists {name} twice, expected each picture once; remove one of its frames")
         mask, depth = (_file_of(keys, key) for key in ("mask_path", "depth_file_path"))
         images[name] = PosedImage(name, lens, rotation, translation, file, mask=mask, depth=depth, listed=listed)
     readers = [keys for keys, _ in frames]
@@ -213,7 +213,7 @@ def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: S
         found = {name: known[name] for name in map(_plain, given) if name in known}
         found |= match([name for name in map(_plain, given) if name not in known], names).names
         if lost := [name for name in given if _plain(name) not in found]:
-            warn(f"{path}: '{key}' lists {examples(lost)}, and no frame has that as its 'file_path'")
+            warn(f"{path}: '{key}' lists {examples(lost)}, but no frame has such a 'file_path'")
         listed.append(set(found.values()))
     train, held_out = listed[0], listed[1] | listed[2]
     if not (train or held_out):
@@ -222,7 +222,7 @@ def _split(path: Path, readers: list[Keys], images: list[PosedImage], missing: S
     if not trained:
         raise InputError(
             f"{path}: 'test_filenames' and 'val_filenames' hold out all {len(images)} pictures, expected some to train "
-            "on; remove these keys for a split of --test-every"
+            "on; remove these keys to split with --test-every"
         )
     return [replace(image, split="train" if image.name in trained else "test") for image in images]
 
@@ -233,7 +233,7 @@ def _warn_of_contradictions(path: Path, readers: list[Keys], images: list[PosedI
         contradictions = []
         for keys, image in zip(readers, images, strict=True):
             used, other = keys.number(focal), keys.get(angle)
-            # a value of the frame takes precedence over one of the file, which then belongs to other frames
+            # compare only values of one level: the file's value belongs to frames without a value of their own
             alike = (keys.frame.get(focal) is None) == (keys.frame.get(angle) is None)
             if used and alike and isinstance(other, int | float) and 0 < other < math.pi:
                 size = image.lens.width if axis == "x" else image.lens.height
@@ -241,16 +241,17 @@ def _warn_of_contradictions(path: Path, readers: list[Keys], images: list[PosedI
                 if abs(used / meant - 1) > FOCAL_ANGLE_TOLERANCE:
                     contradictions.append(f"{image.name} ({used:g}, not {meant:.4g})")
         if contradictions:
-            warn(f"{path}: '{focal}' is used, '{angle}' says otherwise of {examples(contradictions)}")
+            warn(f"{path}: '{focal}' is used; it contradicts '{angle}' for {examples(contradictions)}")
     shutters = [keys.get("rolling_shutter") for keys in readers]
     if any(any(value) if isinstance(value, list) else value for value in shutters):
-        warn(f"{path}: 'rolling_shutter' is ignored, pictures are taken as exposed at once")
+        warn(f"{path}: 'rolling_shutter' is ignored; all rows are assumed to be exposed at the same time")
 
 
 def read_blender(folder: Path, *, images: Path | None = None, missing: Missing = "few") -> DataSet:
-    """Read transforms_train.json and, if it exists, transforms_test.json, the data set's own split. val is not used.
+    """Read transforms_train.json and, if it exists, transforms_test.json, whose pictures are held out.
 
-    images, missing: as for `read_transforms`, which also raises InputError.
+    transforms_val.json is not used.
+    images, missing: as for `read_transforms`. Raises InputError likewise.
     """
     train = read_transforms(folder / "transforms_train.json", images=images, missing=missing)
     held_out = folder / "transforms_test.json"
@@ -273,7 +274,8 @@ def _plain(listed: str) -> str:
 
 
 def _find_file(keys: Keys) -> Path:
-    """Path of a frame's picture. If it does not exist, the path as listed."""
+    """Path of a frame's picture, with the extension added if the file omits it. If no picture exists, the listed
+    path."""
     path = Path(os.path.normpath(keys.path.parent / keys.text("file_path").replace("\\", "/")))
     if is_file(path) or not path.name:
         return path
@@ -304,8 +306,8 @@ def _inside(folder: Path, listed: str, where: str) -> None:
     """Raise InputError if a listed file name leads out of the folder of the file that lists it."""
     if not is_inside(folder, listed):
         raise InputError(
-            f"{where}: {short(listed)} is no path inside the scene's folder {folder}; move what it names into it, or "
-            "put a link there"
+            f"{where}: {short(listed)} is no path inside the scene's folder {folder}; move the file into that folder, "
+            "or put a link there"
         )
 
 
@@ -316,7 +318,7 @@ def _lens(keys: Keys, file: Path, size: tuple[int, int] | None) -> tuple[Lens, b
         if not file.is_file():
             if size is None:
                 raise InputError(
-                    f"{keys.where}: has no 'w' and 'h', nor is its picture there: {file}; give both --width and "
+                    f"{keys.where}: has no 'w' and 'h', and its picture {file} does not exist; give both --width and "
                     "--height"
                 )
             actual = size
@@ -374,7 +376,7 @@ def _focal(keys: Keys, focal: str, angle: str, size: float) -> float | None:
 
 
 def _distortion(keys: Keys) -> tuple[str, list[float]]:
-    """COLMAP's model and its distortion coefficients."""
+    """COLMAP's name of the camera model, and its distortion coefficients."""
     model = keys.get("camera_model") or ""
     k1, k2, k3, k4, k5, k6, p1, p2 = (
         keys.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -383,9 +385,9 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
     if (named is not None and not named.flat) or keys.get("is_fisheye") is True:
         if k5 or k6:
             raise InputError(
-                f"{keys.where}: has 'k5' or 'k6' of a fisheye, expected k1 to k4 alone; undistort the pictures first"
+                f"{keys.where}: has 'k5' or 'k6' for a fisheye, expected k1 to k4 only; undistort the pictures first"
             )
-        if p1 or p2:  # COLMAP's fisheye with tangential terms; where they are 0, it equals OPENCV_FISHEYE
+        if p1 or p2:  # the model with tangential terms; if they are 0, it equals OPENCV_FISHEYE
             return "THIN_PRISM_FISHEYE", [k1, k2, p1, p2, k3, k4, 0.0, 0.0]
         return "OPENCV_FISHEYE", [k1, k2, k3, k4]
     if named is None:
@@ -394,7 +396,7 @@ def _distortion(keys: Keys) -> tuple[str, list[float]]:
     if not any((k1, k2, k3, k4, k5, k6, p1, p2)):
         return "PINHOLE", []
     if k4 and model != "FULL_OPENCV":
-        # in nerfstudio it is the coefficient of r^8, in OpenCV a coefficient in the denominator
+        # k4 is ambiguous: the coefficient of r^8 in nerfstudio, a coefficient of the denominator in OpenCV
         raise InputError(
             f"{keys.where}: 'k4' is {k4} in a perspective camera, expected 0; undistort the pictures first"
         )
@@ -407,21 +409,21 @@ def opengl_pose(given: object, where: str, what: str) -> tuple[Float64, Float64,
     """Convert a `world_from_cam` matrix (4, 4) or (3, 4) in OpenGL's axes.
 
     where, what: place and name of the matrix, for messages.
-    Returns the rotation (3, 3) and translation (3,) of `cam_from_world`, and the scale that the matrix had. Raises
-    InputError for a matrix that is not a pose.
+    Returns the rotation (3, 3) and translation (3,) of `cam_from_world`, and the scale of the matrix, which is removed
+    from both. Raises InputError for a matrix that is not a pose.
     """
     if given is None:
         raise InputError(f"{where}: has no {what} (the 4 x 4 pose); {EXPORT_AGAIN_ADVICE}")
     matrix = numbers(given)
     if matrix.shape not in ((4, 4), (3, 4)) or not (np.abs(matrix) < MAX_COORDINATE).all():
         raise InputError(f"{where}: {what} is {short(given)}, expected 4 x 4 finite numbers")
-    # A scaled camera object leaves its scale in the matrix; a camera has none.
+    # If the camera object was scaled, its scale is in the matrix. Poses have no scale.
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = float(np.cbrt(determinant))
     axes = matrix[:3, :3] / scale if determinant > 0 else np.zeros((3, 3))
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-2:
         raise InputError(
-            f"{where}: {what} has no rotation in it (determinant {determinant:.3g}), expected "
+            f"{where}: {what} contains no rotation (determinant {determinant:.3g}), expected "
             "world_from_camera in OpenGL's axes; check how it was exported"
         )
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW_TOLERANCE:
@@ -445,7 +447,7 @@ def _ngp_box(keys: Keys) -> tuple[Float64, Float64] | None:
         shift = np.broadcast_to(np.array(NGP_OFFSET if offset is None else offset, np.float64), 3)
         factor = float(NGP_SCALE if scale is None else scale)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{keys.where}: 'scale' or 'offset' is not of numbers, expected one and three") from None
+        raise InputError(f"{keys.where}: 'scale' or 'offset' is invalid, expected one number and three") from None
     if not (1 / MAX_COORDINATE < factor < MAX_COORDINATE and (np.abs(shift) < MAX_COORDINATE).all()):
-        raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' {shift.tolist()}, expected a scale above 0")
+        raise InputError(f"{keys.where}: 'scale' is {factor}, 'offset' is {shift.tolist()}, expected a scale above 0")
     return (0.5 - side / 2 - shift) / factor, (0.5 + side / 2 - shift) / factor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Copies of photographs in a folder: downscaled, undistorted, of another file type or name. One of each is used."""
+"""Copies of photographs in a folder: downscaled, undistorted, with another file type or name. One copy is used."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ UNDISTORTION_FOLDERS = (
 )
 """Names of folders that may hold the same photographs before and after undistortion, earlier stages first.
 
-They are used by the 3DGS authors' convert.py, Polycam, OpenSfM (undistorted/images), COLMAP (dense/0/images) and
-others.
+Programs with such folders are the 3DGS authors' convert.py, Polycam, OpenSfM (undistorted/images), COLMAP
+(dense/0/images) and others.
 """
 PLAIN_FOLDER_STAGE, UNDISTORTED_FOLDER_STAGE = 1, 2
 """Indices in UNDISTORTION_FOLDERS of photographs in other folders, and of undistorted photographs."""
@@ -39,35 +39,35 @@ LOSSLESS_EXTENSIONS = (".png", ".tif", ".tiff", ".bmp")
 COPY_THUMBNAIL_SIZE_PX = (96, 72)
 """Width and height of the thumbnails that are compared."""
 MAX_COMPARED_PIXELS_PER_PIXEL, MIN_COMPARED_WIDTH_PX = 0.5, 24
-"""Maximum thumbnail pixels per pixel of the picture, and minimum width that is compared.
+"""Maximum width of compared thumbnails as a fraction of the narrower picture's width, and minimum width in pixels.
 
-Resizing shows in small pictures.
+In small pictures, resizing changes the pixels visibly.
 """
 MAX_COPY_RMS_LEVELS, MAX_COPY_RMS_PER_GRADIENT = 1.0, 0.2
-"""Maximum RMS difference of two thumbnails of one photograph: in 255ths, or in RMS differences of neighbouring pixels.
+"""Maximum RMS difference of two thumbnails of one photograph: in 255ths, or relative to that of neighbouring pixels.
 
-A shift by 0.2 thumbnail pixels, 1/480 of the picture's width, causes the second. JPEG and resizing filters cause less,
-down to pictures of 240 pixels.
+The second is reached by a shift of 0.2 thumbnail pixels, 1/480 of the picture's width. JPEG and resizing filters cause
+less in pictures of at least 240 pixels.
 """
 MIN_FOLDER_CORRELATION, CORRELATION_SIDE_PX = 0.9, 24
-"""Minimum correlation of the pictures in two related folders, median of FOLDER_PAIR_SAMPLES, and the pictures' width
-for it.
+"""Minimum correlation of the pictures in two related folders, and longer side to which the pictures are reduced for it.
 
-Photographs correlate with their undistorted copies at 0.9995 (fox, k1 0.058, k2 -0.081). Six other scenes reach 0.93 or
-more, with k1 from 0.1 to -0.35 at a focal length of 0.8 of the width, cropped to valid pixels. In these scenes,
-successive photographs correlate at 0.16 to 0.87, and more distant ones at 0.45 or less. Successive frames of an almost
-still video correlate more than a picture and its copy through a strong lens. Such folders are mistaken for copies.
+The median of FOLDER_PAIR_SAMPLES pairs is compared. Photographs correlate with their undistorted copies at 0.9995 (fox,
+k1 0.058, k2 -0.081). Six other scenes reach 0.93 or more, with k1 from 0.1 to -0.35 at a focal length of 0.8 of the
+width, cropped to valid pixels. In these scenes, successive photographs correlate at 0.16 to 0.87, and more distant ones
+at 0.45 or less. Successive frames of an almost still video correlate more than a picture and its undistorted copy if
+the distortion is strong. Folders of such frames are mistaken for copies.
 """
 FOLDER_PAIR_SAMPLES = 5
-"""Number of pairs of pictures from two folders that are decoded to compare them."""
+"""Number of pairs of pictures that are decoded to compare two folders."""
 MAX_COPY_ASPECT_RATIO_CHANGE = 1.3
-"""Ratio of aspect ratios from which two pictures are different, although undistortion crops borders."""
+"""Ratio of two pictures' aspect ratios from which they are different. Cropping by undistortion changes it by less."""
 FEATURELESS_STD_LEVELS = 8.0
 """Standard deviation in 255ths below which a picture is featureless and resembles no other."""
 ASPECT_RATIO_TOLERANCE = 0.02
-"""Relative tolerance between the aspect ratios of one photograph's copies, as sides are rounded."""
+"""Relative tolerance between the aspect ratios of one photograph's copies, whose sides are rounded."""
 COMPARED_MIDDLE_BYTES = 4096
-"""Bytes from the middle of a file that are compared before the whole file."""
+"""Number of bytes from the middle of a file that are compared before the whole file."""
 
 _NUMBERED_FOLDER = re.compile(r"(.+?)[_-](\d{1,2})\Z")
 Thumb = NDArray[np.uint8]
@@ -106,8 +106,8 @@ class Decoded(Protocol):
 class Copy:
     """A photograph that is a copy of another.
 
-    kept: name of the photograph that is used.
-    why: the difference from it, or the evidence, such as "smaller" or "same bytes".
+    kept: name of the photograph that is used instead.
+    why: how this one differs from it, or the evidence for a copy, such as "smaller" or "same bytes".
     """
 
     kept: str
@@ -117,11 +117,12 @@ class Copy:
 def told_by_names(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
     """Find copies before all photographs are decoded.
 
-    Copies are files of the same bytes, and pictures of the same names in related folders. A sample of these pictures is
-    decoded to confirm that they look alike.
+    Copies are files with the same bytes, and pictures with the same names in related folders. A sample of these
+    pictures is decoded to confirm that they look alike.
 
-    Related folders are images and images_2, with half the size, and those in UNDISTORTION_FOLDERS, next to each other
-    or nested. The folder with the most pixels is kept, then the earlier one.
+    Related folders are folders such as images and images_2, with half the size, and those in UNDISTORTION_FOLDERS, next
+    to each other or nested. The folder with the most pixels is used; among equals, the earliest in
+    UNDISTORTION_FOLDERS.
     """
     copies = _of_same_bytes(folder, names)
     groups = _staged([name for name in names if name not in copies])
@@ -144,11 +145,11 @@ def told_by_names(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
 
 
 def told_by_pictures(photos: Sequence[Decoded]) -> dict[str, Copy]:
-    """Find copies among decoded photographs: the same picture under the same name in sibling folders, or of another
-    type.
+    """Find copies among decoded photographs: the same picture with the same name in a sibling folder, or with another
+    file type.
 
-    The photograph with the most pixels is kept, then one with transparency, then one with a lens in EXIF, then a
-    lossless one.
+    The photograph with the most pixels is used. Among equals, one with transparency is preferred, then one with a lens
+    in EXIF, then a lossless file.
     """
     by_name = {photo.name: photo for photo in photos}
 
@@ -172,7 +173,7 @@ def to_compare(names: Sequence[str]) -> set[str]:
 
 
 def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
-    """Grey thumbnail (72, 96) of a picture (H, W, C) of any shape.
+    """Grey thumbnail (72, 96) of a picture (H, W, C) of any aspect ratio.
 
     pixels: unsigned integers, or floats from 0 to 1.
     alpha: index of the alpha channel, -1 for none.
@@ -186,7 +187,7 @@ def thumb_of(pixels: NDArray[Any], alpha: int) -> Thumb:
 
 
 def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
-    """Copies with the photograph that is finally used, as the photograph kept for a copy may itself be a copy."""
+    """Copies with the photograph that is used in the end: the photograph kept for a copy may itself be a copy."""
 
     def last(name: str) -> str:
         while name in copies:
@@ -197,7 +198,7 @@ def resolved(copies: dict[str, Copy]) -> dict[str, Copy]:
 
 
 def listed(copies: dict[str, Copy]) -> str:
-    """Copies as text for a message: the first of them by name."""
+    """Copies as text for a message: the first ones in the order of names."""
     return examples(f"{name} is {copy.kept}, {copy.why}" for name, copy in sorted(copies.items()))
 
 
@@ -205,7 +206,7 @@ def listed(copies: dict[str, Copy]) -> str:
 class _Place:
     """A photograph that may have copies.
 
-    folder: the folder in its path that may differ from its copies, "" for none.
+    folder: the folder in its path that may have another name in the paths of its copies, "" for none.
     """
 
     name: str
@@ -217,8 +218,8 @@ class _Staged:
     """A photograph, classified by the names of its folders.
 
     head: path up to the last classified folder, "" for none.
-    stage: latest index in UNDISTORTION_FOLDERS among these folders.
-    factor: factor by which it is downscaled.
+    stage: largest index in UNDISTORTION_FOLDERS of the classified folders.
+    factor: factor by which the photograph is downscaled.
     """
 
     name: str
@@ -235,7 +236,7 @@ class _Staged:
 class _Pictures:
     """Sizes and thumbnails of the pictures in a folder, read on demand.
 
-    groups: photographs of the same name.
+    groups: groups of photographs with the same name.
     """
 
     def __init__(self, folder: Path, groups: Sequence[Sequence[_Staged]]) -> None:
@@ -254,7 +255,7 @@ class _Pictures:
                     self._pairs[frozenset((one.head, two.head))].append((one.name, two.name))
 
     def size(self, name: str) -> tuple[int, int]:
-        """Width and height, 0 for a picture that does not decode. The error is raised when it is staged."""
+        """Width and height; (0, 0) for a picture that does not decode. `photos.stage_photos` raises the error."""
         if name not in self._sizes:
             try:
                 self._sizes[name] = image_size(self._folder / name)
@@ -263,7 +264,7 @@ class _Pictures:
         return self._sizes[name]
 
     def pixels(self, head: str) -> int:
-        """Number of pixels of the median picture."""
+        """Number of pixels of the median picture in the folder `head`."""
         if head not in self._pixels:
             self._pixels[head] = sorted(math.prod(self.size(name)) for name in self._names[head])[
                 len(self._names[head]) // 2
@@ -304,10 +305,10 @@ class _Pictures:
 
 
 def _staged(names: Iterable[str]) -> list[list[_Staged]]:
-    """Groups of photographs with the same stem in the same folders, apart from classified folders.
+    """Groups of photographs with the same stem in the same folders. Classified folders are ignored.
 
-    Each group has at least two kinds. Folders above a folder of undistorted pictures may be another program's and are
-    also ignored.
+    Each group has at least two kinds. Folders above a folder of undistorted pictures may be those of another program
+    and are also ignored.
     """
     groups: dict[tuple[Hashable, ...], list[_Staged]] = defaultdict(list)
     for name in names:
@@ -337,10 +338,10 @@ def _plain_stem(name: str) -> str:
 
 
 def _alike(names: Iterable[str]) -> list[list[_Place]]:
-    """Groups of photographs that may be copies by their names.
+    """Groups of photographs that may be copies according to their names.
 
-    They have the same stem and are in one folder, in sibling folders, or in a folder and its sub-folder. These folders
-    may have sub-folders of the same names.
+    The photographs of a group have the same stem. They are in one folder, in sibling folders, or in a folder and its
+    sub-folder, or in sub-folders of these with the same names.
     """
     groups: dict[tuple[Hashable, ...], list[_Place]] = defaultdict(list)
     for name in names:
@@ -356,9 +357,10 @@ def _alike(names: Iterable[str]) -> list[list[_Place]]:
 def _found(
     groups: Iterable[list[P]], rank: Callable[[P], tuple[Hashable, ...]], why: Callable[[P, P], str]
 ) -> dict[str, Copy]:
-    """Copies in each group: photographs that match one before them in the order of `rank`, which may itself be a copy.
+    """Find the copies in each group: photographs that match an earlier photograph in the order of `rank`.
 
-    why: function of the kept and the other photograph that returns the evidence; empty if they differ.
+    The earlier photograph may itself be a copy.
+    why: function of the earlier and the later photograph. Returns the evidence for a copy; "" if they differ.
     """
     copies: dict[str, Copy] = {}
     for group in groups:
@@ -372,8 +374,8 @@ def _found(
 
 
 def _of_same_bytes(folder: Path, names: Sequence[str]) -> dict[str, Copy]:
-    """Files with the same bytes as another. The one in the earliest of UNDISTORTION_FOLDERS is kept, then the one with
-    the shortest name."""
+    """Files with the same bytes as another file. The file in the earliest of UNDISTORTION_FOLDERS is used; if there are
+    several, the one with the shortest name."""
     alike: dict[tuple[object, ...], list[str]] = {}
     keys: tuple[Callable[[Path], object], ...] = (lambda path: path.stat().st_size, _middle, short_digest)
     groups = [[name for name in names if is_file(folder / name)]]
@@ -398,7 +400,7 @@ def _middle(path: Path) -> bytes:
 
 
 def _stage(folder: str) -> int:
-    """Index of a folder's name in UNDISTORTION_FOLDERS, the last plus 1 for another name."""
+    """Index of a folder's name in UNDISTORTION_FOLDERS; their number for any other name."""
     return next(
         (stage for stage, known in enumerate(UNDISTORTION_FOLDERS) if folder.casefold() in known),
         len(UNDISTORTION_FOLDERS),

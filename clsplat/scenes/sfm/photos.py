@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Photographs for structure from motion: found, decoded once, rotated upright, and grouped by camera."""
+"""Finding of photographs for structure from motion. They are decoded once, rotated upright, and grouped by camera."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from clsplat.images.writing import jpeg_room
 from clsplat.scenes.sfm.copies import Thumb, thumb_of, to_compare
 
 SFM_PHOTO_EXTENSIONS = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-"""Extensions that pycolmap's wheel reads and writes. Its OpenImageIO has no WebP, JPEG 2000 or HEIF."""
+"""Extensions that pycolmap's wheel reads and writes. The wheel's OpenImageIO has no WebP, JPEG 2000 or HEIF."""
 SFM_IMAGE_FORMATS = frozenset({"jpeg", "png", "tiff", "bmp"})
-"""OpenImageIO's names of these formats, which identify a file whatever its extension is."""
+"""OpenImageIO's names of these formats. They identify a file by its contents, whatever its extension is."""
 UNREADABLE_PHOTO_EXTENSIONS = frozenset(
     {".webp", ".heic", ".heif", ".avif", ".jp2", ".gif", ".exr", ".dng", ".cr2", ".nef", ".arw"}
 )
@@ -41,7 +41,7 @@ class Photo:
     name: path below the folder, with forward slashes.
     width, height: pixels, upright.
     lens: make, model and focal length from EXIF, empty strings for missing ones.
-    transparent: True if any pixel is transparent by an alpha channel.
+    transparent: True if the alpha channel makes any pixel transparent.
     thumb: thumbnail from `copies.thumb_of`, for photographs that may be copies.
     """
 
@@ -54,7 +54,7 @@ class Photo:
 
 
 def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path], dict[str, list[Path]]]:
-    """Photographs below a folder, sorted by name, and the files that are left out, by reason.
+    """Photographs below a folder, sorted by name, and for each reason the files that are left out.
 
     Hidden files and folders are skipped, as is `excluded` (the output, if it is inside). Raises InputError for a folder
     that does not exist, cannot be read, or has no photographs.
@@ -82,16 +82,16 @@ def find_photos(folder: Path, excluded: Path | None = None) -> tuple[list[Path],
                 others.append(here / name)
     if not photos:
         kinds = " ".join(sorted(SFM_PHOTO_EXTENSIONS))
-        unusable = f", only {len(others)} of a kind not supported such as {others[0].name}" if others else ""
-        unusable += f", only {len(broken)} link(s) that lead nowhere such as {broken[0].name}" if broken else ""
+        unusable = f", only {len(others)} of an unsupported kind such as {others[0].name}" if others else ""
+        unusable += f", only {len(broken)} broken link(s) such as {broken[0].name}" if broken else ""
         raise InputError(f"{folder}: no photos found{unusable}; expected files ending in {kinds}")
     key = partial(photo_name, folder)
     aside = companions(photos, photos, folder)
     kept = [path for path in photos if path not in aside]
     left_out = {
         "convert to JPEG, PNG or TIFF first": others,
-        "links that lead nowhere": broken,
-        "by their names masks, depths or the like of other photos": aside,
+        "broken links": broken,
+        "their names mark masks, depth maps or the like of other photos": aside,
     }
     return sorted(kept, key=key), {why: sorted(paths, key=key) for why, paths in left_out.items() if paths}
 
@@ -114,10 +114,10 @@ def fingerprint(folder: Path, photos: Sequence[Path], settings: str) -> str:
 def stage_photos(
     folder: Path, photos: Sequence[Path], target: Path, report: Callable[[float], None], threads: int
 ) -> list[Photo]:
-    """Put every photograph under `target`, upright and with its name, and describe it.
+    """Put every photograph under `target`, upright and with its name. Returns their descriptions.
 
-    pycolmap ignores the EXIF orientation and cannot read some formats. Rotated photographs, and those whose content has
-    such a format, are rewritten. The others are linked, or copied if the file system cannot link. Every photograph is
+    pycolmap ignores the EXIF orientation and cannot read some formats. Rotated photographs, and files with contents in
+    such a format, are rewritten. Other files are linked, or copied if the file system cannot link. Every photograph is
     decoded once, as pycolmap would silently skip a broken one. Raises InputError that names the first photograph that
     does not decode.
     """
@@ -142,7 +142,7 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
     try:
         spec, kind = source.spec(), source.format_name()
         pixels = source.read_image(spec.format)
-        # a truncated JPEG still gives pixels, grey at its end, and only an error text says so
+        # a truncated JPEG still gives pixels, with grey at the end; only the error text tells that it is truncated
         trouble = error_of(source)
     finally:
         source.close()
@@ -161,7 +161,7 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
     else:
         try:
             if ON_WINDOWS and not os.access(path, os.W_OK):
-                raise PermissionError("a link to a file that is read-only cannot be removed again")
+                raise PermissionError("a link to a read-only file cannot be removed later")
             os.link(path.resolve(), copy)
         except OSError:
             shutil.copyfile(path, copy)
@@ -173,7 +173,7 @@ def _stage(folder: Path, target: Path, compared: Collection[str], path: Path) ->
 
 
 def _is_transparent(pixels: NDArray[Any], alpha_channel: int) -> bool:
-    """True if a picture (H, W, C) is not opaque everywhere. alpha_channel: -1 for none."""
+    """True if a picture (H, W, C) is not opaque everywhere. alpha_channel: its index, -1 for none."""
     if alpha_channel < 0:
         return False
     opaque = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1
@@ -199,7 +199,7 @@ def _write_upright(path: Path, copy: Path, spec: Any) -> None:
     if not written:
         if error := room_error(copy.parent):
             raise write_error(copy, error)
-        raise ClsplatError(f"{copy}: cannot write the turned copy of {path}: {_last_line(upright.geterror())}")
+        raise ClsplatError(f"{copy}: cannot write the rotated copy of {path}: {_last_line(upright.geterror())}")
 
 
 def _last_line(text: str) -> str:
@@ -208,10 +208,10 @@ def _last_line(text: str) -> str:
 
 
 def camera_groups(photos: Sequence[Photo], shared_camera: bool | str) -> list[list[str]]:
-    """Names of the photographs by camera, each group in order. Photographs in a group share their intrinsics.
+    """Groups of the photographs' names, one group per camera, with names in order. A group shares its intrinsics.
 
-    shared_camera: True groups all photographs of one size. "auto" also requires the same make, model and focal length
-        in EXIF. False gives each photograph its own camera.
+    shared_camera: True groups all photographs of the same size. "auto" also requires the same make, model and focal
+        length in EXIF. False gives each photograph its own camera.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for photo in photos:

@@ -33,18 +33,18 @@ from clsplat.scenes.supervision.masks import OTHER_MASK_FOLDERS, masks_beside, s
 Matching = Literal["auto", "exhaustive", "sequential"]
 
 SFM_RECORD_FILE = "sfm.json"
-"""Record in the result: its photographs and settings, the photographs without a pose, and its quality."""
+"""File in the result that records its photographs and settings, the photographs without a pose, and its quality."""
 MAX_EXHAUSTIVE_PHOTOS = 100
 """Number of photographs up to which "auto" matches every pair.
 
-The number of pairs grows with the square, and a CPU matches about 50 a second.
+The number of pairs grows with the square of the number of photographs, and a CPU matches about 50 pairs per second.
 """
 MIN_SFM_PHOTOS = 3
 SFM_CAMERA_MODELS = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL",
                  "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")  # fmt: skip
 
 PLACED_CAMERAS_UNIT = "cameras stand"
-# by stage of the worker: the text for the user, and the table that grows by one row for each photograph or pair
+# for each stage of the worker: text for the user, and database table that gets a row for each photograph or pair
 _PROGRESS_BY_STAGE = {
     "features": ("finding features", "keypoints"),
     "matches": ("matching photos", "two_view_geometries"),
@@ -56,16 +56,16 @@ _PROGRESS_BY_STAGE = {
 
 @dataclass(frozen=True)
 class SfmSettings:
-    """Settings that decide the cameras of the same photographs.
+    """Settings on which the recovered cameras depend.
 
-    matching: "exhaustive" is every pair, "sequential" is neighbours by name, "auto" is every pair up to 100
-        photographs.
+    matching: "exhaustive" matches every pair, "sequential" matches neighbours in the order of names. "auto" matches
+        every pair of up to 100 photographs, and neighbours of more.
     camera_model: COLMAP name of the lens model that is fitted. "auto" is OPENCV for cameras with 20 photographs or
         more, otherwise SIMPLE_RADIAL (one distortion coefficient).
     shared_camera: which photographs share a camera, as in `photos.camera_groups`.
-    max_image_size: longest side in pixels, for features only; the undistorted photographs keep their size.
+    max_image_size: longest side in pixels for finding features. The undistorted photographs keep their size.
     max_features: maximum number of features in a photograph.
-    seed: the same seed gives the same cameras, bit by bit up to 80 photographs.
+    seed: the same seed gives the same cameras; up to 80 photographs, bit by bit.
     """
 
     matching: Matching = "auto"
@@ -103,21 +103,21 @@ def reconstruct(
 ) -> Path:
     """Recover the cameras of the photographs under `images`, and write a COLMAP scene to `output`, which is returned.
 
-    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. It
-    appears only when all of it is complete. A result of the same photographs and settings is reused.
+    The output has `images/` (undistorted, upright), `sparse/0/` (PINHOLE cameras, poses, points) and `sfm.json`. The
+    folder is created when all files are complete. An existing result for the same photographs and settings is reused.
 
     threads: all cores if None.
     overwrite: replace a result of other photographs.
-    masks: find no features where masks or alpha leave pixels out. The output also gets the masks, as
+    masks: use of masks and alpha. No features are found in masked pixels. The output gets the masks too, as
         `masks/IMAGE.jpg.png`, white for pixels that count.
     progress: function that is called with a text and a fraction or None in every stage.
 
     Of several copies of a photograph, one is used (`clsplat.scenes.sfm.copies`).
 
     Warns of copies, and of photographs that cannot be placed, have an unreadable format, or lost their alpha. Raises
-    InputError for a folder without photographs, a photograph that does not decode, and an output that is something
-    else. Also raises it for photographs whose cameras cannot be recovered. Raises ClsplatError if pycolmap fails.
-    KeyboardInterrupt leaves nothing behind.
+    InputError for a folder without photographs, a photograph that does not decode, and an existing output that must not
+    be replaced. Also raises InputError if the cameras cannot be recovered. Raises ClsplatError if pycolmap fails. After
+    KeyboardInterrupt no files remain.
     """
     report = progress or no_progress
     settings.check()
@@ -136,7 +136,7 @@ def reconstruct(
 
     workers = threads or os.cpu_count() or 1
     output.parent.mkdir(parents=True, exist_ok=True)
-    # next to the output, so that the last step is a rename within one file system
+    # in the parent folder of the output, so that the last step is a rename within one file system
     work = Path(tempfile.mkdtemp(prefix=f".{output.name}-sfm-", dir=output.parent))
     try:
         photos = _staged_photos(images, paths, copies, work / "photos", report, workers)
@@ -163,10 +163,10 @@ def _described(masks: MaskUse | None, shapes: dict[str, Path]) -> str:
 def _staged_photos(
     images: Path, paths: list[Path], copies: dict[str, sfm_copies.Copy], target: Path, report: Progress, threads: int
 ) -> list[sfm_photos.Photo]:
-    """Put the photographs under `target`. Returns those that are no copies; warns of the copies.
+    """Put the photographs under `target`. Returns the photographs that are not copies, and warns of copies.
 
-    copies: copies found by their names, by name.
-    Raises InputError if too few are left.
+    copies: the copies found so far, from names. The keys are their names.
+    Raises InputError if too few photographs remain.
     """
     photos = sfm_photos.stage_photos(
         images, paths, target, lambda fraction: report("reading photos", fraction), threads
@@ -175,7 +175,7 @@ def _staged_photos(
     photos = [photo for photo in photos if photo.name not in copies]
     if copies:
         count = "1 photograph is a copy of another" if len(copies) == 1 else f"{len(copies):,} photographs are copies"
-        again = f"{count} and left out ({sfm_copies.listed(copies)}); to use copies, give their folder alone"
+        again = f"{count} and left out ({sfm_copies.listed(copies)}); to use copies, give only their folder"
         warn(f"{images}: {again}")
     _require_enough(images, len(photos))
     return photos
@@ -237,13 +237,13 @@ def _warn_of_losses(
         warn(f"{images}: {_listed(missing)} could not be placed and will not be used")
     lost = _without_their_alpha(photos, registered, result)
     if lost and (masks is None or masks.alpha == "blend"):
-        loss = "lost their alpha when their lens was undone: the scene's images are opaque there"
+        loss = "lost their alpha when they were undistorted: their images in the scene are opaque"
         warn(f"{images}: {_listed(lost)} {loss}")
 
 
 @dataclass(frozen=True)
 class _FoundPhoto:
-    """A photograph in the folder: its path below it, and its file."""
+    """A photograph: its path relative to the folder of photographs, and its file."""
 
     name: str
     path: Path
@@ -255,30 +255,30 @@ def _require_enough(images: Path, count: int) -> None:
 
 
 def _masks(images: Path, paths: list[Path], use: MaskUse | None) -> dict[str, Path]:
-    """Masks by photograph name. Raises InputError if masks are asked for but missing, or one fits no photograph."""
+    """Mask for each photograph's name. Raises InputError if masks are requested but missing, or if a mask fits no
+    photograph."""
     if use is None or use.masks == "none":
         return {}
     photos = [_FoundPhoto(sfm_photos.photo_name(images, path), path) for path in paths]
     found = masks_beside(photos, others=OTHER_MASK_FOLDERS)
     if not found:
-        raise InputError(
-            f"{images}: there are no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder"
-        )
+        raise InputError(f"{images}: has no masks, expected masks/IMAGE.jpg.png beside the photos or in their folder")
     warn_of_sense(found.values(), use, images)
     return found
 
 
 def _without_their_alpha(photos: list[sfm_photos.Photo], registered: list[str], result: Path) -> list[str]:
-    """Names of photographs with transparency whose results have no alpha.
+    """Names of photographs with transparency that have no alpha after undistortion.
 
-    pycolmap keeps alpha only if the lens model has no distortion and the file is copied.
+    pycolmap keeps alpha only if the lens model has no distortion: it then copies the file.
     """
     transparent = {photo.name for photo in photos if photo.transparent}
     return [name for name in registered if name in transparent and not sfm_photos.has_alpha(result / name)]
 
 
 def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: bool) -> bool:
-    """True if the output is the wanted result. Raises InputError if it must not be replaced."""
+    """True if the output is a complete result of the same photographs and settings. Raises InputError for another
+    output that must not be replaced."""
     if not output.exists():
         return False
     if not output.is_dir():
@@ -287,7 +287,7 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
         record = load_document(output / SFM_RECORD_FILE, "the record of a result of sfm", "its fingerprint")
     except InputError:
         if any(output.iterdir()):
-            raise InputError(f"{output}: is not empty and not a result of sfm, expected a new folder") from None
+            raise InputError(f"{output}: is neither empty nor a result of sfm, expected a new folder") from None
         return False
     complete = (output / "sparse/0/images.bin").is_file() and (output / "images").is_dir()
     files = record.get("files")
@@ -298,19 +298,19 @@ def _is_finished(output: Path, images: Path, fingerprint: str, *, overwrite: boo
         return True
     if changed and not overwrite:
         raise InputError(
-            f"{output}: {examples(changed)} are gone or changed since the cameras were recovered; remove the folder, "
-            "or make it anew with clsplat sfm --overwrite"
+            f"{output}: {examples(changed)} were removed or changed after the cameras were recovered; remove the "
+            "folder, or make it again with clsplat sfm --overwrite"
         )
     if not overwrite:
         raise InputError(
-            f"{output}: holds cameras recovered from other photos or settings than {images} now; "
-            "remove it or choose another folder"
+            f"{output}: its cameras were recovered with other settings or from other photos than those now in "
+            f"{images}; remove it or choose another folder"
         )
     return False
 
 
 def _sizes(result: Path) -> dict[str, int]:
-    """Sizes in bytes of a result's files, by path in the result."""
+    """Size in bytes of each file of a result. The keys are paths relative to the result."""
     folders = (result / "images", result / "sparse", result / "masks")
     paths = (path for folder in folders for path in folder.rglob("*"))
     return {path.relative_to(result).as_posix(): path.stat().st_size for path in sorted(paths) if is_file(path)}
@@ -332,7 +332,7 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
             text=True,
             encoding="utf-8",
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, search_path))},
-            **apart(),  # Ctrl-C on the terminal reaches this process, which ends the worker
+            **apart(),  # Ctrl-C reaches only this process, which then ends the worker
         )
         assert process.stdin is not None
         assert process.stdout is not None
@@ -341,12 +341,12 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
             process.stdin.flush()
             answer = _follow(process.stdout, work / "database.db", report)
             process.wait()
-        except OSError:  # the worker is gone: a broken pipe, or on Windows an invalid argument
+        except OSError:  # the worker has ended: broken pipe, or invalid argument on Windows
             answer = {}
         finally:
             process.kill()
             process.wait()
-            with contextlib.suppress(OSError):  # closing flushes input that the worker never read
+            with contextlib.suppress(OSError):  # closing flushes input, which the worker may not have read
                 process.stdin.close()
             process.stdout.close()
     if not answer:
@@ -356,7 +356,7 @@ def _run_worker(task: dict[str, Any], work: Path, report: Progress) -> dict[str,
 
 
 def _follow(lines: IO[str], database: Path, report: Progress) -> dict[str, Any]:
-    """Report the worker's stages until its answer. Returns an empty dictionary if it ends without one."""
+    """Report the worker's stages until its answer, which is returned; {} if the worker ends without an answer."""
     inbox: queue.Queue[str | None] = queue.Queue()
 
     def read() -> None:
@@ -402,7 +402,7 @@ def _rows(database: Path, table: str) -> int:
 
 
 def _move_into_place(work: Path, output: Path) -> None:
-    """Move the finished result to `output`. An earlier result is removed only when the new one is in place."""
+    """Move the finished result to `output`. If that fails, an earlier result is restored."""
     earlier = work / "earlier"
     if output.exists():
         replace(output, earlier)
@@ -416,9 +416,9 @@ def _move_into_place(work: Path, output: Path) -> None:
 
 def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
     return (
-        f"{images}: no cameras could be recovered from {count} photos: {evidence['features']} features in a typical "
-        f"photo, {evidence['matched']} of {evidence['pairs']} pairs match, {evidence['matches']} matches in the best; "
-        "expected sharp photos of one textured, still scene, each sharing half its view with its neighbours"
+        f"{images}: no cameras could be recovered from {count} photos: the median photo has {evidence['features']} "
+        f"features, {evidence['matched']} of {evidence['pairs']} pairs match, the best has {evidence['matches']} "
+        "matches; expected sharp photos of one textured, still scene, each sharing half its view with its neighbours"
     )
 
 

@@ -26,21 +26,21 @@ from typing import Any, TextIO
 import pycolmap
 
 MAX_SINGLE_THREAD_PHOTOS = 80
-"""Number of photographs up to which mapping runs on one thread, which makes it repeat bit by bit and costs little."""
+"""Number of photographs up to which mapping runs on one thread. Its result is then reproducible, at little cost."""
 MIN_OPENCV_PHOTOS = 20
-"""Number of photographs of one camera from which the eight parameters of OPENCV are fitted.
+"""Minimum number of photographs of one camera for fitting the eight parameters of OPENCV.
 
-On a phone's distorted photographs its reprojection error is 0.477 px, against 0.493 px for SIMPLE_RADIAL.
+On a phone's distorted photographs OPENCV has a reprojection error of 0.477 px, and SIMPLE_RADIAL one of 0.493 px.
 """
 SEQUENTIAL_OVERLAP = 12
-"""Neighbours on each side that sequential matching pairs with a photograph, in addition to those 2, 4, 8, ... away."""
+"""Number of neighbours on each side that sequential matching pairs with a photograph, besides those at distance 2^n."""
 
 
 class Worker:
-    """One reconstruction. Each method is a stage, in the order of `run`.
+    """One reconstruction. `run` calls the methods for its stages in order.
 
-    task: see `sfm.reconstruct.sfm_task`. "photos" and "work" are folders, "groups" the names of the photographs that
-        share a camera.
+    task: see `sfm.reconstruct.sfm_task`. "photos" and "work" are folders. Each of "groups" lists the names of the
+        photographs of one camera.
     """
 
     def __init__(self, task: dict[str, Any], channel: TextIO) -> None:
@@ -59,7 +59,7 @@ class Worker:
         self.match()
         models = self.map(relaxed=False)
         if max((model.num_reg_images() for model in models.values()), default=0) < 0.6 * self.count:
-            # a weak baseline or few features: start from a narrower pair, as a second try
+            # The baseline may be weak, or features few: try again with a smaller angle of the initial pair.
             models |= self.map(relaxed=True)
         if not models:
             self.say(failure=self.evidence())
@@ -87,7 +87,7 @@ class Worker:
         options.sift.max_num_features = self.task["max_features"]
         singles = [names[0] for names in self.task["groups"] if len(names) == 1]
         batches = [(names, pycolmap.CameraMode.SINGLE) for names in self.task["groups"] if len(names) > 1]
-        if singles:  # in one call, as photographs run in parallel only within a call
+        if singles:  # in a single call: only the photographs of one call are processed in parallel
             batches.append((singles, pycolmap.CameraMode.PER_IMAGE))
         for names, mode in batches:
             model = self.task["camera_model"]
@@ -109,7 +109,7 @@ class Worker:
             )
 
     def match(self) -> None:
-        """Match all pairs, or neighbours by name, and verify the matches by epipolar geometry."""
+        """Match all pairs, or neighbours in the order of names, and verify the matches by epipolar geometry."""
         options = pycolmap.FeatureMatchingOptions()
         options.use_gpu = False
         options.num_threads = self.task["threads"]
@@ -131,7 +131,7 @@ class Worker:
         )
 
     def map(self, *, relaxed: bool) -> dict[Path, pycolmap.Reconstruction]:
-        """Map incrementally: camera poses and points. Returns every model by its folder."""
+        """Recover camera poses and points by incremental mapping. Returns all models. The keys are their folders."""
         self.say(stage="cameras again" if relaxed else "cameras", total=self.count)
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = 1 if self.count <= MAX_SINGLE_THREAD_PHOTOS else self.task["threads"]
@@ -183,7 +183,7 @@ class Worker:
         self.undistort_masks(model, result / "masks")
 
     def undistort_masks(self, model: Path, result: Path) -> None:
-        """Resample the masks of the registered photographs likewise, to the photographs' names with .png."""
+        """Resample the masks of the registered photographs like the photographs. The mask of NAME is NAME.png."""
         placed = pycolmap.Reconstruction(model)
         named = {placed.images[image].name: placed.images[image] for image in placed.reg_image_ids()}
         for name in set(self.task["masks"]) & named.keys():
@@ -208,7 +208,7 @@ class Worker:
 
 
 def as_pinhole(folder: Path) -> None:
-    """Rewrite SIMPLE_PINHOLE cameras, which undistortion does not change, as PINHOLE, so that readers get one model."""
+    """Rewrite SIMPLE_PINHOLE cameras as PINHOLE, the model of all others. Undistortion keeps SIMPLE_PINHOLE."""
     model = pycolmap.Reconstruction(folder)
     simple = [camera for camera in model.cameras.values() if camera.model_name == "SIMPLE_PINHOLE"]
     for camera in simple:
@@ -222,8 +222,8 @@ def as_pinhole(folder: Path) -> None:
 def renumber_by_name(database: Path) -> None:
     """Number images, frames, cameras and rigs in the order of the images' names.
 
-    Several threads finish photographs in any order and number them as they finish. The numbers decide the order of all
-    later work, and so the last bits of the result.
+    Several threads process photographs and number them as they finish, in varying order. The numbers decide the order
+    of all later work, and thus the last bits of the result.
     """
     connection = sqlite3.connect(database)
     with connection:
@@ -248,7 +248,7 @@ def renumber_by_name(database: Path) -> None:
             ("rigs", "rig_id", rigs),
             ("frames", "rig_id", rigs),
         ):
-            # in two steps, by way of unused numbers, as the columns are unique
+            # in two steps, via unused numbers, as the values of these columns must be unique
             far = 1 << 30
             connection.executemany(
                 f"UPDATE {table} SET {column} = ? WHERE {column} = ?",  # noqa: S608 - names from the list above
@@ -270,7 +270,7 @@ def _end_with_parent(stream: TextIO) -> None:
 
 def main() -> None:
     """Read the task, run it, and send the answer."""
-    # output that native code prints must not mix with the answers
+    # native code prints to standard output, which must not mix with the answers
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     task = json.loads(sys.stdin.readline())
@@ -278,7 +278,7 @@ def main() -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
     Worker(task, channel).run()
     channel.flush()
-    # skip the teardown of native threads: the answer is sent, and the parent removes the folder
+    # Skip the teardown of native threads. The answer is sent, and the parent removes the folder.
     os._exit(0)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Initial Gaussians: one per point, isotropic, sized by the distance to its neighbours.
+"""Initial Gaussians: one per point, isotropic, with a size according to the distance to the point's neighbours.
 
 Points without colours take the median colour of the training photographs that show them.
 """
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
-"""The authors' lower bound of the mean squared distance, which gives coincident points a size. In world units squared.
+"""Lower bound of the mean squared distance, in world units squared. It gives coincident points a size.
 
-It holds for scenes whose extent is within ORDINARY_EXTENTS. In other scenes it is scaled with the square of the extent,
-from the nearer end of that range.
+This is the 3DGS authors' bound, for scenes whose extent is within ORDINARY_EXTENTS. In other scenes it is scaled by the
+squared ratio of the extent to the nearer end of that range.
 """
 ORDINARY_EXTENTS = (1.0, 100.0)
 MIN_START_COLOUR = 1 / 512
@@ -40,8 +40,8 @@ SCALE_NEIGHBOURS = 3
 COLOUR_VIEWS_PER_POINT = 15
 """Number of nearest photographs that give a point its colour.
 
-In distant photographs the colour of a point is mixed with its surroundings. With fewer photographs than this, one that
-shows something else in front of the point would have too much weight.
+In distant photographs the colour of a point is mixed with its surroundings. With fewer photographs than this number, a
+photograph with something else in front of the point would have too much weight.
 """
 POINTS_PER_OCCLUSION_CELL = 16
 """Mean number of points in an occlusion cell.
@@ -49,17 +49,17 @@ POINTS_PER_OCCLUSION_CELL = 16
 With fewer points, occluded points show through the gaps. With more, cells are so wide that they cover adjacent objects.
 """
 MAX_OCCLUSION_CELL_FRACTION = 1 / 25
-"""Maximum side of an occlusion cell, relative to the picture's longer side. With few points, hardly any is occluded."""
+"""Maximum side of an occlusion cell, relative to the picture's longer side. It keeps cells small if points are few."""
 OCCLUSION_DEPTH_RATIO = 1.05
-"""Depth relative to the nearest point of the cell, above which a point counts as occluded."""
+"""Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
 HIDDEN_POINT_RANK = 1e30
-"""Rank of an occluded point per relative depth; larger than the rank of any visible point."""
+"""An occluded point's rank is this times its relative depth. It thus exceeds the rank of any visible point."""
 UNSEEN_GREY = UNCOLOURED_GREY
 """Grey value of points that no photograph shows."""
 
 
 def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gaussians:
-    """Gaussians of SH degree 0 at the scene's points, or at `random_count` random points if it has none."""
+    """Gaussians of SH degree 0 at the scene's points, or at `random_count` random points if the scene has no points."""
     points: NDArray[Any] = scene.points
     colors: NDArray[Any] = scene.point_colors
     if len(points) == 0:
@@ -79,7 +79,7 @@ def from_points(
 
     points: (N, 3), world units.
     colors: (N, 3) in [0, 1].
-    origin: (3,), origin of the means, by default the world's.
+    origin: (3,), origin of the means in the world, by default the world's origin.
     extent: the scene's extent, world units.
     near: the model's near plane.
 
@@ -90,7 +90,7 @@ def from_points(
     xyz = np.asarray(points, np.float64)
     rgb: NDArray[Any] = np.asarray(colors)
     if xyz.ndim != 2 or xyz.shape[1] != 3 or rgb.shape != xyz.shape:
-        raise ValueError(f"points {xyz.shape} and colors {rgb.shape}: expected (N, 3) both")
+        raise ValueError(f"points have the shape {xyz.shape} and colors {rgb.shape}: expected (N, 3) for both")
     count = len(xyz)
     if count == 0:
         raise InputError("no points to start from, expected at least one")
@@ -130,7 +130,7 @@ def mean_squared_distance(points: Float64) -> Float64:
     if neighbours == 0:
         return np.zeros(len(points))
     distances, _ = cKDTree(points).query(points, k=neighbours + 1)
-    # Sorted, so the first is 0: the point itself or one at the same place, which is the same distance.
+    # Distances are sorted, so the first one is 0: that of the point itself or of a coincident point.
     return np.asarray(np.mean(np.square(distances[:, 1:]), axis=1))
 
 
@@ -138,7 +138,7 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
     """Uniformly random points in a box, and their colours, for a scene without points.
 
     low, high: (3,), corners of the box, world units.
-    Returns points (count, 3) and colours (count, 3), grey with the authors' small amount of noise.
+    Returns points (count, 3) and colours (count, 3). As in the authors' code, these are grey with a little noise.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     points = low + rng.random((count, 3)) * (high - low)
@@ -147,17 +147,17 @@ def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Ge
 
 
 def is_colourless(scene: Scene) -> bool:
-    """True if points have no colours, as in a cloud of --points, or all the same, as clouds without colours are
-    read."""
+    """True if points have no colours: some are marked as colourless, as for --points, or all have the same colour, as
+    after reading other clouds without colours."""
     return scene.colourless is not None or of_one_colour(scene.point_colors)
 
 
 def photographed(scene: Scene, background: ArrayLike) -> Float32:
     """Colours (N, 3) float32 in [0, 1] of the scene's points. Points with colours of their own keep them.
 
-    A colour is the median, by channel, over the COLOUR_VIEWS_PER_POINT training photographs that show the point, at the
-    training size. Masked and occluded points do not count as shown. A point that is occluded in all photographs uses
-    those where it is the least occluded.
+    A colour is the median per channel over the nearest COLOUR_VIEWS_PER_POINT training photographs that show the point,
+    at the training size. Masked and occluded points do not count as shown. A point that is occluded in all photographs
+    uses the photographs in which it is least occluded.
     """
     count = len(scene.points)
     ranks, colors = (
@@ -186,8 +186,8 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
 
 
 def _medians(colors: Float32) -> Float32:
-    """Medians (N, 3) by channel over the finite colours in (N, K, 3), which are sorted in place; UNSEEN_GREY if there
-    are none."""
+    """Medians per channel, (N, 3), of the finite colours in (N, K, 3); UNSEEN_GREY if there are none. Sorts `colors` in
+    place."""
     counts = np.isfinite(colors).all(axis=2).sum(axis=1)[:, None, None]
     colors.sort(axis=1)
     middles = np.concatenate([np.maximum(counts - 1, 0) // 2, counts // 2], axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds to start from: checked against the cameras, and thinned by voxels."""
+"""Point clouds from which training starts. They are checked against the cameras and thinned to one point per voxel."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ MAX_CHECKED_CLOUD_POINTS = 20_000
 MIN_CLOUD_POINTS_IN_VIEW = 0.05
 """Minimum fraction of a cloud's points that the training photographs show."""
 MAX_CLOUD_DEPTH_RATIO = 30.0
-"""Maximum ratio, either way, between the cloud's distance from the cameras that see it and that of the scene's
-points."""
+"""Largest factor by which the distances of the cloud and of the scene's points from the cameras that see them may
+differ."""
 MAX_CLOUD_DISTANCE_EXTENTS = 1000.0
-"""Maximum distance of a cloud from the cameras in scene extents, if the scene has no points."""
+"""Maximum distance of a cloud from the cameras, in scene extents. It applies if the scene has no points."""
 VOXEL_SIZE_TOLERANCE = 0.02
-"""Relative tolerance of the voxel size above the smallest that is sufficient."""
+"""Relative amount by which the voxel size may exceed the smallest sufficient size."""
 MAX_VOXELS_PER_SIDE = 1 << 20
 """Maximum number of voxels along the longest side of the box, so that three indices fit in 64 bits."""
 
 
 def with_points(scene: Scene, start: StartPoints) -> Scene:
-    """Scene with the points that training starts from; `scene` itself if it has them already.
+    """Copy of the scene with the points from which training starts; `scene` itself if it already has them.
 
     Raises InputError for a file that cannot be read, and for a cloud that is not where the cameras look.
     """
@@ -72,9 +72,9 @@ def with_points(scene: Scene, start: StartPoints) -> Scene:
 
 
 def with_cloud_beside(scene: Scene) -> Scene:
-    """Scene with the points of the first cloud next to it that lies where its cameras look, if there is one.
+    """Copy of a scene without points, with the points of a cloud from its folder if one lies where its cameras look.
 
-    For scenes without points. Warns of the cloud that is used, and of clouds that cannot be read or lie elsewhere.
+    The first such cloud is used. Warns of the cloud that is used, and of clouds that cannot be read or lie elsewhere.
     """
     for index, path in enumerate(scene.clouds):
         try:
@@ -83,14 +83,14 @@ def with_cloud_beside(scene: Scene) -> Scene:
         except InputError as error:
             warn(f"{error}; it is not used")
             continue
-        warn(f"{path}: its {len(cloud.points):,} points are the scene's, which names none")
+        warn(f"{path}: its {len(cloud.points):,} points are used, as the scene names no points")
         colors = np.full(cloud.points.shape, UNSEEN_GREY, np.float32) if cloud.colors is None else cloud.colors
         return replace(scene, points=cloud.points, point_colors=colors, clouds=scene.clouds[index + 1 :])
     return replace(scene, clouds=()) if scene.clouds else scene
 
 
 def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArray[np.bool_]:
-    """Mark the points (N, 3) that are not outliers, (N,), compared with the other points and the scene's cameras.
+    """Mark the points (N, 3) that are not outliers, as compared with all points and the scene's cameras. Returns (N,).
 
     where: origin of the points, for the warning about outliers.
     """
@@ -101,21 +101,21 @@ def without_stray_points(points: Float64, scene: Scene, where: object) -> NDArra
         first = " ".join(f"{value:.4g}" for value in far[0])
         warn(
             f"{where}: {len(far):,} of {len(points):,} points lie over {OUTLIER_DISTANCE_RATIO:g} times as far off "
-            "as the others, such "
-            f"as {first}, and are left out"
+            f"as the others, such as the point {first}; they are left out"
         )
     return kept
 
 
 def check_place(points: Float64, scene: Scene, path: Path) -> None:
-    """Raise InputError for a cloud (N, 3) that training photographs do not show, or at very different distances."""
+    """Raise InputError for a cloud (N, 3) that the training photographs do not show or that lies much nearer or farther
+    than the scene's points."""
     looked = _spread(points)
     seen, depths = _seen(looked, scene)
-    advice = "expected points in the scene's frame, as its cameras: the same axes, scale and origin"
+    advice = "expected points with the axes, scale and origin of the scene's cameras"
     if seen < max(MIN_CLOUD_POINTS_IN_VIEW * len(looked), 1):
         raise InputError(
-            f"{path}: {100 * seen / len(looked):.1f} % of its points lie in a training photograph, {_where(points)}, "
-            f"and the cameras stand {_where(_centres(scene))}; {advice}"
+            f"{path}: only {100 * seen / len(looked):.1f} % of its points lie in a training photograph; the points lie "
+            f"{_where(points)}, and the cameras {_where(_centres(scene))}; {advice}"
         )
     if len(scene.points):
         _, usual = _seen(_spread(scene.points), scene)
@@ -123,8 +123,8 @@ def check_place(points: Float64, scene: Scene, path: Path) -> None:
         usual = scene.extent if depths > MAX_CLOUD_DISTANCE_EXTENTS * scene.extent else depths
     if usual > 0 and not 1 / MAX_CLOUD_DEPTH_RATIO <= depths / usual <= MAX_CLOUD_DEPTH_RATIO:
         raise InputError(
-            f"{path}: its points are {depths:.3g} from the cameras that see them, {_where(points)}, and what the scene "
-            f"has is {usual:.3g}; {advice}"
+            f"{path}: its points lie {_where(points)}, at a distance of {depths:.3g} from the cameras that see them, "
+            f"and the scene's points at {usual:.3g}; {advice}"
         )
 
 
@@ -156,9 +156,9 @@ def _where(points: Float64) -> str:
 
 
 def thinned(cloud: Cloud, limit: int) -> Cloud:
-    """Reduce a cloud to at most `limit` points, one per occupied voxel, with the mean position and colour.
+    """Reduce a cloud to at most `limit` points: for each occupied voxel, the mean position and colour.
 
-    The voxel is the smallest that is sufficient, within VOXEL_SIZE_TOLERANCE of its side. A smaller cloud is unchanged.
+    The voxel size is the smallest sufficient one, within VOXEL_SIZE_TOLERANCE. A cloud within the limit is unchanged.
     """
     points = cloud.points
     if len(points) <= limit:
@@ -189,6 +189,6 @@ def _cells(points: Float64, low: Float64, voxel: float) -> NDArray[np.int64]:
 
 
 def _means(values: NDArray[Any], cells: NDArray[np.int64]) -> Float64:
-    """Means (voxels, 3) of values (N, 3), summed in the order of the file."""
+    """Mean per voxel, (voxels, 3), of values (N, 3). They are summed in the order of the file."""
     counts = np.bincount(cells)
     return np.stack([np.bincount(cells, values[:, axis]) / counts for axis in range(3)], axis=1)

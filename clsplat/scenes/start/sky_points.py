@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene, View
 
 SKY_IMAGE_SIDE_PX = 400
-"""Maximum longer side of the photographs in pixels. A sky point covers several pixels of the full size."""
+"""Longer side in pixels to which larger photographs are reduced. A sky point covers several pixels of the full size."""
 SKY_RADIUS_QUANTILE = 0.95
 """Quantile of the distances of the scene's points that counts as the farthest distance."""
 SKY_OVERSAMPLING = 4
@@ -27,25 +27,26 @@ SKY_OVERSAMPLING = 4
 SKYLINE_COLUMNS = 24
 """Number of column strips of a photograph. In each, the sky is above all points."""
 MIN_SKY_VOTE_FRACTION = 0.5
-"""Minimum fraction of sky among the photographs that show a direction."""
+"""A direction is sky if at least this fraction of the photographs that show it have sky there."""
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5.0))
 
 
 def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
     """At most `count` points (N, 3) on the sky sphere in the world, and their mean colours (N, 3) in the photographs.
 
-    A direction above the horizon is sky if most photographs that show it have no scene point above it in its column.
+    A direction above the horizon is sky if, in most photographs that show it, no scene point lies above it in its
+    column strip.
     Raises InputError if there is no such direction, no common up direction, or no points in the scene.
     """
     if len(scene.points) == 0:
         raise InputError(
-            f"{scene.name}: --sky: the scene has no points to tell the sky by, expected some; leave it out"
+            f"{scene.name}: --sky needs points to find the sky above them, and the scene has none; leave out --sky"
         )
     cameras = [view.camera for view in scene.train_views]
     middle, *_ = scene.spread
     up = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
     if (length := float(np.linalg.norm(up))) < 0.1:
-        raise InputError(f"{scene.name}: --sky: the cameras have no common up, expected one; leave it out")
+        raise InputError(f"{scene.name}: --sky needs cameras with a common up direction; leave out --sky")
     radius = SKY_RADIUS_RATIO * max(
         float(np.quantile(np.linalg.norm(scene.points - middle, axis=1), SKY_RADIUS_QUANTILE)), scene.extent
     )
@@ -68,7 +69,7 @@ def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
             votes[there] += 1
     chosen = np.flatnonzero((votes > 0) & (votes >= MIN_SKY_VOTE_FRACTION * shown))
     if len(chosen) == 0:
-        raise InputError(f"{scene.name}: --sky: no photograph shows any above its points, expected some; leave it out")
+        raise InputError(f"{scene.name}: --sky: no photograph shows sky above its points; leave out --sky")
     if len(chosen) > count:
         chosen = chosen[np.linspace(0, len(chosen) - 1, count).astype(int)]
     colors: Float32 = np.clip(sums[chosen] / votes[chosen, None], 0, 1).astype(np.float32)
@@ -76,7 +77,7 @@ def sky_points(scene: Scene, count: int) -> tuple[Float64, Float32]:
 
 
 def half_sphere(count: int, up: Float64) -> Float64:
-    """Directions (count, 3), evenly spaced over the half sphere around `up`, by a golden-angle spiral."""
+    """Directions (count, 3), evenly spaced over the half sphere around `up` on a golden-angle spiral."""
     height = (np.arange(count) + 0.5) / count
     level, angle = np.sqrt(1 - height**2), _GOLDEN_ANGLE * np.arange(count)
     aside = np.eye(3)[int(np.argmin(np.abs(up)))]

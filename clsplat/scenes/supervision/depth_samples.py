@@ -43,7 +43,7 @@ class KnownDepth:
     def at(self, camera: Camera, lens: Lens) -> tuple[NDArray[np.int64], Float32, Float32]:
         """Pixels with known depth in a picture of the camera's size.
 
-        lens: lens of the depth map, and of a camera that is not a pinhole camera.
+        lens: lens of the depth map, and of the camera if that is not a pinhole camera.
         Returns ascending pixel indices (k,), inverse depths in 1 / world units, and weights.
         """
         if self.path is not None:
@@ -81,7 +81,7 @@ class KnownDepth:
 
 
 def sampled(values: Float32, camera: Camera, lens: Lens) -> Float64:
-    """Sample a map (h, w) at the pixels of a camera (H, W) by the nearest value; NaN outside the map.
+    """Nearest values of a map (h, w) at the pixels of a camera (H, W); NaN for pixels outside the map.
 
     lens: the lens of the map, which may have any size.
     """

@@ -18,20 +18,20 @@ from clsplat.scenes.dataset import PosedImage
 from clsplat.scenes.sidecar_files import Named, bases_of, beside, inside, owned
 
 MASK_FOLDERS = ("masks", "mask", ".masks", ".mask")
-"""Names of the mask folder, next to the photographs' folder or inside it. RealityScan's is hidden."""
+"""Names of the mask folder, next to the photographs' folder or inside it. RealityScan hides its mask folder."""
 OTHER_MASK_FOLDERS = (
     *("images_mask", "images_masks", "image_mask", "image_masks", "masks_images", "masks_png", "dynamic_masks"),
     *("dynamic_mask", "mattes", "matte", "silhouettes", "silhouette", "segmentation", "segmentations"),
 )
-"""More names of mask folders, which are searched if masks are asked for and not found."""
+"""More names of mask folders. They are searched if masks are requested and MASK_FOLDERS has none."""
 DYNAMIC_FOLDER_PREFIX = "dynamic"
 """Prefix of the name of a folder whose white pixels may be moving objects."""
 MASK_THRESHOLD = 0.5
-"""Minimum mask value of a pixel that counts. After a change of size, also the minimum fraction of its area that
-counts."""
+"""Minimum mask value of a pixel that counts. In a resized mask, also the minimum fraction of a pixel's area that must
+count."""
 COMPARED_MASKS = 12
-"""Number of masks in a folder that are sampled for values of at least a half and for void. At most twice as many are
-read."""
+"""Approximate number of masks of a folder that are searched for values of at least a half and for void labels. At most
+twice as many are read."""
 VOID_LABEL = 255
 """Label of undefined pixels, as at the object borders in VOC and Cityscapes."""
 MAX_LABEL = 40
@@ -60,8 +60,8 @@ class Mask:
     def applied(self, image: Float32, *, orient: bool) -> tuple[Float32, Float32 | None]:
         """Apply the masks to a photograph (H, W, 3 or 4).
 
-        Returns the photograph, and (H, W, 1): 1 for pixels that count, else 0; None if all count. Raises InputError for
-        a mask of another size, or one that does not decode.
+        Returns the photograph, and an array (H, W, 1) with 1 for pixels that count and 0 for others, or None if all
+        pixels count. Raises InputError for a mask of another size, or one that does not decode.
         """
         kept, counts = image[:, :, 3:] if image.shape[2] == 4 else None, None
         if kept is not None and self.use.alpha == "ignore":
@@ -83,7 +83,8 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
 
     Grey values of at least a half count. If the grey is constant, alpha is used instead. Among labels (0 and 1, perhaps
     255 for void), 1 counts, and void never does. Raises InputError if the file does not decode, and for ambiguous
-    labels. Also raises it if all values are dark: two values, or more if the folder's other masks are dark too.
+    labels. Also raises it if all values are below a half, and either there are only two or the folder's other masks are
+    dark too.
     """
     image = read_image(path, orient=orient)
     pixels = image[:, :, :3]
@@ -100,7 +101,7 @@ def read_mask(path: Path, *, orient: bool, invert: bool) -> Float32:
 
 
 def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
-    """Interpret a mask that has no value of at least a half: 1 for labels of 1, -1 for void.
+    """Interpret a mask whose values are all below a half. In masks of labels, 1 stays 1 and void becomes -1.
 
     pixels: the colours whose means are `values`.
     Raises InputError for other labels. A soft mask may be dark if another mask in its folder is not.
@@ -116,8 +117,8 @@ def _from_labels(path: Path, values: Float32, pixels: Float32) -> Float32:
     if (len(levels) > 2 or not exact) and any(_reaches_half(other) for other in _like(path)):
         return values
     raise InputError(
-        f"{path}: the mask's values are {_stored(pixels, most)}, all of them dark, expected 0 and {most}, where a half "
-        "or more counts (or 0 and 1); make white the pixels that count"
+        f"{path}: the mask's values are {_stored(pixels, most)}, all below a half, expected 0 and {most}, where a half "
+        "or more counts (or 0 and 1); make the pixels that count white"
     )
 
 
@@ -132,10 +133,10 @@ def _stored(pixels: Float32, most: int) -> str:
 
 
 def _without_void(path: Path, values: Float32) -> Float32:
-    """Interpret a mask of black, white and integers that may be labels: 1 for labels of 1, -1 for void.
+    """Interpret a mask of black, white and integers that may be labels. In masks of labels, void becomes -1.
 
-    They are labels if they cover more area than white does, in the mask or in the masks of its folder. Raises
-    InputError for more labels, and if the meaning is ambiguous.
+    The integers are labels if they cover at least the area of white, in this mask or in all masks of its folder. Raises
+    InputError for labels other than 0 and 1, and if the meaning is ambiguous.
     """
     most, exact = stored_range(path)
     areas = _areas(values, most)
@@ -150,10 +151,10 @@ def _without_void(path: Path, values: Float32) -> Float32:
         return values
     if labels < void or several:
         found = ", ".join(map(str, np.unique(np.rint(values * most)).astype(int).tolist()[:-1]))
-        what = "labels of several things and void" if several else "labels of 0 and 1 with void, or black and white"
+        what = "labels of several things and void" if several else "either labels 0 and 1 with void or black and white"
         raise InputError(
-            f"{path}: the mask's values are {found} and {most}, {what}, expected 0 and {most}, where a half or more "
-            "counts (or 0 and 1); make white the pixels that count, and black all others"
+            f"{path}: the mask's values are {found} and {most}, {what}, expected 0 and {most} (values of at least a "
+            "half count) or labels 0 and 1; make the pixels that count white, and all others black"
         )
     return _labels(np.rint(values * most), most)
 
@@ -164,10 +165,11 @@ def _labels(levels: Float32, void: int) -> Float32:
 
 
 def _areas(values: Float32, most: int) -> tuple[int, int] | None:
-    """Pixel counts of labels from 1 up and of white, for a mask that otherwise has only black; else None."""
+    """Number of pixels with labels of at least 1, and of white pixels. None if the mask has other values than labels,
+    black and white."""
     levels = values * most
     dark = levels < most * MASK_THRESHOLD
-    whole = np.abs(levels - np.rint(levels)).max() < 0.25  # a mean of three equal channels is whole but for rounding
+    whole = np.abs(levels - np.rint(levels)).max() < 0.25  # integers up to rounding: values are means of channels
     if not most or not whole or not (levels[~dark] > most - MASK_THRESHOLD).all() or (levels[dark] > MAX_LABEL).any():
         return None
     found = np.unique(np.rint(levels[dark])).astype(int).tolist()
@@ -177,7 +179,7 @@ def _areas(values: Float32, most: int) -> tuple[int, int] | None:
 
 
 def _like(path: Path) -> list[Path]:
-    """Sample of the masks in a mask's folder, which may also have photographs."""
+    """Sample of the masks in the folder of a mask. Photographs in the same folder are excluded by their names."""
     named = "mask" in path.stem.lower()
     others = [other for other in find_images(path.parent, deep=False) if ("mask" in other.stem.lower()) == named]
     return others[:: max(len(others) // COMPARED_MASKS, 1)]
@@ -190,7 +192,7 @@ def _reaches_half(path: Path) -> bool:
 def find_masks(
     folder: Path, names: Iterable[str], without: Iterable[Path] = (), *, strict: bool = True
 ) -> dict[str, Path]:
-    """Masks in a folder, by the names of their photographs.
+    """Find the masks in a folder. The keys are the names of their photographs.
 
     names: all photographs, relative to their folder.
     without, strict: as for `owned`.
@@ -207,7 +209,7 @@ def find_masks(
 
 
 def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
-    """Photographs by the possible names of their masks, without the extension.
+    """Photograph for each name that its mask may have, without the extension.
 
     plain: also accept the photograph's own name.
     """
@@ -223,10 +225,10 @@ def _known(names: Iterable[str], *, plain: bool = True) -> dict[str, str]:
 
 
 def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict: bool = True) -> dict[str, Mask]:
-    """Masks of a scene's photographs, by name; empty if masks and alpha have no meaning.
+    """Mask for each name of a scene's photographs; empty if masks are not used and alpha is blended.
 
     where: the scene, for messages.
-    strict: False if photographs are missing, whose masks may exist.
+    strict: False if photographs are missing, as their masks may still exist.
     Warns of photographs without a mask. Raises InputError if there are no masks, or one is missing, has another size,
     or fits no photograph.
     """
@@ -238,7 +240,7 @@ def masks_of(use: MaskUse, images: Sequence[PosedImage], where: Path, *, strict:
         found = {**masks_beside(images, told, strict=strict, others=OTHER_MASK_FOLDERS), **told}
         if not found:
             raise InputError(
-                f"{where}: --masks {use.masks}, and there are none; expected masks/IMAGE.png beside images/, or "
+                f"{where}: has no masks for --masks {use.masks}; expected masks/IMAGE.png beside images/, or "
                 "'mask_path' in transforms.json"
             )
         files = {image.name: image.path for image in images}
@@ -257,8 +259,8 @@ def warn_of_sense(masks: Iterable[Path], use: MaskUse, where: Path) -> None:
     folder = next((path.parent for path in masks if path.parent.name.lower().startswith(DYNAMIC_FOLDER_PREFIX)), None)
     if folder is not None and not use.invert:
         warn(
-            f"{where}: masks are in {folder.name}, and white is taken for what counts, as in all masks; if it is what "
-            "moves there, give --invert-masks"
+            f"{where}: masks are in {folder.name}, and white pixels are the ones that count, as in all masks; if white "
+            "marks moving objects there, add --invert-masks"
         )
 
 
@@ -269,9 +271,10 @@ def masks_beside(
     strict: bool = True,
     others: Sequence[str] = (),
 ) -> dict[str, Path]:
-    """Masks by photograph name, in a folder next to the photographs' folder or inside it, else next to each photograph.
+    """Find masks in a folder next to the photographs' folder or inside it, else next to each photograph.
 
-    told: masks that the data set names, by photograph name. In nerfstudio's scenes, one mask may serve all.
+    The keys are the names of the photographs.
+    told: mask for each photograph for which the data set names one. In nerfstudio's scenes, one mask may serve all.
     strict: as for `find_masks`.
     others: more names of folders, searched if the usual ones have no masks.
     Raises InputError like `find_masks`.
@@ -345,15 +348,15 @@ def stage_mask(
 
 
 def for_sfm(use: MaskUse) -> MaskUse | None:
-    """Use of masks in `clsplat.scenes.sfm.reconstruct`, which finds no features in left-out pixels; None for no masks.
+    """Use of masks for `clsplat.scenes.sfm.reconstruct`, which finds no features in masked pixels; None for no masks.
 
     Raises InputError if masks and alpha have different meanings, as the reconstruction has one mask for both.
     """
     meanings = {use.masks, use.alpha} - {"none", "blend"}
     if len(meanings) > 1:
         raise InputError(
-            f"--masks {use.masks} and --alpha {use.alpha}: expected one meaning of both for a folder of photos, as "
-            "their reconstruction has one mask for each; give the cameras, or make both the same"
+            f"--masks {use.masks} and --alpha {use.alpha}: expected the same meaning for a folder of photos, as their "
+            "reconstruction combines both into one mask; make both the same, or give a scene with cameras"
         )
     if not meanings:
         return None
@@ -372,6 +375,6 @@ def after_sfm(use: MaskUse, folder: Path) -> MaskUse:
 
 def _misfit(path: Path, size: tuple[int, int], photo: tuple[int, int]) -> InputError:
     return InputError(
-        f"{path}: the mask is {size[0]} x {size[1]} pixels, expected its photograph's {photo[0]} x {photo[1]}; "
-        "make it of that size"
+        f"{path}: the mask has {size[0]}x{size[1]} pixels, expected the size of its photograph, {photo[0]}x{photo[1]}; "
+        "make it again in that size"
     )
