@@ -135,7 +135,7 @@ def test_a_run_that_is_there_is_not_trained_into_and_knows_its_settings(
     for call, message in (
         ({}, "has been trained already; resume=True continues it"),
         ({"config": replace(FEW, iterations=1), "resume": True}, "is already at step 3; expected more"),
-        ({"config": replace(FEW, seed=9), "resume": True}, "seed is 0 there, a resumed run cannot change it to 9"),
+        ({"config": replace(FEW, seed=9), "resume": True}, "seed is 0, a resumed run cannot change it to 9"),
     ):
         with pytest.raises(InputError) as caught:
             train(**{"scene": loaded, "device": default_device, "run": Run.open(run.path), **call})

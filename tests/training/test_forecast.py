@@ -17,7 +17,7 @@ from clsplat.training.forecast import Forecast
 RECORDED = json.loads((Path(__file__).parent / "recorded_steps.json").read_text())
 """Trainings of 3000 steps on two cores: Gaussians of each hundred steps, milliseconds of each twenty."""
 CPU, GAUSSIANS, OVERHEAD = (1.0, 0.5, 1.0, 20.0), (1.0, 0.1, 2.0, 5.0), (4.0, 0.3, 0.6, 5.0)
-"""Costs: milliseconds of a step, quarters of a microsecond of a pixel and of a Gaussian, milliseconds of a photograph."""
+"""Costs: milliseconds of a step, 0.25 us of a pixel and of a Gaussian, milliseconds of reading a photograph."""
 
 
 @dataclass
