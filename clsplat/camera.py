@@ -211,7 +211,7 @@ class Camera:
         for name in ("width", "height"):
             side = getattr(self, name)
             if isinstance(side, bool) or not isinstance(side, int | np.integer) or side < 1:
-                raise InputError(f"camera: {name} is {side}, expected a whole number of at least 1")
+                raise InputError(f"camera: {name} is {side}, expected a whole number of pixels, at least 1")
         for name in ("fx", "fy"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"camera: {name} is {getattr(self, name)}, expected a finite number over 0")
