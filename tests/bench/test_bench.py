@@ -605,7 +605,7 @@ def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyP
         other.unlink(missing_ok=True)
         file.write_bytes(b"precious")
         assert main(["bench", *SMALL, "--plot", str(path)]) == 2
-        said = f"clsplat: error: {file}: is there already; name another file, or give --overwrite to replace it\n"
+        said = f"clsplat: error: {file}: exists already; name another file, or give --overwrite to replace it\n"
         assert capsys.readouterr() == ("", said)
         assert file.read_bytes() == b"precious"
         assert not other.exists()

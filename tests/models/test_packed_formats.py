@@ -110,7 +110,10 @@ def test_morton_order_interleaves_the_bits() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data.replace(b"element chunk 1\n", b"element chunk 0\n"), "0 chunks are too few for 2"),
+        (
+            lambda data: data.replace(b"element chunk 1\n", b"element chunk 0\n"),
+            "has 0 chunks of 256 Gaussians, too few for 2",
+        ),
         (lambda data: data.replace(b"element chunk 1\n", b"element chunk 99999999999\n"), "truncated: its header"),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 255"), "sh has 2 rows, expected 255"),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 0"), "0 Gaussians"),
@@ -297,7 +300,7 @@ def test_a_ply_with_sh_of_degree_4_is_read_up_to_3(tmp_path: Path) -> None:
     more = b"".join(b"property float f_rest_%d\n" % i for i in range(45, 72))
     head = head.replace(b"property float f_rest_44\n", b"property float f_rest_44\n" + more)
     (tmp_path / "b.ply").write_bytes(head + mark + table.astype("<f4").tobytes())
-    with pytest.warns(UserWarning, match=r"b\.ply: SH of degree 4 is left out"):
+    with pytest.warns(UserWarning, match=r"b\.ply: has SH of degree 4; coefficients above degree 3"):
         read = formats.load(tmp_path / "b.ply")
     np.testing.assert_array_equal(read.sh, model.sh)
 

@@ -199,7 +199,7 @@ def test_origin_out_of_all_bounds(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     random_gaussians(5).save(path)
     path.write_bytes(path.read_bytes().replace(b"element", b"comment clsplat origin 1e300 0 0\nelement", 1))
-    with pytest.raises(InputError, match="leaves means that are not finite"):
+    with pytest.raises(InputError, match="gives means that are not finite"):
         Gaussians.load(path)
 
 

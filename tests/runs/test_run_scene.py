@@ -118,7 +118,7 @@ def test_a_run_of_an_earlier_version_resumes_with_one_line(run: Path, own: Path,
     assert resume(run, own) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if scene_record.SCENE_RECORD_FILE_NAME in line]
     assert len(told) == 1
-    assert told[0].startswith(f"clsplat: warning: {run}: has no scene.json, as runs of earlier versions")
+    assert told[0].startswith(f"clsplat: warning: {run}: has no scene.json, like runs of earlier versions")
     assert (run / scene_record.SCENE_RECORD_FILE_NAME).exists()
 
 

@@ -95,7 +95,10 @@ def test_a_setting_of_an_earlier_version_still_loads(
 def test_a_setting_of_an_earlier_version_is_told_once(tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
     path.write_text('clsplat = "1"\n[train.rasterizer]\nsh_angle = 2.5\n')
-    with pytest.warns(UserWarning, match=r"config\.toml: passed over, .*: train\.rasterizer\.sh_angle = 2\.5$") as told:
+    with pytest.warns(
+        UserWarning,
+        match=r"config\.toml: has settings that this version lacks, .*: train\.rasterizer\.sh_angle = 2\.5$",
+    ) as told:
         assert read_config(path) == read_config(path) == (TrainConfig(), None)
     assert len(told) == 1
 
@@ -114,7 +117,7 @@ def test_switches_that_only_the_bench_has_are_passed_over(tmp_path: Path) -> Non
         .replace('extent = "opacity"', 'extent = "constant"')
         .replace("sh_degree_limit = 3", "sh_degree_limit = 1")
     )
-    with pytest.warns(UserWarning, match="passed over") as told:
+    with pytest.warns(UserWarning, match="has settings that this version lacks") as told:
         assert read_config(path) == (TrainConfig(rasterizer=RasterizerConfig(sh_degree_limit=1)), None)
     assert len(told) == 1
     named = ("extent = 'constant'", "row_skip = False", "gradient_skip = False")
@@ -134,7 +137,7 @@ def test_settings_of_training_that_are_gone_are_passed_over(tmp_path: Path) -> N
         assert read_config(path) == (config, None), "as every earlier version wrote them"
     once = {"edge_views": 5, "prune_at": [600, 3000], "prune_fraction": 0.25, "views_agree": 2}
     path.write_text(tomli_w.dumps({"train": {"frequency_steps": 500, "density": once | {"every": 50}}}))
-    with pytest.warns(UserWarning, match="passed over") as told:
+    with pytest.warns(UserWarning, match="has settings that this version lacks") as told:
         assert read_config(path) == (config, None)
     assert len(told) == 1
     assert str(told[0].message).endswith(
@@ -259,7 +262,7 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path: Path, damage: str) -> Non
     data = bytearray(path.read_bytes())
     data[data.index(arrays(2)["means"].tobytes()) + 7] ^= 16
     path.write_bytes({"cut": data[: len(data) // 2], "flip": data, "empty": b"", "text": b"text" * 99}[damage])
-    with pytest.warns(UserWarning, match=r"step-0000002\.npz: checkpoint is damaged"):
+    with pytest.warns(UserWarning, match=r"step-0000002\.npz: is a damaged checkpoint"):
         checkpoint = run.load_latest_checkpoint()
     assert checkpoint is not None
     assert checkpoint.step == 1
@@ -267,7 +270,7 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path: Path, damage: str) -> Non
     assert [step for step, _ in run.checkpoints()] == [1]  # the damaged one was of a later step
 
     run.checkpoints()[0][1].write_bytes(b"")
-    with pytest.warns(UserWarning, match="damaged"), pytest.raises(InputError, match="no checkpoint there is whole"):
+    with pytest.warns(UserWarning, match="damaged"), pytest.raises(InputError, match="no intact checkpoint"):
         run.load_latest_checkpoint()
 
 

@@ -598,7 +598,7 @@ def test_checkpoints_that_are_none_are_passed_over(kind: str, tmp_path: Path) ->
     make_run(tmp_path)
     run = runs.Run.open(tmp_path / "run")
     archive(run.checkpoints_path / "step-0000002.npz", *CHECKPOINTS[kind])
-    with pytest.warns(UserWarning, match="checkpoint is damaged"):
+    with pytest.warns(UserWarning, match="is a damaged checkpoint"):
         checkpoint = run.load_latest_checkpoint()
     assert checkpoint is not None
     assert checkpoint.step == 1
@@ -642,7 +642,7 @@ def test_a_checkpoints_directory_claims_at_most_what_it_has(tmp_path: Path) -> N
     data[end + 12 : end + 16] = struct.pack("<I", 0xFFFFFFF0)
     path.write_bytes(data)
     tracemalloc.start()
-    with pytest.warns(UserWarning, match="checkpoint is damaged"):
+    with pytest.warns(UserWarning, match="is a damaged checkpoint"):
         runs.Run.open(tmp_path / "run").load_latest_checkpoint()
     assert tracemalloc.get_traced_memory()[1] < 1e7
     tracemalloc.stop()

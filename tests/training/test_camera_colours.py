@@ -142,7 +142,7 @@ def test_a_damaged_row(tmp_path: Path, change: dict[str, object]) -> None:
     run = Run.create(tmp_path / "run", OF_CAMERAS)
     row = {"log2_gains": [0.0] * 3, "mixes": [0.0] * 6, "vignette": [0.0] * 3, "centre": [0.5, 0.5]} | change
     run.write_appearance({"kind": "ppisp", "photographs": {"a.jpg": row}, "held_out": {}})
-    with pytest.raises(InputError, match=r"appearance.json: .*expected what clsplat train --appearance"):
+    with pytest.raises(InputError, match=r"appearance.json: .*expected a file that clsplat train --appearance"):
         gains_of(run.path, "a.jpg")
 
 
