@@ -147,7 +147,7 @@ class Book:
         return [self._result(table, row, seed, most[seed]) for seed in range(self.seeds)]
 
     def _most(self, table: str, row: Row, rows: Sequence[Row]) -> list[tuple[str, ...]]:
-        """Settings of each seed: half of the better row's Gaussians with the same seed, so that seeds are independent."""
+        """Settings per seed: half of the better row's Gaussians with the same seed, so that seeds are independent."""
         if not row.half_of:
             return [()] * self.seeds
         others = [self.results(table, other, rows) for other in rows if other.name in row.half_of]
