@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes the checkout's own environment, `.venv`, with clsplat installed in it; `tools/demo` and `tools/test` use it.
 
-Needs nothing but Python's standard library and a package index that pip can reach. As a script, sets up the extras
+It needs only Python's standard library and a package index that pip can reach. Run as a script, it installs the extras
 named as arguments and prints the path of the environment's Python.
 """
 
@@ -20,20 +20,20 @@ ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = ROOT / ".venv"
 OLDEST = (3, 10)
 EDITABLE = str(ROOT).isascii()
-"""Before 3.13 Python reads an editable install's path as the locale says, not in UTF-8 as it is written, and may not
-start. Elsewhere clsplat is installed as any package, and the checkout comes first in PYTHONPATH."""
+"""True if the install may be editable. Before 3.13, Python reads the path of an editable install in the locale's
+encoding, though it is in UTF-8, and may fail to start. If False, `run` puts the checkout first in PYTHONPATH."""
 
 
 def python_of(environment: Path) -> Path:
-    """The interpreter of a virtual environment."""
+    """Path of a virtual environment's interpreter."""
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
 def set_up(extras: tuple[str, ...] = ()) -> Path:
-    """Make `.venv` if it is missing and install clsplat in it, editable where it can be; returns its Python.
+    """Create `.venv` if it is missing, install clsplat in it (editable if possible), and return its Python.
 
-    Installs again only when pyproject.toml has changed, the checkout has moved, or an extra is new. Exits with one
-    line where this Python is too old or pip fails.
+    Installs again only if pyproject.toml has changed, the checkout has moved, or an extra is new. Exits with a message
+    of one line if this Python is too old or pip fails.
     """
     if sys.version_info < OLDEST:
         found = ".".join(map(str, sys.version_info[:3]))
@@ -41,7 +41,7 @@ def set_up(extras: tuple[str, ...] = ()) -> Path:
     python = python_of(ENVIRONMENT)
     if not _runs(python):
         print(f"making {ENVIRONMENT}", file=sys.stderr, flush=True)
-        # --clear: what may be there does not run, as after an interrupted start or an upgrade of Python
+        # --clear: an existing environment is broken, as after an interrupted start or an upgrade of Python
         if _call([sys.executable, "-m", "venv", "--clear", str(ENVIRONMENT)]) != 0:
             shutil.rmtree(ENVIRONMENT, ignore_errors=True)
             sys.exit(f"{sys.argv[0]}: {sys.executable} -m venv failed; on Debian and Ubuntu, install python3-venv")
@@ -63,7 +63,7 @@ def set_up(extras: tuple[str, ...] = ()) -> Path:
 
 
 def run(command: list[str]) -> int:
-    """Run a command to its end and give its exit status; Ctrl-C is for the command, and then for us."""
+    """Run a command until it ends, and return its exit status. Ctrl-C interrupts the command, not the waiting."""
     found = [] if EDITABLE else [str(ROOT)]
     path = os.pathsep.join([*found, *filter(None, [os.environ.get("PYTHONPATH")])])
     process = subprocess.Popen(command, env={**os.environ, **({"PYTHONPATH": path} if path else {})})
@@ -71,7 +71,7 @@ def run(command: list[str]) -> int:
         try:
             status = process.wait()
         except KeyboardInterrupt:
-            continue  # the terminal sent it to the command as well, which ends in its own way
+            continue  # the terminal has sent Ctrl-C to the command too, which ends in its own way
         return status if status >= 0 else 128 - status
 
 
@@ -81,7 +81,7 @@ def _runs(python: Path) -> bool:
 
 def _call(command: list[str], *, quiet: bool = False) -> int:
     stream = subprocess.DEVNULL if quiet else sys.stderr
-    # venv and pip write paths in UTF-8, and fail where the locale is another and a path has letters beyond ASCII
+    # venv and pip write paths in UTF-8, and fail if the locale has another encoding and a path is not ASCII
     utf8 = {} if sys.getfilesystemencoding() == "utf-8" else {"PYTHONUTF8": "1"}
     variables = {**os.environ, **utf8}
     return subprocess.run(
@@ -91,7 +91,7 @@ def _call(command: list[str], *, quiet: bool = False) -> int:
 
 if __name__ == "__main__":
     if isinstance(sys.stdout, io.TextIOWrapper):
-        encoding, errors = sys.getfilesystemencoding(), sys.getfilesystemencodeerrors()  # as paths are
+        encoding, errors = sys.getfilesystemencoding(), sys.getfilesystemencodeerrors()  # those of paths
         sys.stdout.reconfigure(encoding=encoding, errors=errors)
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("extras", nargs="*", metavar="EXTRA", help="as pyproject.toml names them: test, dev, docs, ...")

@@ -222,7 +222,7 @@ class TrainConfig:
     perspective: Perspective = "auto"
     """Projection of a Gaussian in pinhole pictures. plane: as an ellipse on the image plane (Kerbl et al.). rays: along
     the rays of the pixels, as for fisheyes and panoramas, which takes longer. auto: rays if the scene has fisheyes or
-    panoramas, so that all photographs share one projection. The model is rendered the same way; its file says so."""
+    panoramas, so that all photographs share a projection. The model is rendered the same way, and its file says it."""
     masks: MaskMeaning = "none"
     """Meaning of the photographs' masks, which are white where a pixel counts. ignore: the loss ignores black pixels,
     such as people. transparent: black pixels are empty, such as around an object on a turntable. none: masks are not

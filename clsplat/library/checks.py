@@ -32,7 +32,7 @@ def floats(name: str, values: Any, *shapes: Shape) -> Float32:
     if not finite:
         at = np.unravel_index(int(np.argmin(np.isfinite(result))), result.shape)
         place = ", ".join(str(int(index)) for index in at)
-        raise InputError(f"{name}: [{place}] is {array[at]}, expected finite numbers in float32's range")
+        raise InputError(f"{name}: [{place}] is {array[at]}, expected finite numbers within float32")
     return result
 
 

@@ -5,12 +5,12 @@
     python tools/bench/bench_growth.py [--max-gaussians 3e6] [--max-megapixels 8] [--repeat 5] [--device DEVICE]
                                        [--json] [--plot growth.svg]
 
-The scene is the one that `clsplat bench` makes up. With more Gaussians each is smaller, so that all together they cover
-the same area, at 1024x768; with more pixels 200,000 Gaussians grow with the image, 4:3. Wall time of
-`Rasterizer.forward` from an idle device to an idle device, median.
+The scene is the synthetic one of `clsplat bench`. The number of Gaussians grows at 1024x768, and they shrink so that
+their total area stays the same. The number of pixels grows with 200,000 Gaussians, which grow with the image, 4:3.
+Times are medians of the wall time of `Rasterizer.forward`, from an idle device to an idle device.
 
 The line ms = a + b x is fitted by least squares of the relative residuals (each weighted by 1 / ms), so that small
-sizes count as much as large ones. The largest residual is stated, as a share of what was measured.
+sizes count as much as large ones. The largest residual is printed as a fraction of the measured time.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians
 
 GAUSSIANS, WIDTH, HEIGHT = 200_000, 1024, 768
-"""Sizes that stay as they are while the other grows."""
+"""Number of Gaussians and image size that are fixed while the other grows."""
 FEWEST = 10_000
 MEGAPIXELS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 POINTS = 3
-"""Fewer are always on a line, or none at all."""
+"""Smallest number of sizes: a line through one or two points has no residuals."""
 
 
 def size_of(megapixels: float) -> tuple[int, int]:
@@ -45,7 +45,7 @@ def size_of(megapixels: float) -> tuple[int, int]:
 
 
 def measure(device: Device, count: int, width: int, height: int, repeat: int) -> Result:
-    """A row of the table: `pairs` are those of a tile and a Gaussian."""
+    """Measure a frame and return a row of the table. `pairs` counts (tile, Gaussian) pairs."""
     print(f"{count:,} Gaussians, {width}x{height}", file=sys.stderr, flush=True)
     subject = synthetic(count, width, height)
     rasterizer = Rasterizer(device)
@@ -55,7 +55,7 @@ def measure(device: Device, count: int, width: int, height: int, repeat: int) ->
     def draw() -> ForwardPass:
         return rasterizer.forward(gaussians, subject.camera, background, backward=False)
 
-    frames = [draw() for _ in range(2)]  # kernels are built in the first, and the memory has grown after it
+    frames = [draw() for _ in range(2)]  # the first builds kernels and allocates memory
     ms = statistics.median(device.timed(draw)[1] for _ in range(repeat))
     pairs = frames[-1].listed.pairs.tile_keys.shape[0]
     return {"gaussians": count, "width": width, "height": height, "pairs": pairs, "ms": ms}
@@ -71,7 +71,7 @@ def fit(x: Sequence[float], ms: Sequence[float]) -> tuple[float, float, list[flo
 
 
 def growth(rows: list[Result], unit: str, x: Sequence[float]) -> Result:
-    """The rows with their residuals, and the line; x in `unit`, one for each row."""
+    """The rows with their residuals, and the fitted line. x: a number in `unit` for each row."""
     a, b, residuals = fit(x, [row["ms"] for row in rows])
     told = [{**row, "x": value, "residual": residual} for row, value, residual in zip(rows, x, residuals, strict=True)]
     largest = max(residuals, key=abs)
@@ -79,7 +79,7 @@ def growth(rows: list[Result], unit: str, x: Sequence[float]) -> Result:
 
 
 def table(part: Result) -> list[str]:
-    """Text table of one of the two growths."""
+    """Text table of the times over Gaussians, or over pixels."""
     rows: list[tuple[str, ...]] = [("Gaussians", "image", "tile pairs", "ms", "off the line")]
     for row in part["rows"]:
         size, off = f"{row['width']}x{row['height']}", f"{row['residual']:+.1%}"
@@ -89,9 +89,9 @@ def table(part: Result) -> list[str]:
 
 
 def panel(part: Result) -> Panel:
-    """Panel of one of the two growths."""
+    """Panel of the plot for Gaussians, or for pixels."""
     measured = [(row["x"], row["ms"]) for row in part["rows"]]
-    ends = np.geomspace(measured[0][0], measured[-1][0], 50).tolist()  # a line is curved where the axes are logarithmic
+    ends = np.geomspace(measured[0][0], measured[-1][0], 50).tolist()  # the line is curved on logarithmic axes
     fitted = [(x, part["ms_at_zero"] + part["ms_per_unit"] * x) for x in ends]
     kept = [point for point in fitted if point[1] > 0]
     label = (
@@ -102,7 +102,7 @@ def panel(part: Result) -> Panel:
 
 @tool("bench_growth")
 def main(arguments: Sequence[str]) -> int:
-    """Measure and print."""
+    """Run the measurement and print its results."""
     parser = options_parser(__doc__)
     parser.add_argument("--max-gaussians", metavar="N", type=number, default=3_000_000)
     parser.add_argument("--max-megapixels", metavar="X", type=float, default=8.0)

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Cost, for a training step, of looking for numbers that are not finite: with and without, in turn, in one process.
+"""Cost of a training step's checks for numbers that are not finite: steps with and without them alternate.
 
     python tools/bench/bench_guards.py [RUN | MODEL.ply | SCENE] [--repeat 41] [--device DEVICE] [--json]
 
-Without are kernels built with UNGUARDED, which is there for this comparison alone: `adam` stores what it has worked
-out, and `project` draws any colour. Both trainers have the same model and picture, and rates of zero, so that every
-step is the same work; without a subject it is the scene that `clsplat bench` makes up. Each round makes a step with
-either, the first of them in turn. Stated are medians of wall time and of the process's CPU time, and the median of the
-ratios of each round's two, which other load on the machine moves the least.
+Kernels without checks are built with UNGUARDED, which exists only for this comparison: `adam` stores every result, and
+`project` draws any colour. Both trainers have the same model and picture, and learning rates of zero, so that every
+step is the same work. Without a subject, the scene is the synthetic one of `clsplat bench`. Each round runs a step of
+each trainer in alternating order. Printed are medians of wall time and of the process's CPU time, and the median of the
+ratios of each round's two steps, which is the least sensitive to other load on the machine.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def step_seconds(trainer: Trainer) -> tuple[float, float]:
 
 
 def measure(device: Device, path: Path | None, repeat: int) -> Result:
-    """The figures above, in milliseconds."""
+    """Measure the times and ratios that the module describes, in milliseconds."""
     subject = load_subject(path) if path is not None else synthetic()
     trainers = [
         trainer_of(subject, each, RasterizerConfig()) for each in (device, device.with_switches({"UNGUARDED": True}))
@@ -67,7 +67,7 @@ def measure(device: Device, path: Path | None, repeat: int) -> Result:
 
 @tool("bench_guards")
 def main(arguments: Sequence[str]) -> int:
-    """Measure and print."""
+    """Run the measurement and print its results."""
     parser = options_parser(__doc__, 41, plot=False)
     parser.add_argument("subject", nargs="?", type=Path)
     options = parsed(parser, arguments)

@@ -4,11 +4,11 @@
 
     python tools/bench/bench_library.py [--gaussians 1e5] [--size 640x480] [--repeat 25] [--device DEVICE] [--json]
 
-The scene is the one that `clsplat bench` makes up, SH of degree 3. All calls take their turn before one has its next;
-after medians in ms come the medians of the ratios in a turn: of images alone to `Renderer.render`, of images with what
-a gradient needs to a trainer's `Rasterizer.forward`, whose image stays on the device, and of gradients to
-`Rasterizer.backward`. Of a call the gradient by the view matrix is left out, as the trainer has none. Without PyTorch
-its rows are left out.
+The scene is the synthetic one of `clsplat bench`, with SH of degree 3. Each turn runs every call once. The table has
+median times in ms, and medians of the ratios within a turn. Images are compared with `Renderer.render`, images that
+prepare a gradient with a trainer's `Rasterizer.forward`, whose image stays on the device, and gradients with
+`Rasterizer.backward`. No gradient of the view matrix is computed, as the trainer has none. Without PyTorch, its rows
+are absent.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 
 DEGREE = 3
 Call = tuple[str, Callable[[], Callable[[], object]]]
-"""A name, and a function that makes ready outside of the time and returns what is timed."""
+"""A name, and a function that prepares the call, untimed, and returns the function to time."""
 
 
 def size(text: str) -> tuple[int, int]:
@@ -59,19 +59,19 @@ def arrays_of(subject: Subject) -> dict[str, Any]:
 
 
 def view_of(camera: Camera) -> Any:
-    """(1, 4, 4) float32."""
+    """View matrix (1, 4, 4) float32."""
     pose = np.eye(4, dtype=np.float32)
     pose[:3, :3], pose[:3, 3] = camera.rotation, camera.translation
     return pose[None]
 
 
 def lens_of(camera: Camera) -> Any:
-    """(1, 3, 3) float32."""
+    """Intrinsics (1, 3, 3) float32."""
     return np.array([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], np.float32)
 
 
 def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
-    """`Renderer.render`, a trainer's frame, and its gradient from a gradient by the image that is on the device."""
+    """`Renderer.render`, a trainer's frame, and its gradient from an image gradient on the device."""
     renderer, rasterizer, camera = Renderer(device), Rasterizer(device), subject.camera
     gaussians = upload_gaussians(device, subject.gaussians)
     gradients = allocate_gaussians(device, gaussians.count, gaussians.coefficients, zero=True)
@@ -102,7 +102,7 @@ def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]
 
 
 def of_numpy(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
-    """`clsplat.rasterize` without and with what a gradient needs, and its vector-Jacobian product."""
+    """`clsplat.rasterize` without and with preparation for a gradient, and its vector-Jacobian product."""
     arrays, gradient = arrays_of(subject), gradient_of(subject.camera)[None]
 
     def call(*, differentiable: bool = True) -> Any:
@@ -120,7 +120,7 @@ def of_numpy(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
 
 
 def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, Call, Call]:
-    """`clsplat.torch.rasterization` without and with what a gradient needs, and the backward pass."""
+    """`clsplat.torch.rasterization` without and with preparation for a gradient, and its backward pass."""
     import torch
 
     from clsplat.torch import rasterization
@@ -151,14 +151,14 @@ def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, C
 
 
 def gradient_of(camera: Camera) -> Any:
-    """A gradient by the image, (H, W, 3) float32."""
+    """A gradient of the loss with respect to the image, (H, W, 3) float32."""
     return np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
 
 
 def measure(groups: list[tuple[Call, Call, Call]], repeat: int) -> list[Result]:
-    """The rows: the first group is what the others are compared to."""
+    """The rows of the table. The other groups are compared with the first."""
     times: dict[str, list[float]] = {name: [] for group in groups for name, _ in group}
-    for turn in range(repeat + 2):  # kernels are built in the first, and the memory has grown after it
+    for turn in range(repeat + 2):  # the first builds kernels and allocates memory
         for group in groups:
             for name, prepare in group:
                 work = prepare()
@@ -179,7 +179,7 @@ def measure(groups: list[tuple[Call, Call, Call]], repeat: int) -> list[Result]:
 
 @tool("bench_library")
 def main(arguments: Sequence[str]) -> int:
-    """Measure and print."""
+    """Run the measurement and print its results."""
     parser = options_parser(__doc__, 25, plot=False)
     parser.add_argument("--gaussians", metavar="N", type=number, default=100_000)
     parser.add_argument("--size", metavar="WxH", type=size, default=(640, 480))

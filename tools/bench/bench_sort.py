@@ -4,13 +4,13 @@
 
     python tools/bench/bench_sort.py [--max 3e7] [--repeat 5] [--device DEVICE] [--json] [--plot sort.svg]
 
-keys: one sort of n random uint32 keys of 31 bits. pairs: what the pipeline does to bring n pairs of a tile and a
-Gaussian in order of tile and depth: n / 4 Gaussians are sorted by depth (31 bits), then the pairs, which they emit in
-that order, by tile (11 bits). Emitting the pairs lies between the two and is not in the time; NumPy sorts keys of 64
-bits, tile << 32 | depth, in one go. Sizes 1e4, 3e4, 1e5 and so on; wall time from an idle device to an idle device.
+keys: one sort of n random uint32 keys of 31 bits. pairs: the pipeline's sorts of n (tile, Gaussian) pairs by tile and
+depth. n / 4 Gaussians are sorted by depth (31 bits); the pairs that they emit in this order are sorted by tile (11
+bits). The time excludes emitting the pairs. NumPy sorts keys of 64 bits, tile << 32 | depth, in one sort. Sizes are
+1e4, 3e4, 1e5 and so on. Times are wall times from an idle device to an idle device.
 
-Every result is compared with NumPy's order; exit status 1 where one differs. The deviation from linear growth is the
-largest time a key over the smallest, from 1e5 keys up.
+Every result is compared with NumPy's order; the exit status is 1 if one differs. The deviation from linear growth is
+the ratio of the largest to the smallest time per key, for 1e5 keys and more.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ from clsplat.stages.sort import sort
 
 SMALLEST, LINEAR_FROM = 10_000, 100_000
 TARGET = 4_000_000
-"""Measured too: pairs of a large frame."""
+"""An additional size: the number of pairs in a large frame."""
 DEPTH_BITS = 31
 """Bits of a positive float32."""
 TILES_X, TILES_Y = 50, 30
 """Tiles of an image of 800 x 480 pixels."""
 SIDE = 2
-"""A Gaussian reaches 2 x 2 tiles, so that there are four pairs for each."""
+"""Pairs per Gaussian, which reaches 2 x 2 tiles."""
 
 UInt32 = NDArray[np.uint32]
 Order = NDArray[np.integer[Any]]
 Case = tuple[Callable[[], object], Callable[[], Order], Callable[[], Order]]
-"""The work to time, its result as an order of the keys, and NumPy's order."""
+"""A sort to time, a function that returns its result as an order of the keys, and NumPy's order."""
 
 
 def random_keys(n: int) -> UInt32:
-    """n keys of 31 bits, the same every time."""
+    """n keys of 31 bits, the same in every call."""
     return np.random.default_rng(n).integers(0, 1 << DEPTH_BITS, n, dtype=np.uint32)
 
 
 def random_pairs(n: int) -> tuple[UInt32, UInt32]:
-    """Bits of the depths (n / 4,) of Gaussians, and their tiles (n / 4, 4), blocks of 2 x 2; the same every time."""
+    """Bits of the depths (n / 4,) of Gaussians, and their tiles (n / 4, 4), blocks of 2 x 2; the same in every call."""
     rng = np.random.default_rng(n)
     count = n // SIDE**2
     depths = rng.uniform(2.0, 10.0, count).astype(np.float32).view(np.uint32)
@@ -65,7 +65,7 @@ def random_pairs(n: int) -> tuple[UInt32, UInt32]:
 
 
 def keys_case(device: Device, n: int) -> Case:
-    """One sort."""
+    """The work of one sort of keys."""
     keys, work = random_keys(n), Workspace(device)
     on_device = upload(device, keys)
 
@@ -81,7 +81,7 @@ def keys_case(device: Device, n: int) -> Case:
 
 
 def pairs_case(device: Device, n: int) -> Case:
-    """The pipeline's two sorts; the tiles in order of depth are made beforehand, by NumPy."""
+    """The work of the pipeline's two sorts. NumPy puts the tiles in the order of depth beforehand."""
     depths, tiles = random_pairs(n)
     by_depth = np.argsort(depths, kind="stable")
     work = Workspace(device)
@@ -107,12 +107,12 @@ CASES: dict[str, Callable[[Device, int], Case]] = {"keys": keys_case, "pairs": p
 
 
 def measure(device: Device, name: str, n: int, repeat: int) -> Result:
-    """A row of the table. Raises ClsplatError where the order is not NumPy's."""
+    """A row of the table. Raises ClsplatError if the order is not NumPy's."""
     work, ours, by_numpy = CASES[name](device, n)
-    if not np.array_equal(ours(), by_numpy()):  # builds the kernels and makes the arrays, too
-        raise ClsplatError(f"{name}: {n} of them come out in another order than NumPy's")
+    if not np.array_equal(ours(), by_numpy()):  # this also builds the kernels and allocates the arrays
+        raise ClsplatError(f"{name}: the order of {n} differs from NumPy's")
     times, numpy_times = [], []
-    for _ in range(repeat):  # in turn, so that other load meets both
+    for _ in range(repeat):  # alternating, so that other load affects both
         times.append(device.timed(work)[1])
         start = time.perf_counter()
         by_numpy()
@@ -122,13 +122,13 @@ def measure(device: Device, name: str, n: int, repeat: int) -> Result:
 
 
 def deviation(rows: list[Result]) -> float | None:
-    """Largest time a key over the smallest, from LINEAR_FROM keys up; None with fewer than two of that size."""
+    """Ratio of largest to smallest time per key, from LINEAR_FROM keys on; None with fewer than two such sizes."""
     times = [row["ns_per_key"] for row in rows if row["n"] >= LINEAR_FROM]
     return max(times) / min(times) if len(times) > 1 else None
 
 
 def table(result: Result) -> list[str]:
-    """The rows, and what they say of linear growth."""
+    """Text table of the rows, and their deviation from linear growth."""
     rows: list[tuple[str, ...]] = [("sort", "n", "ms", "ns a key", "NumPy ms", "NumPy / ours")]
     for row in result["rows"]:
         times = (f"{row['ms']:.3f}", f"{row['ns_per_key']:.2f}", f"{row['numpy_ms']:.3f}", f"{row['ratio']:.2f}")
@@ -139,7 +139,7 @@ def table(result: Result) -> list[str]:
 
 
 def plot(path: Path, result: Result) -> None:
-    """Milliseconds, and nanoseconds a key, against the number of keys."""
+    """Plot of milliseconds, and of nanoseconds per key, over the number of keys."""
     times, per_key = {}, {}
     for name in CASES:
         rows = [row for row in result["rows"] if row["sort"] == name]
@@ -152,7 +152,7 @@ def plot(path: Path, result: Result) -> None:
 
 @tool("bench_sort")
 def main(arguments: Sequence[str]) -> int:
-    """Measure and print."""
+    """Run the measurement and print its results."""
     parser = options_parser(__doc__)
     parser.add_argument("--max", metavar="N", type=number, default=30_000_000)
     options = parsed(parser, arguments)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time to the first picture on the viewer's page, and pictures a second while the camera moves.
+"""Time to the first picture on the viewer's page, and pictures per second while the camera moves.
 
-A run, a model file, or a made-up model of --gaussians is served by `clsplat view` and opened in a headless Chromium
-without a GPU, which draws the page on the same cores. Times count from when the page is asked for to when a picture has
-been handed to WebGL; when viser's page has its canvas, before it connects, is told too. Needs the extras `view` and
+`clsplat view` serves a run, a model file, or a synthetic model of --gaussians. A headless Chromium without a GPU opens
+it, and draws the page on the same cores. Times are from the request for the page until a picture is passed to WebGL.
+The time until viser's page has its canvas, before it connects, is printed too. Needs the extras `view` and
 `test` (playwright), and a chromium on the path (Debian: apt install chromium).
 """
 
@@ -31,15 +31,15 @@ from clsplat.runs.run import model_file
 
 WINDOW = {"width": 1280, "height": 720}
 TURN = 3.0
-"""Seconds that the camera moves."""
+"""Number of seconds for which the camera moves."""
 FLAGS = {
     "mesa": ("--use-angle=gl-egl", "--ignore-gpu-blocklist"),
     "swiftshader": ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 }
-"""Chromium's flags for drawing WebGL on processors: by the system's llvmpipe, or the library that comes with
+"""Chromium's flags for WebGL on the CPU, by name: the system's llvmpipe, or the library that comes with
 Chromium."""
 PLAIN = "--webgl-antialiasing-mode=none"
-"""Without it each pixel of a page is four, which processors feel."""
+"""Scale of the page. Without it, each pixel of the page would be four, which is slow on a CPU."""
 WATCH = """
 window.pictures = [];
 for (const kind of [WebGL2RenderingContext, WebGLRenderingContext])
@@ -73,12 +73,12 @@ def made_up(count: int) -> Gaussians:
 
 
 def processor_seconds(process: int) -> float:
-    """Processor time of a process and all that it started and that still runs, on Linux; 0 elsewhere."""
+    """CPU time of a process and of its running descendants, on Linux; 0 on other systems."""
     used, parents = {}, {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             words = stat.read_text().rsplit(")", 1)[1].split()
-        except OSError:  # it has just ended
+        except OSError:  # the process has just ended
             continue
         number = int(stat.parent.name)
         parents[number], used[number] = int(words[1]), (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
@@ -90,7 +90,7 @@ def processor_seconds(process: int) -> float:
 
 @contextmanager
 def serving(model: Path, device: str | None) -> Iterator[tuple[str, int]]:
-    """The address of `clsplat view` of this model, and its process."""
+    """Start `clsplat view` for the model; yields its address and its process."""
     command = [sys.executable, "-m", "clsplat", "view", str(model), "--port", "0"]
     process = subprocess.Popen(
         command + (["--device", device] if device else []), stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL
@@ -110,19 +110,19 @@ def serving(model: Path, device: str | None) -> Iterator[tuple[str, int]]:
 
 
 def visit(browser: Any, url: str, server: int) -> dict[str, float]:
-    """One page, opened, and its camera moved."""
+    """Open the page once, move its camera, and return the measurements."""
     page = browser.new_page(viewport=WINDOW)
     page.add_init_script(WATCH)
     page.goto(url, wait_until="commit")
     page.wait_for_function("window.pictures.length > 0", timeout=60_000, polling=20)
     first = page.evaluate("window.pictures[0][0]")
     drawn = page.evaluate("window.drawn")
-    page.wait_for_timeout(2500)  # the exact one, and the page's own beginnings
+    page.wait_for_timeout(2500)  # for the exact picture, and for the page to settle
     widths = [width for _, width, _ in page.evaluate("window.pictures")]
     page.mouse.click(300, 300)
     server_before, before_all = processor_seconds(server), processor_seconds(os.getpid())
     before, start = page.evaluate("[window.pictures.length, performance.now()]")
-    page.keyboard.down("ArrowLeft")  # turns with every frame of the page; a mouse waits for the page to take its moves
+    page.keyboard.down("ArrowLeft")  # turns in every frame; a mouse would wait until the page handles its moves
     page.wait_for_timeout(1000 * TURN)
     end, moved = page.evaluate("[performance.now(), window.pictures]")
     served, used = processor_seconds(server) - server_before, processor_seconds(os.getpid()) - before_all
@@ -142,14 +142,14 @@ def visit(browser: Any, url: str, server: int) -> dict[str, float]:
 
 
 def bench(model: Path, device: str | None, repeat: int, flags: tuple[str, ...]) -> list[dict[str, float]]:
-    """Measurements of `repeat` visits to a page, after one that does not count."""
+    """Measurements of `repeat` visits to the page, after a warm-up visit."""
     from playwright.sync_api import sync_playwright
 
     path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     measuring.require(path is not None, "no chromium on the path, expected Debian's: apt install chromium")
     with serving(model, device) as (url, server), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--use-gl=angle", *flags])
-        visit(browser, url, server)  # the browser's own first time
+        visit(browser, url, server)  # warms up the browser
         found = [visit(browser, url, server) for _ in range(repeat)]
         browser.close()
     return found

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Render one large frame of a made-up scene in little device memory, and say what it took.
+"""Render one large frame of a synthetic scene in little device memory, and print time and memory.
 
     python tools/bench/big_frame.py OUTPUT.exr [WIDTHxHEIGHT] [MEMORY] [GAUSSIANS]
 
-By default 16384x8192 within 512MiB. Prints the strips, the most device memory that was in use, the host's peak and the
-time; exit status 1 where more device memory was used than allowed.
+The default is 16384x8192 within 512MiB. Prints the number of strips, the peaks of device and host memory, and the time.
+The exit status is 1 if more device memory was used than allowed.
 """
 
 from __future__ import annotations

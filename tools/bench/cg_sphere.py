@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""A CG sphere as another renderer would make it of a shot, for docs/shot.md: beauty, depth and deep EXR of each frame.
+"""Render a CG sphere into a shot like another renderer, for docs/shot.md: beauty, depth and deep EXR of each frame.
 
     .venv/bin/python tools/bench/cg_sphere.py shot.json --centre 0,0,0 --radius 0.5 -o cg
 
-The cameras are perspective ones of any file that `clsplat render --cameras` takes; centre and radius are in their
-world. Writes cg/beauty.####.exr (R G B A, associated, linear Rec.709), cg/depth.####.exr (Z alone, the nearest) and
-cg/deep.####.exr (a sample with A and Z in each pixel that the sphere covers a part of).
+The cameras may come from any file that `clsplat render --cameras` takes, and must be perspective; centre and radius are
+in their world. Writes cg/beauty.####.exr (R G B A, premultiplied, linear Rec.709), cg/depth.####.exr (nearest Z) and
+cg/deep.####.exr (a sample with A and Z in each pixel that the sphere covers at least partly).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from clsplat.camera import Camera
 from clsplat.shots import choose_shot
 
 FINE = 8
-"""Rays of a pixel across and down."""
+"""Number of rays in a pixel, across and down."""
 LIGHT = np.array([-0.4, -0.7, -0.6]) / np.linalg.norm([0.4, 0.7, 0.6])
 """Direction to the light, in the camera's space: from the upper left, behind the camera."""
 COLOUR = np.array([0.8, 0.25, 0.05])
@@ -56,8 +56,8 @@ def main(arguments: list[str]) -> int:
 def cast(
     camera: Camera, centre: NDArray[Any], radius: float
 ) -> tuple[NDArray[Any], list[list[list[float]]], NDArray[Any]]:
-    """Beauty (H, W, 4), a sample of alpha and mean depth in each pixel that is hit, and the nearest depth (H, W), which
-    is infinite elsewhere."""
+    """Beauty (H, W, 4), a sample of alpha and mean depth in each pixel that is hit, and the nearest depth (H, W),
+    infinite in other pixels."""
     middle = camera.rotation @ centre + camera.translation
     fine = camera.resized(camera.width * FINE, camera.height * FINE)
     x, y = (np.arange(fine.width) + 0.5 - fine.cx) / fine.fx, (np.arange(fine.height) + 0.5 - fine.cy) / fine.fy

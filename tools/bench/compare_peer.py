@@ -1,23 +1,23 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""A training step beside that of OpenSplat 1.2.0 (CPU), measured elsewhere, on the scenes that it was measured on.
+"""Compare a training step with OpenSplat 1.2.0 (CPU), which was measured on another machine with the same scenes.
 
     python tools/bench/compare_peer.py fox banana sceaux_castle --limit './limit 20000' [--device DEVICE] [--json]
     python tools/bench/compare_peer.py fox --limit-gpairs 3.55
 
-The arguments are the scenes' folders (docs/quality.md says whence), with the sizes and starting points that the
-peer had. The step is the trainer's own, at the full size (`--warmup ''`), pictures decoded beforehand as the peer
-does; the median of steps 3 to 30, wall time from an idle device to an idle device.
+The arguments are the scenes' folders (docs/quality.md names their sources), with the peer's picture sizes and starting
+points. The step is the trainer's own at the full size (`--warmup ''`), with pictures decoded beforehand as in the peer.
+Its time is the median of steps 3 to 30: wall time from an idle device to an idle device.
 
-The peer's seconds are carried over by what limits both machines: the (Gaussian, pixel) pairs a second that blending's
-arithmetic allows with everything in registers. It was 5.09 Gpairs/s where the peer was measured, on two cores with
-vectors of 16 lanes. --limit is a program that prints `... N Gpairs/s` for this machine, with its arguments; it runs
-behind every other step, and the median counts, as of the steps: so neighbours on the machine slow both. Short runs do
-(20000 repetitions of limit.c). Build it for the vectors that the machine has: with wider ones it is too slow, and the
-peer would look slower than it is. For the same reason clsplat's own kernel of that limit is measured too, by the
-shape's vectors, and counts where it is the faster. (By vectors of 16 it does a quarter more than limit.c on AVX-512, as
-a pair takes it fewer operations; its figure where the peer was is not known.) --limit-gpairs is a figure
-known already, and is taken as it is.
+The peer's seconds are scaled to this machine by a limit of both machines: the (Gaussian, pixel) pairs per second that
+blending's arithmetic allows if everything is in registers. The limit was 5.09 Gpairs/s on the peer's machine, with two
+cores and vectors of 16 lanes. --limit is a program, with its arguments, that prints `... N Gpairs/s` for this machine.
+It runs after every second step, and its median is used, so that other load slows it like the steps. Short runs suffice
+(20000 repetitions of limit.c). Build the program for the vectors that the machine has: with wider ones it is too slow,
+and the peer would look slower than it is. For the same reason clsplat's own kernel of that limit is measured too, and
+the faster of the two is used. (On AVX-512, with vectors of 16, the kernel does a quarter more than limit.c, as it needs
+fewer operations per pair; its speed on the peer's machine is unknown.) --limit-gpairs replaces the program by a known
+limit.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from clsplat.training.trainer import Trainer
 
 @dataclass(frozen=True)
 class Peer:
-    """Work of the peer, pixels and starting Gaussians, and its median seconds a step."""
+    """The peer's pixels and starting Gaussians, and its median seconds per step."""
 
     width: int
     height: int
@@ -63,12 +63,12 @@ PEERS = {
 }
 """Medians of steps 3 to 30 on a quiet machine, with OMP_WAIT_POLICY=passive, which is faster than without."""
 PEER_GPAIRS = 5.09
-"""The limit where the peer was measured, 10^9 pairs a second."""
+"""The limit of the peer's machine, in 10^9 pairs per second."""
 FIRST, LAST = 3, 30
 
 
 def open_scene(folder: Path) -> tuple[Scene, Peer]:
-    """The scene, as the peer had it. Raises InputError where it is another."""
+    """The scene that the peer trained. Raises InputError if pictures or points differ."""
     scene = load_scene(folder)
     peer = PEERS.get(scene.name)
     if peer is None:
@@ -97,7 +97,7 @@ def step_and_limit(scene: Scene, device: Device, program: str | None) -> tuple[f
 
 
 def limit_of(program: str) -> float:
-    """Limit of this machine that the program prints, in Gpairs/s. Raises InputError."""
+    """The limit of this machine in Gpairs/s, as printed by the program. Raises InputError."""
     try:
         done = subprocess.run(shlex.split(program), capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError, ValueError, IndexError) as error:
@@ -109,7 +109,7 @@ def limit_of(program: str) -> float:
 
 
 def measure(folder: Path, device: Device, program: str | None, known: float | None) -> Result:
-    """A row of the table; seconds but for `ms`, limits in Gpairs/s."""
+    """A row of the table. Times are in seconds except for `ms`; limits are in Gpairs/s."""
     scene, peer = open_scene(folder)
     ms, printed = step_and_limit(scene, device, program)
     limits: dict[str, float] = {}
@@ -135,7 +135,7 @@ def measure(folder: Path, device: Device, program: str | None, known: float | No
 
 
 def table(result: Result) -> list[str]:
-    """A line a scene."""
+    """Text table with a line for each scene."""
     header = ("scene", "image", "Gaussians", "ms", "peer, s", "limit, Gpairs/s", "peer scaled, s", "scaled / ours")
     rows: list[tuple[str, ...]] = [header]
     for row in result["rows"]:
@@ -153,7 +153,7 @@ def table(result: Result) -> list[str]:
 
 @tool("compare_peer")
 def main(arguments: Sequence[str]) -> int:
-    """Measure and print."""
+    """Run the measurement and print its results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str]) -> int:
     for folder in options.scenes:
         open_scene(folder)
     if options.limit is not None:
-        limit_of(options.limit)  # a program that does not run is told before anything is measured
+        limit_of(options.limit)  # reports a program that does not run before any measurement
     device = open_device(options.device)
     rows = []
     for folder in options.scenes:

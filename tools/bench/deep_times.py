@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Time deep frames: the kernels, OpenEXR's own writer of the same samples, and all of it.
+"""Time deep frames: the kernels, the writing of the same samples by OpenEXR, and everything together.
 
     python tools/bench/deep_times.py [MODEL CAMERAS] [--size 1920x1080] [--bins 16] [--samples 1] [--repeats 5]
         [--device NAME]
 
-Without MODEL a made-up scene of 200,000 Gaussians. The frame is the first of CAMERAS, rendered once before, so that
-kernels are built. Prints medians in seconds, the samples, and the most main memory of the process while it renders. The
-writer's time is that of OpenImageIO's write of the samples that were read back, from first byte to closed file; it
-works with as many threads as in the frame. Where others use the machine too, processor time says more.
+Without MODEL the scene is a synthetic one of 200,000 Gaussians. The frame is the first of CAMERAS. It is rendered once
+beforehand, so that kernels are built. Prints medians in seconds, the number of samples, and the peak of the process's
+memory while it renders. For the writing time, the samples are read back and written with OpenImageIO, with as many
+threads as for the frame. On a machine with other load, CPU time is more reliable.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def main(arguments: list[str]) -> int:
             totals.append(time.monotonic() - start)
         used = (time.process_time() - used) / options.repeats
         most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        device = open_device(options.device, profile=True)  # its events take memory
+        device = open_device(options.device, profile=True)  # profiling events take memory
         renderer = Renderer(device)
         for _ in range(options.repeats):
             with device.recorder.recording(wait=False) as stages:
@@ -98,7 +98,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _written(path: Path, again: Path, spec: Any) -> tuple[float, float]:
-    """Seconds that the writer takes for the samples of a file, and of processor time."""
+    """Wall and CPU seconds of writing the samples of a file."""
     source = oiio.ImageInput.open(str(path))
     assert source is not None, oiio.geterror()
     data = source.read_native_deep_image()

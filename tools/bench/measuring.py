@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Helpers of the tools that measure: sizes, a result's record of the machine, messages of trouble."""
+"""Helpers of the measuring tools: sizes, the description of the machine in a result, error messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Result = dict[str, Any]
 
 
 def options_parser(description: str | None, repeat: int = 5, *, plot: bool = True) -> argparse.ArgumentParser:
-    """Parser with the options of every tool that measures; the description stands as it is written."""
+    """Parser with the common options of the measuring tools. The help keeps the line breaks of the description."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
@@ -34,7 +34,7 @@ def options_parser(description: str | None, repeat: int = 5, *, plot: bool = Tru
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
-    """Parsed options. Raises InputError for fewer than one repetition and a plot that cannot be drawn."""
+    """Parse the options. Raises InputError for less than one repetition, and for a plot that cannot be drawn."""
     options = parser.parse_args(arguments)
     require(options.repeat >= 1, f"--repeat {options.repeat}: expected at least 1")
     if getattr(options, "plot", None) is not None:
@@ -43,7 +43,7 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
 
 
 def number(text: str) -> int:
-    """An integer that may be written as 3e7; for argparse, which tells of a ValueError."""
+    """An integer that may be written as 3e7. For argparse, which reports a ValueError."""
     try:
         return int(float(text))
     except OverflowError:
@@ -63,7 +63,7 @@ def require(condition: bool, message: str) -> None:
 
 
 def machine(device: Device, repeat: int) -> Result:
-    """Record of the machine that every figure needs beside it."""
+    """Description of the machine, for the record of a measurement."""
     return {
         "device": device.name,
         "driver": device.driver,
@@ -74,7 +74,7 @@ def machine(device: Device, repeat: int) -> Result:
 
 
 def heading(result: Result) -> str:
-    """`machine` in a line."""
+    """The description by `machine` in one line."""
     load = f"load average {result['load_average'] or 0:.1f}"
     shape = Shape(**result["shape"], chunks=1).words
     driver = result["driver"].split("  ")[0]
@@ -82,12 +82,12 @@ def heading(result: Result) -> str:
 
 
 def show(result: Result, lines: Sequence[str], *, as_json: bool) -> None:
-    """The result on standard output, for programs or for people."""
+    """Print the result as JSON or as text."""
     print(json.dumps(result, indent=2) if as_json else "\n".join([heading(result), "", *lines]))
 
 
 def tool(name: str) -> Callable[[Callable[[Sequence[str]], int]], Callable[[Sequence[str]], int]]:
-    """Decorator of a tool's main function, which tells trouble in one line as the command line does."""
+    """Decorator of a tool's main function. It reports errors in one line, like the command line."""
 
     def decorated(work: Callable[[Sequence[str]], int]) -> Callable[[Sequence[str]], int]:
         @wraps(work)

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""A training loop written as gsplat's documentation shows it, on `clsplat.torch`, beside `clsplat train` of a scene.
+"""Compare a training loop on `clsplat.torch`, as in gsplat's documentation, with `clsplat train` on a scene.
 
 python tools/bench/own_loop.py SCENES/fox --resolution 400 --steps 2000 --strategy default
 python tools/bench/own_loop.py SCENES/fox --resolution 400 --steps 2000 --strategy mcmc --steps-scaler 0.0667
 
-The loop is gsplat's `simple_trainer` in outline: its parameters, learning rates, schedules, loss and calls of a
-strategy; with `from gsplat import ...` in place of the import of `clsplat.torch` it is a program for CUDA. Prints the
-mean PSNR of the held-out views, the number of Gaussians and the seconds of each. Status 1 where the loop is more than
---bound below.
+The loop follows gsplat's `simple_trainer`: its parameters, learning rates, schedules, loss and calls of a strategy.
+With `from gsplat import ...` instead of the import of `clsplat.torch` it is a program for CUDA. Prints the mean PSNR of
+the held-out views, the number of Gaussians and the seconds of both trainings. The exit status is 1 if the loop's PSNR
+is more than --bound below that of `clsplat train`.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from clsplat.scenes.start.initialise import from_scene
 from clsplat.torch import DefaultStrategy, MCMCStrategy, rasterization
 
 MAX_STEPS = 30_000
-"""Steps of gsplat's settings, over which the rate of the means falls; of clsplat's too."""
+"""Steps for which the defaults of gsplat and clsplat are meant, and over which the rate of the means falls."""
 SH_DEGREE, SH_DEGREE_EVERY, SSIM_WEIGHT = 3, 1000, 0.2
 OPACITY_WEIGHT = SCALE_WEIGHT = 0.01
-"""Of gsplat's settings for MCMC, which also start from other sizes and opacities."""
+"""gsplat's settings for MCMC, which also start from other sizes and opacities."""
 Params: TypeAlias = torch.nn.ParameterDict
 
 
 def main(arguments: list[str]) -> int:
-    """Print a line for each training; 1 where the loop is below the bound."""
+    """Print a line for each training. Returns 1 if the loop is below the bound."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("--resolution", type=int, default=0)
@@ -85,7 +85,7 @@ def report(title: str, score: float, count: int, began: float) -> None:
 
 
 def psnr(render: Callable[[View], Tensor], scene: Scene) -> float:
-    """Mean of the held-out views, dB."""
+    """Mean PSNR of the held-out views in dB."""
 
     def image(view: View) -> Any:
         with torch.no_grad():
@@ -136,7 +136,7 @@ def own_loop(scene: Scene, given: argparse.Namespace) -> Params:
 
 
 def scaled(steps: int, given: argparse.Namespace) -> int:
-    """A setting of gsplat's that is a number of steps, in this training."""
+    """Scale one of gsplat's numbers of steps to this training."""
     return max(1, int(steps * given.steps_scaler))
 
 

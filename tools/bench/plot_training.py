@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Seconds of training against held-out PSNR, a line for each run, as SVG or PNG.
+"""Plot held-out PSNR over seconds of training, with a line for each run, as SVG or PNG.
 
     clsplat train SCENE -o RUN --eval-at 500,1000,2000,4000,7000
     python tools/bench/plot_training.py RUN [RUN ...] -o training.svg [--title TEXT]
@@ -24,7 +24,7 @@ from clsplat.runs.run import Run
 
 
 def curve(path: Path) -> list[tuple[float, float]]:
-    """(seconds, PSNR) of every evaluation of a run. Raises InputError where there is none."""
+    """(seconds, PSNR) of every evaluation of a run. Raises InputError if there is none."""
     run = Run.open(path)
     found = [record["eval"] for record in run.read_metrics() if "eval" in record]
     with suppress(OSError):
@@ -40,7 +40,7 @@ def curve(path: Path) -> list[tuple[float, float]]:
 
 
 def main(arguments: list[str]) -> int:
-    """Draw it."""
+    """Read the runs and write the plot."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

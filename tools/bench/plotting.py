@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plots that only the tools draw: of training, growth and errors. Legible at 800 pixels of width, as `bench`'s are."""
+"""Plots of the tools: training, growth and errors. Legible at a width of 800 pixels, like the plots of `bench`."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from clsplat.bench.plots import (
 MARKERS = "os^DvP*X"
 DASHES = ("-", "--", "-.", ":")
 COLUMNS = 2
-"""Panels in a row: three are too narrow for their labels."""
+"""Number of panels in a row: three would be too narrow for their labels."""
 NARROW = 44
-"""Letters under one of them."""
+"""Number of letters that fit under a panel."""
 
 Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A pair of logarithmic axes, what they show, and by name what was measured and what was fitted to it."""
+    """A pair of logarithmic axes: their labels, and measured and fitted points keyed by name."""
 
     x: str
     y: str
@@ -42,7 +42,7 @@ class Panel:
 
 
 def plot_training(path: Path, runs: Mapping[str, Points], title: str, time: str = "seconds of training") -> None:
-    """Of each run by name (seconds of training, held-out PSNR in dB); `time` says which seconds they are."""
+    """Plot each run, keyed by name: (seconds of training, held-out PSNR in dB). time: label for the seconds."""
     figure = _figure(5.2, title)
     axes = figure.subplots()
     for number, (name, points) in enumerate(runs.items()):
@@ -56,7 +56,7 @@ def plot_training(path: Path, runs: Mapping[str, Points], title: str, time: str 
 
 
 def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
-    """How a time grows with a size: panels side by side."""
+    """Plot how times grow with sizes, in panels side by side."""
     figure = _figure(4.4, title)
     alike = len({(*panel.measured, *panel.fitted) for panel in panels}) == 1
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False).flat, panels, strict=True):
@@ -78,7 +78,7 @@ def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
 
 
 def plot_grid(path: Path, panels: Sequence[Panel], title: str, columns: int = COLUMNS) -> None:
-    """Panels in rows with one scale of y, one legend for all below them."""
+    """Plot panels in rows with one scale of y, and one legend below all of them."""
     rows = -(-len(panels) // columns)
     figure = _figure(2.1 * rows + 1.0, title)
     grid = list(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
@@ -102,7 +102,7 @@ def plot_grid(path: Path, panels: Sequence[Panel], title: str, columns: int = CO
 
 
 def plot_stacks(path: Path, bars: Mapping[str, Mapping[str, float]], title: str, x: str) -> None:
-    """A horizontal bar for each name, of the same parts end to end, and its sum behind it."""
+    """Plot a horizontal bar for each name: its parts end to end, then the sum as text."""
     figure = _figure(0.42 * len(bars) + 1.6, title)
     axes = figure.subplots()
     names = list(bars)
@@ -137,13 +137,13 @@ def _figure(height: float, title: str) -> Any:
 
 
 def _style(number: int) -> dict[str, Any]:
-    """Colour, marker and dashes of a line: two neighbours differ in all three."""
+    """Colour, marker and dashes of a line. Neighbouring lines differ in all three."""
     kinds = {"color": OKABE_ITO_COLOURS, "marker": MARKERS, "linestyle": DASHES}
     return {name: values[number % len(values)] for name, values in kinds.items()}
 
 
 def _logarithmic(axes: Any) -> None:
-    """Both axes, their ticks as plain numbers where they span few decades."""
+    """Style both axes. Ticks are plain numbers if an axis spans few decades."""
     ticker = import_module("matplotlib.ticker")
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -156,7 +156,7 @@ def _logarithmic(axes: Any) -> None:
 
 
 def _legend_below(figure: Any, axes: Any, columns: int) -> None:
-    """A legend under all axes, where it covers no point."""
+    """Add a legend below all axes, where it covers no points."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside lower center", ncols=min(columns, len(labels)), fontsize=FONT_SIZE_POINTS

@@ -4,9 +4,10 @@
 
     python tools/ci/check_memory.py [--shapes 1x64,8x1] [--jobs N] [--keep FOLDER]
 
-Runs `memory_workload.py` in children whose only device is Oclgrind's (Debian and Ubuntu: apt install oclgrind), once
-for bounds, races and API calls and once for uninitialised values; prints each finding with its kernel and line. Exit
-status 0: nothing found, 1: something was, a kernel never ran, or a fault planted to be found was not, 2: no Oclgrind.
+Runs `memory_workload.py` in child processes whose only device is Oclgrind's (Debian and Ubuntu: apt install oclgrind),
+once for bounds, races and API calls, and once for uninitialised values. Prints each finding with its kernel and line.
+The exit status is 0 if nothing was found, 2 without Oclgrind, and 1 if there are findings, if a kernel never ran, or if
+a planted fault was missed.
 """
 
 from __future__ import annotations
@@ -32,20 +33,20 @@ from clsplat.device.source import _INCLUDE, kernel_root
 
 LIBRARY = "lib/oclgrind/liboclgrind-rt-icd.so"
 WORKLOAD = Path(__file__).with_name("memory_workload.py")
-COMMON_OPTIONS = "-D__has_builtin(x)=0"  # it has no prefetch
+COMMON_OPTIONS = "-D__has_builtin(x)=0"  # Oclgrind has no prefetch
 CHECKS = {
-    # Functions are not inlined, as it does not know what LLVM 14 then says of pointers that do not overlap.
+    # Functions are not inlined, as Oclgrind does not know LLVM 14's metadata of pointers that do not overlap.
     "races": {"OCLGRIND_DATA_RACES": "1", "OCLGRIND_BUILD_OPTIONS": f"-fno-inline {COMMON_OPTIONS}"},
-    # Not optimised, as it does not know LLVM's `freeze`.
+    # Nothing is optimised, as Oclgrind does not know LLVM's `freeze`.
     "uninitialised": {"OCLGRIND_UNINITIALIZED": "1", "OCLGRIND_BUILD_OPTIONS": f"-O0 {COMMON_OPTIONS}"},
 }
-"""The environment of each; bounds and API calls are checked in both."""
+"""Environment variables of each check. Both also check bounds and API calls."""
 
 PLANTED = {
     "races": {"planted_bounds": "Invalid write", "planted_race": "data race"},
     "uninitialised": {"planted_bounds": "Invalid write", "planted_uninitialised": "Uninitialized"},
 }
-"""Findings expected of memory_workload.PLANTED, for the check to be one."""
+"""Findings that each check must report for the faults in memory_workload.PLANTED."""
 
 ACCEPTED = (
     (
@@ -53,17 +54,16 @@ ACCEPTED = (
         "pyopencl asks every device for its shared virtual memory when it makes a kernel, which came with OpenCL 2.0",
     ),
 )
-"""Findings that count as none: a pattern of the whole finding, and why."""
+"""Findings that are ignored: a pattern of the whole finding, and the reason."""
 
 
 STARTS = r"^(?=Invalid |Uninitialized |Controlflow |\S+-\S+ data race|Oclgrind|OCLGRIND|\S.*detected)"
-"""Pattern of the start of a finding in a log."""
+"""Pattern of the beginning of a finding in a log."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A finding of Oclgrind, with numbers that differ from run to run left out; kernel and place where it names
-    them."""
+    """A finding of Oclgrind, without numbers that differ from run to run. kernel, place: empty if it names none."""
 
     message: str
     kernel: str = ""
@@ -81,7 +81,7 @@ def library() -> Path | None:
 
 
 def kernels() -> dict[str, str]:
-    """The stem of the file of every kernel."""
+    """File stems, keyed by kernel name."""
     pattern = re.compile(r"__kernel\s+void\s+(\w+)\s*\(")
     return {
         name: path.stem for path in sorted(kernel_root().glob("*.cl")) for name in pattern.findall(path.read_text())
@@ -89,7 +89,7 @@ def kernels() -> dict[str, str]:
 
 
 def places(stem: str) -> list[str]:
-    """FILE:LINE of every line that a driver gets for `stem`.cl, see `clsplat.device.source.kernel_source`."""
+    """FILE:LINE of every line that a driver compiles for `stem`.cl, see `clsplat.device.source.kernel_source`."""
     seen: set[str] = set()
     found: list[str] = []
 
@@ -108,7 +108,7 @@ def places(stem: str) -> list[str]:
 
 
 def findings(log: str, stems: dict[str, str]) -> tuple[Counter[Finding], Counter[str]]:
-    """Findings in a log, and the reasons of those that were accepted, each with its number."""
+    """Count the findings in a log, and the reasons of the ignored findings."""
     found: Counter[Finding] = Counter()
     accepted: Counter[str] = Counter()
     for text in re.split(STARTS, log, flags=re.MULTILINE):
@@ -132,7 +132,7 @@ def findings(log: str, stems: dict[str, str]) -> tuple[Counter[Finding], Counter
 
 @dataclass(frozen=True)
 class Result:
-    """One child: what it was asked, its status, what it printed and what Oclgrind logged."""
+    """The result of a child process: its name, exit status, output, and Oclgrind's log."""
 
     name: str
     status: int
@@ -142,7 +142,7 @@ class Result:
 
 
 def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result:
-    """A part of the workload in a child whose only device is Oclgrind's."""
+    """Run a part of the workload in a child process whose only device is Oclgrind's."""
     vendors = folder / "vendors"
     vendors.mkdir(exist_ok=True)
     (vendors / "oclgrind.icd").write_text(f"{driver}\n")
@@ -158,7 +158,7 @@ def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result
         "OCLGRIND_GLOBAL_MEM_SIZE": str(1 << 30),
         "OCLGRIND_NUM_THREADS": "1",
         "CLSPLAT_TRUST_DRIVER": "1",  # this process is the trial
-        "PYOPENCL_NO_CACHE": "1",  # else the optimised build of one check would be found by the other
+        "PYOPENCL_NO_CACHE": "1",  # one check must not load the builds of the other from the cache
         "PYTHONPATH": os.pathsep.join(filter(None, (str(WORKLOAD.parents[2]), os.environ.get("PYTHONPATH", "")))),
     }
     command = [sys.executable, str(WORKLOAD), shape, part, *(["plain"] if check == "uninitialised" else [])]
@@ -169,7 +169,7 @@ def run(shape: str, check: str, part: str, driver: Path, folder: Path) -> Result
 
 
 def report(result: Result, stems: dict[str, str]) -> bool:
-    """Print what a child found; whether that is nothing."""
+    """Print the findings of a child process. Returns True if there are none."""
     found, accepted = findings(result.log, stems)
     print(f"{result.name}: {sum(found.values())} findings, {result.seconds:.0f} s")
     for reason, count in accepted.items():
@@ -183,7 +183,7 @@ def report(result: Result, stems: dict[str, str]) -> bool:
 
 
 def report_planted(result: Result, check: str) -> bool:
-    """Print the planted faults that were missed; True if every one was found and the child ended well."""
+    """Print the planted faults that were missed. Returns True if none were and the child process succeeded."""
     found, _ = findings(result.log, {})
     missing = [
         name
@@ -197,7 +197,7 @@ def report_planted(result: Result, check: str) -> bool:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the checks; see the module."""
+    """Run the checks that the module describes."""
     parser = argparse.ArgumentParser(prog="check_memory", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--shapes", default="1x64,8x1", help="kernel shapes, LANESxITEMS with 1 or 8 lanes")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="children at once")
@@ -210,7 +210,7 @@ def main(arguments: list[str]) -> int:
     stems = kernels()
     shapes = options.shapes.split(",")
     asked = [(shape, check, part) for shape in shapes for check in reversed(CHECKS) for part in PARTS]
-    asked += [("planted", check, "") for check in CHECKS]  # the longest are first
+    asked += [("planted", check, "") for check in CHECKS]  # the longest parts begin first
     with tempfile.TemporaryDirectory(prefix="clsplat-memory-") as scratch:
         folder = options.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
@@ -224,7 +224,7 @@ def main(arguments: list[str]) -> int:
         clean &= report(result, stems)
         missing[check] -= set(result.output.split())
     for check, names in missing.items():
-        if names:  # some kernels are built in some shapes alone
+        if names:  # some kernels are built only in some shapes
             print(f"{check}, never ran: {', '.join(sorted(names))}")
             clean = False
     print(f"{len(stems)} kernels in {len(shapes)} shapes: {'clean' if clean else 'NOT clean'}")

@@ -1,21 +1,21 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Table of drivers and kernel shapes: digests of frames, of pictures with every channel by every kind of camera, of
-gradients and of a trained model, or how far they differ.
+"""Table of drivers and kernel shapes: digests of frames, of gradients, of a trained model, and of pictures with every
+channel and camera model; or by how much they differ.
 
     .venv/bin/python tools/ci/digests.py
 
-Prints the tables of docs/bit-identity.md: drivers with the same digests in one row, and each channel's own digest. The
-first line is the processor that they were made on.
+Prints the tables of docs/bit-identity.md: drivers with the same digests share a row, and every channel has a digest.
+The first line names the processor.
 
-Every driver that is found is run in every shape, each in a process of its own, PoCL also with its other ways to make
-work-groups, and Rusticl where CLSPLAT_RUSTICL names its libRusticlOpenCL.so. Exit status 1 where
+Every driver found is run in every shape, in a process of its own: PoCL also with its other methods for work-groups, and
+Rusticl if CLSPLAT_RUSTICL names its libRusticlOpenCL.so. The exit status is 1 if
 
 - a frame or a channel of a picture has other bits anywhere,
 - gradients differ within a shape, or between shapes by more than GRADIENT_BOUND,
 - two trainings on one driver differ in a bit, or those of two drivers in one shape,
 - trainings in two shapes differ by more than PSNR_BOUND,
-- what is expected to fail does not, or something else does.
+- a combination that is expected to fail works, or another fails.
 """
 
 from __future__ import annotations
@@ -41,37 +41,39 @@ import numpy as np  # noqa: E402
 from processor import processor  # noqa: E402
 
 SUBGROUPED = ("1x32s", "1x64s", "1x128s", "1x256s")
-"""Shapes with sub-groups, of drivers that have them; they have the gradients of the shapes without."""
+"""Shapes with sub-groups, for drivers that have them. Their gradients equal those of the shapes without sub-groups."""
 SHAPES = ("8x1", "16x1", "1x1", "1x32", "1x64", "1x128", "1x256", "1x32g", "1x64g", *SUBGROUPED)
-"""Lanes x items, `g` for a gradient by Gaussian; the first is what the others are compared with."""
+"""Lanes x items; `g`: an item computes the gradient of a Gaussian. Other shapes are compared with the first."""
 TRAINED = ("8x1", "16x1", "1x1", "1x64")
-"""Shapes in which a model is trained, twice: kernels of other groups differ from 1x64 in what gradients show."""
+"""Shapes in which a model is trained, twice. Other work-groups differ from 1x64 only where gradients show it."""
 METHODS = {"loops": ("8x1", "1x64"), "loopvec": ("1x64",), "cbs": ("1x64",)}
-"""POCL_WORK_GROUP_METHOD, beside the one that PoCL takes by itself, and shapes."""
+"""Values of POCL_WORK_GROUP_METHOD in addition to PoCL's default, with the shapes to run."""
 UNKNOWN_METHOD = "Unknown work group generation method"
-"""PoCL's words, at the first kernel that it builds."""
+"""PoCL's error message for an unknown method, at the first kernel that it builds."""
 LIMIT = 600
-"""Seconds for one driver and shape: the longest takes 95 of a core, and the machine may be busy."""
+"""Time limit in seconds for one driver and shape. The longest takes 95 s of a core, and the machine may be busy."""
 EXPECTED_LIMIT = 20
-"""Seconds for one that is known not to come back: alone it is done in 5."""
+"""Time limit in seconds for a combination that is known to hang: if it worked, it would take 5 s."""
 EXPECTED = {
     ("PoCL 3.0, cbs", "1x64"): UNKNOWN_METHOD,
     ("PoCL 3.1, cbs", "1x64"): UNKNOWN_METHOD,
     ("Rusticl", "8x1"): "llvmpipe's compiler does not come back from vectors of 8",
 }
-"""Combinations that do not work, with the reason. They are tried all the same."""
+"""Combinations that do not work, with the reason. They are run nevertheless."""
 GRADIENT_BOUND = 1e-6
-"""Relative, in norm, of each parameter group of each scene. Two orders of adding up 256 numbers differ by some
-sqrt(256) half ulp of what is added, 5e-7, where that does not cancel."""
+"""Largest relative difference, in norm, of the gradient of a parameter group. Two orders of summing 256 numbers differ
+by about sqrt(256) half ulps of the terms, 5e-7, unless they cancel."""
 PSNR_BOUND = 0.2
-"""dB between models of 60 steps from one seed that two shapes have trained; 0.05 was the most that was found."""
+"""Largest difference in dB between models of 60 steps from one seed in two shapes. The largest observed is 0.05."""
 
 
 @dataclass
 class Row:
-    """One driver in one shape: digests of frame, gradient and model (None: not trained); of pictures by kind of camera
-    and channel; whether a second training gave the same bytes; PSNR on the held-out views; how far the gradient is from
-    the first row's, relative in norm; trouble in words."""
+    """One driver in one shape: digests of frame, gradient and model (None if not trained).
+
+    repeats: True if a second training gave the same bytes. psnr: of the held-out views.
+    difference: relative difference of the gradient from the first row's, in norm. trouble: what went wrong, as text.
+    pictures: digests, keyed by camera model and channel."""
 
     driver: str
     shape: str
@@ -94,7 +96,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Job:
-    """Work of a child, and the variables in its environment."""
+    """The work of a child process, and its environment variables."""
 
     driver: str
     index: int
@@ -104,7 +106,7 @@ class Job:
 
 
 def main(arguments: list[str]) -> int:
-    """Print the table, and on standard error what is wrong."""
+    """Print the tables, and problems on standard error."""
     if arguments[:1] == ["child"]:
         child(int(arguments[1]), arguments[2], Path(arguments[3]), Path(arguments[4]) if arguments[4:] else None)
         return 0
@@ -151,7 +153,7 @@ def jobs(folder: Path) -> list[Job]:
 
 
 def _names() -> list[str]:
-    """Names of the devices that are found, in order: PoCL and its version, or the platform's name."""
+    """Names of the devices found, in order: PoCL with its version, or the platform's name."""
     from clsplat.device.context import all_devices
 
     names = []
@@ -163,14 +165,14 @@ def _names() -> list[str]:
 
 
 def rusticl(library: Path, folder: Path) -> dict[str, str]:
-    """An environment in which that is a driver."""
+    """Environment variables that make this library an OpenCL driver."""
     folder.mkdir()
     (folder / "rusticl.icd").write_text(f"{library}\n")
     return {"OCL_ICD_VENDORS": str(folder), "RUSTICL_ENABLE": "llvmpipe", "LP_NUM_THREADS": "2"}
 
 
 def run_all(listed: list[Job], folder: Path) -> list[Row]:
-    """Two at a time, each in a process; differences to the first that has the shape to compare with."""
+    """Run jobs, two at a time, each in a process. Differences are to the first row of the shape to compare with."""
     from tiny import write_scene
 
     scene = write_scene(folder / "scene")
@@ -189,9 +191,8 @@ def run_all(listed: list[Job], folder: Path) -> list[Row]:
 
 
 def in_turn(listed: Sequence[Job]) -> list[int]:
-    """The numbers of the jobs in the order in which they begin: Rusticl's first, which build longest, so that nothing
-    waits for them at the end; then one of each driver in turn, as rows of a driver share kernels, which two at a time
-    would both build."""
+    """Indices of the jobs in the order in which they begin: Rusticl's first, whose builds take longest. Then one job of
+    each driver in turn: jobs of one driver share kernels, and two at a time would both build them."""
     before: Counter[str] = Counter()
     keys = []
     for number, job in enumerate(listed):
@@ -231,9 +232,9 @@ def _in_a_process(job: Job, arrays: Path, scene: Path) -> Row:
 
 
 def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
-    """Run on the `index`-th device, or with -1 on Rusticl's; print the digests and write the gradients.
+    """Run on the device of this index, -1 for Rusticl's. Prints the digests and writes the gradients.
 
-    scene: to train on, if any; "open" for a device that is only to be opened, which launches a kernel.
+    scene: scene to train on, or none; "open" only opens the device, which launches a kernel.
     """
     from golden_frames import arrays_of, checksum, pictures_of, trained
 
@@ -242,14 +243,14 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
     found = next(d for d in all_devices() if d.platform.name == "rusticl") if index < 0 else all_devices()[index]
     device = Device(found).with_shape(shape)
     if scene == Path("open"):
-        Device(found).kernels("probe")  # in the driver's own shape, whose vectors are probed by a launch
+        Device(found).kernels("probe")  # in the driver's default shape; a launch probes its vectors
         return
     made = arrays_of(device)
     frame = [part for each in made.values() for name in ("image", "transmittance") for part in each[name]]
     gradient = {f"{scene}/{k}": part for scene, each in made.items() for k, part in enumerate(each["gradients"])}
     gradient.update({f"{scene}/screen": each["screen"][0] for scene, each in made.items()})
     np.savez(arrays, **gradient)  # type: ignore[arg-type]
-    unsigned = [part + np.float32(0) for part in gradient.values()]  # a sum that is zero may be so with either sign
+    unsigned = [part + np.float32(0) for part in gradient.values()]  # adding 0 removes the sign of zeros
     told: dict[str, Any] = {"frame": checksum(frame), "gradient": checksum(unsigned)}
     told["pictures"] = pictures_of(device)
     if scene is not None:
@@ -261,14 +262,14 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
 
 
 def _difference(got: Any, wanted: Any) -> float:
-    """The largest of all arrays, relative in norm."""
+    """The largest relative difference, in norm, of all arrays."""
     return max(
         float(np.linalg.norm(got[key].astype(np.float64) - wanted[key]) / np.linalg.norm(wanted[key])) for key in wanted
     )
 
 
 def problems(rows: list[Row]) -> list[str]:
-    """Rows that are not as they should be, in words."""
+    """Descriptions of all rows that are not as expected."""
     found = []
     good = [row for row in rows if not row.trouble]
     for row in rows:
@@ -310,7 +311,7 @@ def problems(rows: list[Row]) -> list[str]:
 
 
 def other_channels(row: Row, first: Row) -> list[str]:
-    """Channels of which a row has other bits than the first row."""
+    """Channels whose bits in a row differ from the first row."""
     found = []
     for kind, wanted in first.pictures.items():
         for name, digest in wanted.items():
@@ -322,7 +323,7 @@ def other_channels(row: Row, first: Row) -> list[str]:
 
 
 def table(rows: list[Row]) -> str:
-    """Table with a row for each shape and result, and all drivers that have it."""
+    """Table with a row for each shape and result, which lists all drivers with this result."""
     good = [row for row in rows if not row.trouble]
     drivers: dict[tuple[str, ...], list[str]] = {}
     for row in rows:
@@ -344,7 +345,7 @@ def table(rows: list[Row]) -> str:
 
 
 def channel_table(row: Row) -> list[str]:
-    """Every channel's digest by kind of camera."""
+    """Table of every channel's digest for each camera model."""
     names = list(next(iter(row.pictures.values()), {}))
     lines = [f"| camera | {' | '.join(names)} |", "|---" * (1 + len(names)) + "|"]
     for kind, digests in row.pictures.items():

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Four public programs that call gsplat, ten steps of each on clsplat, with another import and another device.
+"""Run ten steps of four public programs that call gsplat, with clsplat in place of gsplat, and without CUDA.
 
 python tools/ci/gsplat_programs.py --programs DIR        # has a checkout of each, by the names in PROGRAMS
 
-The program's own model, loss and loop are what runs; the few lines of each below give it Gaussians and cameras. Its
-sources are read with `cpu` in the place of `cuda`, and what it imports and does not call here (readers of files,
-viewers, other rasterizers in CUDA) may be missing. Prints the commit, and the first and last loss; status 1 where one
-fails, or its loss does not fall.
+Each program's own model, loss and loop run; the few lines below give it Gaussians and cameras. In its sources `cuda` is
+replaced by `cpu`. Modules that it imports but does not call here (file readers, viewers, other CUDA rasterizers) may be
+missing. Prints the commit, and the first and last loss. The exit status is 1 if a program fails or its loss does not
+fall.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ points = torch.rand(N, 3) * torch.tensor([2.0, 1.5, 2.0]) + torch.tensor([-1.0, 
 colours = torch.rand(N, 3)
 def said(step, loss): print(f"step {step}: loss {float(loss):.9g}", flush=True)
 """
-"""Lines before each program's, after MISSING: clsplat in the place of gsplat, and 500 points before the camera."""
+"""Lines that run before each program's lines and after MISSING: install clsplat as gsplat, and create 500 points."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """A program: its folder below DIR, what in it is put on the path, modules that may be missing, and the lines that
-    run STEPS steps and tell their losses; falls: True if it trains."""
+    """A program: its folder in DIR, the subfolders that are put on the path, modules that may be missing, and lines
+    that run STEPS steps and print their losses. falls: True if the program trains."""
 
     folder: str
     where: str
@@ -149,7 +149,7 @@ for step in range({STEPS}):
 
 
 def main(arguments: list[str]) -> int:
-    """Run them; 1 where one fails."""
+    """Run the programs. Returns 1 if one fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--programs", type=Path, required=True, metavar="DIR")
     parser.add_argument("--only", metavar="NAME", help="one of them, by its folder's name")
@@ -162,7 +162,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _runs(program: Program, folder: Path) -> bool:
-    """True where the program's loss falls over its steps."""
+    """Run a program. Returns True if its loss falls."""
     with tempfile.TemporaryDirectory() as temporary:
         for source in sorted(folder.rglob("*.py")):
             copy = Path(temporary) / source.relative_to(folder)

@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's own tests of the calls that `clsplat.torch` has, run on clsplat, at their full size.
+"""Run gsplat's own tests of the functions that `clsplat.torch` replaces, on clsplat, at their full size.
 
 git clone --branch v1.5.3 https://github.com/nerfstudio-project/gsplat DIR
 python tools/ci/gsplat_tests.py --gsplat DIR
 python tools/ci/gsplat_tests.py --gsplat DIR -k test_isect          # other arguments are pytest's
 
-The files of `DIR/tests` are run as they are, but for the device, which is the CPU in place of cuda:0, and the marks
-that leave them out where there is no CUDA. What they compare with is gsplat's own code in PyTorch; two things of it
-need CUDA and are written anew here, in PyTorch: `rasterize_to_indices_in_range`, and nerfacc's two functions that add
-up along rays. Prints the commit, and how many passed, were refused by an error of clsplat that names the argument, and
-failed, by test. Status 1 where one failed.
+The files of `DIR/tests` are unchanged, except that the device is the CPU instead of cuda:0, and that the marks for
+skipping without CUDA are removed. The tests compare with gsplat's code in PyTorch. Two parts of that code need CUDA and
+are rewritten here in PyTorch: `rasterize_to_indices_in_range`, and nerfacc's two functions that sum along rays. Prints
+the commit, and for each test how many cases passed, how many clsplat refused with an error that names the argument, and
+how many failed. The exit status is 1 if one failed.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ CLAIMED = {
     "test_rasterization.py": ("test_rasterization",),
     "test_strategy.py": ("test_strategy", "test_strategy_requires_grad"),
 }
-"""gsplat's tests, by file, that call nothing but what `clsplat.torch` has."""
+"""gsplat's tests that call only functions of `clsplat.torch`, keyed by file."""
 AT_ONCE = 1 << 21
-"""Pairs of a Gaussian and a pixel that the reference holds at a time."""
+"""Number of (Gaussian, pixel) pairs in the reference's memory at a time."""
 LEAST_ALPHA, LEAST_LIGHT = 1 / 255, 1e-4
 
 
 class Report:
-    """Tests by what became of them."""
+    """Counts of the tests' outcomes."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
@@ -59,12 +59,12 @@ class Report:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_setup(self) -> None:
-        """Seed what gsplat's fixtures draw, which they do not."""
+        """Seed the random numbers of gsplat's fixtures, which do not seed them."""
         torch.manual_seed(self.seed)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self, item: Any, call: Any) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-        """Count a test, once."""
+        """Count a test's outcome once."""
         report = yield
         if call.when == "call" or (call.when == "setup" and not report.passed):
             kind: str = report.outcome
@@ -76,7 +76,7 @@ class Report:
 
 
 def main(arguments: list[str]) -> int:
-    """Run them; 1 where one failed."""
+    """Run the tests. Returns 1 if one failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--gsplat", type=Path, required=True, metavar="DIR", help="gsplat's sources, tag v1.5.3")
     parser.add_argument("--commit", help="of DIR, where it is no checkout")
@@ -104,7 +104,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _commit(folder: Path) -> str:
-    """The commit of a checkout; ? where it is none."""
+    """The commit of a checkout; ? if the folder is not a checkout."""
     done = subprocess.run(
         ["git", "-C", str(folder), "rev-parse", "--show-toplevel", "HEAD"], capture_output=True, text=True, check=False
     )
@@ -113,7 +113,7 @@ def _commit(folder: Path) -> str:
 
 
 def _copied(folder: Path, to: Path) -> list[str]:
-    """Identifiers of the claimed tests, in copies of their files for the CPU, beside gsplat's data."""
+    """Copy the test files, changed for the CPU, beside gsplat's data. Returns the identifiers of the tests to run."""
     (to / "tests").mkdir()
     (to / "assets").symlink_to(folder / "assets")
     (to / "pytest.ini").write_text("[pytest]\naddopts = -q -p no:cacheprovider\n", "utf-8")
@@ -130,7 +130,7 @@ def _copied(folder: Path, to: Path) -> list[str]:
 
 
 def _install() -> None:
-    """clsplat in the place of gsplat's CUDA, and what the reference needs."""
+    """Replace gsplat's CUDA functions by clsplat, and the CUDA parts of the reference."""
     import gsplat.cuda._torch_impl as reference
     import gsplat.cuda._wrapper as wrapper
 
@@ -146,8 +146,8 @@ def _install() -> None:
 
 
 def in_pieces(accumulate: Callable[..., tuple[Tensor, Tensor]]) -> Callable[..., tuple[Tensor, Tensor]]:
-    """gsplat's `accumulate`, of AT_ONCE pairs at a time, which end with a pixel; their memory is made again for the
-    gradient."""
+    """gsplat's `accumulate`, on about AT_ONCE pairs at a time, in whole pixels. The gradient recomputes intermediate
+    results to save memory."""
 
     def call(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, *ids: Any) -> tuple[Tensor, Tensor]:
         *pairs, width, height = ids
@@ -171,7 +171,7 @@ def in_pieces(accumulate: Callable[..., tuple[Tensor, Tensor]]) -> Callable[...,
 
 
 def weights_from_alphas(alphas: Tensor, *, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
-    """Weights, and the light that is left before each, of pairs in the order of rays, each ray's front to back."""
+    """Weights of pairs, and the transmittance before each. Pairs are in the order of rays, and then front to back."""
     logs = torch.log1p(-alphas.double())
     before = torch.cumsum(logs, 0) - logs
     firsts = torch.searchsorted(ray_indices, torch.arange(n_rays, device=ray_indices.device))
@@ -180,7 +180,7 @@ def weights_from_alphas(alphas: Tensor, *, ray_indices: Tensor, n_rays: int) -> 
 
 
 def summed_along_rays(weights: Tensor, values: Tensor | None, *, ray_indices: Tensor, n_rays: int) -> Tensor:
-    """(n_rays, D): sums of weighted values; of the weights where there are no values."""
+    """(n_rays, D): sums of weighted values, or of the weights if there are no values."""
     rows = weights[:, None] if values is None else weights[:, None] * values
     return torch.zeros(n_rays, rows.shape[1], dtype=rows.dtype).index_add(0, ray_indices, rows)
 
@@ -198,8 +198,8 @@ def indices_in_range(
     isect_offsets: Tensor,
     flatten_ids: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gaussians, pixels and images of the pairs that have a part in the images, of blocks of tile_size^2 Gaussians of
-    each tile's list from range_start to before range_end, in the order of images and pixels, front to back."""
+    """Gaussians, pixels and images of the pairs that contribute to the images. range_start, range_end: blocks of
+    tile_size^2 Gaussians in each tile's list. Pairs are in the order of images and pixels, front to back."""
     rows, columns = isect_offsets.shape[-2:]
     count, images = means2d.shape[-2], means2d.shape[:-2].numel()
     ends = torch.cat([isect_offsets.flatten(), torch.tensor([len(flatten_ids)])]).tolist()

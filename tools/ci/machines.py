@@ -1,17 +1,18 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Table of machines: on each the short self-test of its drivers and the smoke tests, in this one environment.
+"""Table of simulated machines: each runs the short self-test of its drivers and the smoke tests.
 
     .venv/bin/python tools/ci/machines.py [--list] [--only NAME,...] [--full NAME,...] [--jobs N] [--markdown]
 
-A machine differs in the drivers that there are, the variables that are set, the user, and the place of the home. Its
-home is new, so that every driver is met for the first time. --list prints the names and --only runs some; --full
-runs all of tools/test on some; --jobs runs so many at once; --markdown prints the table as docs/machines.md has it.
+All machines share this Python environment. They differ in drivers, environment variables, user, and the place of the
+home folder, which is new, so that every driver is used for the first time. --list prints the machines' names, --only
+selects some, --full runs all of tools/test on some, --jobs sets how many run at once, and --markdown prints the table
+for docs/machines.md.
 
-PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL where CLSPLAT_DEBIAN_POCL names its
-libpocl.so or in the system's list, Rusticl where CLSPLAT_RUSTICL names its libRusticlOpenCL.so, and Debian's QEMU where
-CLSPLAT_QEMU names its program or on the path. A machine that cannot be had is "not run", with the reason. Exit status 1
-where one failed. docs/machines.md has what each is for.
+PyPI's PoCL and Intel's runtime are found in this environment, Debian's PoCL through CLSPLAT_DEBIAN_POCL (its
+libpocl.so) or in the system's list, Rusticl through CLSPLAT_RUSTICL (its libRusticlOpenCL.so), and Debian's QEMU
+through CLSPLAT_QEMU (its program) or on the path. A machine whose parts are missing is "not run", with the reason. The
+exit status is 1 if one failed. docs/machines.md has the purpose of each.
 """
 
 from __future__ import annotations
@@ -39,17 +40,17 @@ HOOKS = ROOT / "tools" / "ci" / "hooks"
 PYTHON = sys.executable
 
 SHORT_LIMIT = 300
-"""Seconds for the short self-test: 7 with PoCL on two free cores, 40 with four drivers, and the machine may be busy."""
+"""Time limit in seconds of the short self-test: 7 with PoCL on two free cores, 40 with four drivers, more if busy."""
 SMOKE_LIMIT = 600
-"""Seconds for the smoke tests: 27 with PoCL on two free cores, some 70 with four drivers; a busy machine took 211."""
+"""Time limit in seconds of the smoke tests: 27 with PoCL on two free cores, about 70 with four drivers, 211 if busy."""
 FULL_LIMIT = 1200
-"""Seconds for tools/test, which takes 6 minutes on two cores."""
+"""Time limit in seconds of tools/test, which takes 6 minutes on two cores."""
 TRAIN_LIMIT = 120
-"""Seconds for ten steps on a tiny scene, whose kernels the self-test has built for the most part."""
+"""Time limit in seconds of ten steps on a tiny scene. The self-test has already built most of the kernels."""
 EMULATED = 4
-"""Factor on an emulated processor's limits: the short self-test takes 80 s of a core instead of 20."""
+"""Factor of the time limits on an emulated processor: the short self-test takes 80 s of a core instead of 20."""
 TAIL = 25
-"""Lines of a failed step's output that are shown."""
+"""Number of last lines of a failed step's output that are printed."""
 
 SHORT = """
 import sys
@@ -68,7 +69,7 @@ try:
 except ClsplatError as error:
     sys.exit(str(error))
 """
-"""The question that `train` asks of a driver at its first use, of each driver in turn."""
+"""Program that runs, for each driver, the test that `train` runs when it first uses a driver."""
 SCENE = """
 import sys
 from pathlib import Path
@@ -80,8 +81,8 @@ write_scene(Path(sys.argv[1]))
 
 @dataclass(frozen=True)
 class Step:
-    """A command of a machine. status: its exit status; says: a part of its last line on standard error, then the only
-    one; without: what none of its output has."""
+    """A command that a machine runs. status: the expected exit status. says: text in its only line on standard error,
+    if any is expected. without: text that its output must not contain."""
 
     name: str
     command: tuple[str, ...]
@@ -93,9 +94,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Machine:
-    """A row. drivers: their .icd files by name, the folder of OCL_ICD_VENDORS; pypi: whether PyPI's PoCL is there too;
-    wrap: the words before each command; missing: the reason that it cannot run, or nothing; prepare: given the
-    machine's folder, made ready before the first step; home, temporary: below that folder, unless absolute."""
+    """A row of the table. drivers: names and contents of the .icd files. pypi: True to keep PyPI's PoCL visible.
+    wrap: words before each command. missing: the reason why the machine cannot run, or empty. prepare: called with the
+    machine's folder before the first step. home, temporary: folders, relative to that folder or absolute."""
 
     name: str
     purpose: str
@@ -112,7 +113,7 @@ class Machine:
 
 @dataclass
 class Result:
-    """The outcome of a machine: seconds of each step that passed, and the trouble, or why it was not run."""
+    """The outcome of a machine: seconds of each step that passed, and the problem, if any."""
 
     machine: Machine
     seconds: dict[str, float] = field(default_factory=dict)
@@ -121,21 +122,21 @@ class Result:
 
     @property
     def words(self) -> str:
-        """Result for the table."""
+        """The result, as text for the table."""
         if self.machine.missing:
             return f"not run: {self.machine.missing}"
         return f"FAILED: {self.trouble}" if self.trouble else "passed"
 
 
 def environment_of(machine: Machine, folder: Path) -> dict[str, str]:
-    """All variables of a machine: nothing of ours but the path."""
+    """All environment variables of a machine. Only PATH is inherited."""
     variables = {
         "PATH": os.environ.get("PATH", os.defpath),
         "LANG": "C.UTF-8",
         "HOME": str(folder / machine.home),
         "TMPDIR": str(folder / machine.temporary),
         "OCL_ICD_VENDORS": str(folder / "drivers"),
-        "PYTHONDONTWRITEBYTECODE": "1",  # the checkout is not this user's, in some
+        "PYTHONDONTWRITEBYTECODE": "1",  # on some machines the checkout belongs to another user
         "RUSTICL_ENABLE": "llvmpipe",
     }
     if not machine.pypi:
@@ -172,7 +173,7 @@ def run_machine(machine: Machine, show: Callable[[str], None] = print) -> Result
 
 
 def run_step(step: Step, wrap: Sequence[str], environment: dict[str, str], folder: Path) -> tuple[str, str]:
-    """Run a step to its end or its limit; gives what is wrong, or nothing, and what it printed."""
+    """Run a step until its end or time limit. Returns the problem, if any, and the output."""
     command = [word.replace("{folder}", str(folder)) for word in (*wrap, *step.command)]
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
         child = subprocess.Popen(
@@ -200,11 +201,11 @@ def run_step(step: Step, wrap: Sequence[str], environment: dict[str, str], folde
 
 
 _RUNNING: set[subprocess.Popen[bytes]] = set()
-"""Children that Ctrl-C has to end: the terminal sends it to our own group alone."""
+"""Child processes to end on Ctrl-C, which the terminal sends only to this process group."""
 
 
 def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
-    """Difference of a step's end from what was expected, or nothing; status None: it did not end."""
+    """How a step's end differs from the expected end, or empty. status: None if the step did not end."""
     if status is None:
         return f"did not end within {step.limit:g} s"
     if status != step.status:
@@ -218,7 +219,7 @@ def wrong(step: Step, status: int | None, errors: str, output: str) -> str:
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """End all that a step has started; it leads a group of its own."""
+    """End all processes of a step, which are a process group."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
     child.wait()
@@ -229,13 +230,13 @@ def short_test(limit: float = SHORT_LIMIT) -> Step:
 
 
 OWN_SHAPE = "not 8x1-rusticl and not 1x1-rusticl"
-"""Expression for the smoke tests that run. Rusticl 22.3 runs work-groups of one item wrongly: the sort leaves its
-output as it was. It gets 1x64, and the self-test refuses what is wrong where another is asked for."""
+"""Expression that selects smoke tests. Rusticl 22.3 runs work-groups of one item wrongly: the sort does not write its
+output. Rusticl therefore uses 1x64 by default, and the self-test refuses shapes that fail."""
 
 
 def smoke(*, stages: bool = True) -> Step:
-    """The smoke tests, from the files that have any: collecting all tests takes 10 s more. stages: also those of single
-    kernels; where only the user or the paths are other, the self-test has run the same kernels on the same driver."""
+    """The step of the smoke tests, from only the files that have any: collecting all tests takes 10 s more. stages:
+    also test single kernels. If only user or paths differ, the self-test has already run them on the same driver."""
     pytest = (PYTHON, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--no-header", "--tb=short")
     files = sorted(path for path in (ROOT / "tests").rglob("test_*.py") if "mark.smoke" in path.read_text("utf-8"))
     names = [str(path.relative_to(ROOT)) for path in files if stages or path.parent.name != "stages"]
@@ -244,8 +245,8 @@ def smoke(*, stages: bool = True) -> Step:
 
 
 def full() -> Step:
-    """The quick tests, with the caller's binaries for Intel's runtime: the steps before build theirs, and all would
-    take minutes."""
+    """The step of the quick tests. It uses the caller's cached binaries for Intel's runtime, as building all would take
+    minutes; earlier steps build their own."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     binaries = os.environ.get("CLSPLAT_BINARIES") or str(cache / "clsplat" / "binaries")
     command = ("env", f"CLSPLAT_BINARIES={binaries}", PYTHON, "tools/test", "--quiet")
@@ -253,7 +254,7 @@ def full() -> Step:
 
 
 def ten_steps(folder: str, *, limit: float = TRAIN_LIMIT, status: int = 0, says: str = "") -> tuple[Step, Step]:
-    """Ten steps of training on a tiny scene below a folder, which is written first, by this machine too."""
+    """Two steps: write a tiny scene into a folder, and train it for ten steps."""
     scene, run = f"{folder}/scene", f"{folder}/run"
     tests = SCENE.format(support=str(ROOT / "tests" / "support"))
     train = (PYTHON, "-m", "clsplat", "train", scene, "-o", run, "--iterations", "10")
@@ -265,7 +266,7 @@ def ten_steps(folder: str, *, limit: float = TRAIN_LIMIT, status: int = 0, says:
 
 @dataclass(frozen=True)
 class Found:
-    """Means to make machines of; empty where it is missing."""
+    """Drivers and programs from which machines are made. Fields are empty if something is missing."""
 
     pypi: bool
     intel: str
@@ -275,13 +276,13 @@ class Found:
     avx512: bool
     root: bool
     mounts: tuple[str, ...]
-    """The command that runs another with mounts of its own; none where that is not allowed."""
+    """Command prefix to run a command with its own mounts; empty if that is not allowed."""
     stranger: tuple[str, ...]
-    """The command that runs another as a user other than root that can read this; none where that is not allowed."""
+    """Command prefix to run a command as a user other than root who can read the checkout; empty if not allowed."""
 
 
 def look() -> Found:
-    """The means that this machine has."""
+    """Find the drivers and programs of this machine."""
     intel = Path(sys.prefix) / "lib" / "libintelocl.so"
     debian = os.environ.get(BESIDE, "")
     if not debian and (listed := SYSTEM_VENDORS / "pocl.icd").exists():
@@ -312,7 +313,7 @@ def machines(found: Found) -> list[Machine]:
     home_alone = Machine("", "", (short_test(), elsewhere), pypi=True, missing=no_pypi)
     every = tuple(
         (name, path) for name, path in (*debian, *intel, *rusticl) if path
-    )  # what is missing here has a row of its own that says so
+    )  # other rows report what is missing here
     return [
         Machine("pypi-pocl", "what pip brings, alone", usual, pypi=True, missing=no_pypi),
         replace(
@@ -393,10 +394,10 @@ def machines(found: Found) -> list[Machine]:
 
 
 def emulated(found: Found, missing: str) -> Machine:
-    """A processor without AVX-512, which PyPI's PoCL takes for what it is."""
+    """A processor without AVX-512, which PyPI's PoCL recognises."""
 
     def write_interpreter(folder: Path) -> None:
-        # what TCG lacks of Haswell: it says so of each in every process
+        # features of Haswell that TCG lacks, which would cause a warning in every process
         processor = "Haswell,-pcid,-x2apic,-tsc-deadline,-hle,-invpcid,-rtm"
         command = shlex.join([found.qemu, "-cpu", processor, PYTHON])
         script = folder / "python"
@@ -416,7 +417,7 @@ def emulated(found: Found, missing: str) -> Machine:
             ("PYTHONPATH", str(HOOKS)),
             ("CLSPLAT_INTERPRETER", "{folder}/python"),
             ("CLSPLAT_SHAPE", "16x1"),
-            # np.fmax of NumPy 2.4 ends the emulator (QEMU 7.2) where it has loops for AVX2; kernels are none of NumPy's
+            # np.fmax of NumPy 2.4 crashes QEMU 7.2 in its loops for AVX2; this does not affect kernels
             ("NPY_DISABLE_CPU_FEATURES", "X86_V3"),
         ),
         missing=missing or ("" if found.qemu else "qemu-x86_64 is missing (Debian's qemu-user)"),
@@ -425,7 +426,7 @@ def emulated(found: Found, missing: str) -> Machine:
 
 
 def no_driver() -> tuple[Step, ...]:
-    """Each verb that wants a device says what to install."""
+    """A machine without drivers, on which each verb that needs a device must say what to install."""
     install = "pip install 'pyopencl[pocl]'"
     scene, train = ten_steps("{folder}/made")
     return (
@@ -437,7 +438,7 @@ def no_driver() -> tuple[Step, ...]:
 
 
 def read_only_home(found: Found, alone: Machine) -> Machine:
-    """A home on a mount that is read-only, which holds for root too; else a home that cannot be made, below a file."""
+    """A home on a read-only mount, which root cannot write either; without mounts, a home that cannot be created."""
     machine = replace(alone, name="read-only-home", purpose="nothing can be written at home")
     if found.mounts:
         script = 'mount --bind "$1" "$1" && mount -o remount,ro,bind "$1" && shift && exec "$@"'
@@ -450,7 +451,7 @@ def read_only_home(found: Found, alone: Machine) -> Machine:
 
 
 def full_temporary(found: Found, alone: Machine) -> Machine:
-    """A TMPDIR without a byte left, for training beside it and on it."""
+    """A full TMPDIR, for training outside it and in it."""
     script = 'mount -t tmpfs -o size=64k none "$1" && { cat /dev/zero >"$1/filler" 2>/dev/null; shift; exec "$@"; }'
     scene, train = ten_steps("{folder}/made")
     command = tuple("{folder}/tmp/run" if word == "{folder}/made/run" else word for word in train.command)
@@ -475,11 +476,11 @@ def _mounts() -> tuple[str, ...]:
 
 
 def _stranger() -> tuple[str, ...]:
-    """The command prefix for user nobody, allowed to read all if the checkout or Python lie in root's home: so nothing
-    has to be copied."""
+    """Command prefix for the user nobody. If the checkout or Python is in root's home, the user may read everything, so
+    that nothing has to be copied."""
     nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
     reading = ("--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search")
-    # a child too: setpriv itself may still follow paths that its command may not
+    # also test a child process: setpriv itself can follow paths that its command cannot
     code = "import clsplat.cli.main, pyopencl, subprocess, sys; subprocess.check_call([sys.executable, '-V'])"
     for command in (nobody, (*nobody, *reading)):
         if _is_root() and _works((*command, PYTHON, "-c", code)):
@@ -505,7 +506,7 @@ def _works(command: Sequence[str]) -> bool:
 
 
 def table(results: Sequence[Result], *, markdown: bool = False) -> str:
-    """All rows, plain or as Markdown."""
+    """The table of all rows, as plain text or as Markdown."""
     rows = [("machine", "what it is", "seconds", "result")]
     for result in results:
         times = ", ".join(f"{name} {seconds:.0f}" for name, seconds in result.seconds.items())
@@ -557,7 +558,7 @@ def _named(rows: Sequence[Machine], flag: str, text: str) -> set[str]:
 
 
 def run_all(rows: Sequence[Machine], *, jobs: int = 1, markdown: bool = False) -> int:
-    """Run machines and print how each went, and the table; gives the exit status."""
+    """Run machines, print the result of each, and the table. Returns the exit status."""
 
     def show(text: str) -> None:
         print(text, flush=True)

@@ -1,13 +1,12 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Write what tests/golden/ holds and the tests repeat: the losses of 20 steps of the tests' tiny training, and
-checksums of frames and gradients; and clsplat/selftest/digests.json, the digests that `clsplat selftest` compares with.
+"""Write the files of tests/golden/, which tests compare with: losses of 20 steps of the tests' tiny training, and
+checksums of frames and gradients. Also write clsplat/selftest/digests.json, with which `clsplat selftest` compares.
 
     .venv/bin/python tools/ci/make_golden.py [loss_curve] [frames] [selftest]
 
-Run it, and commit what it writes, only where a change is meant to change training, or the bits of a frame or of a
-gradient; say why in the commit. Without a name it writes all three files. The default device has to be one that can
-have 16 lanes.
+Run it and commit its files only after a change that is meant to change training, or the bits of frames or gradients;
+explain it in the commit. Without a name it writes all three files. The default device must support 16 lanes.
 """
 
 from __future__ import annotations
@@ -70,13 +69,13 @@ SHAPES = (
     *("1x1", "1x16", "1x32", "1x64", "1x128", "1x256", "1x32g", "1x64g"),
     *("4x1", "8x1", "8x16", "16x1"),
 )
-"""Whose gradients get a digest: those that some device has by default, and those of the tests."""
+"""Shapes whose gradients get a digest: defaults of devices, and shapes that the tests use."""
 ORDERED = ("/blend_grad", "/values")
-"""Stages whose sums have an order of the shape's."""
+"""Stages in which the order of sums depends on the shape."""
 
 
 def write_selftest(path: Path) -> None:
-    """Run the self-test in every shape and write the digests: one of all shapes, of ORDERED one each."""
+    """Run the self-test in every shape and write the digests: one for all shapes, but one per shape in ORDERED."""
     from clsplat.device.context import open_device
     from clsplat.selftest.worker import run, shape_label
 

@@ -15,11 +15,11 @@ from clsplat.library.tile_list_pixels import rasterize_to_pixels
 from clsplat.library.tiles import isect_offset_encode, isect_tiles
 
 WIDTH, HEIGHT, COUNT = 20, 10, 65
-"""Tiles that end beyond the image, and Gaussians beyond a group's 64."""
+"""Image size and number of Gaussians: the last tiles extend beyond the image, and one group of 64 is not enough."""
 
 
 def library(device: Device) -> None:
-    """Every kernel of clsplat/library in the builds that differ. Raises SystemExit for numbers that are not finite."""
+    """Run every kernel of clsplat/library in all builds that differ. Raises SystemExit for non-finite numbers."""
     rng = np.random.default_rng(0)
     means, quaternions = rng.uniform(-0.7, 0.7, (COUNT, 3)), rng.normal(size=(COUNT, 4))
     scales, opacities = rng.uniform(0.02, 0.2, (COUNT, 3)), rng.uniform(0.1, 1.0, COUNT)
@@ -37,7 +37,7 @@ def library(device: Device) -> None:
         ((means, None, None, opacities), colours, {"covars": covars, "rasterize_mode": "antialiased"}),
     )
     for index, (gaussians, values, settings) in enumerate(calls):
-        cameras = slice(0, 2 if index == 0 else 1)  # a second one's gradients are added
+        cameras = slice(0, 2 if index == 0 else 1)  # a second camera adds to the gradients
         views = (poses[cameras], lenses[cameras], WIDTH, HEIGHT)
         result = rasterize(*gaussians, values, *views, device=device, **settings)
         gradients = result.vjp(np.ones_like(result.images), np.ones_like(result.alphas))
@@ -55,6 +55,6 @@ def library(device: Device) -> None:
 
 
 def check(*arrays: np.ndarray | Sequence[np.ndarray]) -> None:
-    """Raise SystemExit where a number is not finite."""
+    """Raise SystemExit if a number is not finite."""
     if not all(np.isfinite(array).all() for array in arrays):
         raise SystemExit("the library's results are not finite")

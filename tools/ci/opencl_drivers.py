@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every OpenCL driver of this machine at once: the ones installed system-wide and those from PyPI, and Debian's PoCL
-where it is unpacked beside the system and CLSPLAT_DEBIAN_POCL names its libpocl.so.
+"""Make all OpenCL drivers of this machine visible at once: system-wide drivers, those from PyPI, and an unpacked Debian
+PoCL if CLSPLAT_DEBIAN_POCL names its libpocl.so.
 
-The PoCL that `pyopencl[pocl]` brings loads by itself, wherever OCL_ICD_VENDORS points. Any other driver needs an
-.icd file in the one folder that OCL_ICD_VENDORS names, read when pyopencl is first imported. Intel's CPU runtime
-from PyPI does bring .icd files, but they name a path that does not exist.
+The PoCL of `pyopencl[pocl]` is always loaded, whatever OCL_ICD_VENDORS is. Any other driver needs an .icd file in the
+folder that OCL_ICD_VENDORS names, which is read when pyopencl is first imported. Intel's CPU runtime from PyPI has .icd
+files, but they name a path that does not exist.
 
-As a script, prints the devices that are found.
+Run as a script, it prints the devices found.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pathlib import Path
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
 BESIDE = "CLSPLAT_DEBIAN_POCL"
 PACKAGED_LIBRARIES = ("libintelocl.so",)
-"""Drivers that a package on PyPI puts under sys.prefix/lib."""
+"""Drivers that packages from PyPI install in sys.prefix/lib."""
 
 
 def list_drivers(folder: Path) -> list[str]:
-    """Write an .icd file for each driver into folder (made if missing); returns their names."""
+    """Write an .icd file for each driver into `folder`, which is created if missing. Returns the drivers' names."""
     folder.mkdir(parents=True, exist_ok=True)
     names = []
     if SYSTEM_VENDORS.is_dir():
@@ -45,10 +45,10 @@ def list_drivers(folder: Path) -> list[str]:
 
 
 def use_every_driver() -> Path | None:
-    """Point OCL_ICD_VENDORS at a temporary folder with every driver; call it before pyopencl is imported.
+    """Point OCL_ICD_VENDORS at a temporary folder with every driver. Call it before pyopencl is imported.
 
-    Returns the folder, which goes when the process ends; None where the variable was set already, which is left
-    as it is, so that a run can be narrowed down to one driver. Raises RuntimeError where it is too late.
+    Returns the folder, which is removed when the process ends. If the variable is already set, it stays, so that a run
+    can be limited to one driver, and the result is None. Raises RuntimeError if pyopencl is already imported.
     """
     if "OCL_ICD_VENDORS" in os.environ:
         return None

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of docs/other-programs.md, made from the marks `brings` of the tests: what other programs write, what is
-read of it, and the test that holds it.
+"""Write the table of docs/other-programs.md from the tests' marks `brings`: what other programs write, what
+clsplat reads of it, and the test of it.
 
-python3 tools/ci/other_programs.py            # write it anew
-python3 tools/ci/other_programs.py --check    # exit status 1 if it is another
+python3 tools/ci/other_programs.py            # write the table
+python3 tools/ci/other_programs.py --check    # exit status 1 if the page has another table
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MARK = "pytest.mark.brings"
 
 
 def rows() -> list[tuple[str, str, str, str]]:
-    """Program, what it writes, what is read, and the test, in this order."""
+    """Rows of the table: program, what it writes, what clsplat reads, and the test."""
     return sorted(row for path in sorted((ROOT / "tests").rglob("test_*.py")) for row in _marked(path))
 
 
@@ -43,7 +43,7 @@ def table() -> str:
 
 
 def page(text: str) -> str:
-    """The page with the table as it should be."""
+    """The text of the page with the current table."""
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
     return before + BEGIN + table() + END + after

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""This machine's processor, for tables that hang on it."""
+"""Name of this machine's processor, for tables that depend on it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CPUINFO = Path("/proc/cpuinfo")
 
 @cache
 def processor() -> str:
-    """Its name, and whether it has AVX-512."""
+    """The processor's name, and whether it has AVX-512."""
     try:
         lines = CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -22,7 +22,7 @@ def processor() -> str:
 
 
 def has_avx512() -> bool:
-    """True if the processor has it, as far as the system says so."""
+    """True if the system reports that the processor has AVX-512."""
     try:
         return "avx512f" in CPUINFO.read_text(encoding="utf-8", errors="replace").split()
     except OSError:

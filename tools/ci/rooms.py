@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The table of rooms in docs/architecture.md, from the import contracts and the rooms' docstrings.
+"""The table of packages in docs/architecture.md, from the import contracts and the packages' docstrings.
 
     python3 tools/ci/rooms.py [--write]
 
-Prints the table; --write puts it into the page. The order of the rooms is that of `[tool.importlinter]` in
-pyproject.toml, from the top; inside a divided room a module imports from those behind it alone.
+Prints the table; --write puts it into the page. The order of packages is that of `[tool.importlinter]` in
+pyproject.toml, from the top. Inside a package with a contract of its own, a module imports only modules behind it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs/architecture.md"
 HEAD = "| room | what is in it | modules, from the top where a contract orders them |"
 UNLISTED = {"stages", "reference", "cli"}
-"""Rooms with a module for each kernel file or verb: too many to list."""
+"""Packages with a module for each kernel file or verb, which are too many to list."""
 
 
 def what(folder: Path) -> str:
@@ -33,7 +33,7 @@ def what(folder: Path) -> str:
 
 
 def orders() -> dict[str, list[str]]:
-    """The layers of each contract, from the top, by the name of its room: "" for the package."""
+    """The layers of each contract, from the top, keyed by the contract's package; "" is clsplat itself."""
     document = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     contracts = document["tool"]["importlinter"]["contracts"]
     return {
@@ -46,7 +46,7 @@ def orders() -> dict[str, list[str]]:
 
 
 def table() -> str:
-    """The table as Markdown, a row a room and sub-room."""
+    """The table as Markdown, with a row for each package and subpackage."""
     order = orders()
     rows = [HEAD, "|---|---|---|"]
 
@@ -66,7 +66,7 @@ def table() -> str:
 
 
 def page() -> str:
-    """The page with the table as it should be."""
+    """The text of the page with the current table."""
     before, head, rest = PAGE.read_text("utf-8").partition(HEAD)
     return f"{before}{table()}\n{rest.partition(chr(10) * 2)[2]}" if head else before
 

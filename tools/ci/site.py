@@ -1,15 +1,14 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The site of README.md and docs/, with an API page from the docstrings; needs the extra `docs`.
+"""Build a site of README.md and docs/, with an API page from the docstrings. Requires the extra `docs`.
 
     .venv/bin/python tools/ci/site.py [FOLDER]
 
-Writes HTML to FOLDER, by default build/site: open its index.html. Exit status 1 where there is a warning, such as for a
-link that leads nowhere or a docstring that is not found. docs/mkdocs.yml has the settings.
+Writes HTML to FOLDER (build/site): open its index.html. The exit status is 1 if there are warnings, for example
+of a broken link or a missing docstring. docs/mkdocs.yml has the settings.
 
-mkdocs takes one folder of pages and nothing beside it, so the pages are copied to a temporary one, where every link
-between them stays what it is; three things are added to the copy: a list of the decisions, the text of each example
-below the link to it, and formulas as MathML.
+mkdocs reads only one folder, so the pages are copied to a temporary one, with the same links between them. Three things
+are added to the copy: a list of the decisions, the text of each example below the link to it, and formulas as MathML.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ from mkdocs.exceptions import MkDocsException
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md", "LICENSE", ".github")
-"""Copied beside docs/, as pages link to them."""
+"""Files that are copied beside docs/, as pages link to them."""
 DECISIONS = "docs/decisions"
 EXAMPLE = re.compile(r"^\[[^]]+\]\((examples/\w+\.py)\)$", re.MULTILINE)
-"""A link to an example that is a line of its own."""
+"""Pattern of a link to an example on a line of its own."""
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 TAG = re.compile(r"\\tag\{(\w+)\}")
 
 
 def copy_pages(folder: Path) -> list[str]:
-    """Copy what is published to the folder; returns the decisions' pages, in order."""
+    """Copy the pages to the folder. Returns the pages of the decisions, in order."""
     shutil.copytree(ROOT / "docs", folder / "docs", ignore=shutil.ignore_patterns("__pycache__"))
     for name in PAGES:
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copyfile
@@ -54,12 +53,12 @@ def copy_pages(folder: Path) -> list[str]:
 
 
 def with_code(link: re.Match[str], docs: Path) -> str:
-    """A link to an example, with the example below it."""
+    """The link to an example, followed by the example's text."""
     return f"{link[0]}\n\n```python\n{(docs / link[1]).read_text('utf-8')}```"
 
 
 def formulas(text: str, **_: object) -> str:
-    """A page's HTML with its TeX as MathML, which browsers show by themselves. Numbers of equations go to the right."""
+    """Replace TeX in a page's HTML by MathML, which browsers display. Equation numbers are put on the right."""
 
     def mathml(found: re.Match[str]) -> str:
         tex = html.unescape(found[2])
@@ -72,7 +71,7 @@ def formulas(text: str, **_: object) -> str:
 
 
 def main() -> int:
-    """Build the site; returns the exit status."""
+    """Build the site. Returns the exit status."""
     logging.basicConfig(format="%(levelname)s %(message)s", level=logging.WARNING)
     target = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "build/site").resolve()
     with tempfile.TemporaryDirectory() as folder:

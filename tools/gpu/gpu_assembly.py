@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops of kernels, and the instructions in them by class, from NVIDIA's and AMD's assembly."""
+"""Parse NVIDIA's and AMD's assembly into the loops of kernels, and count their instructions by class."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 CLASSES = ("fp32", "integer", "shared", "global", "control", "other", "scalar")
-"""fp32: arithmetic and comparisons; integer: the same, and moves; shared: shared and private memory; control: branches,
+"""fp32: arithmetic and comparisons; integer: these and moves; shared: shared and private memory; control: branches,
 barriers, waits; other: reciprocals, conversions, votes, special registers; scalar: AMD's scalar unit."""
 
 
 @dataclass(frozen=True)
 class Instruction:
-    """An instruction. target: the label that it may go on at; ends: it never goes on at the next one; source: the line
-    of the kernel's text that it was made of, or 0."""
+    """An instruction. target: the label that it may jump to. ends: True if the next instruction never follows it.
+    source: its line in the kernel's text, or 0 if unknown."""
 
     name: str
     kind: str
@@ -27,7 +27,7 @@ class Instruction:
 
 @dataclass
 class Block:
-    """Instructions that run one after the other, and the labels that lead to them."""
+    """A basic block: instructions that run one after the other, and the labels of the first."""
 
     labels: set[str] = field(default_factory=set)
     body: list[Instruction] = field(default_factory=list)
@@ -35,7 +35,7 @@ class Block:
 
 @dataclass
 class Loop:
-    """A loop: its blocks without those of loops inside; sources: of the jumps back to its head; the loops inside."""
+    """A loop: its blocks without those of inner loops, the source lines of the jumps back to its head, inner loops."""
 
     blocks: list[Block]
     sources: set[int]
@@ -43,23 +43,23 @@ class Loop:
 
     @property
     def counts(self) -> Counter[str]:
-        """Instructions by class, without those of loops inside."""
+        """Number of instructions by class, without inner loops."""
         return Counter(each.kind for block in self.blocks for each in block.body)
 
     @property
     def size(self) -> int:
-        """Instructions, without those of loops inside."""
+        """Number of instructions, without inner loops."""
         return sum(len(block.body) for block in self.blocks)
 
     def walk(self, depth: int = 0) -> Iterator[tuple[int, Loop]]:
-        """This loop and all inside it, each with its depth."""
+        """This loop and all inner loops, each with its depth."""
         yield depth, self
         for loop in self.inner:
             yield from loop.walk(depth + 1)
 
     @property
     def tree(self) -> str:
-        """The shape of the loops inside, such as `(()())`."""
+        """The nesting of inner loops as parentheses, such as `(()())`."""
         return f"({''.join(loop.tree for loop in self.inner)})"
 
 
@@ -101,7 +101,8 @@ def _successors(blocks: list[Block]) -> list[list[int]]:
 
 
 def _dominators(after: list[list[int]]) -> list[set[int]]:
-    """The blocks that every way from the first block to this one goes through; for one that none leads to, itself."""
+    """For each block its dominators: the blocks on every path from the first block. Unreachable blocks have only
+    themselves."""
     before: list[list[int]] = [[] for _ in after]
     for block, following in enumerate(after):
         for each in following:
@@ -125,7 +126,7 @@ def _dominators(after: list[list[int]]) -> list[set[int]]:
 
 
 def _natural(after: list[list[int]], head: int, latch: int) -> set[int]:
-    """The blocks that lead to the latch without going through the head."""
+    """The blocks of a loop: those that reach the latch without passing the head."""
     before: dict[int, list[int]] = {}
     for block, following in enumerate(after):
         for each in following:
@@ -140,7 +141,7 @@ def _natural(after: list[list[int]], head: int, latch: int) -> set[int]:
 
 
 def blocks_of(items: Iterable[str | Instruction]) -> list[Block]:
-    """Basic blocks of labels and instructions."""
+    """Split labels and instructions into basic blocks."""
     blocks = [Block()]
     for item in items:
         last = blocks[-1]
@@ -167,7 +168,7 @@ SASS_KINDS = (
     ("control", r"BRA|BRX|BSSY|BSYNC|BREAK|BMOV|BAR|CALL|RET|EXIT|JMP|WARPSYNC|YIELD|DEPBAR|NANOSLEEP|KILL"),
     ("integer", _SASS_INTEGER),
 )
-"""Class of a SASS instruction: the first pattern that its name begins with; else `other`."""
+"""Class of a SASS instruction: that of the first pattern with which its name begins, else `other`."""
 
 GCN_KINDS = (
     (
@@ -181,7 +182,7 @@ GCN_KINDS = (
     ("fp32", r"v_(dual_|pk_)?\w*f32"),
     ("integer", r"v_"),
 )
-"""The same of AMD's. An instruction that does two things at once counts as one."""
+"""Class of an AMD instruction. An instruction that does two operations at once counts as one."""
 
 
 def _classifier(kinds: tuple[tuple[str, str], ...]) -> Callable[[str], str]:
@@ -201,14 +202,14 @@ _GCN_SOURCE = re.compile(r"^\s+\.loc\s+\d+\s+(\d+)")
 
 
 def parse_sass(text: str) -> dict[str, Loop]:
-    """Kernels by name from the output of `nvdisasm -c`, with source lines where it was made with -g."""
+    """Kernels by name, from the output of `nvdisasm -c`. They have source lines if compiled with -g."""
     return _parsed(text, (_SECTION, _SASS_SOURCE, _SASS_LABEL, _SASS_LINE), _sass)
 
 
 def parse_gcn(text: str) -> dict[str, Loop]:
-    """Kernels by name from the assembly that clang writes for AMD."""
+    """Kernels by name, from the assembly that clang writes for AMD."""
     names = re.findall(r"^\s+\.amdhsa_kernel (\w+)", text, flags=re.MULTILINE)
-    begins = re.compile(rf"^({'|'.join(names)}|\.Lfunc_end\d+):")  # what follows an end is no instruction
+    begins = re.compile(rf"^({'|'.join(names)}|\.Lfunc_end\d+):")  # no instructions follow a function's end
     kernels = _parsed(text, (begins, _GCN_SOURCE, _GCN_LABEL, _GCN_LINE), _gcn)
     return {name: kernels[name] for name in names}
 
@@ -218,8 +219,8 @@ def _parsed(
     patterns: tuple[re.Pattern[str], re.Pattern[str], re.Pattern[str], re.Pattern[str]],
     instruction: Callable[[re.Match[str], int], Instruction],
 ) -> dict[str, Loop]:
-    """Functions by name. patterns: of lines that begin a function, name a source line, are a label, or an instruction;
-    the first that matches counts."""
+    """Functions by name. patterns: match lines that begin a function, name a source line, or are labels or
+    instructions; the first match counts."""
     begins, names_source, label, line = patterns
     functions: dict[str, list[str | Instruction]] = {}
     current: list[str | Instruction] = []
@@ -231,14 +232,14 @@ def _parsed(
             source = int(match[1])
         elif match := label.match(each):
             current.append(match[1])
-        elif (match := line.match(each)) and match["name"] != "NOP":  # which fill up what is behind NVIDIA's end
+        elif (match := line.match(each)) and match["name"] != "NOP":  # NOPs are padding after NVIDIA's last instruction
             current.append(instruction(match, source))
     return {name: kernel_of(blocks_of(items)) for name, items in functions.items()}
 
 
 def _sass(match: re.Match[str], source: int) -> Instruction:
-    """BSSY names where ways meet again, so that it is no jump. CALL is one, if it is to a label of the kernel: a
-    function has a name."""
+    """Target of a jump. BSSY is no jump: it names the place where paths meet again. CALL is a jump if its target is a
+    label of the kernel rather than a function's name."""
     name, rest = match["name"], match["rest"]
     family = name.partition(".")[0]
     target = re.search(r"`\((\.[\w$]+)\)", rest) if family in ("BRA", "BRX", "JMP", "CALL") else None

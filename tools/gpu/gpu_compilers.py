@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiles kernels for GPUs that are not here: clang, NVIDIA's assembler and disassembler, and what they say."""
+"""Compile kernels for GPUs without having them, with clang and NVIDIA's assembler, and parse the output."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from clsplat.device.source import kernel_source
 from clsplat.errors import ClsplatError
 
 CLANG = "19"
-"""Version of clang, of which the counts depend; 16 is the first that knows every target."""
+"""Version of clang, on which the counts depend. 16 is the first that supports every target."""
 NVIDIA = "13.5.37"
-"""Version of the packages that have NVIDIA's assembler and disassembler."""
+"""Version of the packages with NVIDIA's assembler and disassembler."""
 PACKAGES = {"ptxas": "nvidia-cuda-nvcc", "nvdisasm": "nvidia-cuda-nvdisasm"}
 TARGETS = ("sm_75", "sm_89", "sm_90", "gfx90a", "gfx1030", "gfx1100")
 BUILTINS = Path(__file__).with_name("gpu_builtins.cl")
@@ -41,7 +41,7 @@ class NoCompilerError(ClsplatError):
 
 @dataclass(frozen=True)
 class Built:
-    """A kernel for a target. registers: of an item; spills, stack, shared: bytes, of an item, an item and a group;
+    """A kernel compiled for a target. registers: per item. spills, stack: bytes per item. shared: bytes per group.
     whole: the kernel as a loop that runs once."""
 
     kernel: str
@@ -55,47 +55,47 @@ class Built:
 
 @dataclass(frozen=True)
 class Source:
-    """A kernel file and the options that the package builds it with."""
+    """A kernel file and the options with which clsplat builds it."""
 
     stem: str
     options: tuple[str, ...]
 
     @property
     def items(self) -> int:
-        """Work-items of a group of kernels that co-operate."""
+        """Number of work-items in a group, for kernels whose items cooperate."""
         return next(int(each.partition("=")[2]) for each in self.options if each.startswith("-DITEMS="))
 
     @property
     def by_gaussian(self) -> bool:
-        """True for the gradient of blending in which an item has a Gaussian."""
+        """True for the gradient of blending in which each item has a Gaussian."""
         return "-DBY_GAUSSIAN" in self.options
 
     @property
     def subgroup(self) -> int:
-        """Items that exchange values, 1 where none do."""
+        """Number of items that exchange values, 1 if none do."""
         return next((int(each.partition("=")[2]) for each in self.options if each.startswith("-DSUBGROUP=")), 1)
 
     def options_for(self, target: str) -> tuple[str, ...]:
-        """The options, with the target's way to exchange values."""
+        """The options, including the target's functions for exchanging values."""
         shuffle = "-DSHUFFLE_PTX" if target.startswith("sm_") else "-DSHUFFLE_AMD"
         return tuple(shuffle if each.startswith("-DSHUFFLE") else each for each in self.options)
 
     @property
     def shape(self) -> str:
-        """The kernels' shape, as CLSPLAT_SHAPE has it."""
+        """The kernels' shape, as in CLSPLAT_SHAPE."""
         return f"1x{self.items}{'g' if self.by_gaussian else 's' if self.subgroup > 1 else ''}"
 
     @property
     def label(self) -> str:
-        """The stem, with the defines beside the shape."""
+        """The file's stem, with the defines other than the shape."""
         shape = ("-DITEMS=", "-DLANES=", "-DSUBGROUP=", "-DSHUFFLE", "-cl")
         defines = [each[2:].removesuffix("=1") for each in self.options if not each.startswith(shape)]
         return " ".join((self.stem, *defines))
 
     @property
     def used(self) -> Source:
-        """The same without defines that the text does not name: two of which this is the same are the same kernels, as
-        most files are in shapes that differ in the items of a group."""
+        """The source without defines that its text does not use. Sources for which this is equal have the same kernels,
+        as most files do in shapes that differ only in the number of items."""
         words = set(re.findall(r"\w+", kernel_source(self.stem)))
         names = {each: each.removeprefix("-D").partition("=")[0].partition("(")[0] for each in self.options}
         kept = (each for each in self.options if not each.startswith("-D") or names[each] in words)
@@ -103,12 +103,12 @@ class Source:
 
     @property
     def lines(self) -> list[str]:
-        """Lines of the text."""
+        """The text's lines."""
         return kernel_source(self.stem).splitlines()
 
 
 def clang() -> str:
-    """The compiler's path. Raises NoCompilerError."""
+    """Path of clang. Raises NoCompilerError."""
     found = shutil.which(f"clang-{CLANG}") or shutil.which("clang") or ""
     version = _run([found, "--version"]).stdout if found else ""
     if re.search(rf"clang version {CLANG}\.", version) is None:
@@ -118,14 +118,14 @@ def clang() -> str:
 
 
 def compilers() -> str:
-    """The versions of clang and ptxas, in words."""
+    """The versions of clang and ptxas, as text."""
     version = re.search(r"clang version (\S+)", _run([clang(), "--version"]).stdout)
     return f"clang {version[1] if version else CLANG}, ptxas {NVIDIA}"
 
 
 @cache
 def nvidia(name: str) -> str:
-    """The path of ptxas or nvdisasm, in the cache folder; downloaded by pip where it is not. Raises NoCompilerError."""
+    """The path of ptxas or nvdisasm, in the cache folder. pip downloads it if it is missing. Raises NoCompilerError."""
     path = cache_folder() / f"nvidia-{NVIDIA}" / name
     if path.is_file():
         return str(path)
@@ -151,7 +151,7 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 def run_checked(command: Sequence[str], what: str) -> str:
-    """Output of a command that has to succeed, both streams. Raises ClsplatError."""
+    """Both output streams of a command. Raises ClsplatError if the command fails."""
     done = _run(command)
     if done.returncode:
         told = [line for line in done.stderr.splitlines() if "error" in line or "fatal" in line]
@@ -167,7 +167,7 @@ def target_flags(target: str) -> tuple[str, ...]:
 
 
 def build_builtins(target: str, folder: Path) -> Path:
-    """Bitcode of the built-in functions. It names no lines, so that a call of one counts as its caller's line."""
+    """Bitcode of the built-in functions. It has no source lines, so that instructions count for the caller's line."""
     path = folder / f"builtins-{target}.bc"
     options = (*FLAGS, *target_flags(target), "-cl-std=CL1.2", "-cl-fp32-correctly-rounded-divide-sqrt")
     run_checked([clang(), *options, "-c", "-emit-llvm", str(BUILTINS), "-o", str(path)], BUILTINS.name)
@@ -175,7 +175,7 @@ def build_builtins(target: str, folder: Path) -> Path:
 
 
 def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
-    """The kernels of a file. Raises ClsplatError where a compiler refuses it."""
+    """Compile a kernel file. Raises ClsplatError if a compiler refuses it."""
     what = f"{source.label} for {target}"
     with tempfile.TemporaryDirectory(dir=builtins.parent) as scratch:
         text, assembly, cubin = (Path(scratch) / f"{source.stem}.{end}" for end in ("cl", "s", "cubin"))
@@ -204,7 +204,7 @@ _FUNCTION = re.compile(
 
 
 def read_nvidia(told: str, sass: str, target: str) -> list[Built]:
-    """Kernels, from what `ptxas -v` has said and `nvdisasm -c` has written."""
+    """Kernels, from the outputs of `ptxas -v` and `nvdisasm -c`."""
     wholes = parse_sass(sass)
     built = []
     for match in _FUNCTION.finditer(told):
@@ -216,7 +216,7 @@ def read_nvidia(told: str, sass: str, target: str) -> list[Built]:
 
 
 def read_amd(assembly: str, target: str) -> list[Built]:
-    """Kernels, from the metadata that clang's assembly has."""
+    """Kernels, from the metadata in clang's assembly."""
     wholes = parse_gcn(assembly)
     entries = assembly.partition("amdhsa.kernels:")[2].partition("amdhsa.target:")[0]
     built = []
@@ -232,7 +232,7 @@ def read_amd(assembly: str, target: str) -> list[Built]:
 
 
 def ask_package(shape: str, frames: Sequence[Mapping[str, Any]]) -> list[Any]:
-    """Launches of each frame that `gpu_variants.py` notes of the package. Raises ClsplatError."""
+    """Launches of each frame, as recorded by `gpu_variants.py`. Raises ClsplatError."""
     script = Path(__file__).with_name("gpu_variants.py")
     command = [sys.executable, str(script), shape, *(json.dumps(frame) for frame in frames)]
     root = str(script.parents[2])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GPUs as their makers' data sheets and guides have them: what limits a group, and what a whole device does."""
+"""Data of GPUs from data sheets and programming guides: limits of groups, and rates of the whole device."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from gpu_compilers import Built
 class Architecture:
     """The limits of a unit that groups share: NVIDIA's SM, half of AMD's work-group processor or its compute unit.
 
-    wave: items that run in step; waves, groups: most at a time; registers: of 32 bits, for all waves together, of which
-    a wave gets `grain` times as many for each item as it has items; shared: bytes, and `reserved` for each group.
+    wave: items that run in step. waves, groups: maximum at a time. registers: number of 32-bit registers of all waves,
+    allocated in multiples of `grain` per item. shared: bytes of shared memory, of which each group uses `reserved`.
     """
 
     name: str
@@ -34,13 +34,13 @@ ARCHITECTURES = {
     "gfx1030": Architecture("RDNA 2", 32, 32, 16, 64 << 10, 8, 64 << 10),
     "gfx1100": Architecture("RDNA 3", 32, 32, 16, 96 << 10, 24, 64 << 10),
 }
-"""By target. CUDA programming guide, table of compute capabilities; AMD's ISA guides and LLVM's AMDGPU usage guide."""
+"""Limits by target, from the CUDA programming guide (compute capabilities), AMD's ISA guides and LLVM's guide."""
 
 
 @dataclass(frozen=True)
 class Gpu:
-    """A device. units: SMs or compute units; issue: instructions of a wave that a unit starts each cycle; ghz: the
-    boost clock; gb: memory, GB/s."""
+    """A device. units: SMs or compute units. issue: wave instructions that a unit starts per cycle. ghz: boost clock.
+    gb: memory bandwidth in GB/s."""
 
     name: str
     target: str
@@ -51,13 +51,13 @@ class Gpu:
 
     @property
     def issued(self) -> float:
-        """Instructions of a wave that the device starts in a millisecond, at most."""
+        """Maximum number of wave instructions that the device starts per millisecond."""
         return self.units * self.issue * self.ghz * 1e6
 
 
 GPUS = (
     Gpu("RTX 2080 Ti", "sm_75", 68, 4, 1.545, 616),
-    Gpu("RTX 3090", "sm_89", 82, 4, 1.695, 936),  # sm_86, for which no code is made
+    Gpu("RTX 3090", "sm_89", 82, 4, 1.695, 936),  # its target is sm_86, which is not compiled for
     Gpu("RTX 4090", "sm_89", 128, 4, 2.520, 1008),
     Gpu("H100 SXM", "sm_90", 132, 4, 1.980, 3350),
     Gpu("H200", "sm_90", 132, 4, 1.980, 4800),
@@ -68,7 +68,7 @@ GPUS = (
 
 
 def waves_at_a_time(built: Built, items: int, more_shared: int = 0) -> int:
-    """Waves of a kernel that a unit holds; more_shared: bytes that a launch gives to a group."""
+    """Number of a kernel's waves that fit in a unit. more_shared: bytes that a launch adds per group."""
     unit = ARCHITECTURES[built.target]
     waves = -(-items // unit.wave)
     a_wave = -(-max(built.registers, 1) // unit.grain) * unit.grain * unit.wave
@@ -80,5 +80,5 @@ def waves_at_a_time(built: Built, items: int, more_shared: int = 0) -> int:
 
 
 def occupancy(built: Built, items: int, more_shared: int = 0) -> float:
-    """The same, of as many as a unit can hold at all."""
+    """Waves of a kernel that fit in a unit, as a fraction of the unit's maximum."""
     return waves_at_a_time(built, items, more_shared) / ARCHITECTURES[built.target].waves

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Counts of real frames, from which `gpu_static.py` predicts: Gaussians, visible ones, pairs, pixels.
+"""Count Gaussians, visible Gaussians, pairs and pixels of real frames, for the predictions of `gpu_static.py`.
 
     python tools/gpu/gpu_frames.py NAME=PATH...
 
-PATH is a run, a model or a scene, as `clsplat bench` takes it; its first view is drawn. Listed are the pairs of a tile
-and a Gaussian in the tiles' lists, walked those up to the last one that some pixel of the tile takes. Rows of
-gpu_frames.json of these names are replaced. Rows that nobody counted are of made-up frames, whose counts are assumed;
-one with `picture` is drawn and not trained on.
+PATH is a run, a model or a scene, as for `clsplat bench`; its first view is rendered. `listed` counts the (tile,
+Gaussian) pairs in the tiles' lists, `walked` those up to the last pair that a pixel of the tile needs. The rows of
+these names in gpu_frames.json are replaced. Rows that were not counted are hypothetical frames with assumed counts. A
+row with `picture` is only rendered, not trained.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FRAMES = Path(__file__).with_name("gpu_frames.json")
 
 
 def count(name: str, subject: Subject) -> dict[str, Any]:
-    """The row of a subject."""
+    """Count the frame of a subject, and return its row."""
     device, camera = open_device(), subject.camera
     rasterizer = Rasterizer(device)
     gaussians = upload_gaussians(device, subject.gaussians)
@@ -63,7 +63,7 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
 
 @tool("gpu_frames")
 def main(arguments: Sequence[str]) -> int:
-    """Count, and write the rows."""
+    """Count the frames and write their rows."""
     parser = argparse.ArgumentParser(
         prog="gpu_frames", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

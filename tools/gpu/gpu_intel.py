@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kernels as Intel's offline compiler makes them for its GPUs: how many items run in step, and what is in memory.
+"""Compile the kernels with Intel's offline compiler for its GPUs: items that run in step, and use of memory.
 
-Its instructions are not counted. `ocloc` is in Debian's intel-opencl-icd, of 2022, and is looked for on the path.
+Instructions are not counted. `ocloc` must be on the path; it is in Debian's intel-opencl-icd, from 2022.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from clsplat.device.source import kernel_source
 from clsplat.errors import ClsplatError
 
 INTEL = {"tgllp": "Xe-LP", "dg2-g10": "Arc A770"}
-"""Devices by ocloc's names."""
+"""Devices, by their names in ocloc."""
 
 
 @dataclass(frozen=True)
 class IntelBuilt:
-    """A kernel for a device. step: items that run in step; stack: bytes of an item, spills among them; shared: bytes of
-    a group."""
+    """A kernel compiled for a device. step: items that run in step. stack: bytes per item, including spills. shared:
+    bytes per group."""
 
     source: Source
     kernel: str
@@ -37,12 +37,12 @@ class IntelBuilt:
 
 
 def ocloc() -> str | None:
-    """The compiler's path, or None."""
+    """Path of ocloc, or None."""
     return shutil.which("ocloc")
 
 
 def compile_intel(source: Source, device: str) -> list[IntelBuilt]:
-    """The kernels of a file. Raises ClsplatError where the compiler refuses it."""
+    """Compile a kernel file. Raises ClsplatError if the compiler refuses it."""
     program, what = ocloc(), f"{source.label} for {device}"
     if program is None:
         raise NoCompilerError("no ocloc found: apt install intel-opencl-icd")
@@ -56,7 +56,7 @@ def compile_intel(source: Source, device: str) -> list[IntelBuilt]:
 
 
 def read_intel(source: Source, device: str, binary: bytes) -> list[IntelBuilt]:
-    """Kernels, from what a binary says of itself. Raises ClsplatError for one that says nothing."""
+    """Kernels, from the description in a binary. Raises ClsplatError if there is none."""
     start = binary.find(b"---\nversion:")
     if start < 0:
         raise ClsplatError(f"{source.label} for {device}: the binary of ocloc does not describe its kernels")
@@ -73,7 +73,7 @@ def read_intel(source: Source, device: str, binary: bytes) -> list[IntelBuilt]:
 
 
 def compiled_for_intel(sources: Iterable[Source], jobs: int, say: Callable[[str], None]) -> list[IntelBuilt]:
-    """The kernels of every source for every device. Raises ClsplatError."""
+    """Compile every source for every device. Raises ClsplatError."""
     asked = [(source, device) for device in INTEL for source in sources]
     say(f"{len(asked)} kernel files to compile for Intel")
     with ThreadPoolExecutor(jobs) as pool:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Instructions that a wave runs of a kernel, from its loops and how often each runs (`gpu_rules.py`).
+"""Count the instructions that a wave runs in a kernel, from its loops and how often each runs (`gpu_rules.py`).
 
-A loop that no rule knows is an error, and so is a rule that no loop of a kernel has on any target.
+A loop without a rule is an error, and so is a rule that no loop has on any target.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from clsplat.errors import ClsplatError
 
 
 class UnknownLoopError(ClsplatError):
-    """A kernel or loop that no rule knows, or a rule that no loop has."""
+    """A kernel or loop has no rule, or a rule has no loop."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Instructions by class that a wave runs, on average. once: beside all loops; rounds: in them; rules: those that a
-    loop or branch has."""
+    """Average number of instructions by class that a wave runs. once: outside of loops. rounds: in loops. rules: the
+    rules that apply to a loop or branch."""
 
     once: Counter[str]
     rounds: Counter[str]
@@ -40,15 +40,15 @@ def rules_of(kernel: str) -> tuple[Rule, ...]:
 
 
 def _same(one: Loop, other: Loop, lines: Sequence[str]) -> bool:
-    """True for loops of one rule that are of the same lines, or one of the line that a rule has for its end; lines that
-    read alike are of several loops."""
+    """True if two loops of one rule are copies of the same loop: they share source lines, or their lines differ. Equal
+    lines at different places belong to different loops."""
     texts = ({lines[number - 1] for number in each.sources if number} for each in (one, other))
     return bool(one.sources & other.sources) or not set.intersection(*texts)
 
 
 def _unrolled(loop: Loop, rule: Rule, twins: Sequence[Loop]) -> float:
-    """Rounds of the text in one of the loop: by the rule's mark, or beside a loop of the same lines with less in it,
-    which does what is left over, by how often memory is used; infinite for that one."""
+    """Rounds of the source loop in one round of this loop. The rule's mark determines it, or else the number of memory
+    accesses relative to the remainder loop, a shorter copy with the same lines. Infinite for the remainder loop."""
 
     def uses(each: Loop) -> tuple[int, int]:
         return each.counts["shared"] + each.counts["global"], each.size
@@ -62,7 +62,7 @@ def _unrolled(loop: Loop, rule: Rule, twins: Sequence[Loop]) -> float:
 
 
 def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run) -> Cost:
-    """Instructions of a wave of the kernel. lines: the kernel's text. Raises UnknownLoopError."""
+    """Number of instructions that a wave of the kernel runs. lines: the kernel's text. Raises UnknownLoopError."""
     rounds: Counter[str] = Counter()
     unknown: list[str] = []
     parts = [rule for rule in rules if rule.part]
@@ -71,7 +71,7 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
 
     def visit(outer: Loop, outer_rounds: float) -> None:
         for loop in outer.inner:
-            if loop.size <= 1 and not loop.inner:  # a jump to itself behind the end
+            if loop.size <= 1 and not loop.inner:  # a jump to itself after the end of the kernel
                 continue
             matching = [rule for rule in rules if not rule.part and rule.opens(loop, lines)]
             if len(matching) != 1:
@@ -95,7 +95,7 @@ def cost_of(built: Built, lines: Sequence[str], rules: Sequence[Rule], run: Run)
 
 
 def unused_rules(used: Mapping[str, Iterable[Rule]]) -> list[str]:
-    """Rules that no loop has, in words. used: by kernel, those of its loops on every target and in every shape."""
+    """Descriptions of rules without a loop. used: for each kernel, the rules of its loops on all targets and shapes."""
     found = {kernel: set(rules) for kernel, rules in used.items()}
     somewhere = set().union(*found.values()).intersection(EVERYWHERE)
     return [
@@ -112,7 +112,7 @@ def _title(loop: Loop, lines: Sequence[str]) -> str:
 
 
 def _share(loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, used: set[Rule]) -> Counter[str]:
-    """Instructions by class of a round, each as often as it runs."""
+    """Instructions by class in a round, weighted by how often each runs."""
     counts: Counter[str] = Counter()
     for block in loop.blocks:
         sources = {each.source for each in block.body}
@@ -125,7 +125,7 @@ def _share(loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, us
 
 
 def by_pair(cost: Cost, run: Run) -> Counter[str]:
-    """Instructions by class, of all waves of a group, for a pair."""
+    """Instructions by class per pair, of all waves of a group."""
     counts: Counter[str] = Counter()
     for kind in CLASSES:
         counts[kind] = cost.rounds[kind] * run.waves

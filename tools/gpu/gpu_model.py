@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predicted milliseconds of a training step on a GPU: by the instructions that it starts, and by the bytes it moves.
+"""Predict the milliseconds of a training step on a GPU from its instructions and from the bytes that it moves.
 
-Every unit starts as many instructions as it can in each cycle at its boost clock, and memory moves as much as its data
-sheet says; arrays are read and written once by each launch. So the figures are what is left when nothing waits: ratios
-may be trusted, real times are longer.
+The model assumes that every unit starts the maximum number of instructions in each cycle at its boost clock, that
+memory has the bandwidth of its data sheet, and that each launch reads and writes its arrays once. Nothing ever waits:
+ratios can be trusted, but real times are longer.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from gpu_rules import BY_PAIR, NUMBERS, Run
 from clsplat.layouts.columns import TILE
 
 COPIES = ("write", "read")
-"""Launches that are transfers between host and device, which are not predicted."""
+"""Transfers between host and device, which are not predicted."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Milliseconds of a stage: of starting instructions, and of moving bytes; launches, fills among them."""
+    """Milliseconds of a stage for instructions and for bytes, and its number of launches, including fills."""
 
     issue: float = 0.0
     memory: float = 0.0
@@ -34,7 +34,7 @@ class Stage:
 
     @property
     def both(self) -> float:
-        """The sum: as if neither hid behind the other."""
+        """The sum of both times, as if they did not overlap."""
         return self.issue + self.memory
 
     def __add__(self, other: Stage) -> Stage:
@@ -42,7 +42,7 @@ class Stage:
 
 
 def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave: int) -> Run:
-    """The numbers of a frame and of a launch on which loops depend."""
+    """The numbers of a frame and a launch on which loops depend."""
     tiles = -(-frame["width"] // TILE) * -(-frame["height"] // TILE)
     numbers = dict(zip(NUMBERS.get(launch["kernel"], ()), map(int, launch["scalars"]), strict=False))
     return Run(
@@ -57,8 +57,8 @@ def run_of(frame: Mapping[str, Any], launch: Mapping[str, Any], items: int, wave
 
 
 def issued(cost: Cost, target: str) -> tuple[float, float]:
-    """Instructions that keep a unit's issue busy, beside loops and in them: AMD's scalar unit, branches and waits have
-    an issue of their own."""
+    """Instructions that use a unit's main issue slots, outside of loops and in them. AMD's scalar unit, branches and
+    waits have issue slots of their own."""
     apart = () if target.startswith("sm_") else ("scalar", "control")
     once, rounds = (
         sum(count for kind, count in counts.items() if kind not in apart) for counts in (cost.once, cost.rounds)
@@ -72,7 +72,7 @@ def predict(
     frame: Mapping[str, Any],
     gpu: Gpu,
 ) -> dict[str, Stage]:
-    """The stages of a step, in order, from its launches (`gpu_variants.py`) and the kernels for the GPU's target."""
+    """The stages of a step in order, from its launches (`gpu_variants.py`) and kernels compiled for the GPU."""
     stages: dict[str, Stage] = {}
     wave = ARCHITECTURES[gpu.target].wave
     for launch in launches:

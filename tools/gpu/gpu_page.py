@@ -21,9 +21,9 @@ from clsplat.gaussians import floats_of
 ROOT = Path(__file__).resolve().parents[2]
 PAGE, PLOT = ROOT / "docs/gpu-static.md", ROOT / "docs/images/gpu-static.svg"
 SHAPE, TARGET, GPU = "1x64", "sm_89", "RTX 4090"
-"""Of the tables that show one of each."""
+"""Shape, target and GPU of the tables that show only one."""
 LETTERS = 128
-"""Of a line of text."""
+"""Length of a line of text."""
 PARTS = {
     "project": ("project",),
     "lists and sorts": ("duplicate", "ranges"),
@@ -33,14 +33,14 @@ PARTS = {
     "project_grad, Adam": ("project_grad", "adam"),
     "statistics": ("statistics",),
 }
-"""Parts of a step, of which each is a row of a table and a bar of the plot; stages by name."""
+"""Parts of a step, each a row of the table and a part of the plot's bars, with the names of their stages."""
 VKSPLAT, VKSPLAT_GPU = (19, 25, 25, 32, 130, 131, 5), "RTX 3090"
-"""Seconds of these parts in VkSplat's trainings of 30,000 steps, mean of seven scenes, by its project's page."""
+"""Seconds of these parts in VkSplat's trainings of 30,000 steps: means of seven scenes, from its project's page."""
 WANTED, FRAMES_WANTED, LITEGS = 12, 200, 4.0
-"""Milliseconds of a step, at most, and pictures a second, at least; milliseconds of a step of LiteGS."""
+"""Maximum milliseconds of a step, and minimum pictures per second; milliseconds of a step of LiteGS."""
 
 Predictions = Mapping[tuple[str, str, str], Mapping[str, Stage]]
-"""Stages of a step by shape, GPU and frame."""
+"""Stages of a step, keyed by shape, GPU and frame."""
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -51,7 +51,7 @@ def markdown(rows: Sequence[Sequence[str]]) -> str:
 
 
 def kernel_table(rows: Sequence[Any]) -> str:
-    """Each kernel of a step, for one target and shape."""
+    """Table of the kernels of a step, for one target and shape."""
     lines = [
         ["kernel", "registers", "stack, B", "spills, B", "local memory, B", "occupancy", "instructions", "in loops"]
     ]
@@ -69,7 +69,7 @@ def kernel_table(rows: Sequence[Any]) -> str:
 
 
 def pair_table(rows: Sequence[Any]) -> str:
-    """Instructions a pair, by shape and target, of the two kernels."""
+    """Table of instructions per pair of the two blending kernels, by shape and target."""
     found = {(row.built.kernel, row.built.target, row.source.shape): row for row in rows if row.pair or row.unknown}
     targets = list(dict.fromkeys(target for _, target, _ in found))
     lines = [["kernel", "shape", *targets]]
@@ -86,7 +86,7 @@ def pair_table(rows: Sequence[Any]) -> str:
 
 
 def intel_table(built: Sequence[IntelBuilt]) -> str:
-    """Items in step, and stack, by shape and device."""
+    """Table of items in step, and of stack memory, by shape and device."""
     found = {(each.kernel, each.device, each.source.items): each for each in built}
     shapes = sorted({items for _, _, items in found})
     lines = [["kernel", *(f"{INTEL[device]}, 1x{items}" for device in INTEL for items in shapes)]]
@@ -102,7 +102,7 @@ def intel_table(built: Sequence[IntelBuilt]) -> str:
 
 
 def parts_of(stages: Mapping[str, Stage]) -> dict[str, Stage]:
-    """The parts of a step. Raises ClsplatError for a stage that is of none."""
+    """Milliseconds of the parts of a step. Raises ClsplatError for a stage that belongs to no part."""
     of_part = {stage: part for part, members in PARTS.items() for stage in members}
     if strange := [name for name in stages if name not in of_part]:
         raise ClsplatError(f"stages {', '.join(strange)}: of no part in PARTS of gpu_page.py")
@@ -114,7 +114,7 @@ def _gpu(name: str) -> Gpu:
 
 
 def stage_table(predictions: Predictions, frame: str) -> str:
-    """Milliseconds of each part of a step on one GPU, and of others' beside it."""
+    """Table of the milliseconds of each part of a step on one GPU, beside those of other programs."""
     now, other = (list(parts_of(predictions[SHAPE, gpu, frame]).items()) for gpu in (GPU, VKSPLAT_GPU))
     lines = [["part", "launches", "issue, ms", "memory, ms", "sum, ms", f"{VKSPLAT_GPU}: sum, ms", "VkSplat there, ms"]]
     theirs = [seconds / 30 for seconds in VKSPLAT]
@@ -127,7 +127,7 @@ def stage_table(predictions: Predictions, frame: str) -> str:
 
 
 def goals(rows: Sequence[Any], predictions: Predictions, frame: Mapping[str, Any], picture: str) -> str:
-    """A step and a picture in a sentence each, and what a step as fast as LiteGS would take."""
+    """A sentence each about a step and a picture, and about a step as fast as that of LiteGS."""
     gpu = _gpu(GPU)
     stages, drawn = (predictions[SHAPE, GPU, name] for name in (frame["name"], picture))
     whole, shown = (sum(each.values(), Stage()) for each in (stages, drawn))
@@ -158,8 +158,8 @@ def goals(rows: Sequence[Any], predictions: Predictions, frame: Mapping[str, Any
 
 
 def device_table(predictions: Predictions, frames: Sequence[str], picture: str) -> str:
-    """Milliseconds of a step on every GPU: of the largest frame in every shape, of the others in one; and pictures a
-    second."""
+    """Table of milliseconds of a step on every GPU, and of pictures per second. The largest frame has all shapes, the
+    others have one."""
     *smaller, largest = frames
     shapes = sorted({shape for shape, _, _ in predictions}, key=lambda shape: int(shape.partition("x")[2]))
     columns = [(SHAPE, frame) for frame in smaller] + [(shape, largest) for shape in shapes]
@@ -173,7 +173,7 @@ def device_table(predictions: Predictions, frames: Sequence[str], picture: str) 
 
 
 def frame_table(frames: Sequence[Mapping[str, Any]]) -> str:
-    """The frames' counts."""
+    """Table of the frames' counts."""
     lines = [["frame", "pixels", "Gaussians", "visible", "pairs listed", "pairs walked"]]
     for frame in frames:
         size = f"{frame['width']}x{frame['height']}"
@@ -184,15 +184,15 @@ def frame_table(frames: Sequence[Mapping[str, Any]]) -> str:
 
 
 def gpu_table() -> str:
-    """The devices' figures."""
+    """Table of the devices' data."""
     lines = [["GPU", "code for", "units", "instructions a cycle and unit", "GHz", "GB/s"]]
     lines += [[g.name, g.target, str(g.units), str(g.issue), f"{g.ghz:g}", f"{g.gb:g}"] for g in GPUS]
     return markdown(lines)
 
 
 def fill_in(page: str, tables: Mapping[str, str]) -> str:
-    """The page with its tables replaced: each stands between `<!-- NAME -->` and `<!-- end -->`. Raises ClsplatError
-    where the page has no such place."""
+    """The page with its tables replaced. Each is between `<!-- NAME -->` and `<!-- end -->`. Raises ClsplatError if the
+    page lacks these comments."""
     for name, text in tables.items():
         pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
         if not pattern.search(page):
@@ -204,18 +204,18 @@ def fill_in(page: str, tables: Mapping[str, str]) -> str:
 
 
 def _between(text: str) -> Callable[[re.Match[str]], str]:
-    """The replacement of a table that keeps what stands around it."""
+    """Replace a table, and keep the text around it."""
     return lambda match: f"{match[1]}{text}\n{match[2]}"
 
 
 def trained_and_picture(frames: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], str]:
-    """The frames of training, the largest last, and the name of the one that is drawn alone."""
+    """The frames that are trained, the largest last, and the name of the frame that is only rendered."""
     trained = [frame for frame in frames if not frame.get("picture")]
     return trained, next(frame["name"] for frame in frames if frame.get("picture"))
 
 
 def missed_goals(predictions: Predictions, frames: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The goals that the predictions miss, in words."""
+    """Descriptions of the goals that the predictions miss."""
     trained, picture = trained_and_picture(frames)
     largest = trained[-1]["name"]
     step, shown = (sum(predictions[SHAPE, GPU, name].values(), Stage()).both for name in (largest, picture))
@@ -234,7 +234,7 @@ def tables_of(
     compilers: str,
     intel: Sequence[IntelBuilt] = (),
 ) -> dict[str, str]:
-    """The page's tables by name. compilers: their versions; intel: empty for no table of Intel's."""
+    """The page's tables, keyed by name. compilers: their versions. intel: empty to omit Intel's table."""
     trained, picture = trained_and_picture(frames)
     names, largest = [frame["name"] for frame in trained], trained[-1]["name"]
     tables = {
@@ -253,8 +253,8 @@ def tables_of(
 
 
 def stale_tables(page: str, tables: Mapping[str, str]) -> list[str]:
-    """The names of tables that are not the page's, or none where other compilers made it. Raises ClsplatError where the
-    page has no place for one."""
+    """Names of tables that differ from the page's; none if other compilers made the page. Raises ClsplatError if the
+    page has no place for a table."""
     stale = [name for name, text in tables.items() if fill_in(page, {name: text}) != page]
     return [] if "compilers" in stale else stale
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rounds of each loop of a training step's kernels: for each pair in blending, for each item elsewhere.
+"""Rules for how often each loop of a training step's kernels runs: per pair in blending, per item in other kernels.
 
-A loop is known by the line of the kernel's text that opens it. Each loop has one rule here and each rule a loop, so
-that a kernel that is rewritten gets rules of its own (`gpu_loops.py`).
+A rule names the line of the kernel's text that opens its loop. Each loop must have one rule and each rule a loop, so
+that a rewritten kernel needs new rules (`gpu_loops.py`).
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from gpu_assembly import Loop
 
 PER_ITEM = 16
-"""Keys of a tile of the radix sort for each item, RUN in sort_radix.cl."""
+"""Keys per item in a tile of the radix sort: RUN in sort_radix.cl."""
 WINDOW, REACH = 11, 5
-"""Taps of the loss's window, and how far it reaches."""
+"""Number of taps of the loss's window, and its radius."""
 _UNEVEN = 2
-"""Rounds of a wave, of which the longest item counts, over those of an item, where Gaussians of all sizes are side by
-side: a guess."""
+"""Estimated ratio of a wave's rounds, which are those of its longest item, to the rounds of an average item, if
+neighbouring Gaussians have all sizes."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Numbers that the rounds of a loop depend on. items: of a group; wave: items that run in step; subgroup: items
-    that exchange values; addends: pairs of a visible Gaussian; listed: pairs of a tile; coefficients: of SH. Of the
-    launch: groups, elements that they share, and digits of a pass of the sort."""
+    """Numbers on which the rounds of a loop depend. items: per group. wave: items that run in step. subgroup: items
+    that exchange values. addends: pairs per visible Gaussian. listed: pairs per tile. coefficients: of SH. groups,
+    elements: of the launch. digits: of a pass of the sort."""
 
     items: int
     wave: int = 32
@@ -44,44 +44,44 @@ class Run:
 
     @property
     def waves(self) -> int:
-        """Of a group."""
+        """Number of waves per group."""
         return max(self.items // self.wave, 1)
 
     @property
     def batch(self) -> int:
-        """Pairs of a batch of blending, BATCH in blocks.h."""
+        """Pairs in a batch of blending: BATCH in blocks.h."""
         return max(self.items, 64)
 
     @property
     def batches(self) -> float:
-        """Batches for a pair; a tile's last one is half full."""
+        """Batches per pair. A tile's last batch is half full on average."""
         return 1 / self.batch + 0.5 / self.listed
 
     @property
     def fetches(self) -> float:
-        """Rounds in which an item fetches a splat, for a pair."""
+        """Rounds per pair in which an item fetches a splat."""
         return self.batches * self.batch / self.items
 
     @property
     def together(self) -> int:
-        """Pairs whose sums are made together, TOGETHER in blend_grad.cl."""
+        """Pairs whose sums are computed together: TOGETHER in blend_grad.cl."""
         if self.subgroup > 1:
             return self.items // PLAIN_SLOTS.floats
         return 3 if self.items < 256 else 1
 
     @property
     def summing(self) -> float:
-        """Share of the waves that add up rows of sums."""
+        """Fraction of the waves that add up rows of sums."""
         return self.shared(self.together * PLAIN_SLOTS.floats)
 
     @property
     def of_item(self) -> float:
-        """Elements of an item."""
+        """Elements per item."""
         return self.elements / (self.groups * self.items)
 
     @property
     def tiles(self) -> float:
-        """Tiles of keys of a group in the scatter of the sort."""
+        """Tiles of keys per group in the scatter of the sort."""
         return math.ceil(self.elements / (PER_ITEM * self.items)) / self.groups
 
     @property
@@ -91,11 +91,11 @@ class Run:
 
     @property
     def loss_rows(self) -> int:
-        """Rows of a block of the loss, ROWS in loss.cl."""
+        """Rows in a block of the loss: ROWS in loss.cl."""
         return min(max(self.items // 16, 1), 16)
 
     def shared(self, count: float) -> float:
-        """Rounds of a wave, on average over the group's, where its items share so many."""
+        """Average rounds per wave of a group whose items share `count` elements."""
         return math.ceil(count / self.wave) / self.waves
 
 
@@ -104,13 +104,13 @@ Rounds = Callable[[Run], float]
 
 @dataclass(frozen=True)
 class Rule:
-    """A part of a line of a kernel's text, and how often the loop that it opens runs, in all: for a pair, or an item.
+    """A part of a line of a kernel's text, and the total rounds of the loop that it opens, per pair or per item.
 
-    ends: parts of other lines, in which some compiler jumps back to the loop's head.
-    function: a part of the head of the function that the line is in, where others have such a line too.
-    part: not a loop but a branch: the share of its loop's rounds in which a wave takes it; the line is inside.
-    mark: instructions of a class that a round has, such as ("shared", 2): a loop with more is unrolled so many times.
-    inner: rounds are those for each round of the loop around it, not in all.
+    ends: parts of other lines, from which some compiler jumps back to the loop's head.
+    function: a part of the head of the function with the line, if several functions have such a line.
+    part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it.
+    mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
+    inner: True if rounds are per round of the enclosing loop.
     """
 
     text: str
@@ -122,19 +122,19 @@ class Rule:
     inner: bool = False
 
     def matches(self, number: int, lines: Sequence[str]) -> bool:
-        """True if the line of this number, from 1 on, is such a line."""
+        """True if the rule matches the line with this number, counted from 1."""
         if not number or not any(text in lines[number - 1] for text in (self.text, *self.ends)):
             return False
         heads = (line for line in reversed(lines[: number - 1]) if line.startswith(_HEADS))
         return self.function in next(heads, "")
 
     def opens(self, loop: Loop, lines: Sequence[str]) -> bool:
-        """True if the loop was made of such a line."""
+        """True if a source line of the loop matches the rule."""
         return any(self.matches(number, lines) for number in loop.sources)
 
 
 _HEADS = ("static ", "GROUP __kernel", "__kernel", "RARE ")
-"""Beginnings of the head of a function."""
+"""Words with which the head of a function begins."""
 
 
 EVERYWHERE: tuple[Rule, ...] = (
@@ -147,9 +147,9 @@ EVERYWHERE: tuple[Rule, ...] = (
         inner=True,
     ),
 )
-"""Loops that any kernel may have, of functions that kernels share."""
+"""Rules of loops in functions that kernels share."""
 _BEFORE_PAIRS = (
-    Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # pairs beyond
+    Rule("for (int first = last; first < end; first += ITEMS)", lambda run: 0),  # for pairs beyond the last
     Rule("RAISE_TO_GROUP_MAX(last)", lambda run: 0),  # once a tile
 )
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
@@ -171,7 +171,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
         Rule("return (four.x + four.y)", lambda run: run.summing, ends=("DOUBLED(",), part=True),
     ),
 }
-"""Kernels that a group runs for a tile: rounds for a pair in each of the group's waves."""
+"""Rules of kernels that run a group per tile: rounds per pair in each of the group's waves."""
 WALK: tuple[Rule, ...] = (
     *_BEFORE_PAIRS,
     Rule("for (int k = ITEM; k < TILE * TILE; k += ITEMS)", lambda run: 0),  # once a tile
@@ -180,7 +180,7 @@ WALK: tuple[Rule, ...] = (
     Rule("slot[field] = sums[field];", lambda run: 1 / run.waves, part=True),
     Rule("const Staged s = staged[ITEM];", lambda run: 1 / run.waves, part=True),
 )
-"""The same of `blend_grad` where an item has a Gaussian."""
+"""Rules of `blend_grad` if each item has a Gaussian."""
 
 
 def _of_item(run: Run) -> float:
@@ -224,7 +224,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "compact_visible": (
         _group_sum(lambda run: run.sums_before),
         Rule("for (uint first = begin; first < end; first += ITEMS)", _of_item),
-        Rule("atomic_max(extremes, complement)", lambda run: run.wave),  # AMD's, over a wave's items
+        Rule("atomic_max(extremes, complement)", lambda run: run.wave),  # AMD's compiler loops over a wave's items
         Rule("atomic_max(extremes + 1, largest)", lambda run: run.wave),
     ),
     "order_counts": (),
@@ -263,7 +263,7 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "ranges": (),
     "loss_ssim": (
         Rule("FOR_VECTORS(block, margin, ROWS)", _loss(2 * REACH), function=" moments("),
-        Rule("for (int tap = 0; tap < taps.x; ++tap) beyond", _never),  # at the picture's edges
+        Rule("for (int tap = 0; tap < taps.x; ++tap) beyond", _never),  # only at the picture's edges
         Rule("for (int tap = taps.y; tap < TAPS; ++tap) beyond", _never),
         Rule("for (int tap = taps.x; tap < taps.y;", _loss(2 * REACH, WINDOW), mark=("global", 2)),
         Rule("FOR_VECTORS(block, margin, LINES)", _loss(0), function=" derivatives("),
@@ -286,13 +286,13 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         _stepped("opacity_logits", 1),
         _stepped("sh_dc", 3),
         Rule("for (uint k = me; k < sh_width * rows; k += items)", lambda run: 3 * _bands(run), mark=("global", 6)),
-        Rule("first[i] = 0.0f;", _never, part=True),  # a step that is refused
+        Rule("first[i] = 0.0f;", _never, part=True),  # only for a refused step
         Rule("second[i] = again ? 0.0f", _never, part=True),
         Rule("atomic_inc(s.readback", _never, part=True),
     ),
     "density_statistics": (),
 }
-"""The other kernels of a training step: rounds for an item."""
+"""Rules of the other kernels of a training step: rounds per item."""
 
 NUMBERS = {
     "visible_sums": ("elements",),
@@ -303,4 +303,4 @@ NUMBERS = {
     "radix_offsets": ("elements", "digits"),
     "radix_scatter": ("elements", "chunk", "base", "shift", "digits"),
 }
-"""The first scalars that kernels are launched with."""
+"""Names of the first scalar arguments of kernels."""

@@ -1,21 +1,21 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Registers, spills, memory and instructions of the kernels as GPUs' compilers make them, counted without a GPU.
+"""Count registers, spills, memory and instructions of kernels from GPUs' compilers, without a GPU.
 
     python tools/gpu/gpu_static.py [--shapes 1x64] [--targets sm_89,gfx1100] [--stems blend,...] [--loops] [--json]
     python tools/gpu/gpu_static.py --check
     python tools/gpu/gpu_static.py --page
     python tools/gpu/gpu_static.py --intel [--shapes 1x64] [--stems blend,...]
 
-The kernels are those of a training step, with the defines that the package gives them (`gpu_variants.py`). clang 19
-makes NVIDIA's and AMD's assembly of them; NVIDIA's is assembled by ptxas, of a package that pip fetches once into the
-cache folder. Division and sqrt are rounded correctly.
+The kernels are those of a training step, with clsplat's defines (`gpu_variants.py`). clang 19 compiles them to
+NVIDIA's and AMD's assembly. ptxas assembles NVIDIA's; pip downloads it once into the cache folder. Division and sqrt
+are rounded correctly.
 
-Instructions for a pair of a tile and a Gaussian are those of all waves of a group, from its loops (`gpu_rules.py`).
---intel has a table of Intel's own compiler, which says less (`gpu_intel.py`). --page writes docs/gpu-static.md, with
-the times that `gpu_model.py` predicts; --check holds the ceilings below, the page's goals, and the page against what it
-would be now. Exit status 0: as expected, 1: a ceiling is broken or a goal is missed, the page is of older kernels, a
-loop or a rule is without the other, or a compiler refuses a kernel, 2: a compiler is missing.
+Instructions per (tile, Gaussian) pair are those of all waves of a group, from its loops (`gpu_rules.py`). --intel
+prints a table from Intel's compiler, which reports less (`gpu_intel.py`). --page writes docs/gpu-static.md, with the
+times that `gpu_model.py` predicts. --check tests the ceilings below and the page's goals, and compares the page with
+current kernels. The exit status is 0 if all is as expected, 2 if a compiler is missing, and 1 if a ceiling is exceeded,
+a goal is missed, the page is out of date, a loop or rule lacks the other, or a compiler refuses a kernel.
 """
 
 from __future__ import annotations
@@ -50,24 +50,24 @@ from clsplat.progress import aligned
 
 SHAPES = ("1x32", "1x64", "1x128", "1x256")
 FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
-"""Shapes with another form of blending's gradient alone."""
+"""Shapes that differ only in the form of blending's gradient."""
 FRAMES = Path(__file__).with_name("gpu_frames.json")
 CHECKED = (("1x64", "1x32g"), ("sm_89", "gfx1100"))
-"""Shapes and targets of which the ceilings are held."""
+"""Shapes and targets that have ceilings."""
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
-"""Kernel files of which nothing may lie in stack memory or be spilled, on sm_89."""
+"""Kernel files that must use no stack memory and no spills on sm_89."""
 NO_SCRATCH = ("blend", "blend_grad")
-"""The same on gfx1100."""
+"""Kernel files that must use no stack memory and no spills on gfx1100."""
 MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
-"""Instructions of a warp for a pair, at most, on sm_89."""
+"""Maximum number of a warp's instructions per pair, on sm_89."""
 MOST_BY_GAUSSIAN = 500
-"""The same of blend_grad by Gaussian."""
+"""Maximum number of a warp's instructions per pair on sm_89, for blend_grad with a Gaussian per item."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A kernel of a file, for a target and shape. pair: instructions for a pair by class, or None where it is not
-    counted so; rules: those that its loops have; unknown: the reason, where there is no rule for one."""
+    """A kernel for a target and shape. pair: instructions per pair by class, or None if it has no pairs. rules: the
+    rules of its loops. unknown: the reason if a loop has no rule."""
 
     source: Source
     built: Built
@@ -79,11 +79,11 @@ class Row:
 
     @property
     def a_pair(self) -> float | None:
-        """Instructions for a pair."""
+        """Number of instructions per pair."""
         return None if self.pair is None else sum(self.pair.values())
 
     def told(self) -> dict[str, Any]:
-        """For JSON."""
+        """The row as a dict for JSON."""
         built = self.built
         loops = [
             {"depth": depth, "loop": title, "instructions": dict(counts)}
@@ -107,11 +107,11 @@ class Row:
 
 
 _COMPILED: dict[tuple[Source, str], list[Built]] = {}
-"""The kernels of this process, by `Source.used` and target."""
+"""Cache of compiled kernels, keyed by `Source.used` and target."""
 
 
 def sources_of(launches: Iterable[Mapping[str, Any]]) -> dict[Source, dict[str, tuple[int, int]]]:
-    """The kernel files of launches, and of each kernel the items of a group and the shared memory that it is given."""
+    """The kernel files of launches, and for each kernel the items per group and the shared memory from the host."""
     found: dict[Source, dict[str, tuple[int, int]]] = {}
     for launch in launches:
         if "stem" in launch:
@@ -130,7 +130,7 @@ def compiled(
     jobs: int,
     say: Callable[[str], None],
 ) -> list[Row]:
-    """The rows of every source for every target. Raises ClsplatError."""
+    """The rows of all sources for all targets. Raises ClsplatError."""
     clang()
     if any(target.startswith("sm_") for target in targets):
         nvidia("ptxas")
@@ -151,7 +151,7 @@ def compiled(
 
 
 def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
-    """The row of a kernel; launch: items of a group and shared memory, if it is known to be launched."""
+    """The row of a kernel. launch: items per group and shared memory, if the kernel is launched."""
     items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
     pair, rules, unknown = None, frozenset[Rule](), ""
     if launch or built.kernel in BY_PAIR:
@@ -165,7 +165,7 @@ def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
 
 
 def table(rows: Sequence[Row]) -> list[str]:
-    """Text table of the rows; behind each the defines that are not the shape's."""
+    """Text table of the rows. The last column has the defines that do not come from the shape."""
     head = (
         "kernel",
         "shape",
@@ -190,7 +190,7 @@ def table(rows: Sequence[Row]) -> list[str]:
 
 
 def intel_lines(built: Sequence[IntelBuilt]) -> list[str]:
-    """Text table of what Intel's compiler says."""
+    """Text table of the reports of Intel's compiler."""
     lines: list[tuple[str, ...]] = [("kernel", "shape", "device", "items in step", "stack", "shared")]
     for each in built:
         numbers = (str(value) for value in (each.step, each.stack, each.shared))
@@ -199,7 +199,7 @@ def intel_lines(built: Sequence[IntelBuilt]) -> list[str]:
 
 
 def loops_of(rows: Sequence[Row]) -> list[str]:
-    """The loops of each row, as a tree."""
+    """Text with the loops of each row, as a tree."""
     lines = []
     for row in rows:
         lines.append(f"{row.source.label}: {row.built.kernel}, {row.source.shape}, {row.built.target}")
@@ -213,7 +213,7 @@ def loops_of(rows: Sequence[Row]) -> list[str]:
 
 
 def broken(rows: Sequence[Row]) -> list[str]:
-    """The ceilings that are broken, in words."""
+    """Descriptions of exceeded ceilings."""
     found = []
     for row in rows:
         built, stem = row.built, row.source.stem
@@ -288,7 +288,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
-    """Print the rows that have ceilings, and what is broken, missed or stale."""
+    """Print the rows that have ceilings, exceeded ceilings, missed goals and outdated tables."""
     rows, predictions = counted(frames, jobs)
     shapes, targets = CHECKED
     held = [row for row in rows if row.source.shape in shapes and row.built.target in targets]
@@ -301,7 +301,7 @@ def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
 
 
 def make_page(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
-    """Count and predict everything, and write the page; without ocloc, Intel's table stays as it is."""
+    """Count and predict everything, and write the page. Without ocloc, Intel's table is unchanged."""
     rows, predictions = counted(frames, jobs)
     sources = dict.fromkeys(row.source for row in rows if row.source.stem in NO_STACK and not row.source.by_gaussian)
     intel = compiled_for_intel(list(sources), jobs, note) if ocloc() else []
@@ -337,7 +337,7 @@ def counted(frames: Sequence[Mapping[str, Any]], jobs: int) -> tuple[list[Row], 
 
 
 def note_of(shape: str, text: str) -> None:
-    """Say where the work on a shape is."""
+    """Print the progress of the work on a shape."""
     note(f"{shape}: {text}")
 
 

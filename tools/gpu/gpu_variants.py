@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Launches of kernels as the package itself asks for them, noted in a child process for `gpu_static.py`.
+"""Record the kernel launches of clsplat in a child process, for `gpu_static.py`.
 
-    gpu_variants.py LANESxITEMS FRAME...    a training step of frames of these counts, in JSON, or a picture alone
+    gpu_variants.py LANESxITEMS FRAME...    a training step, or only a picture, of frames with these counts, in JSON
 
-A step is not made: nothing is built, put on a queue or kept in memory, and the numbers that it reads back are the
-frame's. What the kernels would have been given is noted all the same.
+The step is simulated: nothing is compiled, queued or allocated, and the numbers that it reads back are the frame's.
+Only the kernels' launches and arguments are recorded.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import COUNTED, READBACK
 
 MEMORY = 64 << 30
-"""Bytes of the device that is made believe: a step's arrays are whole."""
+"""Bytes of memory of the simulated device: enough to allocate a step's arrays whole."""
 OPTIONS = "-cl-std=CL1.2 -cl-fp32-correctly-rounded-divide-sqrt"
-"""Options of a build: NVIDIA's and AMD's drivers say that they can divide and take roots with correct rounding."""
+"""Options of a build. NVIDIA's and AMD's drivers support correctly rounded division and square roots."""
 
 
 SUBGROUPS = {"SUBGROUP": 32, "SHUFFLE_PTX": True}
-"""Defines of a shape with sub-groups; what compiles them puts in the target's way to exchange values."""
+"""Defines of a shape with sub-groups. `gpu_compilers.py` adds the target's functions for exchanging values."""
 
 
 def noted(variant: Variant) -> dict[str, Any]:
-    """A variant for JSON: stem and options."""
+    """A build variant for JSON: stem and options."""
     return {"stem": variant.stem, "options": list(variant.options)}
 
 
 class _Buffer:
-    """Stands for a buffer; it has a size alone."""
+    """Replaces a buffer. It has only a size."""
 
     def __init__(self, context: object, flags: object, size: int) -> None:
         del context, flags
@@ -62,7 +62,7 @@ class _Buffer:
 
 
 class _Kernel:
-    """Stands for a kernel: its variant and name."""
+    """Replaces a kernel: its variant and name."""
 
     def __init__(self, variant: Variant, name: str) -> None:
         self.variant, self.name = variant, name
@@ -78,7 +78,7 @@ class _Kernel:
 
 
 class _Kernels:
-    """Stands for the kernels of a file."""
+    """Replaces the kernels of a file."""
 
     def __init__(self, variant: Variant) -> None:
         self.variant = variant
@@ -91,14 +91,14 @@ class _Kernels:
 
 
 class Rehearsed:
-    """The launches of a step that is not made."""
+    """Records the launches of a simulated step."""
 
     def __init__(self, frame: Mapping[str, Any]) -> None:
         self.frame = frame
         self.launches: list[dict[str, Any]] = []
 
     def install(self) -> None:
-        """Put the stand-ins in the place of the driver."""
+        """Replace the driver's classes."""
         rehearsed = self
 
         def built(device: Device, stem: str, defines: Mapping[str, object]) -> _Kernels:
@@ -149,15 +149,15 @@ class Rehearsed:
         DeviceArray.fill = lambda array, value: note(array, "fill")  # type: ignore[assignment,method-assign]
 
     def counted(self) -> list[int]:
-        """The numbers that a forward pass reads back."""
+        """The numbers of the frame that a forward pass would read back."""
         least = 0x3F800000
         largest = least + (1 << self.frame["key_bits"]) - 1
         return [self.frame["visible"], self.frame["listed"], 2**32 - 1 - least, largest]
 
 
 def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The launches of a training step of this frame, or with `picture` of its forward pass, copies among them, each
-    with its stage and bytes."""
+    """The launches and copies of a training step of this frame, or of its forward pass if it has `picture`, each with
+    its stage and bytes."""
     rehearsed = Rehearsed(frame)
     rehearsed.install()
     device = Device(all_devices()[0], shape).with_memory_limit(MEMORY)
@@ -169,13 +169,13 @@ def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
     gaussians = Gaussians(means, quaternions, sizes, logits, sh)
     photograph = np.zeros((height, width, 3), np.uint8)
     trainer = trainer_of(Subject("rehearsed", gaussians, camera, photograph), device, RasterizerConfig())
-    trainer.pending.on = False  # launches of as many items as have work, for bytes and times
+    trainer.pending.on = False  # launches then have exactly the items with work, for bytes and times
 
     def forward() -> None:
         trainer.rasterizer.forward(trainer.parameters, camera, np.zeros(3, np.float32), backward=False)
 
     work = forward if frame.get("picture") else trainer.train_step
-    work()  # the first makes what later ones find
+    work()  # the first call fills caches
     rehearsed.launches.clear()
     device.recorder.on = trainer.device.recorder.on = True
     work()
@@ -184,7 +184,7 @@ def step(shape: Shape, frame: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def main(arguments: list[str]) -> int:
-    """Print what the arguments ask for."""
+    """Print the launches of the frames in the arguments."""
     shape = Shape(1, 1, chunks=64).relabelled(arguments[0])
     print(json.dumps([step(shape, json.loads(frame)) for frame in arguments[1:]]))
     return 0

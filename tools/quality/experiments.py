@@ -55,16 +55,16 @@ from clsplat.training.held_out_alignment import aligned
 from clsplat.training.trainer import Trainer
 
 Rows = Generator[tuple[object, ...] | str, None, int | None]
-"""Rows of tables, of which the first of each is its head, and lines of text between; then the exit status."""
+"""Yields rows of tables, the first row of each being its head, and lines of text. Returns the exit status."""
 
 POINTS = {"scene": (1000, 40_000), "turntable": (1000, 20_000), "poses": (5000, 5000)}
-"""Sparse and dense points of the ray caster's scenes; sparse ones are as many as structure from motion finds."""
+"""Numbers of sparse and dense points in synthetic scenes. Structure from motion finds about the sparse number."""
 PHOTOS = 40
-"""Photographs of the ray caster's scenes and of an RGB-D sequence."""
+"""Number of photographs of a synthetic scene, and of an RGB-D sequence."""
 WIDTH = 120
-"""Pixels of their pictures, across."""
+"""Width of these photographs in pixels."""
 LEAST = 2500
-"""Steps of trainings from dense points or known depths."""
+"""Number of steps of trainings from dense points or known depths."""
 STEPS = (250, 500, 1000, 1500, 2000, 2500, 5000)
 """Steps at which held-out pictures are measured in between."""
 OFF_DEGREES, OFF_PERCENT = 0.5, 1.0
@@ -75,9 +75,9 @@ EXPOSED = (
     ("clean, learnt", False, True),
     ("gains, learnt", True, True),
 )
-"""Rows of the experiment with exposures: whether gains are on the photographs, and whether appearance is learnt."""
+"""Rows of the exposure experiment: name, True if gains change the photographs, True if appearance is learnt."""
 UNITS = (*((factor, 0.0) for factor in (1.0, 1e-7, 1e-4, 1e4, 1e7)), (1.0, 1e6))
-"""Factors on a scene's world, and what it is moved by."""
+"""Factors by which a scene's world is scaled, and distances by which it is moved."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Trained:
 
     @property
     def model(self) -> Gaussians:
-        """The model as its file has it."""
+        """The model, read from its file."""
         return Gaussians.load(self.run / "model.ply")
 
     @property
@@ -97,14 +97,14 @@ class Trained:
         return _json(self.run / "eval.json")
 
     def psnr_by_step(self) -> dict[int, float]:
-        """Mean PSNR of the held-out views, dB, by step."""
+        """Mean PSNR of the held-out views in dB, keyed by step."""
         lines = map(json.loads, (self.run / "metrics.jsonl").read_text("utf-8").splitlines())
         psnr = {line["step"]: line["eval"]["mean"]["psnr"] for line in lines if "eval" in line}
         return psnr | {self.last["step"]: self.last["mean"]["psnr"]}
 
     @property
     def appearance(self) -> dict[str, dict[str, list[float]]]:
-        """Learnt appearance of each photograph, by name."""
+        """Learnt appearance of each photograph, keyed by name."""
         photographs: dict[str, dict[str, list[float]]] = _json(self.run / "appearance.json")["photographs"]
         return photographs
 
@@ -115,7 +115,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def words_of(settings: str, **usual: object) -> list[str]:
-    """Words of `clsplat train` for settings `name=value,...`, which take precedence over the usual ones."""
+    """Arguments of `clsplat train` for settings `name=value,...`, which take precedence over the usual settings."""
     values = {name: str(value) for name, value in usual.items() if value is not None}
     for setting in filter(None, settings.split(",")):
         name, value = setting.split("=", 1)
@@ -127,11 +127,11 @@ def words_of(settings: str, **usual: object) -> list[str]:
 def trained(
     given: Namespace, name: str, scene: Path | Scene, *words: str, settings: str = "", **usual: object
 ) -> Trained:
-    """Train a row, or continue an interrupted training of it; a finished run is used as it is.
+    """Train a row, or continue its interrupted training. A finished run is not repeated.
 
-    scene: a folder, or a scene that `clsplat train` gets in place of a folder's contents.
-    settings, usual: settings that take precedence over each other in that order, beside iterations, resolution and
-    seed; then those of --with.
+    scene: a folder, or a scene that `clsplat train` gets instead of a folder's contents.
+    settings, usual: settings in addition to iterations, resolution and seed. `settings` take precedence over `usual`,
+    and these over the settings of --with.
     """
     settings = settings or getattr(given, "settings", "")
     usual = {
@@ -147,7 +147,7 @@ def trained(
     if not (run / "eval.json").is_file():
         more = ["--resume"] if (run / "config.toml").is_file() else every
         services = Services() if isinstance(scene, Path) else Services(load_scene=lambda *_, **__: scene)
-        with redirect_stdout(sys.stderr):  # where the table is not
+        with redirect_stdout(sys.stderr):  # standard output is for the table
             status = clsplat(["train", str(folder), "-o", str(run), "--no-report", *more], services)
         if status:
             raise SystemExit(status)
@@ -155,24 +155,24 @@ def trained(
 
 
 def picture_of(renderer: Renderer, model: Gaussians, view: View) -> Image:
-    """A view of a model."""
+    """The picture of a model from a view."""
     return renderer.render(model, view.camera).image
 
 
 def psnr_of(draw: Callable[[View], Image], views: Sequence[View], background: ArrayLike = (0, 0, 0)) -> float:
-    """Mean PSNR of drawn views, dB."""
+    """Mean PSNR of rendered views in dB."""
     mean = evaluate(draw, views, background, model=EvaluatedModel(None, 0, None))["mean"]
     return float(mean["psnr"])
 
 
 def masks(given: Namespace) -> Rows:
-    """A block that moves over a COLMAP scene's photographs, masked and not, and a cut-out on a turntable.
+    """Photographs with a moving block, with and without masks, and a cut-out object on a turntable.
 
-    A block of patterned pixels covers a twelfth of each photograph to train on, elsewhere in each, and masks cover the
-    block. Status 1 where models under masks have other bytes when the block has other pixels. The held-out photographs
-    have no block. The turntable is the demo's still life without its floor and wall, photographs with alpha, trained
-    over black; alpha is of the renders where the held-out photographs are transparent. block.png and turntable.png have
-    photographs and renders side by side.
+    A block of patterned pixels covers a twelfth of each training photograph of a COLMAP scene, in another place each
+    time, and masks cover the block. The status is 1 if a model trained with masks depends on the block's pixels. The
+    held-out photographs have no block. The turntable is the demo's still life without floor and wall: photographs with
+    alpha, trained over black. The column alpha is the render's alpha where held-out photographs are transparent.
+    block.png and turntable.png show photographs and renders side by side.
     """
     path, renderer = given.scenes[0].resolve(), Renderer(open_device())
     blocks = [with_block(path, given.folder / f"{path.name}-block-{seed}", seed) for seed in (1, 2)]
@@ -214,15 +214,15 @@ def masks(given: Namespace) -> Rows:
 
 
 def exposure(given: Namespace) -> Rows:
-    """Photographs whose exposure changes against the same photographs as they were, with and without --appearance.
+    """Photographs with changing exposure against the original photographs, with and without --appearance.
 
-    The photographs are written at that resolution as float EXR, once as they are and once times 2^U(-1, 1), so that
-    nothing clips. --mixes has their channels mixed too, each by up to so much of each other, and --corners a lens that
-    leaves 2^-CORNERS of the light there. All models are measured against the held-out photographs as they are, and
-    after the affine map of colours that fits them best. Gains that were learnt are compared with those put on, but for
-    a common factor: largest and mean error; then but for those learnt of the photographs as they are too, whose
-    exposure may change as well. Further lines have the errors of mixes (rms, but for their mean and for those learnt of
-    the photographs as they are) and of the light at the corners, for --appearance ppisp.
+    The photographs are written at the training resolution as float EXR, once unchanged and once multiplied by 2^U(-1,
+    1), so that nothing clips. --mixes also mixes their channels, by up to this fraction, and --corners adds a lens that
+    transmits 2^-CORNERS of the light in the corners. All models are compared with the unchanged held-out photographs,
+    directly and after the affine map of colours that fits best. The table has the largest and mean error of the learnt
+    gains up to a common factor. A second pair of errors is relative to the gains learnt from the unchanged photographs,
+    whose exposure may vary too. For --appearance ppisp there are also the rms errors of mixes, without their mean and
+    relative to those of the unchanged photographs, and the errors of the light in the corners.
     """
     clean = load_scene(given.scenes[0], resolution=given.resolution)
     renderer, rng = Renderer(open_device()), np.random.default_rng(given.seed)
@@ -258,7 +258,7 @@ def _gains(photographs: Mapping[str, Mapping[str, list[float]]]) -> dict[str, li
 
 
 def gain_errors(learnt: Mapping[str, list[float]], wanted: Mapping[str, list[float]]) -> str:
-    """Largest and mean relative error of the gains that were learnt, both as logs, but for a common factor."""
+    """Largest and mean relative error of the learnt gains, up to a common factor. Arguments are logs."""
     apart = np.array([np.subtract(learnt[name], wanted[name]) for name in learnt])
     wrong = np.abs(2.0 ** (apart - apart.mean(axis=0)) - 1)
     return f"{wrong.max():.1%} / {wrong.mean():.1%}"
@@ -267,9 +267,9 @@ def gain_errors(learnt: Mapping[str, list[float]], wanted: Mapping[str, list[flo
 def colour_errors(
     learnt: Mapping[str, Any], own: Mapping[str, Any], mixes: Mapping[str, Any], corners: float, *, put: bool
 ) -> tuple[str, ...]:
-    """Cells of the errors of mixes and of the light at the corners.
+    """Table cells with the errors of the mixes and of the light in the corners.
 
-    own: learnt of the photographs as they are, or nothing.
+    own: the appearance learnt from the unchanged photographs, or nothing.
     """
     apart = np.array([np.subtract(logs["mixes"], mixes[name] * put) for name, logs in learnt.items()])
     if own:
@@ -284,13 +284,13 @@ def colour_errors(
 
 
 def fisheye(given: Namespace) -> Rows:
-    """A fisheye capture of 190 degrees against pinhole photographs of the same scene, each trained as it is.
+    """A fisheye capture of 190 degrees against pinhole photographs of the same scene.
 
-    Both captures are made by the demo's ray caster from the same places: one through Kannala and Brandt's lens, one
-    through a pinhole with as many pixels a radian on the axis. What lies around the fisheye's circle is masked, as in
-    any capture. Both models are measured on the same held-out pinhole pictures, each drawn as its file says, that of
-    fisheyes along rays; then on the inner and the outer half of their pixels. views.png has truth, the fisheye's model,
-    the pinhole's, and the fisheye's own held-out picture.
+    The demo's ray caster makes both captures from the same places: one with Kannala and Brandt's lens, one with a
+    pinhole that has as many pixels per radian on the axis. Masks hide the pixels around the fisheye's circle. Both
+    models are measured on the same held-out pinhole pictures, and on the inner and outer half of their pixels. The
+    fisheye's model is rendered along rays, as its file says. views.png shows the true picture, both models' renders,
+    and the fisheye's own held-out picture.
     """
     surfaces, renderer = baked(given.seed), Renderer(open_device())
     pinholes = cameras(PHOTOS, WIDTH, WIDTH * 3 // 4, given.seed)
@@ -326,12 +326,12 @@ def fisheye(given: Namespace) -> Rows:
 
 
 def points(given: Namespace) -> Rows:
-    """Dense points and known depths against sparse points: in how many steps they reach what sparse ones do in many.
+    """Dense points and known depths against sparse points: how many steps they need for the same PSNR.
 
     The scene is the demo's, whose ray caster knows every depth, or an RGB-D sequence: a folder of frame-N.color.jpg,
-    .depth.png (16 bit, mm) and .pose.txt, with camera-intrinsics.txt beside. Sparse points are drawn at random from the
-    dense ones. Trained are sparse points with --iterations steps, dense ones with fewer, sparse ones with depth maps,
-    and dense ones with depth maps. The table has PSNR by step.
+    .depth.png (16 bit, mm) and .pose.txt, with camera-intrinsics.txt. Sparse points are drawn at random from the dense
+    points. The trainings start from sparse points with --iterations steps, and with fewer steps from dense points, from
+    sparse points with depth maps, and from dense points with depth maps. The table has PSNR by step.
     """
     made = rgbd(given.scenes[0], WIDTH, PHOTOS) if given.scenes else demo(WIDTH, PHOTOS, given.seed)
     name = f"{given.scenes[0].name if given.scenes else 'scene'}-{given.seed}"
@@ -358,7 +358,7 @@ def points(given: Namespace) -> Rows:
 
 
 def colours(given: Namespace) -> Rows:
-    """Points without colours against the same with them: PSNR by step of COLMAP scenes that are trained from both."""
+    """Points without colours against the same points with colours: PSNR by step in COLMAP scenes."""
     early = [step for step in (300, 1000) if step < given.iterations]
     yield "scene", "points", *early, given.iterations
     for path in given.scenes:
@@ -370,13 +370,13 @@ def colours(given: Namespace) -> Rows:
 
 
 def poses(given: Namespace) -> Rows:
-    """Disturbed poses or lenses, and how far training brings them back (--refine-poses, --refine-lenses).
+    """Disturbed poses or lenses, and how well training corrects them (--refine-poses, --refine-lenses).
 
-    The scene is the demo's, whose poses are exact, or another at --width. All training poses but the two that are held
-    are turned about random axes and shifted. Trained are the scene as it is, the disturbed one, and that with its poses
-    refined. The table has mean errors of the disturbed poses, and PSNR on held-out views, with their own poses and with
-    those that fit the model best. With --lens poses stay, and focal length and principal point, across, are off by so
-    many hundredths of the focal length, which the run can refine by 2.5 times that.
+    The scene is the demo's, whose poses are exact, or another at --width. All training poses except the two fixed ones
+    are turned about random axes and shifted. There are three trainings: the original scene, the disturbed scene, and
+    the disturbed scene with refined poses. The table has mean errors of the disturbed poses, and PSNR on held-out
+    views, with their own poses and with the poses that fit the model best. --lens instead disturbs focal length and
+    horizontal principal point by so many hundredths of the focal length; the run can refine them by 2.5 times as much.
     """
     if given.scenes:
         scene = load_scene(given.scenes[0], resolution=given.width)
@@ -410,7 +410,7 @@ def poses(given: Namespace) -> Rows:
 
 
 def pose_psnr(trainer: Trainer, config: TrainConfig, scene: Scene) -> tuple[float, float]:
-    """Mean PSNR of the held-out views, dB, with their own poses and with those that fit the model best."""
+    """Mean PSNR of the held-out views in dB, with their own poses and with the poses that fit the model best."""
     background, renderer = background_colour(config.background), Renderer(trainer.device, config=config.rasterizer)
     views = trainer.cameras.lenses.of_views(scene.test_views)
 
@@ -424,7 +424,7 @@ def pose_psnr(trainer: Trainer, config: TrainConfig, scene: Scene) -> tuple[floa
 
 
 def pose_errors(learnt: list[Camera], true: list[Camera]) -> tuple[float, float]:
-    """Mean degrees and world units by which poses that were disturbed are off; two are not."""
+    """Mean error of the disturbed poses, in degrees and world units. Two poses are not disturbed."""
     cosines = [(np.trace(a.rotation @ b.rotation.T) - 1) / 2 for a, b in zip(learnt, true, strict=True)]
     shifts = [np.linalg.norm(a.position - b.position) for a, b in zip(learnt, true, strict=True)]
     count = len(true) - 2
@@ -432,10 +432,10 @@ def pose_errors(learnt: list[Camera], true: list[Camera]) -> tuple[float, float]
 
 
 def views(given: Namespace) -> Rows:
-    """Training on few photographs: PSNR of the held-out views against their number, for several settings.
+    """Training on few photographs: PSNR of the held-out views by number of photographs, for several settings.
 
-    The photographs are picked evenly from the training views by name, so that they are the same each time; the points
-    are those of the whole scene. Each --try is a row of the table beside that of the defaults.
+    The photographs are picked evenly from the training views by name, the same ones each time. The points are those of
+    the whole scene. The table has a row for the defaults, and one for each --try.
     """
     methods = {"as ever": "", **dict(one.split(":", 1) for one in given.tried)}
     scene = load_scene(given.scenes[0], resolution=given.resolution)
@@ -451,7 +451,7 @@ def views(given: Namespace) -> Rows:
 
 
 def seeds(given: Namespace) -> Rows:
-    """Held-out PSNR of scenes that are trained from several seeds, to be compared before and after a change."""
+    """Held-out PSNR of scenes trained with several seeds, to compare the code before and after a change."""
     yield "scene", "PSNR, dB", "of the seeds", "Gaussians"
     for path in given.scenes:
         rows = [trained(given, path.name, path, seed=seed).last for seed in given.seeds]
@@ -462,9 +462,9 @@ def seeds(given: Namespace) -> Rows:
 
 
 def units(given: Namespace) -> Rows:
-    """A scene in many units, and moved: each is trained alike, written, read back and rendered.
+    """A scene in various units, or moved: each is trained in the same way, written, read back and rendered.
 
-    Status 1 where PSNR is off that of the scene's own units by more than --bound.
+    The status is 1 if PSNR differs by more than --bound from that in the scene's own units.
     """
     scene, renderer = load_scene(given.scenes[0], resolution=given.resolution), Renderer(open_device())
     yield "times", "moved by", "extent", "near plane", "Gaussians", "PSNR, dB", "beside its own units"
@@ -481,14 +481,14 @@ def units(given: Namespace) -> Rows:
 
 
 def numbers(text: str) -> list[int]:
-    """Whole numbers with commas between."""
+    """Parse whole numbers separated by commas."""
     return [int(number) for number in text.split(",")]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment: what yields its rows, how many scenes it takes (as argparse's nargs, 0 for none), its usual number
-    of steps, and its options beside those of all, as argparse has them."""
+    """An experiment: the function that yields its rows, its number of scenes (as argparse's nargs, 0 for none), its
+    default number of steps, and its additional options for argparse."""
 
     rows: Callable[[Namespace], Rows]
     scenes: int | str
@@ -520,4 +520,4 @@ EXPERIMENTS = {
     "seeds": Experiment(seeds, "+", 2000, {**RESOLUTION, **WITH, **SEEDS}),
     "units": Experiment(units, 1, 300, {**RESOLUTION, "--bound": _number(0.3, "dB")}),
 }
-"""The experiments by name."""
+"""The experiments, keyed by name."""

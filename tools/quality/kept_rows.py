@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finished trainings of `tables.py` in a file that is committed, so that its tables are made over several days
-and machines."""
+"""A committed file of finished trainings, so that `tables.py` can make its tables over several days and machines."""
 
 from __future__ import annotations
 
@@ -21,16 +20,16 @@ from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_write
 
 CODE = ("kernels", "clsplat/config", "clsplat/device", "clsplat/rendering", "clsplat/stages", "clsplat/training")
-"""Folders whose code a row's bytes are taken to depend on."""
+"""Folders with the code on which a row's results are assumed to depend."""
 ONLY_MCMC = "clsplat/training/density/mcmc.py"
-"""Left out for rows of other growths, which run nothing of it."""
+"""Excluded for rows of other growths, which do not run it."""
 COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished training. settings: what was given beside steps, resolution and seed; code: `code_digest`; seconds
-    are of that device, beside whatever else it did; sizes: PSNR by size of the pictures."""
+    """A finished training. settings: arguments other than steps, resolution and seed. code: `code_digest`. seconds:
+    time on that device, whatever its other load. sizes: PSNR for each size of the pictures."""
 
     table: str
     row: str
@@ -50,13 +49,13 @@ class Finished:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """Equal for trainings of the same name, settings and code, whatever the device."""
+        """A key that is equal for trainings of the same name, settings and code on any device."""
         return (self.table, self.row, self.seed, self.settings, self.iterations, self.resolution, self.code)
 
 
 @dataclass(frozen=True)
 class Same:
-    """A statement by a person that two digests of code give the same bytes, and how that was found."""
+    """A person's statement that the code of two digests gives the same bytes, and how that was verified."""
 
     code: str
     was: str
@@ -65,31 +64,31 @@ class Same:
 
 @dataclass(frozen=True)
 class Kept:
-    """The file: {"same": [...], "rows": [...]}, a line for each, in order, so that what two machines add can be
-    merged."""
+    """The file: {"same": [...], "rows": [...]}. Each entry is a line, and lines are sorted, so that additions from two
+    machines can be merged."""
 
     path: Path
 
     def find(self, wanted: Finished) -> Finished | None:
-        """The finished training with this key, or with one whose code is said to be the same."""
+        """The finished training with this key, or with a code that is stated to be the same; else None."""
         rows, same = self._read()
         codes = {wanted.code}
-        for _ in same:  # one of the same as another of the same
+        for _ in same:  # follows chains of statements
             codes |= {each.was for each in same if each.code in codes}
         found = [row for row in rows if row.code in codes and row.key[:-1] == wanted.key[:-1]]
         return min(found, key=lambda row: (row.code != wanted.code, row.date)) if found else None
 
     def has(self, code: str, *, mcmc: bool) -> bool:
-        """True if a row, of growth mcmc or of another, is of this code."""
+        """True if there is a row with this code, of growth mcmc or of other growths."""
         return any(row.code == code and ("mcmc" in row.settings) == mcmc for row in self._read()[0])
 
     def add(self, row: Finished) -> None:
-        """Write the file with one more, in place of one of the same key."""
+        """Add a row to the file. It replaces a row with the same key."""
         rows, same = self._read()
         self._write([*(other for other in rows if other.key != row.key), row], same)
 
     def say_same(self, statement: Same) -> None:
-        """Write the file with one more statement."""
+        """Add a statement to the file."""
         rows, same = self._read()
         self._write(rows, [*(other for other in same if other != statement), statement])
 
@@ -115,8 +114,8 @@ class Kept:
 
 @cache
 def code_digest(root: Path, *, mcmc: bool) -> str:
-    """Digest of the code that a row runs, of the folders CODE without comments, docstrings and empty lines. What is
-    equal gives the same bytes on one device; what differs may give them too."""
+    """Digest of the code in the folders CODE, without comments, docstrings and empty lines. Equal digests give the same
+    bytes on one device. Different digests may give the same bytes too."""
     digest = hashlib.blake2b(digest_size=8)
     for folder in CODE:
         for path in sorted((root / folder).rglob("*")):
@@ -132,8 +131,8 @@ def _bare(path: Path) -> str:
 
 
 def bare_python(text: str) -> str:
-    """Python's text without comments, docstrings and empty lines. It is the same in every version of Python, which
-    what `ast.unparse` makes is not."""
+    """Source text without comments, docstrings and empty lines. Unlike the result of `ast.unparse`, it is the same in
+    every version of Python."""
     lines = [f"{line}\n" for line in text.split("\n")]
     starts = list(accumulate(map(len, lines), initial=0))
     spans = []

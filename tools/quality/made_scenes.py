@@ -36,11 +36,11 @@ from clsplat.scenes.scene import Scene, View
 from clsplat.training.cameras.poses import Poses
 
 FARTHEST = 6.0
-"""Largest depth of an RGB-D camera that is used, metres."""
+"""Largest depth of an RGB-D camera that is used, in metres."""
 ROUNDS = 3
-"""How many times the block crosses the picture in the course of the photographs."""
+"""How many times the block crosses the picture from the first photograph to the last."""
 RADIAL = (0.03, -0.012, 0.003, -0.0004)
-"""Distortion of the fisheye by a few pixels."""
+"""Distortion coefficients of the fisheye, which move points by a few pixels."""
 ANGLE = np.deg2rad(190)
 """Angle of view of the fisheye."""
 FISHEYE_POINTS = 4000
@@ -50,7 +50,7 @@ Capture = tuple[list[Camera], list[Float32], list[Float32]]
 
 
 def baked(seed: int) -> list[Surface]:
-    """The demo's surfaces with their light."""
+    """The demo's surfaces, with lighting."""
     surfaces = still_life()
     bake(surfaces, seed)
     return surfaces
@@ -109,7 +109,7 @@ def rgbd(folder: Path, width: int, photos: int) -> Capture:
 
 
 def cut_out(surfaces: list[Surface], camera: Camera) -> Float32:
-    """The ray caster's picture (H, W, 4) of the surfaces alone, with straight alpha, four rays a pixel."""
+    """The ray caster's picture (H, W, 4) of only these surfaces, with straight alpha and four rays per pixel."""
     fine = camera.resized(2 * camera.width, 2 * camera.height)
     hit = (depth_of(surfaces, fine) > 0).astype(np.float32)[:, :, None]
     both = np.concatenate([render(surfaces, fine, samples=1) * hit, hit], axis=2)
@@ -117,7 +117,7 @@ def cut_out(surfaces: list[Surface], camera: Camera) -> Float32:
 
 
 def turntable(photos: int, seed: int) -> Capture:
-    """The still life's things, cut out of their surroundings."""
+    """A scene of the still life's objects, cut out of their surroundings."""
     things = [surface for surface in baked(seed) if not isinstance(surface, Floor | Wall)]
     views = cameras(photos, 160, 120, seed)
     with ThreadPoolExecutor(2) as pool:
@@ -126,8 +126,8 @@ def turntable(photos: int, seed: int) -> Capture:
 
 
 def write_transforms(folder: Path, capture: Capture, counts: tuple[int, int], seed: int) -> Path:
-    """Write nerfstudio's transforms.json with sparse.ply in it, and dense.ply: so many points, drawn at random from the
-    depths."""
+    """Write nerfstudio's transforms.json, which names sparse.ply, and dense.ply. The points are drawn at random from
+    the depths."""
     for name in ("images", "depths"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     frames: list[dict[str, Any]] = []
@@ -140,7 +140,7 @@ def write_transforms(folder: Path, capture: Capture, counts: tuple[int, int], se
         np.save(folder / "depths" / f"{index:03d}.npy", depth)
         files = {"file_path": f"images/{index:03d}.png", "depth_file_path": f"depths/{index:03d}.npy"}
         frames.append({**files, **lens, "transform_matrix": matrix.tolist()})
-        if index % TEST_EVERY:  # none of the points are of held-out pictures
+        if index % TEST_EVERY:  # held-out pictures contribute no points
             rows, columns = np.nonzero(depth)
             z = depth[rows, columns].astype(float)
             x, y = (columns + 0.5 - view.cx) / view.fx * z, (rows + 0.5 - view.cy) / view.fy * z
@@ -167,7 +167,7 @@ def write_ply(path: Path, points: Float64, colors: Float32) -> None:
 
 
 def fisheye_of(pinhole: Camera, side: int) -> Camera:
-    """The fisheye in the place of a pinhole, with a circle of 190 degrees as wide as its square picture."""
+    """The fisheye at a pinhole camera's pose. Its circle of 190 degrees is as wide as its square picture."""
     theta = ANGLE / 2
     reach = theta * (1 + sum(k * theta ** (2 * power) for power, k in enumerate(RADIAL, 1)))
     focal, middle = side / 2 / reach, side / 2
@@ -183,8 +183,8 @@ def circle(camera: Camera) -> NDArray[np.bool_]:
 
 
 def photograph(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Float32:
-    """The ray caster's picture of a camera of any projection, without gloss: samples^2 rays a pixel; black beyond 190
-    degrees."""
+    """The ray caster's picture of a camera of any projection, without gloss, with samples^2 rays per pixel; black
+    beyond 190 degrees."""
     fine = camera.resized(camera.width * samples, camera.height * samples)
     rays = np.nan_to_num(cam_from_pixel(fine, pixel_grid(fine))[1])
     shown = circle(fine).ravel() if camera.projection == "fisheye" else np.any(rays != 0, axis=1)
@@ -201,8 +201,8 @@ def photograph(surfaces: list[Surface], camera: Camera, samples: int = 2) -> Flo
 
 
 def write_colmap(folder: Path, surfaces: list[Surface], views: list[Camera]) -> Path:
-    """Write a COLMAP scene of the cameras' photographs, with points on the surfaces. Masks hide what lies around a
-    fisheye's circle."""
+    """Write a COLMAP scene of the cameras' photographs, with points on the surfaces. Masks hide the pixels
+    around a fisheye's circle."""
     one, fisheye = views[0], views[0].projection == "fisheye"
     for name in ("images", "masks") if fisheye else ("images",):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -235,7 +235,7 @@ def pattern(width: int, height: int, seed: int) -> Float32:
 
 
 def with_block(scene: Path, folder: Path, seed: int) -> Path:
-    """Write the COLMAP scene with a block on each photograph to train on, of pixels by the seed, and masks of it."""
+    """Write the COLMAP scene with a block on each training photograph, and masks of it. seed: of the block's pixels."""
     if not (scene / "sparse" / "0").is_dir():
         raise InputError(f"{scene / 'sparse' / '0'}: no such folder, expected a COLMAP scene")
     for name in ("images", "masks", "sparse/0"):
@@ -278,7 +278,7 @@ def without_colours(scene: Path, folder: Path) -> Path:
 
 
 def picked(scene: Scene, count: int) -> Scene:
-    """The scene with `count` of its training views, evenly by name, the first and the last among them."""
+    """The scene with `count` of its training views, evenly spaced by name, including the first and the last."""
     names = [view.name for view in scene.train_views]
     places = np.rint(np.linspace(0, len(names) - 1, min(count, len(names)))).astype(int)
     kept = {names[place] for place in places}
@@ -286,7 +286,7 @@ def picked(scene: Scene, count: int) -> Scene:
 
 
 def in_units(scene: Scene, factor: float, offset: Float64) -> Scene:
-    """The scene with its world times factor, and then moved by offset (3,)."""
+    """The scene with its world scaled by factor, and then moved by offset (3,)."""
 
     def moved(camera: Camera) -> Camera:
         return replace(camera, translation=factor * camera.translation - camera.rotation @ offset)
@@ -297,7 +297,7 @@ def in_units(scene: Scene, factor: float, offset: Float64) -> Scene:
 
 
 def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:
-    """The scene with its training poses turned and shifted by percent of the extent, but for the two that are held."""
+    """The scene with its training poses, except the two fixed ones, turned and shifted by percent of the extent."""
     rng = np.random.default_rng(seed)
     train = [view.name for view in scene.train_views]
     held = {train[index] for index in Poses(TrainConfig(refine_poses=True), scene.train_views, scene.extent).held}
@@ -313,7 +313,7 @@ def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:
 
 
 def refocused(scene: Scene, part: float) -> Scene:
-    """The scene with every focal length and principal point, across, off by this part of the focal length."""
+    """The scene with focal lengths and horizontal principal points changed by this fraction of the focal length."""
     change = (part, part, 0.0)
     views = [
         replace(view, camera=view.camera.refocused(*change), lens=view.lens.refocused(*change)) for view in scene.views
@@ -323,14 +323,14 @@ def refocused(scene: Scene, part: float) -> Scene:
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes of photographs: a gain each, mixes (6,) each, and octaves of light that their lens takes from corners."""
+    """Changes of photographs: a gain and mixes (6,) for each, and the octaves of light lost in corners."""
 
     gains: Float64
     mixes: Float64
     corners: float
 
     def on(self, place: int, view: View, pixels: Image) -> Image:
-        """The photograph number `place`, whose pixels are those of `view`."""
+        """The changed photograph number `place`, from the pixels of `view`."""
         changed: Image = pixels * np.float32(self.gains[place])
         if self.mixes.any():
             changed = changed @ np.linalg.inv(unmixing(self.mixes[place])).T
@@ -342,7 +342,7 @@ class Changes:
 
     @property
     def label(self) -> str:
-        """Part of a folder's name for changes beside gains."""
+        """Part of a folder's name that names the changes other than gains."""
         most = f"-mixes-{np.abs(self.mixes).max():.4f}" if self.mixes.any() else ""
         return most + (f"-corners-{self.corners:g}" if self.corners else "")
 
@@ -353,7 +353,7 @@ class Changes:
 
 
 def changed(scene: Scene, folder: Path, changes: Changes) -> Scene:
-    """The scene with changed photographs, which are EXR files of their working size."""
+    """The scene with changed photographs, written as EXR files in their working size."""
     folder.mkdir(parents=True, exist_ok=True)
     views: list[View] = []
     for view in scene.views:
@@ -362,11 +362,11 @@ def changed(scene: Scene, folder: Path, changes: Changes) -> Scene:
         path = folder / f"{len(views):04d}.exr"
         if not path.exists():
             write_image(path, changes.on(len(views), view, composite(view.load(), (0, 0, 0))))
-        lens = replace(view.lens, width=view.camera.width, height=view.camera.height)  # the file's size
+        lens = replace(view.lens, width=view.camera.width, height=view.camera.height)  # the size of the written file
         views.append(replace(view, path=path, lens=lens))
     return replace(scene, views=views)
 
 
 def write_strip(path: Path, pictures: Sequence[Float32], axis: int = 1) -> None:
-    """Write pictures side by side, or below each other."""
+    """Write several pictures as one file, side by side or below each other."""
     write_image(path, np.clip(np.concatenate(pictures, axis=axis), 0, 1).astype(np.float32))

@@ -5,9 +5,9 @@
     .venv/bin/python tools/quality/run.py NAME FOLDER [SCENE...] [--iterations N] [--seed N] [--help]
     .venv/bin/python tools/quality/run.py tables SCENES -o FOLDER [--help]
 
-NAME is masks, exposure, fisheye, points, colours, poses, views, seeds or units; `tables` makes every table of the page
-from them. FOLDER has the scenes that are made and the runs, which are not made again: a call goes on where an earlier
-one stopped. The tables are Markdown.
+NAME is masks, exposure, fisheye, points, colours, poses, views, seeds or units; `tables` makes all tables of the page.
+FOLDER gets the created scenes and the runs. They are reused, so that a call continues where an earlier one stopped. The
+tables are Markdown.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def parser_of(name: str) -> argparse.ArgumentParser:
 
 
 def show(rows: Rows) -> int:
-    """Print rows as they come, a head with the line below it; the status that they end with."""
+    """Print rows as they come, with a line below each head. Returns the experiment's status."""
     before = ""
     while True:
         try:
@@ -62,7 +62,7 @@ def show(rows: Rows) -> int:
 
 
 def main(words: list[str]) -> int:
-    """Make the rows of an experiment; 1 where it or the work fails, 2 for a call that makes no sense."""
+    """Run an experiment. Returns 1 if it fails, and 2 for invalid arguments."""
     name, *words = words or ["--help"]
     if name in ("-h", "--help"):
         print(__doc__)

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every table of docs/quality.md, from one command that can be interrupted, over several days and machines.
+"""Make all tables of docs/quality.md with one command, which may be interrupted, over several days and machines.
 
     tools/quality/run.py tables SCENES -o FOLDER [--only growth,antialiasing] [--rows 'fox *,bonsai mcmc*']
         [--seeds 2] [--iterations 7000] [--resolution 0] [--kept docs/quality-rows.json] [--list]
     tools/quality/run.py tables --same-as DIGEST --why WORDS [--kept docs/quality-rows.json]
 
-SCENES has fox, banana, sceaux_castle, snowmiku, bonsai and lego_blender_400; a row whose scene is missing is left out,
-and said. Each training has a folder below FOLDER/DIGEST-ITERATIONS-RESOLUTION, in which it goes on where it stopped;
-quality.md there has all tables as far as they are done.
+SCENES has fox, banana, sceaux_castle, snowmiku, bonsai and lego_blender_400. Rows of a missing scene are skipped with a
+message. Each training has a folder in FOLDER/DIGEST-ITERATIONS-RESOLUTION, in which it continues where it stopped;
+quality.md there has the finished rows of all tables.
 
-Finished rows go into the file --kept, to be committed, and are taken from there where the digest of the code is the
-same: of what is in kernels/ and clsplat/config, device, rendering, stages and training, without comments and
-docstrings, and without mcmc's module for rows of other growths. Whatever else has a part in a figure (scenes, their
-loading, how pictures are compared) is taken to be as it was, and rows of any device are taken. --same-as says that the
-code as it is gives the same bytes as that of DIGEST, where a change was shown to change none; WORDS say how, and are
-kept.
+Finished rows are written to the file --kept, which is to be committed. They are reused if the digest of the code is
+equal: of kernels/ and clsplat/config, device, rendering, stages and training, without comments and docstrings, and
+without mcmc's module for rows of other growths. Everything else that affects results (scenes, their loading, the
+comparison of pictures) is assumed unchanged, and rows of any device are reused. --same-as states that the current code
+gives the same bytes as that of DIGEST; WORDS say how this was verified, and are stored.
 """
 
 from __future__ import annotations
@@ -40,14 +39,14 @@ ROOT = Path(__file__).resolve().parents[2]
 RUN = Path(__file__).with_name("run.py")
 SCENES = ("fox", "banana", "sceaux_castle", "snowmiku", "bonsai")
 SIZES = (400, 200, 100, 50)
-"""Pictures' sides at which the antialiased model is measured; it is trained at the first."""
+"""Picture sizes at which the antialiased model is measured. It is trained at the first."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A training: its scene's folder and settings, {stop} for the step at which the short schedule's growth ends.
-    half_of: names of rows of this scene; the most Gaussians are half of the better one's. sizes: pictures' sides to
-    measure at, beside the one it was trained at."""
+    """A training: its scene's folder and settings. {stop} is the step at which the short schedule's growth ends.
+    half_of: names of rows of this scene; the maximum number of Gaussians is half that of the better row. sizes: picture
+    sizes at which the model is also measured."""
 
     name: str
     scene: str
@@ -58,7 +57,7 @@ class Row:
 
 SHORT, HIGH = ("--schedule", "short"), ("--schedule", "high-rates")
 WHOLES = {"default": (), "short": SHORT, "high rates": HIGH}
-"""Rows of the growth table that grow as the paper's method has it; the first two are what others get half of."""
+"""Rows of the growth table with the paper's growth. The first two determine the number that other rows get half of."""
 HALVES = {
     "budget": (*SHORT, "--density.growth", "budget"),
     "long axis": (*SHORT, "--density.growth", "budget", "--density.long-axis"),
@@ -68,14 +67,14 @@ HALVES = {
 }
 """Rows of the growth table that get half of the Gaussians."""
 FEWEST = ("bonsai", 290_000)
-"""A scene whose mcmc is measured with this many Gaussians too, a third of what the short schedule ends with."""
+"""A scene, and a number of Gaussians with which mcmc is also measured: a third of the short schedule's number."""
 BY_PAPER, FLAT = ("banana", "sceaux_castle"), ("--sh-degree", "0")
-"""Scenes of few photographs, measured at the paper's rates too, and with one colour in all directions: of nine
-photographs these are learnt wrong, and the more so the higher their rate."""
+"""Scenes with few photographs, also measured at the paper's rates, and with one colour in all directions. From nine
+photographs, the dependence on direction is learnt wrongly, and the more so the higher its rate."""
 
 
 def growth_rows() -> list[Row]:
-    """The paper's growth and the short schedule, and the others with half of the better one's Gaussians."""
+    """Rows with the paper's growth, and other growths with half as many Gaussians as the better of those."""
     rows = []
     for scene in SCENES:
         rows += [Row(f"{scene} {name}", scene, settings) for name, settings in WHOLES.items()]
@@ -101,7 +100,7 @@ def growth_rows() -> list[Row]:
 
 
 def antialiasing_rows() -> list[Row]:
-    """lego with and without, seen from farther and farther."""
+    """lego with and without antialiasing, measured at smaller and smaller sizes."""
     usual = (*SHORT, "--background", "white", "--resolution", str(SIZES[0]))
     return [
         Row("lego", "lego_blender_400", usual, sizes=SIZES),
@@ -115,9 +114,9 @@ AUTO = ("--try", "auto:" + ",".join(f"{name}={value}" for name, value in SETTING
 """Settings that --auto takes for few photographs."""
 FEW = ("--views", "3,6,9,12", "--seeds", "0,1")
 EXPOSED = ("--with", "schedule=high-rates,density.growth=mcmc,density.max_gaussians=290000")
-"""Settings that bonsai is trained with, with and without gains."""
+"""Settings of bonsai's trainings with and without gains."""
 CAMERAS = ("--appearance", "ppisp", "--mixes", "0.15", "--corners", "0.8")
-"""Photographs whose channels mix, through a lens that takes light from the corners."""
+"""Arguments for photographs with mixed channels, and a lens that darkens the corners."""
 EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "masks": ("masks", "{work}", "{scenes}/fox", *SIZED),
     "exposure": ("exposure", "{work}", "{scenes}/bonsai", *SIZED, *EXPOSED),
@@ -130,12 +129,12 @@ EXPERIMENTS: dict[str, tuple[str, ...]] = {
     "few views of fox": ("views", "{work}", "{scenes}/fox", *SIZED, *FEW, *AUTO),
     "few views of bonsai": ("views", "{work}", "{scenes}/bonsai", *SIZED, *FEW, *AUTO),
 }
-"""Tables of experiments: their commands, with the folder of scenes, a folder to work in, steps and size. They are run
-for each seed, but for those that take several."""
+"""Commands of the experiments' tables, with placeholders. They run once per seed, except those that take several
+seeds."""
 
 
 class Book:
-    """Trainings in a folder, and the file of those that are finished."""
+    """The trainings in a folder, and the file of finished trainings."""
 
     def __init__(self, scenes: Path, folder: Path, seeds: int, iterations: int, resolution: int, kept: Kept) -> None:
         self.scenes, self.folder, self.seeds, self.kept = scenes, folder, seeds, kept
@@ -143,12 +142,12 @@ class Book:
         folder.mkdir(parents=True, exist_ok=True)
 
     def results(self, table: str, row: Row, rows: Sequence[Row]) -> list[Finished]:
-        """One for each seed, trained where that is not done yet."""
+        """The row's training for each seed; unfinished ones are trained."""
         most = self._most(table, row, rows)
         return [self._result(table, row, seed, most[seed]) for seed in range(self.seeds)]
 
     def _most(self, table: str, row: Row, rows: Sequence[Row]) -> list[tuple[str, ...]]:
-        """Settings of each seed: half of what the better row has with the same seed, so that more seeds change none."""
+        """Settings per seed: half of the better row's Gaussians with the same seed, so that seeds are independent."""
         if not row.half_of:
             return [()] * self.seeds
         others = [self.results(table, other, rows) for other in rows if other.name in row.half_of]
@@ -182,7 +181,7 @@ class Book:
         return float(json.loads(told)["mean"]["psnr"])
 
     def printed(self, table: str) -> str:
-        """The tables of an experiment, of each seed."""
+        """The tables of an experiment for each seed."""
         if "--seeds" in EXPERIMENTS[table]:
             return self._said(table, table)
         parts = (
@@ -213,7 +212,7 @@ def _run(command: Sequence[str]) -> str:
 
 
 def line(row: Row, found: Sequence[Finished]) -> str:
-    """A row in Markdown: means of the seeds, and how far apart they are."""
+    """A row in Markdown: means and ranges over the seeds."""
     psnr = [result.psnr for result in found]
     cells = [
         row.name,
@@ -231,7 +230,7 @@ def line(row: Row, found: Sequence[Finished]) -> str:
 
 
 def header(rows: Sequence[Row]) -> str:
-    """The two first lines of a table."""
+    """The first two lines of a table."""
     sizes = rows[0].sizes
     cells = ["scene", "PSNR, dB", "seeds' range", "SSIM", "Gaussians", "seconds", "on", *map(str, sizes)]
     cells += ["mean"] if sizes else []
@@ -239,7 +238,7 @@ def header(rows: Sequence[Row]) -> str:
 
 
 def commit() -> str:
-    """The name of the tree that is measured."""
+    """Git's name of the measured commit."""
     described = subprocess.run(
         ["git", "describe", "--always", "--dirty", "--abbrev=10"], cwd=ROOT, capture_output=True, text=True, check=False
     )
@@ -247,7 +246,7 @@ def commit() -> str:
 
 
 def say_same(kept: Kept, was: str, why: str) -> int:
-    """Keep the statement that a digest's rows are those of the code as it is; 2 if there are none."""
+    """Store the statement that a digest's rows hold for the current code. Returns 2 if there are no such rows."""
     for mcmc in (False, True):
         if kept.has(was, mcmc=mcmc):
             kept.say_same(Same(code_digest(ROOT, mcmc=mcmc), was, why))
@@ -257,7 +256,7 @@ def say_same(kept: Kept, was: str, why: str) -> int:
 
 
 def run(arguments: list[str]) -> int:
-    """Make the tables and print them; 2 for a table that is not known or scenes that are not there."""
+    """Make the tables and print them. Returns 2 for unknown tables or missing scenes."""
     names = [*TRAININGS, *EXPERIMENTS]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenes", type=Path, nargs="?")

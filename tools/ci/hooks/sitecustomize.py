@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hooks for the interpreters of a pretended machine: this folder is put on PYTHONPATH by `tools/ci/machines.py`.
+"""Hooks for the interpreters of a simulated machine. `tools/ci/machines.py` puts this folder on PYTHONPATH.
 
-Python runs this file when it starts, and so in every process that a process of such a machine starts.
+Python runs this file when it starts, in every process that such a machine starts.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ import os
 import sys
 
 WITHOUT = "CLSPLAT_WITHOUT_PYPI_POCL"
-"""Set to a folder without drivers: the PoCL that pip brings is not there. Its loader reads the folder .libs below
-PYOPENCL_HOME, which pyopencl sets to its own when it is imported, wherever OCL_ICD_VENDORS points."""
+"""Variable with a folder without drivers, which hides PyPI's PoCL. PoCL's loader reads the folder .libs in
+PYOPENCL_HOME, which pyopencl sets to its own folder when it is imported, whatever OCL_ICD_VENDORS is."""
 INTERPRETER = "CLSPLAT_INTERPRETER"
-"""Set to a script that runs Python: processes that Python starts by sys.executable go through it too. An emulator's
-child would else be a process of the real processor."""
+"""Variable with a script that runs Python, for processes that Python starts through sys.executable. Without it, the
+child of an emulator's process would run on the real processor."""
 
 
 class _Hider:
-    """Finds no module. Each part that pyopencl imports after it has set the variable is looked for here first."""
+    """Finds no module. Python asks it first for each part that pyopencl imports after setting PYOPENCL_HOME."""
 
     @staticmethod
     def find_spec(name: str, *_: object) -> None:
@@ -27,6 +27,6 @@ class _Hider:
 
 
 if os.environ.get(WITHOUT):
-    sys.meta_path.insert(0, _Hider)  # a finder needs no more than this
+    sys.meta_path.insert(0, _Hider)  # a finder needs no other method
 if os.environ.get(INTERPRETER):
     sys.executable = os.environ[INTERPRETER]
