@@ -22,7 +22,14 @@ from clsplat.device import cl
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers.shapes import Shape, candidates, default_shape, save_shape
-from clsplat.device.drivers.worker_process import WorkerProcess, driver_timeout, end_with_parent, python_module, tell
+from clsplat.device.drivers.worker_process import (
+    WorkerEndedError,
+    WorkerProcess,
+    driver_timeout,
+    end_with_parent,
+    python_module,
+    tell,
+)
 from clsplat.errors import DriverError
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
@@ -78,10 +85,9 @@ def choose(trials: list[Trial]) -> Shape:
 def _in_a_process(index: int, shape: Shape) -> float | None:
     with closing(WorkerProcess(python_module("clsplat.bench.shapes", str(index), shape.label))) as child:
         try:
-            answer = child.receive(driver_timeout())
-        except TimeoutError:
+            return float(child.receive(driver_timeout())["ms"])
+        except WorkerEndedError:
             return None
-    return float(answer["ms"]) if answer is not None else None
 
 
 def measure(device: Device, workload: tuple[int, int, int] = TRIAL_WORKLOAD, repeat: int = 7) -> float:

@@ -271,7 +271,7 @@ class Device:
         return event
 
     def _not_launched(self, kernel: Kernel, error: cl.Error) -> DriverError:
-        return DriverError(self._trouble(kernel, f"cannot be launched: {' '.join(str(error).split())}"))
+        return self.trials.error(kernel.variant, kernel.name, f"cannot be launched: {' '.join(str(error).split())}")
 
     def record(self, work: Callable[[], T]) -> tuple[T, CommandBuffer | None]:
         """The result of `work`, and a command buffer of its queue commands, or None if they cannot be replayed
@@ -307,17 +307,12 @@ class Device:
         start, seconds, pause = time.monotonic(), driver_timeout(), 1e-5
         while (status := event.command_execution_status) > cl.command_execution_status.COMPLETE:
             if time.monotonic() - start > seconds:
-                raise DriverError(
-                    self._trouble(kernel, f"does not finish within {seconds:g} s ({DRIVER_TIMEOUT_VARIABLE})")
-                )
+                text = f"does not finish within {seconds:g} s ({DRIVER_TIMEOUT_VARIABLE})"
+                raise self.trials.error(kernel.variant, kernel.name, text)
             time.sleep(pause)
             pause = min(2 * pause, 1e-2)
         if status < 0:
-            raise DriverError(self._trouble(kernel, f"failed with OpenCL's status {status}"))
-
-    def _trouble(self, kernel: Kernel, text: str) -> str:
-        where = f"{kernel.variant.stem}.cl, {kernel.name}"
-        return f"{title(self.cl_device)}, kernels in the shape {self.shape.label}: {where}, {text}"
+            raise self.trials.error(kernel.variant, kernel.name, f"failed with OpenCL's status {status}")
 
     def finish(self) -> None:
         """Wait until the device is idle."""

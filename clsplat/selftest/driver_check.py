@@ -17,9 +17,10 @@ from clsplat.device import sandbox
 from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.quirks import title
-from clsplat.device.drivers.shapes import Shape, failures, instead, shapes_in_turn, wanted_shape
+from clsplat.device.drivers.shapes import Shape, failures, instead, shapes_to_try, wanted_shape
 from clsplat.device.drivers.worker_process import (
     TRUST_DRIVER_VARIABLE,
+    WorkerEndedError,
     WorkerProcess,
     driver_timeout,
     python_module,
@@ -92,7 +93,8 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *
     words = [str(index), shape.label, ",".join(stages), *(["quick"] if quick else [])]
     with closing(WorkerProcess(python_module("clsplat.selftest.worker", *words))) as child:
         try:
-            while (message := child.receive(seconds)) is not None:
+            while True:
+                message = child.receive(seconds, begun)
                 begun = message.get("begins", begun)
                 report.build_seconds = message.get("built", report.build_seconds)
                 if "result" in message:
@@ -102,9 +104,9 @@ def examine(index: int, shape: Shape, stages: Sequence[str] = SELFTEST_STAGES, *
                     report.kernels, report.end = message.get("done", {}), message.get("failed", "")
                     report.crashed = bool(report.end)
                     return report
-            report.end, report.crashed = f"the process {child.ending(begun)}", child.crashed
-        except TimeoutError as error:
-            report.end, report.crashed, report.hung = f"the driver {error} from {begun}", True, True
+        except WorkerEndedError as ended:
+            report.end = f"the {'driver' if ended.hung else 'process'} {ended}"
+            report.crashed, report.hung = ended.crashed, ended.hung
     return report
 
 
@@ -120,16 +122,14 @@ def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
     if regardless():
         return device
     cl_device, given = device.cl_device, device.shape
-    failed, wanted = failures(cl_device), wanted_shape(cl_device)
-    shapes = [shape for shape in (given, *shapes_in_turn(cl_device)) if shape.label not in failed]
-    # if all have failed, the reason may be gone: the wanted shape is tried again
-    announced = False
-    for shape in dict.fromkeys(shapes or [given]):
+    entries, failed, wanted = driver_records.entries(cl_device), failures(cl_device), wanted_shape(cl_device)
+    shapes = shapes_to_try(cl_device, given, failed)
+    for shape in shapes:
         tried = device if shape == given else device.with_shape(shape.label)
-        if not _has_passed(tried, stages):
-            if not announced:
+        known = entries.get(shape.label, driver_records.Entry())
+        if known.failed or not set(stages) <= known.stages:
+            if shape == shapes[0]:
                 print(f"{title(cl_device)}: used for the first time, a short test of its driver", file=sys.stderr)
-            announced = True
             if failure := _short_test(tried, stages):
                 driver_records.remember(cl_device, shape.label, failed=failure)
                 failed[shape.label] = failure
@@ -147,11 +147,6 @@ def require(device: Device, stages: Sequence[str] = TRAINING_STAGES) -> Device:
 _ADVICE = (
     f"clsplat selftest tells more, CLSPLAT_DEVICE takes another device, {TRUST_DRIVER_VARIABLE}=1 goes on regardless"
 )
-
-
-def _has_passed(device: Device, stages: Sequence[str]) -> bool:
-    entry = driver_records.entries(device.cl_device).get(device.shape.label, driver_records.Entry())
-    return not entry.failed and set(stages) <= entry.stages
 
 
 def _short_test(device: Device, stages: Sequence[str]) -> str:
@@ -184,7 +179,7 @@ def examine_device(index: int) -> DriverReport:
     device = all_devices()[index]
     shape = wanted_shape(device)
     report = examine(index, shape)
-    entry = driver_records.entries(device).get(shape.label, driver_records.Entry())
+    entry = driver_records.entry(device, shape.label)
     if entry.failed and not report.failure:
         report.remembered = _still(index, entry, report)
         if not report.remembered:

@@ -134,7 +134,7 @@ def _child(index: int, shape: str, stages: Sequence[str], *, quick: bool) -> Non
     except DriverError as error:
         tell(failed=str(error))
     else:
-        tell(done=device.trials.done)
+        tell(done=device.trials.known)
 
 
 if __name__ == "__main__":

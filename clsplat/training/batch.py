@@ -23,6 +23,7 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.layouts.columns import SPLAT
+from clsplat.optimisation.step_noise import Exploration
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.adam import adam, add_view
@@ -91,17 +92,19 @@ class _AddedView(GradientStep):
 
     shown: (n,), nonzero for Gaussians that any view shows; None if Adam does not need it.
     own: for the place of each view, the gradients with respect to the parameters of its parts.
+    noise: noise that the step adds after its last view.
     """
 
     shown: DeviceArray | None
     own: dict[int, Sequence[DeviceArray | None]]
+    noise: Exploration
 
     def learn(self, inputs: ViewInputs, own: Sequence[DeviceArray | None]) -> None:
         """Keep the gradients instead of taking a step: all views use the components' state before the batch."""
         self.own[inputs.place] = own
 
     def update(self, rows: StepRows) -> None:
-        """Add the rows' gradients to the sums. If kernels are only tried in the sandbox, try Adam's too."""
+        """Add the rows' gradients to the sums. If kernels are only tried in the sandbox, try those that follow too."""
         assert rows.gradients is not None, "the batch asks for them"
         parameters, sums = rows.model
         shown = None if self.shown is None else self.shown.rows(rows.start, rows.stop)
@@ -110,7 +113,7 @@ class _AddedView(GradientStep):
         if self.device.only_tries:
             models = (parameters, sums, rows.gradients, rows.gradients)
             adam(self.device, step, *models, counts, self.rasterizer.readback)
-            noise(self.device, self.explore, parameters, 0, self.rasterizer.readback)
+            noise(self.device, self.noise, parameters, rows.start, self.rasterizer.readback)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +298,8 @@ class Batch:
         config, rates = replace(self.config, optimiser=optimiser), scaled_rates(step.rates, batch)
         sums, shown = self._room_for(device, model[0])
         own: dict[int, Sequence[DeviceArray | None]] = {}
-        settings = (device, self.rasterizer, config, number, rates, step.fields, shown, own)
+        explore = step.explore.scaled(sqrt(batch))
+        settings = (device, self.rasterizer, config, number, rates, step.fields, shown, own, explore)
         step_of_view = _AddedView(*settings, explore=step.explore.of_view())
         adam_step = step_of_view.adam_step
         first, *others = shares(len(views), 1 + len(self.replicas))
@@ -321,7 +325,7 @@ class Batch:
             counts = self.rasterizer.readback if shown is None else shown.rows(start, stop)
             models = (parameters, gradients, moments, squares)
             adam(device, adam_step, *models, counts, self.rasterizer.readback)
-            noise(device, step.explore.scaled(sqrt(batch)), parameters, start, self.rasterizer.readback)
+            noise(device, explore, parameters, start, self.rasterizer.readback)
         for inputs in views:
             for part, gradient in zip(inputs.parts, own[inputs.place], strict=True):
                 part.update(gradient, self.rasterizer.readback)

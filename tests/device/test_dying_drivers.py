@@ -10,12 +10,11 @@ from __future__ import annotations
 import json
 import os
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 from calls import Capture, train
-from dying import ALWAYS, DRIVER, LATE, VERBS, Standing, call, error_of, forget, number_of
+from dying import ALWAYS, DRIVER, LATE, VERBS, Standing, call, error_of, forget
 from tiny import CONFIG
 
 from clsplat.cli.main import main
@@ -27,7 +26,6 @@ from clsplat.device.drivers.shapes import shapes_in_turn
 from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, WorkerProcess
 from clsplat.device.program import build, variant_of
 from clsplat.errors import DriverError
-from clsplat.selftest import driver_check
 
 QUICK = [("abort", verb) for verb in VERBS]
 OTHERS = {
@@ -182,56 +180,6 @@ def test_what_failed_in_every_shape_is_tried_anew(
     assert call("eval", scene, trained, tmp_path / "new") == 0
     assert "warning" not in capsys.readouterr().err
     assert driver_records.entries(device)[standing_device.shape.label].failed == ""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("how", "name"), [("launch", "gather_rows"), ("abort", "NO_SH_REST")])
-def test_training_goes_on_after_a_late_failure(
-    how: str, name: str, standing: Standing, scene: Path, tmp_path: Path, standing_device: Device, capsys: Capture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    numbers = standing(how, ALWAYS)
-    assert train(scene, tmp_path / "whole", LATE) == 0
-    latest = number_of(name, numbers)
-    driver_records.memory_path().unlink()
-    run = tmp_path / "run"
-    standing(how, latest, latest)
-    assert train(scene, run, LATE) == 1
-    line = error_of(capsys)
-    assert f"kernels in the shape {standing_device.shape.label}: " in line
-    assert ".cl" in line
-    assert list((run / "checkpoints").iterdir())
-    assert not (run / "model.ply").exists()
-    assert not list(run.rglob("*.clsplat-tmp"))
-    monkeypatch.delenv("CLSPLAT_STAND_IN")
-    forget()
-    assert main(["train", "-o", str(run), "--resume"]) == 0
-    assert "is taken" in capsys.readouterr().err
-    assert (run / "model.ply").exists()
-    assert (run / "eval.json").exists()
-
-
-@pytest.mark.slow
-def test_what_was_mended_gives_the_same_bytes(
-    standing: Standing, scene: Path, tmp_path: Path, standing_device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    numbers = standing("launch", ALWAYS)
-    assert train(scene, tmp_path / "whole", LATE) == 0
-    latest = number_of("gather_rows", numbers)
-    driver_records.memory_path().unlink()
-    standing("launch", latest, latest)
-    assert train(scene, tmp_path / "run", LATE) == 1
-    monkeypatch.delenv("CLSPLAT_STAND_IN")
-    forget()
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            driver_check, "examine", partial(driver_check.examine, quick=True)
-        )  # one scene of its three tells as much here
-        assert main(["selftest", "--device", str(DRIVER)]) == 0
-    assert driver_records.entries(standing_device.cl_device)[standing_device.shape.label].failed == ""
-    assert main(["train", "-o", str(tmp_path / "run"), "--resume"]) == 0
-    models = [(tmp_path / name / "model.ply").read_bytes() for name in ("whole", "run")]
-    assert models[0] == models[1]
 
 
 @pytest.mark.slow

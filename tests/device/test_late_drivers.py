@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calls import Capture, train
-from dying import ALWAYS, LATE, Standing, call, error_of, forget, number_of
+from dying import ALWAYS, DRIVER, LATE, Standing, call, error_of, forget, number_of
 
 from clsplat.api import train as train_on
 from clsplat.cli.main import main
+from clsplat.config.training import TrainConfig
 from clsplat.device import launch
 from clsplat.device.context import Device
 from clsplat.device.drivers import driver_records
@@ -22,6 +25,7 @@ from clsplat.errors import DriverError
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
+from clsplat.selftest import driver_check
 from clsplat.training import loop as training
 from clsplat.training.step import monitor
 
@@ -128,25 +132,48 @@ def test_what_is_half_changed_is_not_kept(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("config", [LATE, WITHOUT], ids=["dense", "sparse"])
 @pytest.mark.parametrize(("how", "name", "step"), [("launch", "gather_rows", 15), ("abort", "NO_SH_REST", 12)])
-def test_the_checkpoint_of_a_late_failure_gives_the_same_bytes(
-    how: str, name: str, step: int, standing: Standing, scene: Path, tmp_path: Path, capsys: Capture,
-    monkeypatch: pytest.MonkeyPatch,
+def test_the_checkpoint_of_a_late_failure(
+    how: str, name: str, step: int, config: TrainConfig, standing: Standing, scene: Path, tmp_path: Path,
+    standing_device: Device, capsys: Capture, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    numbers = standing(how, ALWAYS)
-    assert train(scene, tmp_path / "whole", WITHOUT) == 0
+    """A resume takes another shape; once the failure is mended or forgotten, it ends with the same bytes."""
+    numbers, run = standing(how, ALWAYS), tmp_path / "run"
+    assert train(scene, tmp_path / "whole", config) == 0
     latest = number_of(name, numbers)
     driver_records.memory_path().unlink()
     standing(how, latest, latest)
-    assert train(scene, tmp_path / "run", WITHOUT) == 1
-    assert f"; a checkpoint of step {step} is written: " in error_of(capsys)
-    assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == [f"step-{step:07}.npz"]
-    driver_records.memory_path().unlink()  # else it would go on in another shape
+    assert train(scene, run, config) == 1
+    line = error_of(capsys)
+    assert f"kernels in the shape {standing_device.shape.label}: " in line
+    assert ".cl" in line
+    assert f"; a checkpoint of step {step} is written: " in line
+    names = [path.name for path in (run / "checkpoints").iterdir()]
+    assert max(names) == f"step-{step:07}.npz"
+    assert len(names) == 1 or config.checkpoint_every
+    assert not (run / "model.ply").exists()
+    assert not list(run.rglob("*.clsplat-tmp"))
+    for copy in ("mended", "forgotten"):
+        shutil.copytree(run, tmp_path / copy)
     monkeypatch.delenv("CLSPLAT_STAND_IN")
-    forget()
-    assert main(["train", "-o", str(tmp_path / "run"), "--resume"]) == 0
-    models = [(tmp_path / each / "model.ply").read_bytes() for each in ("whole", "run")]
-    assert models[0] == models[1]
+
+    def resume(name: str) -> bytes:
+        forget()
+        assert main(["train", "-o", str(tmp_path / name), "--resume"]) == 0
+        return (tmp_path / name / "model.ply").read_bytes()
+
+    resume("run")
+    assert "is taken" in capsys.readouterr().err
+    assert (run / "eval.json").exists()
+    with monkeypatch.context() as patch:  # one scene of the three tells as much here
+        patch.setattr(driver_check, "examine", partial(driver_check.examine, quick=True))
+        assert main(["selftest", "--device", str(DRIVER)]) == 0
+    assert driver_records.entry(standing_device.cl_device, standing_device.shape.label).failed == ""
+    whole = (tmp_path / "whole" / "model.ply").read_bytes()
+    assert resume("mended") == whole
+    driver_records.memory_path().unlink()
+    assert resume("forgotten") == whole
 
 
 @pytest.mark.slow

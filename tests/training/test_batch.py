@@ -21,6 +21,7 @@ from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device, open_devices
 from clsplat.errors import DeviceError, DriverError, InputError
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.optimisation.step_noise import Exploration
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
 from clsplat.runs.run import Run
@@ -28,6 +29,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_gaussians import allocate_gaussians
+from clsplat.training import batch
 from clsplat.training.batch import Batch, Replica, ViewOutcome, scaled, scaled_rates, shares
 from clsplat.training.step.gradient_step import GradientStep, StepProbe, slot_fields
 from clsplat.training.step.inputs import StepRows
@@ -255,6 +257,23 @@ def test_trouble_on_a_further_device_ends_the_training(
     with pytest.raises(KeyboardInterrupt):
         train(scene, TWO, device=devices)
     assert ended.is_set(), "the other device's view was waited for"
+
+
+def test_the_noise_of_a_batch_is_tried_before_anything_changes(
+    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, made = batch.noise, []
+
+    def noise(device: Device, explore: Exploration, *given: Any) -> None:
+        made.append((device.only_tries, explore.amount))
+        real(device, explore, *given)
+
+    monkeypatch.setattr(batch, "noise", noise)
+    density = {"growth": "mcmc", "max_gaussians": 150}
+    train(scene, short(batch=2, iterations=2, density=density), device=default_device)
+    (amount,) = {each for _, each in made}
+    assert amount > 0
+    assert [tried for tried, _ in made] == [True, False]
 
 
 def test_a_device_that_is_there_twice_is_refused(scene: Scene, default_device: Device) -> None:

@@ -24,6 +24,14 @@ _PCI_DISPLAY_CLASS = "0x03"
 _LOAD_LIBRARY_CODE = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"
 
 
+def _outcome(*command: str) -> subprocess.CompletedProcess[str] | None:
+    """The outcome of a process; None if it did not come back in time."""
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=driver_timeout(), check=False)
+    except subprocess.TimeoutExpired:
+        return None
+
+
 def _last_line(result: subprocess.CompletedProcess[str]) -> str:
     """The reason why a process failed: the last line of its errors, or its exit status."""
     line = (result.stderr.strip().splitlines() or [f"status {result.returncode}"])[-1]
@@ -79,15 +87,8 @@ def _driver(path: Path) -> Diagnostic:
     except (OSError, UnicodeDecodeError) as error:
         return Diagnostic("driver", "note", f"{path}: cannot be read ({error})")
     name = str(path.parent / library) if (path.parent / library).is_file() else library
-    try:
-        result = subprocess.run(
-            [sys.executable, "-c", _LOAD_LIBRARY_CODE, name],
-            capture_output=True,
-            text=True,
-            timeout=driver_timeout(),
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
+    result = _outcome(sys.executable, "-c", _LOAD_LIBRARY_CODE, name)
+    if result is None:
         return Diagnostic("driver", "note", f"{path}: {library} does not come back from being loaded", f"remove {path}")
     if result.returncode == 0:
         return Diagnostic("driver", "ok", f"{path}: {library}")
@@ -97,10 +98,8 @@ def _driver(path: Path) -> Diagnostic:
 
 def listed_devices() -> tuple[list[dict[str, Any]], str]:
     """The devices that `clsplat devices --json` lists, and the reason if it failed, or an empty string."""
-    command = [*python_module("clsplat", "devices", "--json")]
-    try:
-        result = subprocess.run(command, capture_output=True, text=True, timeout=driver_timeout(), check=False)
-    except subprocess.TimeoutExpired:
+    result = _outcome(*python_module("clsplat", "devices", "--json"))
+    if result is None:
         return [], f"a driver does not come back within {driver_timeout():g} s"
     if result.returncode == 0:
         return json.loads(result.stdout[result.stdout.index("[") :]), ""
@@ -141,15 +140,10 @@ def access_findings(nodes: Sequence[Path] | None = None) -> list[Diagnostic]:
 
 def loader_finding() -> Diagnostic:
     """A line about pyopencl, which includes the driver loader: whether it can be imported."""
-    code = "import pyopencl; print(pyopencl.VERSION_TEXT)"
-    try:
-        result = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, timeout=driver_timeout(), check=False
-        )
-    except subprocess.TimeoutExpired:
-        return Diagnostic(
-            "loader", "missing", f"pyopencl does not come back from its import within {driver_timeout():g} s"
-        )
+    result = _outcome(sys.executable, "-c", "import pyopencl; print(pyopencl.VERSION_TEXT)")
+    if result is None:
+        text = f"pyopencl does not come back from its import within {driver_timeout():g} s"
+        return Diagnostic("loader", "missing", text)
     if result.returncode == 0:
         return Diagnostic("loader", "ok", f"pyopencl {result.stdout.strip()}")
     text = f"pyopencl cannot be imported: {_last_line(result)}"

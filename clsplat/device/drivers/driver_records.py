@@ -11,7 +11,7 @@ import os
 import threading
 import warnings
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -85,15 +85,14 @@ def driver_key(device: cl.Device) -> str:
 
 def _entry(value: object) -> Entry:
     """Parse an entry of the file. A value that clsplat cannot have written gives an empty entry."""
-    if not isinstance(value, dict):
+    given = value if isinstance(value, dict) else {}
+    stages, kernels, failed = given.get("stages", []), given.get("kernels", {}), given.get("failed", "")
+    trial = given.get("trial", {})
+    if not (isinstance(stages, list) and isinstance(kernels, dict) and isinstance(trial, dict)):
         return Entry()
-    stages, kernels, failed = value.get("stages", []), value.get("kernels", {}), value.get("failed", "")
-    trial = value.get("trial", {})
-    if not (isinstance(stages, list) and isinstance(kernels, dict) and isinstance(failed, str)):
+    if not all(isinstance(text, str) for text in (*stages, *kernels.values(), failed)):
         return Entry()
-    if not all(isinstance(text, str) for text in (*stages, *kernels.values())):
-        return Entry()
-    return Entry(frozenset(stages), kernels, failed, trial if isinstance(trial, dict) else {})
+    return Entry(frozenset(stages), kernels, failed, trial)
 
 
 _RECORDS_LOCK = threading.Lock()
@@ -119,20 +118,25 @@ def _add(saved: dict[str, Any], driver: str, shape: str, addition: Entry) -> Non
     shapes = saved.pop(driver, None)
     shapes = shapes if isinstance(shapes, dict) else {}
     known = _entry(shapes.get(shape))
-    entry: dict[str, object] = {
+    last = known if addition.failed is None else addition
+    merged = {
         "stages": sorted(known.stages | addition.stages),
         "kernels": {**known.kernels, **addition.kernels},
+        "failed": last.failed,
+        "trial": last.trial if last.failed else {},
     }
-    last = known if addition.failed is None else addition
-    if last.failed:
-        entry |= {"failed": last.failed, **({"trial": last.trial} if last.trial else {})}
-    saved[driver] = {**shapes, shape: entry}
+    saved[driver] = {**shapes, shape: merged}
 
 
 def entries(device: cl.Device) -> dict[str, Entry]:
     """All entries of the driver, by LANESxITEMS."""
     shapes = _read().get(driver_key(device))
     return {name: _entry(value) for name, value in shapes.items()} if isinstance(shapes, dict) else {}
+
+
+def entry(device: cl.Device, shape: str) -> Entry:
+    """The entry of the driver for a shape, LANESxITEMS."""
+    return entries(device).get(shape, Entry())
 
 
 def remember(
@@ -156,15 +160,17 @@ def remember(
     with _RECORDS_LOCK:
         _unwritten.setdefault(path, []).append((driver_key(device), shape, addition))
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with briefly_locked(path):
-                saved = _read()
-                for oldest in list(saved)[:-MAX_DRIVER_RECORDS]:
-                    del saved[oldest]
-                atomic_write(path, (json.dumps(saved, indent=1) + "\n").encode())
+            rewrite(path, lambda: dict([*_read().items()][-MAX_DRIVER_RECORDS:]))
             del _unwritten[path]
         except OSError as error:
             tell_once(f"{path}: cannot be written ({reason_of(error)}), so that drivers are tested anew each time")
+
+
+def rewrite(path: Path, changed: Callable[[], Mapping[str, Any]]) -> None:
+    """Write what `changed` makes of a JSON file, while no other process or thread rewrites it. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with briefly_locked(path):
+        atomic_write(path, (json.dumps(changed(), indent=1) + "\n").encode())
 
 
 @lru_cache(maxsize=8)

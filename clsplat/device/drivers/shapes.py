@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,6 @@ from clsplat.device.drivers.capabilities import capabilities_of
 from clsplat.device.drivers.quirks import most_lanes, subgroup_ways, title
 from clsplat.device.drivers.worker_process import regardless
 from clsplat.errors import DeviceError, reason_of
-from clsplat.files.atomic import atomic_write
 from clsplat.files.documents import parse_json
 
 VECTOR_LANES = (1, 4, 8, 16)
@@ -184,11 +183,8 @@ def shape_of(device: cl.Device) -> tuple[Shape, str]:
     with a warning. Raises DeviceError like `wanted_shape`.
     """
     wanted, failed = wanted_shape(device), failures(device)
-    if wanted.label in failed:
-        for other in shapes_in_turn(device):
-            if other.label not in failed:
-                return other, instead(device, wanted, other, failed[wanted.label])
-    return wanted, ""  # if no other shape is left, the error is raised when this one fails again
+    shape = shapes_to_try(device, wanted, failed)[0]
+    return shape, "" if shape == wanted else instead(device, wanted, shape, failed[wanted.label])
 
 
 def shape_text(device: cl.Device) -> str:
@@ -207,6 +203,15 @@ def shapes_in_turn(device: cl.Device) -> list[Shape]:
     smaller = [replace(default, lanes=lanes, items=1) for lanes in (4, 1)] if default.items == 1 else []
     smaller += [replace(default, items=items) for items in (128, 64, 32) if items < default.items]
     return [*first, *(shape for shape in smaller if shape not in first)]
+
+
+def shapes_to_try(device: cl.Device, first: Shape, failed: Mapping[str, str]) -> list[Shape]:
+    """The shapes in which the driver has not failed: `first`, then `shapes_in_turn`.
+
+    `first` alone if it has failed in all, as the reason may be gone.
+    """
+    shapes = dict.fromkeys((first, *shapes_in_turn(device)))
+    return [shape for shape in shapes if shape.label not in failed] or [first]
 
 
 def instead(device: cl.Device, wanted: Shape, other: Shape, failure: str) -> str:
@@ -251,12 +256,12 @@ def saved_shapes() -> dict[str, str]:
 
 def save_shape(device: cl.Device, shape: Shape | None) -> None:
     """Save the shape for the device with its current driver; None removes the entry. Raises OSError."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        saved = saved_shapes()
-    saved.pop(driver_records.device_key(device), None)
-    if shape is not None:
-        saved[driver_records.device_key(device)] = shape.label
-    path = saved_path()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, (json.dumps(saved, indent=2, sort_keys=True) + "\n").encode())
+
+    def changed() -> dict[str, str]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            saved = saved_shapes()
+        saved.pop(driver_records.device_key(device), None)
+        return saved if shape is None else {**saved, driver_records.device_key(device): shape.label}
+
+    driver_records.rewrite(saved_path(), changed)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import queue
@@ -16,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any
+from typing import Any
 
 from clsplat.errors import DriverError, InputError, switched_on
 from clsplat.process import MAX_SIGNAL_WAIT_SECONDS, Interrupted, apart, endings
@@ -28,12 +29,27 @@ DRIVER_TIMEOUT_SECONDS = 120.0
 kernel."""
 DRIVER_TIMEOUT_VARIABLE = "CLSPLAT_DRIVER_TIMEOUT"
 TRUST_DRIVER_VARIABLE = "CLSPLAT_TRUST_DRIVER"
-SIGKILL_NUMBER = 9
-"""SIGKILL, which Windows does not define."""
+_SIGKILL, _SIGTERM = -9, -15
+"""Exit statuses of killed processes. Windows does not define the number of SIGKILL."""
 
 
 class TrialInterrupted(Interrupted):
     """This process was asked to end while it waited for a driver's trial."""
+
+
+class WorkerEndedError(Exception):
+    """A worker process has ended before it answered. The text is the end of a sentence about it.
+
+    hung: True if it was ended because it did not answer in time.
+    status: its exit status; negative for a signal.
+    """
+
+    def __init__(self, text: str, status: int = 0, *, hung: bool = False) -> None:
+        super().__init__(text)
+        self.hung = hung
+        # which only a driver can cause; a Python error has status 1 or 2
+        self.crashed = hung or status not in (0, 1, 2, _SIGTERM, _SIGKILL)
+        self.killed = status == _SIGKILL
 
 
 def driver_timeout() -> float:
@@ -88,8 +104,8 @@ def ending_at_once() -> Iterator[None]:
             before[number](number, frame)
         raise TrialInterrupted(number)
 
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, *endings())}
-    before = {int(number): handler for number, handler in handlers.items() if callable(handler)}
+    numbers = (signal.SIGINT, *endings())
+    before = {int(number): handler for number in numbers if callable(handler := signal.getsignal(number))}
     for number in before:
         signal.signal(number, interrupt)
     try:
@@ -103,10 +119,11 @@ def ending_at_once() -> Iterator[None]:
 _alive: weakref.WeakSet[WorkerProcess] = weakref.WeakSet()
 
 
+@atexit.register
 def abandon() -> None:
     """End all worker processes at once. A thread that waits for one gets TrialInterrupted."""
     for child in list(_alive):
-        child.abandon()
+        child.close()
 
 
 class WorkerProcess:
@@ -116,7 +133,7 @@ class WorkerProcess:
     """
 
     def __init__(self, command: Sequence[str]) -> None:
-        self._abandoned = False
+        self._closed = False
         try:
             self._process = subprocess.Popen(
                 list(command),
@@ -131,27 +148,23 @@ class WorkerProcess:
             )
         except OSError as error:
             raise DriverError(f"{command[0]}: {error.strerror}, {_NO_PYTHON_ADVICE}") from None
-        _alive.add(self)
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._errors: list[str] = []
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        self._readers = [
-            threading.Thread(target=self._read, args=(self._process.stdout,), daemon=True),
-            threading.Thread(target=self._read_errors, args=(self._process.stderr,), daemon=True),
-        ]
+        self._readers = [threading.Thread(target=read, daemon=True) for read in (self._read, self._read_errors)]
         for reader in self._readers:
             reader.start()
+        _alive.add(self)
 
-    def _read(self, stream: IO[str]) -> None:
-        for line in stream:
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
             if line.startswith(CHILD_MESSAGE_PREFIX):
                 self._lines.put(line[len(CHILD_MESSAGE_PREFIX) :])
         self._lines.put(None)
 
-    def _read_errors(self, stream: IO[str]) -> None:
-        for line in stream:
-            self._errors.append(line.strip())
+    def _read_errors(self) -> None:
+        assert self._process.stderr is not None
+        self._errors.extend(line.strip() for line in self._process.stderr)
 
     def send(self, message: object) -> None:
         """Send a line to the process. If it has ended, nothing is sent, and `receive` reports the end."""
@@ -160,10 +173,11 @@ class WorkerProcess:
             self._process.stdin.write(json.dumps(message) + "\n")
             self._process.stdin.flush()
 
-    def receive(self, seconds: float) -> dict[str, Any] | None:
-        """The next message; None if the process has ended.
+    def receive(self, seconds: float, doing: str = "") -> dict[str, Any]:
+        """The next message.
 
-        Raises TrialInterrupted. After `seconds` without a message it ends the process and raises TimeoutError.
+        doing: work of the process, for the text of the error.
+        Raises TrialInterrupted, and WorkerEndedError. After `seconds` without a message it ends the process.
         """
         until = time.monotonic() + seconds
         while True:
@@ -174,43 +188,27 @@ class WorkerProcess:
                 if time.monotonic() < until:
                     continue
                 self._process.kill()
-                raise TimeoutError(f"did not come back within {seconds:g} s") from None
-        if self._abandoned:
+                text = f"did not come back within {seconds:g} s" + (f" from {doing}" if doing else "")
+                raise WorkerEndedError(text, hung=True) from None
+        if self._closed:
             raise TrialInterrupted(signal.SIGINT)
         if line is None:
-            return None
+            status = self._process.wait()
+            how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+            raise WorkerEndedError(how + (f" in {doing}" if doing else "") + self._last_words(), status)
         message: dict[str, Any] = json.loads(line)
         return message
 
-    def ending(self, where: str = "") -> str:
-        """The end of a sentence about how the process ended: its status, `where` if given, and its last output."""
-        status = self._process.wait()
+    def _last_words(self) -> str:
+        """The line of its standard error that tells most, in brackets, or an empty string."""
         self._readers[1].join(timeout=5)
         words = [line for line in self._errors if line]
         said = next((line for line in words if "ERROR" in line or "Assertion" in line), words[-1] if words else "")
-        how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
-        return how + (f" in {where}" if where else "") + (f" ({said[:300]})" if said else "")
-
-    @property
-    def crashed(self) -> bool:
-        """True if the process crashed, which only a driver can cause.
-
-        False after a Python error, which has status 1 or 2, and if the system killed the process for lack of memory.
-        """
-        return self._process.wait() not in (0, 1, 2, *(-number for number in (signal.SIGTERM, SIGKILL_NUMBER)))
-
-    @property
-    def killed(self) -> bool:
-        """True if the system killed the process, as it does when memory runs out."""
-        return self._process.wait() == -SIGKILL_NUMBER
-
-    def abandon(self) -> None:
-        """End the process without waiting; a thread that waits for an answer gets TrialInterrupted."""
-        self._abandoned = True
-        self._process.kill()
+        return f" ({said[:300]})" if said else ""
 
     def close(self) -> None:
-        """End the process."""
+        """End the process. A thread that waits for an answer gets TrialInterrupted."""
+        self._closed = True
         _alive.discard(self)
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):  # a process that hangs in a system call cannot be killed
@@ -218,7 +216,7 @@ class WorkerProcess:
         for reader in self._readers:
             reader.join(timeout=5)
         assert self._process.stdin is not None
-        with suppress(OSError):  # closing writes buffered text that the process never read
+        with suppress(OSError, ValueError):  # it writes text that the process never read; two threads may close it
             self._process.stdin.close()
 
 
