@@ -108,10 +108,10 @@ class ConvertVerb(Verb):
     crop_sphere: Annotated[str | None, arg(metavar="X,Y,Z,R")] = None
     """Keep the Gaussians whose mean lies in this sphere."""
     prune_opacity: Annotated[float | None, arg(metavar="FLOAT")] = None
-    """Leave out Gaussians with an opacity below this, 0 to 1."""
+    """Leave out Gaussians with an opacity below this value, from 0 to 1."""
     prune_contribution: Annotated[float | None, arg(metavar="PIXELS")] = None
-    """Leave out Gaussians that contribute less than this to every picture of --cameras: alpha times transmittance,
-    summed over the picture, in pixels, like --density.min-contribution in training."""
+    """Leave out Gaussians that contribute less than this number of pixels to every picture of --cameras. This is alpha
+    times transmittance, summed over the picture, like --density.min-contribution in training."""
     cameras: Annotated[Path | None, arg(metavar="PATH")] = None
     """Cameras for --prune-contribution, in any format that `clsplat render` reads."""
     transform: Annotated[str | None, arg(metavar="FILE|M00,M01,...")] = None

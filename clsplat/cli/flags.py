@@ -24,7 +24,7 @@ OTHER_FLAGS_TITLE = "Others"
 HELP_TEXT_COLUMN = 24
 """Column at which help texts begin. If a flag's name is longer, its text begins on the next line."""
 MIN_FLAG_SIMILARITY = 0.75
-"""Smallest similarity, 0 to 1, at which a known flag is suggested for an unknown one."""
+"""Smallest similarity, from 0 to 1, at which a known flag is suggested for an unknown one."""
 _METAVARS = {int: "INT", float: "FLOAT", str: "STR"}
 
 

@@ -80,7 +80,9 @@ def exposure_chart(run: Run) -> Markup:
         for channel, (name, color) in enumerate((("red", 1), ("green", 2), ("blue", 0)))
     ]
     note = "log2 of the factors of the model's colours; +1 is twice as bright as the mean" + corners
-    return chart("Exposure of the photographs", series, "training photograph, by name", "gain, stops", note=note)
+    return chart(
+        "Exposure of the photographs", series, "training photographs in the order of names", "gain, stops", note=note
+    )
 
 
 def _corners(photographs: Mapping[str, Any]) -> str:

@@ -24,7 +24,7 @@ CURVE_KEYS = ("step", "loss", "psnr", "gaussians", "seconds")
 MAX_NAME_CHARACTERS = 200
 """Largest number of displayed characters of the name of a view, a stage or a device."""
 MAX_EVALUATED_VIEWS, MAX_STAGES, MAX_SESSIONS, MAX_SAMPLES = 10_000, 40, 100, 2000
-"""Limits for files that clsplat did not write: its own have fewer entries. The last samples and sessions are kept."""
+"""Limits for files from elsewhere; files that clsplat writes have fewer entries. The last entries are kept."""
 MAX_DRAWN_VALUE = 1e30
 
 

@@ -166,7 +166,7 @@ def _middle(values: Float64) -> tuple[float, float]:
 
 
 def _beside(views: Sequence[View], told: Mapping[str, Path], *, strict: bool) -> dict[str, Path]:
-    """Depth maps by view name, in a folder next to the photographs' folder or inside it.
+    """Depth map for each view's name, from a folder next to the photographs' folder or inside it.
 
     A map is named like its photograph, with or without the photograph's extension, or with _depth or .depth after the
     stem.

@@ -49,7 +49,7 @@ def detect(path: Path) -> Kind:
     if (path / "transforms_train.json").is_file():
         return "blender"
     model = colmap.find_model(path)
-    # a model in colmap/ is that from which nerfstudio made transforms.json; its pictures are larger, so it is not used
+    # nerfstudio makes transforms.json from a model in colmap/, which has larger pictures: prefer transforms.json
     if model is not None and not (model.is_relative_to(path / "colmap") and (path / "transforms.json").is_file()):
         return "colmap"
     if (path / "transforms.json").is_file():

@@ -262,7 +262,7 @@ class Scene:
 
     @cached_property
     def near(self) -> float:
-        """Near plane of a model of this scene, world units (docs/decisions/0019)."""
+        """Near plane, in world units, of a model of this scene (docs/decisions/0019)."""
         return min(DEFAULT_NEAR_PLANE, self.extent / MIN_NEAR_PLANES_PER_EXTENT)
 
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from clsplat.viewer.models import Model
 
 PAGE_PHOTO_SIDE_PX = 240
-"""Longest side of a photograph on the page, in pixels."""
+"""Longest side in pixels of a photograph on the page."""
 FRUSTUM_SCALE = 0.05
 """Size of a drawn camera, relative to the distance between the start position and its target."""
 UP_CHOICES = ("as the scene", "y", "-y", "z", "-z", "x", "-x")

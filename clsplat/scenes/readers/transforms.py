@@ -146,7 +146,7 @@ def read_poses(path: Path, size: tuple[int, int] | None = None, lenses: Lenses =
 def read_images(path: Path, size: tuple[int, int] | None = None) -> list[PosedImage]:
     """Images of a transforms.json, in the order of the file. Pictures need not exist, as for `read_poses`."""
     readers = _readers(path, load_document(path))
-    with warnings.catch_warnings():  # of missing pictures: they are not needed here
+    with warnings.catch_warnings():  # hide warnings of missing pictures, which are not needed
         warnings.simplefilter("ignore")
         try:
             files = _pictures(path, readers, None, "skip")

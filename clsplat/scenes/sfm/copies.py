@@ -83,11 +83,11 @@ class Decoded(Protocol):
 
     @property
     def width(self) -> int:
-        """Pixels, upright."""
+        """Width in pixels of the upright photograph."""
 
     @property
     def height(self) -> int:
-        """Pixels, upright."""
+        """Height in pixels of the upright photograph."""
 
     @property
     def lens(self) -> tuple[str, ...]:

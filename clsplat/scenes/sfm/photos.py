@@ -39,7 +39,7 @@ class Photo:
     """A photograph as staged for pycolmap.
 
     name: path below the folder, with forward slashes.
-    width, height: pixels, upright.
+    width, height: size in pixels of the upright photograph.
     lens: make, model and focal length from EXIF, empty strings for missing ones.
     transparent: True if the alpha channel makes any pixel transparent.
     thumb: thumbnail from `copies.thumb_of`, for photographs that may be copies.

@@ -77,10 +77,10 @@ def from_points(
 ) -> Gaussians:
     """One Gaussian per point.
 
-    points: (N, 3), world units.
+    points: (N, 3), in world units.
     colors: (N, 3) in [0, 1].
     origin: (3,), origin of the means in the world, by default the world's origin.
-    extent: the scene's extent, world units.
+    extent: the scene's extent in world units.
     near: the model's near plane.
 
     The standard deviation is the root of the mean squared distance to the three nearest other points, or to all if
@@ -114,7 +114,7 @@ def from_points(
 
 
 def squared_floor(extent: float) -> float:
-    """Lower bound of the mean squared distance of a scene's points, world units squared."""
+    """Lower bound, in world units squared, of the mean squared distance of a scene's points."""
     low, high = ORDINARY_EXTENTS
     return MIN_SQUARED_DISTANCE * (extent / min(max(extent, low), high)) ** 2
 
@@ -137,7 +137,7 @@ def mean_squared_distance(points: Float64) -> Float64:
 def random_points(count: int, low: ArrayLike, high: ArrayLike, rng: np.random.Generator) -> tuple[Float64, Float64]:
     """Uniformly random points in a box, and their colours, for a scene without points.
 
-    low, high: (3,), corners of the box, world units.
+    low, high: (3,), corners of the box in world units.
     Returns points (count, 3) and colours (count, 3). As in the authors' code, these are grey with a little noise.
     """
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
