@@ -526,7 +526,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--colorspace ACEScq", "a.#.exr", "--colorspace ACEScq: is not in the configuration"),
         ("--model-colorspace srbg", "a.#.exr", "--model-colorspace srbg: is not in the configuration"),
         ("--ocio-config none.ocio --colorspace ACEScg", "a.#.exr", "none.ocio: is not an OpenColorIO configuration"),
-        ("--region 40,0,20,10", "a.#.exr", f"--region 40,0,20,10: ends at 60,10, expected at most the frame's {WIDTH}"),
+        ("--region 40,0,20,10", "a.#.exr", f"--region 40,0,20,10: ends at 60,10, beyond the frame's size {WIDTH}"),
         ("--region 0,0,8,8 --overscan 2", "a.#.exr", "--overscan and --region exclude each other"),
         ("--supersample 0", "a.#.exr", "--supersample 0: expected 1 to 64"),
         ("--shutter-open 0.1", "a.#.exr", "--shutter-open 0.1 --shutter-close None: expected two times"),

@@ -156,7 +156,7 @@ def test_the_warning_has_the_figures_and_a_way_on() -> None:
     gate, said = judged([25.126, 24, 23.5, 28])
     text = (
         "--refine-poses: held-out views had 25.13 dB at step 100, 24.00 and 23.50 dB at steps 200 and 300: the cameras "
-        "are again those of step 100, and stay; try a smaller --pose-reach, or train without --refine-poses"
+        "of step 100 are restored, and refinement ends; try a smaller --pose-reach, or train without --refine-poses"
     )
     assert said == [text]
     assert gate.record()["best"] == 100
