@@ -45,7 +45,7 @@ def test_arrays(default_device: Device, name: str, value: Any, message: str) -> 
         ({"rotation": np.eye(4)}, r"rotation is float64 \(4, 4\), expected numbers of shape \(3, 3\)"),
         ({"rotation": 2 * np.eye(3)}, "rotation is not a rotation matrix, its axes are 3 off"),
         ({"translation": np.array([0, np.inf, 0])}, "translation has numbers that are not finite"),
-        ({"near": 5.0, "far": 1.0}, r"near is 5\.0, far 1\.0, expected 0 < near < far"),
+        ({"near": 5.0, "far": 1.0}, r"near is 5\.0 and far is 1\.0, expected 0 < near < far"),
         ({"projection": "wide"}, "projection is 'wide', expected one of perspective"),
     ],
 )
