@@ -133,11 +133,10 @@ class DensityConfig:
     """With growth mcmc: noise added to the means in each step, in multiples of their learning rate, for Gaussians of
     scale 1 in a scene of extent 1. 0 adds none. The cooldown has no noise."""
     opacity_weight: float = 0.01
-    """With growth mcmc: weight of the mean opacity in the loss, summed over the Gaussians that the step's view
-    shows."""
+    """With growth mcmc: weight in the loss of the opacities' sum over the Gaussians that the step's view shows, divided
+    by the number of all Gaussians."""
     scale_weight: float = 0.01
-    """With growth mcmc: weight of the mean scale in the loss, relative to the scene's extent, summed over the Gaussians
-    that the step's view shows."""
+    """With growth mcmc: like opacity-weight, but for scales relative to the scene's extent."""
     min_contribution: float = 0.0
     """Prune Gaussians that contribute less than this to every training view of an epoch (a pass through all of them). A
     contribution is alpha times transmittance, summed over the picture, in pixels. 0 prunes none."""
@@ -261,9 +260,9 @@ class TrainConfig:
     points_use: PointsUse = "replace"
     """replace: the file's points replace the scene's own. join: they are added."""
     points_limit: int = 0
-    """Maximum number of points to keep, of the file or else of the scene's own. One point is kept per occupied voxel,
-    the mean of its places and colours, with the smallest sufficient voxels. 0 keeps 200,000 of a file, and all of the
-    scene's own."""
+    """Maximum number of points to keep, of the file or else of the scene's own. Each occupied voxel keeps one point,
+    the mean of its points' places and colours. Voxels are as small as possible. 0 keeps 200,000 of a file, and all of
+    the scene's own."""
     sky: int = 0
     """Maximum number of sky points to start from, on a sphere around the scene, where photographs show nothing above
     the scene's points; 0 for none."""

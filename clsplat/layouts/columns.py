@@ -146,7 +146,7 @@ DEEP_SLICE = ("RED", "GREEN", "BLUE", "ALPHA", "DEPTH")
 """A pixel's slice of a deep picture: colour, premultiplied with alpha; alpha; and its depth."""
 
 DEEP_LEVELS = 64
-"""Number of levels of the slack with which a pixel's slices are cut."""
+"""Number of levels of the slack s, (74) of docs/pictures.md, with which a pixel's slices are cut."""
 
 DEEP_PICTURES = 16
 """Maximum number of deep pictures that are merged at once."""

@@ -66,7 +66,7 @@ class Tangents(Seen):
         return np.array([a, b, c])
 
     def by_mean(self, gaussian: int, splat: Footprint) -> tuple[Float64, Float64]:
-        """Eq. (21): the plane turns with the mean, which moves distant points on it by more."""
+        """Eq. (21): the tangent plane turns with the mean, so that points far from the mean move by more."""
         by_x, by_y = super().by_mean(gaussian, splat)
         q = splat.dx * by_x + splat.dy * by_y
         return by_x + q * splat.dx, by_y + q * splat.dy
