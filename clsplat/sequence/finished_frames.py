@@ -57,7 +57,7 @@ def is_complete(task: Task, options: RenderOptions) -> bool:
     """True if the frame's file is there, with the right size, channels, model and settings, and readable to its end."""
     attributes = {name: value for name, value in options.attributes.items() if name in IDENTITY_ATTRIBUTES}
     attributes[SETTINGS_DIGEST_ATTRIBUTE] = settings_digest(task, options)
-    camera = picture_camera(task, options)
+    camera = picture_camera(task, options.pictures)
     return is_whole(
         task.path,
         camera.width,

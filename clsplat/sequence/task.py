@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from functools import lru_cache
 from glob import escape, glob
@@ -248,9 +248,9 @@ def _beside_middle(shot: Shot, resize: Callable[[Camera], Camera], number: int, 
     return moving.continued(resize(shot.moment(time - way)), resize(shot.moment(time)))
 
 
-def sampling_of(task: Task, options: RenderOptions) -> SamplingConfig:
+def sampling_of(task: Task, pictures: PictureConfig) -> SamplingConfig:
     """Shutter and lens of a frame."""
-    return task.sampling or options.pictures.sampling
+    return task.sampling or pictures.sampling
 
 
 @dataclass(frozen=True)
@@ -292,52 +292,52 @@ class RenderOptions:
     ids_from: str = ""
 
 
-def picture_camera(task: Task, options: RenderOptions) -> Camera:
+def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
     """Camera of the written picture: its size, its window, and the middle of the shutter. For a warped picture only
     size and window count.
 
     Raises InputError for a region outside the frame.
     """
-    warp = warp_of(task, options)
-    shown = task.at(sampling_of(task, options).middle) if warp is None else warp.shown
-    return framed(shown, options.pictures.framing)
+    warp = warp_of(task, pictures)
+    shown = task.at(sampling_of(task, pictures).middle) if warp is None else warp.shown
+    return framed(shown, pictures.framing)
 
 
-def lens_of(task: Task, options: RenderOptions) -> Places | None:
+def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
     """The lens or STMap that warps the picture, None if nothing does. Raises InputError for an unreadable map."""
-    if stmap := options.pictures.warp.stmap:
+    if stmap := pictures.warp.stmap:
         return ByMap(read_stmap(Path(stmap)))
     return ByLens(task.lens) if task.lens is not None else None
 
 
-def warp_of(task: Task, options: RenderOptions) -> Warp | None:
+def warp_of(task: Task, pictures: PictureConfig) -> Warp | None:
     """The warp of the picture, None for a straight one."""
-    lens = lens_of(task, options)
-    return None if lens is None else Warp(lens, task.at(sampling_of(task, options).middle))
+    lens = lens_of(task, pictures)
+    return None if lens is None else Warp(lens, task.at(sampling_of(task, pictures).middle))
 
 
-def straight_camera(task: Task, options: RenderOptions) -> Camera:
+def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
     """Camera of the rendered picture: `picture_camera`, or for a warped picture the straight window that it is sampled
     from."""
-    camera, warp = picture_camera(task, options), warp_of(task, options)
+    camera, warp = picture_camera(task, pictures), warp_of(task, pictures)
     return camera if warp is None else warp.of_window(camera)[1] or camera
 
 
-def camera_after(task: Task, options: RenderOptions) -> Camera | None:
+def camera_after(task: Task, pictures: PictureConfig) -> Camera | None:
     """Camera of the whole frame that motion leads to: one frame after the middle of the shutter."""
-    middle = sampling_of(task, options).middle
+    middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
 
 
-def camera_before(task: Task, options: RenderOptions) -> Camera | None:
+def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
     """Camera of the whole frame that backward motion leads to: one frame before the middle of the shutter."""
-    middle = sampling_of(task, options).middle
+    middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)
 
 
-def end_before(task: Task, time: float, options: RenderOptions) -> float | None:
+def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
     """The time from which the camera at another time is extrapolated, both in frames from the frame.
 
     None if the shot's source defines the camera at that time, and for a shot of one frame. A stage defines its camera
@@ -346,17 +346,17 @@ def end_before(task: Task, time: float, options: RenderOptions) -> float | None:
     if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:
         return None
     if isinstance(task.stretch, Moments):
-        middle = sampling_of(task, options).middle
+        middle = sampling_of(task, pictures).middle
         return middle if time in (middle - 1, middle + 1) else None
     return task.ends[0] - task.number if time < 0 else task.ends[1] - task.number
 
 
-def model_times(task: Task, options: RenderOptions) -> list[float]:
+def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) -> list[float]:
     """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and the
     targets of motion."""
-    sampling = sampling_of(task, options)
+    sampling = sampling_of(task, pictures)
     times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
-    times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in options.channels]
+    times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in channels]
     return list(dict.fromkeys(times))
 
 
@@ -394,14 +394,14 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     Includes cameras, channels, encoding, pictures, rasterizer, the content of its holdout, and the models' placements.
     For models with one file per frame, it includes the content of these files.
     """
-    pictures, sampling = options.pictures, sampling_of(task, options)
+    pictures, sampling = options.pictures, sampling_of(task, options.pictures)
     encoding = {
         name: getattr(options.encoding, name) for name in _ENCODING_FIELDS_BY_SUFFIX.get(task.path.suffix.lower(), ())
     }
-    cameras: list[Camera | Moments] = [picture_camera(task, options)]
-    if "motion" in options.channels and (after := camera_after(task, options)) is not None:
+    cameras: list[Camera | Moments] = [picture_camera(task, pictures)]
+    if "motion" in options.channels and (after := camera_after(task, pictures)) is not None:
         cameras.append(after)
-    if "backward" in options.channels and (before := camera_before(task, options)) is not None:
+    if "backward" in options.channels and (before := camera_before(task, pictures)) is not None:
         cameras.append(before)
     if sampling.moves and isinstance(task.stretch, Moments):
         cameras.append(task.stretch)
@@ -417,13 +417,13 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made += (options.mattes,) if options.mattes else ()
     colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
     more: list[Any] = [settings_digest(task.right, options)] if task.right is not None else []
-    if (lens := lens_of(task, options)) is not None:
+    if (lens := lens_of(task, pictures)) is not None:
         bends = lens.stmap.digest if isinstance(lens, ByMap) else task.lens
         more += [bends, task.at(sampling.middle)]
     if task.files:
         made += ("files", [_digest_at(str(path), _changed(path)) for path in task.files])
     if task.placed is not None:
-        more.append([task.placed[time] for time in model_times(task, options)])
+        more.append([task.placed[time] for time in model_times(task, pictures, options.channels)])
     return digest_of(cameras, made, encoding, colour, pictures.framing, used, *more)
 
 
@@ -474,9 +474,9 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Fra
     An EXR file also gets its window, and an attribute that marks a whole panorama.
     whole: the file's task, if the file has other views too.
     """
-    camera = picture_camera(task, options)
+    camera = picture_camera(task, options.pictures)
     matrices = camera_matrices(camera)
-    if warp_of(task, options) is not None:
+    if warp_of(task, options.pictures) is not None:
         matrices.pop("worldToNDC", None)  # no matrix describes a warp
     attributes = {
         **options.attributes,
@@ -492,7 +492,7 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Fra
         attributes["colorInteropID"] = name
     if is_whole_panorama(camera):
         attributes |= LATLONG_ATTRIBUTES
-    sampling = sampling_of(task, options)
+    sampling = sampling_of(task, options.pictures)
     typed = headers(task.at(sampling.middle), task.number, task.optics, sampling)
     return FrameFileHeader(
         attributes, matrices, camera.window, CHROMATICITIES.get(space, ()), view=task.eye, typed=typed

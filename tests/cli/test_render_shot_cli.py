@@ -373,7 +373,8 @@ def test_a_worker_places_what_it_has_read(folder: Path, tmp_path: Path) -> None:
     shot, channels = layout(folder, "farm", **MOVING), ("rgb", "motion")
     cast, options = load_cast(shot), RenderOptions(channels)
     cameras = read_shot(folder / "cameras.json")
-    (task,) = cast.seen(make_tasks(cameras.only("2"), cameras, str(tmp_path / "#.exr"), lambda c: c, channels), options)
+    tasks = make_tasks(cameras.only("2"), cameras, str(tmp_path / "#.exr"), lambda c: c, channels)
+    (task,) = cast.seen(tasks, options.pictures, channels)
     layout(folder, "farm")  # changed meanwhile
     job = WorkerJob(str(shot), cast.digest, options, RasterizerConfig(), placed=True)
     assert not isinstance(render_frame(pickle.loads(pickle.dumps(task)), job), Failure)

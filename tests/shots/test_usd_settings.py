@@ -248,7 +248,7 @@ def test_flags_go_before_the_stages_shutter(tmp_path: Path) -> None:
     instant = "double shutter:open = 0.15\ndouble shutter:close = 0.15"
     task = tasks_of(read_shot(write_stage(tmp_path / "shot.usda", instant)))[1]
     assert task.sampling is not None and not task.sampling.on
-    np.testing.assert_allclose(picture_camera(task, RenderOptions()).position, [5, 2, 5], atol=1e-12)
+    np.testing.assert_allclose(picture_camera(task, PictureConfig()).position, [5, 2, 5], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -273,7 +273,7 @@ def test_motion_of_the_stages_shutter(tmp_path: Path) -> None:
     tasks, options = tasks_of(shot, channels=("rgb", "motion")), RenderOptions(("rgb", "motion"))
     assert shot.moment is not None
     for task in tasks:
-        after = camera_after(task, options)
+        after = camera_after(task, options.pictures)
         assert after is not None
         here = shot.moment(task.number + 0.25)
         step = shot.moment(task.number + 1.25) if task.number < 3 else None

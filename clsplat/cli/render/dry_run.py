@@ -56,7 +56,7 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
     model, output = job.spaces
     frames = []
     for task in tasks:
-        camera = picture_camera(task, options)
+        camera = picture_camera(task, options.pictures)
         frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
         frame |= {"width": camera.width, "height": camera.height, "skipped": task.key in skipped}
         if task.holdout is not None:
@@ -74,7 +74,7 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
         "deep_bins": options.deep.bins if options.deep else 0,
         "model_colorspace": model,
         "colorspace": output,
-        "samples": max(sampling_of(task, options).pictures for task in tasks),
+        "samples": max(sampling_of(task, options.pictures).pictures for task in tasks),
         "supersample": options.pictures.framing.supersample,
         **({"fps": job.video.fps or DEFAULT_VIDEO_FPS} if job.is_video else {}),
         "frames": frames,
@@ -127,9 +127,9 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     framing, names = options.pictures.framing, set(options.channels)
     gaussians = job.cast.at(job.tasks[0].number)
     floats, moved = held_sh(gaussians, job.rasterizer).floats, job.cast.tracks is not None and "motion" in names
-    features, samples = feature_floats(names), max(sampling_of(task, options).pictures for task in job.tasks)
+    features, samples = feature_floats(names), max(sampling_of(task, options.pictures).pictures for task in job.tasks)
     plans = []
-    cameras = [straight_camera(task, options) for task in job.tasks]
+    cameras = [straight_camera(task, options.pictures) for task in job.tasks]
     for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
         if options.deep:
             bins, planes = options.deep.bins, 4 * DEEP_FLOATS * options.deep.bins
@@ -159,7 +159,7 @@ def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _samples(job: Job) -> str:
-    sampling, framing = sampling_of(job.tasks[0], job.options), job.options.pictures.framing
+    sampling, framing = sampling_of(job.tasks[0], job.options.pictures), job.options.pictures.framing
     words = [f"{sampling.samples} frames for one" if sampling.on else ""]
     if sampling.moves:
         opens, closes = sampling.shutter

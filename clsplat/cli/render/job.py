@@ -154,7 +154,7 @@ def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
     sizes = set()
     check_warps(tasks, options)
     for task in tasks:
-        cameras = [picture_camera(view, options) for view in task.views]
+        cameras = [picture_camera(view, options.pictures) for view in task.views]
         for camera in cameras:
             if options.pictures.framing.supersample > 1:
                 finer(camera, options.pictures.framing)
@@ -194,12 +194,12 @@ def check_warps(tasks: list[Task], options: RenderOptions) -> None:
     flag = f"--stmap {options.pictures.warp.stmap}" if options.pictures.warp.stmap else "--distort"
     empty: dict[int, float] = {}
     for task in (view for whole in tasks for view in whole.views):
-        if (warp := warp_of(task, options)) is None:
+        if (warp := warp_of(task, options.pictures)) is None:
             continue
         if task.camera.model.wraps:
             raise InputError(f"{flag}: frame {task.number} is a panorama, expected a picture with edges")
         if isinstance(warp.source, ByMap):
-            camera, stmap = picture_camera(task, options), warp.source.stmap
+            camera, stmap = picture_camera(task, options.pictures), warp.source.stmap
             window = camera.window or Window(0, 0, camera.width, camera.height)
             if not stmap.covers(window.x, window.y, camera.width, camera.height):
                 raise InputError(

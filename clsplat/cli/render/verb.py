@@ -263,7 +263,8 @@ def _read_job(verb: RenderVerb) -> Job:
         warn(text)
     cast = asked.model() if cast is None else cast
     gains = gains_of(verb.model, verb.appearance) if verb.appearance is not None else ()
-    tasks, mattes = cast.seen(tasks, options), mattes_of(cast, options.channels, verb.ids_from or "")
+    tasks = cast.seen(tasks, options.pictures, options.channels)
+    mattes = mattes_of(cast, options.channels, verb.ids_from or "")
     colours = Colours(options.pictures.colour, cast.space)
     check_colours(verb.output, colours)
     options = with_models(options, cast, mattes, colours.output)
