@@ -23,7 +23,6 @@ from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.pictures import SamplingConfig
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import linear_to_srgb, srgb_to_linear
 from clsplat.models import edit
@@ -36,6 +35,7 @@ from clsplat.sequence.job_models import load_cast
 from clsplat.sequence.task import RenderOptions, make_tasks
 from clsplat.shots import read_shot
 from clsplat.shots.shot_file import parse_transform, read_layout
+from clsplat.shots.shutter_times import sample_moments
 from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 CLOSE = 1e-5

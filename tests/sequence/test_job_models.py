@@ -19,7 +19,6 @@ from tiny import HEIGHT, WIDTH, hidden_model
 from clsplat.arrays import Float32
 from clsplat.cli.main import main
 from clsplat.config.pictures import PictureConfig, SamplingConfig
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.images.frame_files import camera_matrices
 from clsplat.models import edit
 from clsplat.models.formats import usd
@@ -28,6 +27,7 @@ from clsplat.sequence.job_models import load_cast
 from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, make_tasks, model_times
 from clsplat.shots import Shot, read_shot
 from clsplat.shots.shot_file import AnimatedProperty, KeyedTrack, Within
+from clsplat.shots.shutter_times import sample_moments
 
 KEY = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
 LATE = SamplingConfig(shutter_open=0.0, shutter_close=0.5, samples=2)

@@ -14,12 +14,12 @@ from needs import require
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.sequence.task import RenderOptions, Task, camera_after, make_tasks, picture_camera, settings_digest
 from clsplat.shots import Shot, choose_shot, read_shot
 from clsplat.shots.optics import Optics, settled, time_code
 from clsplat.shots.readers.usd_settings import CONFORM_POLICIES
+from clsplat.shots.shutter_times import sample_moments
 
 LENS = "float fStop = 2\nfloat focusDistance = 5\n"
 SHUTTER = "double shutter:open = -0.25\ndouble shutter:close = 0.25\n"
