@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from difflib import get_close_matches
 from functools import cached_property, lru_cache
 from glob import escape, glob
@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.config.pictures import ColourConfig
-from clsplat.errors import InputError, examples
+from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file, known_digest
+from clsplat.images.frame_files import VIDEO_SUFFIXES
 
 SRGB = "sRGB"
 """sRGB curve over Rec.709 primaries: the space of 8-bit photographs, and the default of models."""
@@ -158,16 +159,20 @@ class Colours:
         one, rest = colours[:3][np.eye(3, dtype=bool)], colours[:3][~np.eye(3, dtype=bool)]
         return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *colours[3]], colours[3, 0], atol=2e-3))
 
-    def check_file(self, path: str, extension: str, videos: Collection[str]) -> None:
-        """Raise InputError if a file of that extension would show other colours than it holds.
+    def check_file(self, path: str) -> None:
+        """Raise InputError if a file of that name would show other colours than it holds.
 
-        Integer formats cannot hold linear light. A video, whose extension is one of `videos`, must be in Rec.709.
+        Integer formats cannot hold linear light. A video must be in Rec.709. Warns if an EXR file does not record the
+        chromaticities.
         """
+        extension = Path(path).suffix.lower()
         advice = "write .exr, or give --colorspace sRGB"
         if extension != ".exr" and self.is_linear(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, which is linear, expected sRGB; {advice}")
-        if extension in videos and not self.has_rec709(self.output):
+        if extension in VIDEO_SUFFIXES and not self.has_rec709(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, expected sRGB's primaries; {advice}")
+        if extension == ".exr" and self.is_linear(self.output) and self.output not in CHROMATICITIES:
+            warn(f"{path}: the chromaticities of {self.output} are not known here, and are not in the files")
 
     @cached_property
     def _config(self) -> Any:

@@ -24,6 +24,9 @@ from clsplat.shots.frame_numbers import ranges
 from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_layout
 from clsplat.shots.usd_models import read_stage
 
+Known = dict[Placement | State, Placement | State]
+"""Placements that are stored already, by themselves: equal ones are stored once."""
+
 
 @dataclass(frozen=True, eq=False)
 class JobModels:
@@ -91,7 +94,7 @@ class JobModels:
 
     def seen(self, tasks: Sequence[Task], pictures: PictureConfig, channels: Collection[str]) -> list[Task]:
         """The tasks with placements of the models, and cameras adapted to these. Raises InputError."""
-        known: dict[Placement | State, Placement | State] = {}  # equal placements are stored once
+        known: Known = {}
         self._check_numbers([task.number for task in tasks])
         placed = []
         for task in tasks:
@@ -99,13 +102,7 @@ class JobModels:
             placed.append(replace(views[0], right=views[1] if views[1:] else None))
         return placed
 
-    def _seen(
-        self,
-        task: Task,
-        pictures: PictureConfig,
-        times: Sequence[float],
-        known: dict[Placement | State, Placement | State],
-    ) -> Task:
+    def _seen(self, task: Task, pictures: PictureConfig, times: Sequence[float], known: Known) -> Task:
         """A view with placements of the models."""
         model = kind_of(self.models[0])
         if self.tracks is None:

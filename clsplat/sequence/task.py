@@ -34,7 +34,7 @@ from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
 from clsplat.shots.motion import Moments
 from clsplat.shots.optics import Optics, headers, settled
-from clsplat.shots.shutter_times import shutter_times
+from clsplat.shots.shutter_times import sample_moments
 
 LATLONG_ATTRIBUTES: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
 """OpenImageIO's attributes for EXR's envmap. The level mode says that no mipmap levels follow, for which OpenImageIO
@@ -328,7 +328,7 @@ def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) 
     """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and the
     targets of motion."""
     sampling = sampling_of(task, pictures)
-    times = [sampling.middle, *shutter_times(sampling)]
+    times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
     times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in channels]
     return list(dict.fromkeys(times))
 
@@ -385,10 +385,10 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
     made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera were not clipped at the far plane
+    colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:
         made += ("holdout", known_digest(task.holdout), options.holdout)
     made += (options.mattes,) if options.mattes else ()
-    colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     more: list[Any] = [settings_digest(task.right, options)] if task.right is not None else []
     if (lens := lens_of(task, pictures)) is not None:
         bends = lens.stmap.digest if isinstance(lens, ByMap) else task.lens

@@ -21,11 +21,6 @@ def sample_times(count: int) -> Float64:
     return np.asarray((np.argsort(np.argsort(radical)) + 0.5) / count)
 
 
-def shutter_times(config: SamplingConfig) -> list[float]:
-    """The times of `sample_moments` for an open shutter; none for another."""
-    return sample_moments(config) if config.moves else []
-
-
 def sample_moments(config: SamplingConfig) -> list[float]:
     """The time of each sample, in frames from the frame: spread over an open shutter, else the shutter's middle."""
     if not config.on or config.samples == 1:
