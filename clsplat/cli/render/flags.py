@@ -12,6 +12,7 @@ from tyro.conf import arg
 
 from clsplat.cli.options import Flag, Memory, OptionalInt, RunOrModel, Verb, with_given
 from clsplat.cli.render.help_page import RENDER_GROUPS
+from clsplat.config.channels import in_words
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import (
     DEFAULT_EXR_DEPTH,
@@ -30,6 +31,12 @@ from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.stereo import StereoConfig
 from clsplat.config.training import Lenses
 from clsplat.errors import InputError
+
+_CHANNELS_HELP = (
+    f"Channels of the files: {in_words('image')}. EXR files can also hold {in_words('features', 'depths')}. Further "
+    f"EXR channels are {in_words('whole')}, {in_words('shares')}. docs/render.md describes each."
+)
+
 
 @dataclass(frozen=True)
 class RenderVerb(Verb):
@@ -71,10 +78,7 @@ class RenderVerb(Verb):
     """Rendering of fisheye cameras of photographs. undistort: as the pinhole cameras that fit into them; native:
     through their own lens. If not given: as the run was trained; but undistort with --path, whose cameras are pinholes,
     and without a run."""
-    channels: Annotated[str, arg(metavar="NAME,...")] = "rgb"
-    """Channels of the files: rgb and alpha. EXR files can also hold depth, median and first (depths), normals,
-    position, motion (to the next frame) and backward (to the previous frame). Further EXR channels are count and id (of
-    Gaussians), objects and semantic (Cryptomattes). docs/render.md describes each."""
+    channels: Annotated[str, arg(metavar="NAME,...", help=_CHANNELS_HELP)] = "rgb"
     ids_from: Annotated[str | None, arg(metavar="PROPERTY")] = None
     """Property of the models' PLY files with an integer for each Gaussian, for --channels semantic."""
     background: Annotated[str | None, arg(metavar="black|white|R,G,B")] = None
