@@ -33,7 +33,7 @@ class Option:
     """A flag, or a positional argument.
 
     names: the flag's names on the command line; empty for a positional argument.
-    text: docstring of the dataclass field.
+    text: the help of the annotation, else the docstring of the dataclass field.
     off: name of the flag that switches this one off, "" for none.
     """
 
@@ -79,9 +79,8 @@ def options(kind: type, prefix: str = "") -> Iterator[Option]:
         names = () if positional else (*(getattr(conf, "aliases", None) or ()), f"--{long}")
         metavar = getattr(conf, "metavar", None) or ("" if bare is bool else _metavar(bare, long))
         off = ".".join([*parents, f"no-{last}"]) if pairs else ""
-        yield Option(
-            names, metavar, texts.get(field.name, ""), None if required else default, required, off and f"--{off}"
-        )
+        text = getattr(conf, "help", None) or texts.get(field.name, "")
+        yield Option(names, metavar, text, None if required else default, required, off and f"--{off}")
 
 
 def grouped_help(kind: type, prog: str, groups: Groups, width: int | None = None) -> str:

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 from clsplat.cli.options import Flag, RunOrModel, Verb
 from clsplat.cli.render import verb as render
+from clsplat.cli.render.flags import RenderVerb
 from clsplat.cli.session import Services
 from clsplat.config.pictures import ColourConfig
 from clsplat.errors import InputError
@@ -59,7 +60,7 @@ def run(verb: ThumbnailVerb, services: Services) -> int:
     if FRAME_FIELD_PATTERN.search(str(output)) or UNKNOWN_FIELD_PATTERN.search(output.name):
         raise InputError(f"{output}: is a pattern for frame numbers, expected the name of a single picture after -o")
     is_exr = output.suffix.lower() == ".exr"  # only EXR files keep a model's linear colours
-    frame = render.RenderVerb(
+    frame = RenderVerb(
         verb.model,
         str(output),
         path="turntable",

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Literal
 
 Kind = Literal["colour", "exact", "whole"]
@@ -26,6 +27,7 @@ class Channel:
     features, one for each object.
     kernel: its name in the kernels, which get a feature's offset as FEATURE_NAME.
     signs: factors from the kernel's values to the file's; empty if they are equal.
+    note: words of --help on it, and on the channels before it with the same words.
     """
 
     names: tuple[str, ...]
@@ -34,6 +36,7 @@ class Channel:
     source: Source
     kernel: str
     signs: tuple[int, ...] = ()
+    note: str = ""
 
     @property
     def is_light(self) -> bool:
@@ -44,15 +47,19 @@ class Channel:
 FRAME_CHANNELS: dict[str, Channel] = {
     "rgb": Channel(("R", "G", "B"), "colour", "rgba", "image", "image"),
     "alpha": Channel(("A",), "colour", "rgba", "image", "transmittance"),
-    "depth": Channel(("Z",), "exact", "depth", "features", "depth"),
-    "median": Channel(("median.Z",), "exact", "median", "depths", "median"),
-    "first": Channel(("first.Z",), "exact", "first", "depths", "first"),
+    "depth": Channel(("Z",), "exact", "depth", "features", "depth", note="depths"),
+    "median": Channel(("median.Z",), "exact", "median", "depths", "median", note="depths"),
+    "first": Channel(("first.Z",), "exact", "first", "depths", "first", note="depths"),
     "normals": Channel(("N.x", "N.y", "N.z"), "colour", "N", "features", "normal"),
     "position": Channel(("P.x", "P.y", "P.z"), "exact", "P", "features", "position"),
-    "motion": Channel(("forward.u", "forward.v"), "exact", "forward", "features", "motion", signs=(1, -1)),
-    "backward": Channel(("backward.u", "backward.v"), "exact", "backward", "features", "backward", signs=(1, -1)),
-    "count": Channel(("count",), "whole", "count", "whole", "count"),
-    "id": Channel(("id",), "whole", "id", "whole", "index"),
+    "motion": Channel(
+        ("forward.u", "forward.v"), "exact", "forward", "features", "motion", (1, -1), "to the next frame"
+    ),
+    "backward": Channel(
+        ("backward.u", "backward.v"), "exact", "backward", "features", "backward", (1, -1), "to the previous frame"
+    ),
+    "count": Channel(("count",), "whole", "count", "whole", "count", note="of Gaussians"),
+    "id": Channel(("id",), "whole", "id", "whole", "index", note="of Gaussians"),
 }
 """Every channel that `--channels` takes, in the order of a file and of the kernels' planes. In files the v of both
 motions points up; in docs/channels.md y points down."""
@@ -63,7 +70,7 @@ CRYPTOMATTE_LAYERS = 3
 
 def _matte(name: str) -> Channel:
     layers = tuple(f"{name}{layer:02d}.{channel}" for layer in range(CRYPTOMATTE_LAYERS) for channel in "RGBA")
-    return Channel(layers, "exact", name, "shares", name)
+    return Channel(layers, "exact", name, "shares", name, note="Cryptomattes")
 
 
 CRYPTOMATTE_CHANNELS: dict[str, Channel] = {"objects": _matte("cryptoobject"), "semantic": _matte("cryptosemantic")}
@@ -73,6 +80,17 @@ WRITABLE_CHANNELS = ChainMap(CRYPTOMATTE_CHANNELS, FRAME_CHANNELS)
 
 DEEP_CHANNELS = ("R", "G", "B", "A", "Z", "ZBack")
 """Channels of a deep picture."""
+
+
+def in_words(*sources: Source) -> str:
+    """Names of the channels of these sources, with their notes, for --help."""
+    rows = [(name, row.note) for name, row in WRITABLE_CHANNELS.items() if row.source in sources]
+    groups = [[*group] for _, group in groupby(rows, lambda row: row[1] or row[0])]
+    return _and([_and([name for name, _ in group]) + (f" ({group[0][1]})" if group[0][1] else "") for group in groups])
+
+
+def _and(words: Sequence[str]) -> str:
+    return " and ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
 
 
 def floats_of(source: Source) -> dict[str, int]:

@@ -9,6 +9,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +28,20 @@ Specification: https://github.com/git-lfs/git-lfs/blob/main/docs/spec.md.
 def digest(path: str | os.PathLike[str]) -> str:
     """SHA-256 of the file's content, in hexadecimal. Raises OSError."""
     return _digest(path, hashlib.sha256())
+
+
+def known_digest(path: Path) -> str:
+    """`digest`, kept until the file's modification time changes. Raises InputError for a file that is not there."""
+    try:
+        changed = path.stat().st_mtime_ns
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason_of(error)}") from None
+    return _digest_at(path, changed)
+
+
+@lru_cache(maxsize=4096)
+def _digest_at(path: Path, changed: int) -> str:  # noqa: ARG001  # a cache key: a changed file is read again
+    return digest(path)
 
 
 def short_digest(path: Path) -> str | None:

@@ -32,13 +32,13 @@ from clsplat.frame.holdout import Cut
 from clsplat.frame.lens import Places, Warp
 from clsplat.frame.mattes import Matte
 from clsplat.frame.samples import sample_cameras, sampled, supersampled
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.frame.strips import in_strips, strip_rows
 from clsplat.frame.warp import warped
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import SRGB, Colours
 from clsplat.images.cryptomatte import ranked
 from clsplat.rendering.renderer import Renderer
+from clsplat.shots.shutter_times import sample_moments
 from clsplat.stages.holdout import held_bytes
 
 BLANK_COLOUR_TOLERANCE = 1e-6

@@ -20,8 +20,8 @@ from clsplat.camera import Camera
 from clsplat.config.pictures import SENSOR_WIDTH_MM, Filter, FramingConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import Draw, Planes, in_two
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.frame.window import crop, reframed
+from clsplat.shots.shutter_times import sample_moments
 
 _FILTER_RADII_PX: dict[Filter, float] = {"box": 0.5, "blackman-harris": 1.5}
 """Radius of each pixel filter, in pixels."""

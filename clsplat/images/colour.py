@@ -9,9 +9,11 @@ OpenImageIO. The sRGB curve is computed here: OpenColorIO's fast approximation i
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable
+import re
+from collections.abc import Iterable
 from difflib import get_close_matches
 from functools import cached_property, lru_cache
+from glob import escape, glob
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,9 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.config.pictures import ColourConfig
-from clsplat.errors import InputError, examples
+from clsplat.errors import InputError, examples, warn
+from clsplat.files.documents import is_file, known_digest
+from clsplat.images.frame_files import VIDEO_SUFFIXES
 
 SRGB = "sRGB"
 """sRGB curve over Rec.709 primaries: the space of 8-bit photographs, and the default of models."""
@@ -155,16 +159,20 @@ class Colours:
         one, rest = colours[:3][np.eye(3, dtype=bool)], colours[:3][~np.eye(3, dtype=bool)]
         return bool(np.allclose(rest, 0, atol=2e-3) and np.allclose([*one, *colours[3]], colours[3, 0], atol=2e-3))
 
-    def check_file(self, path: str, extension: str, videos: Collection[str]) -> None:
-        """Raise InputError if files with that extension cannot hold the output's colours.
+    def check_file(self, path: str) -> None:
+        """Raise InputError if a file of that name cannot hold the colours of the output.
 
-        Integer formats cannot hold linear light. A video, whose extension is one of `videos`, must be in Rec.709.
+        Integer formats cannot hold linear light. A video must be in Rec.709. Warns if an EXR file does not record the
+        chromaticities.
         """
+        extension = Path(path).suffix.lower()
         advice = "write .exr, or give --colorspace sRGB"
         if extension != ".exr" and self.is_linear(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, which is linear, expected sRGB; {advice}")
-        if extension in videos and not self.has_rec709(self.output):
+        if extension in VIDEO_SUFFIXES and not self.has_rec709(self.output):
             raise InputError(f"{path}: its colours would be {self.output}, expected sRGB's primaries; {advice}")
+        if extension == ".exr" and self.is_linear(self.output) and self.output not in CHROMATICITIES:
+            warn(f"{path}: the chromaticities of {self.output} are not known here, and are not in the files")
 
     @cached_property
     def _config(self) -> Any:
@@ -246,3 +254,30 @@ class Colours:
         if reason := result.geterror():
             raise InputError(f"{self._source}: cannot convert {source} to {target}: {' '.join(reason.split())}")
         return np.asarray(result.get_pixels(oiio.FLOAT), np.float32)
+
+
+def configuration_digest(source: str) -> str:
+    """SHA-256 of an OpenColorIO file and of the tables that it names; for any other configuration, its name."""
+    if not source or not is_file(source):
+        return source
+    patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
+    tables = sorted({path for pattern in patterns for path in glob(pattern) if is_file(path)})  # noqa: PTH207
+    return " ".join(known_digest(Path(path)) for path in (source, *tables))
+
+
+@lru_cache(maxsize=8)
+def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # a cache key
+    """Glob patterns of the files that a configuration's FileTransforms name, in the folders of its search_path.
+
+    Its variables, which are set elsewhere, match anything.
+    """
+    text = Path(source).read_text("utf-8", "replace")
+    listed = re.search(r"^search_path:([^\n]*(?:\n[ \t]*- [^\n]*)*)", text, re.MULTILINE)
+    places = re.split(r"[\n\[\],:;]|\s-\s", listed[1]) if listed else []
+    names = re.findall(r"\bsrc:[ \t]*(\"[^\"]*\"|'[^']*'|[^,}\n]+)", text)
+    folders, files = (
+        {re.sub(r"\$\{\w+\}|\$\w+|%\w+%", "*", escape(text.strip(" \t\"'"))) for text in texts}
+        for texts in (places, names)
+    )
+    home = Path(escape(str(Path(source).parent)))
+    return tuple(sorted({str(home / folder / file) for folder in folders | {""} for file in files}))

@@ -88,8 +88,11 @@ def read_stmap(path: Path) -> StMap:
     Raises InputError for a file that is missing, not an image, of integers, or without two channels. Warns of half
     floats, which are too coarse for positions in large images.
     """
-    open_image(path).close()
-    return _read(path, path.stat().st_mtime_ns)
+    try:
+        changed = path.stat().st_mtime_ns
+    except OSError:
+        changed = 0  # opening it says why
+    return _read(path, changed)
 
 
 @lru_cache(maxsize=2)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from clsplat.config.pictures import DEFAULT_VIDEO_FPS, ProRes, VideoConfig
 from clsplat.errors import ClsplatError, InputError
 from clsplat.files.atomic import DISK_FULL_ERRNOS, atomic_name
+from clsplat.files.documents import is_file
 from clsplat.files.names import native_name
 from clsplat.images.alpha import unassociate
 from clsplat.images.colour import REC709_LUMA_WEIGHTS
@@ -62,6 +63,8 @@ def video_record(path: Path, frames: int | None = None) -> dict[str, str]:
     """
     import av
 
+    if not is_file(path):
+        return {}
     try:
         with av.open(native_name(path)) as container:
             record = parse_record(container.metadata.get("comment"))

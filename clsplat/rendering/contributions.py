@@ -35,8 +35,7 @@ def largest_contributions(
     config = config or RasterizerConfig()
     alpha_alone = drop_sh(gaussians, 0)  # contributions do not depend on colour
     plan = plan_step(device, len(gaussians), 1, cameras, config, StepMemory(CONTRIBUTION_SLOT_FIELDS))
-    rasterizer = Rasterizer(device, config)
-    rasterizer.antialias(on=gaussians.antialiased)
+    rasterizer = Rasterizer(device, config, antialiased=gaussians.antialiased)
     rasterizer.follow(plan)
     model = host_gaussians(alpha_alone, plan.rows) if plan.streamed else upload_gaussians(device, alpha_alone)
     background = allocate(device, (3,), np.float32)

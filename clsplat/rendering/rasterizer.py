@@ -100,11 +100,18 @@ class Rasterizer:
     readback: (len(READBACK),) uint32, the numbers that each pass reads back, with the counts of `adam`.
     """
 
-    def __init__(self, device: Device, config: RasterizerConfig | None = None, work: Workspace | None = None) -> None:
-        self.config = config or RasterizerConfig()
-        self._switches, self._bare = self.config.switches(), device
+    def __init__(
+        self,
+        device: Device,
+        config: RasterizerConfig | None = None,
+        work: Workspace | None = None,
+        *,
+        antialiased: bool = False,
+    ) -> None:
+        self.config, self._bare = config or RasterizerConfig(), device
+        self._switches = self.config.switches()
         self._antialiased: bool | None = None
-        self.antialias(on=False)
+        self.antialias(on=antialiased)
         self.work = work or Workspace(device)
         self._packs: WeakKeyDictionary[Camera, NDArray[np.float32]] = WeakKeyDictionary()  # training has few cameras
         aligned = -(-len(CAMERA) // device.row_alignment) * device.row_alignment
@@ -120,8 +127,8 @@ class Rasterizer:
         """Switch to antialiased models, or back to others (`Gaussians.antialiased`)."""
         if on == self._antialiased:
             return
-        self._antialiased = on
-        self.device = self._bare.with_switches(kernel_defines(self.config, antialiased=on))
+        defines = kernel_defines(self.config, antialiased=on)
+        self._antialiased, self.device = on, self._bare.with_switches(defines)
         self._by_model = {
             model: self.device.with_switches(model.defines) if model.defines else self.device for model in CAMERA_MODELS
         }

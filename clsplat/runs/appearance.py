@@ -51,13 +51,14 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
             f"--appearance {photograph}: {model} has learnt no appearances (no appearance.json), expected a run of "
             "clsplat train --appearance exposure or ppisp"
         )
-    kind = _kind(path)
+    record = _document(path)
+    kind = record.get("kind") if isinstance(record, dict) else None
     if isinstance(kind, str) and kind not in KINDS_WITH_GAINS:
         raise InputError(
             f"--appearance {photograph}: {path} is of --appearance {kind}, which is only for training; expected a run "
             f"of clsplat train --appearance {' or '.join(KINDS_WITH_GAINS)}"
         )
-    rows = _read(path, "photographs") | _read(path, "held_out")
+    rows = _read(path, record, "photographs") | _read(path, record, "held_out")
     found = [name for name in rows if photograph in (name, *_ends(name))]
     if len(found) > 1 and photograph not in found:
         raise InputError(f"--appearance {photograph}: fits {len(found)} photographs, {examples(found)}; name one")
@@ -75,7 +76,8 @@ def gains_of(model: Path, photograph: str) -> tuple[float, ...]:
 
 def looks_of_run(run: Run | None) -> Look:
     """`held_out_looks` of a run's appearance.json. Without this file the looks change nothing. Raises InputError."""
-    return _looks(_read(run.appearance_path, "held_out") if run is not None and run.appearance_path.exists() else {})
+    path = run.appearance_path if run is not None else None
+    return _looks({} if path is None or not path.exists() else _read(path, _document(path), "held_out"))
 
 
 def held_out_looks(record: Mapping[str, Any] | None) -> Look:
@@ -131,18 +133,22 @@ def _light(vignette: Float64, centre: Float64, width: int, height: int) -> Float
     return light
 
 
-def _kind(path: Path) -> Any:
+def _document(path: Path) -> Any:
     try:
-        return parse_json(read_document(path, EXPECTED_APPEARANCE_FILE, MAX_APPEARANCE_BYTES)).get("kind")
-    except (ValueError, AttributeError):
-        return None
+        return parse_json(read_document(path, EXPECTED_APPEARANCE_FILE, MAX_APPEARANCE_BYTES))
+    except ValueError as error:
+        raise _misread(path, error) from None
 
 
-def _read(path: Path, key: str) -> dict[str, Row]:
+def _read(path: Path, record: Any, key: str) -> dict[str, Row]:
     try:
-        return _rows_in(parse_json(read_document(path, EXPECTED_APPEARANCE_FILE, MAX_APPEARANCE_BYTES)), key)
+        return _rows_in(record, key)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED_APPEARANCE_FILE}") from None
+        raise _misread(path, error) from None
+
+
+def _misread(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: {type(error).__name__}: {error}; expected {EXPECTED_APPEARANCE_FILE}")
 
 
 def _rows_in(record: Any, key: str) -> dict[str, Row]:

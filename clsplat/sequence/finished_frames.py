@@ -4,19 +4,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 from clsplat.config.pictures import VideoConfig
-from clsplat.errors import InputError, reason_of
+from clsplat.errors import InputError, examples, reason_of, warn
 from clsplat.files.documents import is_file
 from clsplat.files.locks import abandoned
 from clsplat.images.frame_files import attribute, is_foreign, is_whole
 from clsplat.images.provenance import MODEL_DIGEST_ATTRIBUTE, SETTINGS_DIGEST_ATTRIBUTE
+from clsplat.images.video import video_record
 from clsplat.sequence.task import RenderOptions, Task, digest_of, picture_camera, settings_digest
+
+T = TypeVar("T")
 
 MAX_FILE_THREADS = 8
 """Largest number of threads that read or write files at once."""
@@ -53,18 +56,26 @@ def remove_temporaries(tasks: Sequence[Task]) -> None:
             path.unlink()
 
 
+def _identity(task: Task, options: RenderOptions) -> dict[str, str | int | float]:
+    """Attributes of a frame's file that tell it from frames of other models and settings."""
+    known = {name: value for name, value in options.attributes.items() if name in IDENTITY_ATTRIBUTES}
+    return {**known, SETTINGS_DIGEST_ATTRIBUTE: settings_digest(task, options)}
+
+
 def is_complete(task: Task, options: RenderOptions) -> bool:
     """True if the frame's file is there, with the right size, channels, model and settings, and readable to its end."""
-    attributes = {name: value for name, value in options.attributes.items() if name in IDENTITY_ATTRIBUTES}
-    attributes[SETTINGS_DIGEST_ATTRIBUTE] = settings_digest(task, options)
-    camera = picture_camera(task, options)
+    return _is_whole(task, options, _identity(task, options))
+
+
+def _is_whole(task: Task, options: RenderOptions, identity: Mapping[str, str | int | float]) -> bool:
+    camera = picture_camera(task, options.pictures)
     return is_whole(
         task.path,
         camera.width,
         camera.height,
         options.channels,
         options.encoding,
-        attributes,
+        identity,
         deep=options.deep is not None,
         views=len(task.views),
     )
@@ -79,36 +90,64 @@ def made_of(tasks: Sequence[Task], options: RenderOptions, config: VideoConfig) 
     }
 
 
-def complete(tasks: Sequence[Task], options: RenderOptions) -> set[str]:
-    """Keys of the frames that `--skip-existing` leaves out."""
-    return {task.key for task in _those(tasks, lambda task: is_complete(task, options))}
+def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConfig) -> set[str]:
+    """Keys of the frames that `--skip-existing` leaves out.
+
+    Warns if files do not record their settings, and if existing frames have to be rendered again.
+    """
+    if tasks[0].is_video:
+        return _video_there(tasks, options, video)
+    states = dict(zip(tasks, _at_once(tasks, lambda task: _state(task, options)), strict=True))
+    if untold := [task.path for task, state in states.items() if state == "untold"]:
+        warn(
+            f"--skip-existing: {len(untold)} of the frames that are there do not say how they were made, such as "
+            f"{untold[0]}: they are kept, whatever their cameras, precision and other settings are"
+        )
+    if changed := [task.path for task, state in states.items() if state == "changed"]:
+        warn(
+            f"--skip-existing: {len(changed)} of the frames that are there were made of another model, or with other "
+            f"cameras or settings, such as {changed[0]}: they are rendered again"
+        )
+    return {task.key for task, state in states.items() if state in ("told", "untold")}
 
 
-def untold(tasks: Sequence[Task]) -> list[Path]:
-    """The tasks' files that do not record their settings."""
-    return [task.path for task in _those(tasks, lambda task: attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None)]
+def _state(task: Task, options: RenderOptions) -> Literal["told", "untold", "changed", "missing"]:
+    """State of a frame's file: complete, with its settings recorded or not; of another model or settings; or missing,
+    damaged or of another kind."""
+    wanted = _identity(task, options)
+    if _is_whole(task, options, wanted):
+        return "untold" if attribute(task.path, SETTINGS_DIGEST_ATTRIBUTE) is None else "told"
+    found = {name: attribute(task.path, name) for name in (*IDENTITY_ATTRIBUTES, SETTINGS_DIGEST_ATTRIBUTE)}
+    return "changed" if any(value not in (None, wanted.get(name)) for name, value in found.items()) else "missing"
 
 
-def changed(tasks: Sequence[Task], options: RenderOptions) -> list[Path]:
-    """The tasks' files that were made from another model, or with other cameras or settings."""
-
-    def differs(task: Task) -> bool:
-        wanted = {**options.attributes, SETTINGS_DIGEST_ATTRIBUTE: settings_digest(task, options)}
-        found = {name: attribute(task.path, name) for name in (*IDENTITY_ATTRIBUTES, SETTINGS_DIGEST_ATTRIBUTE)}
-        return any(value not in (None, wanted.get(name)) for name, value in found.items())
-
-    return [task.path for task in _those(tasks, differs)]
-
-
-def foreign(tasks: Sequence[Task]) -> list[Path]:
-    """The tasks' files that are pictures from other programs."""
-    return [task.path for task in _those(tasks, lambda task: is_file(task.path) and is_foreign(task.path))]
+def _video_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConfig) -> set[str]:
+    """Keys of all frames, or of none: a video is complete only as a whole."""
+    path = tasks[0].path
+    if video_record(path, len(tasks)) == made_of(tasks, options, video):
+        return {task.key for task in tasks}
+    if path.exists():
+        warn(
+            f"--skip-existing: {path} is not whole, or was made of another model or frames, or with other cameras or "
+            "settings: it is rendered again"
+        )
+    return set()
 
 
-def _those(tasks: Sequence[Task], condition: Callable[[Task], bool]) -> list[Task]:
-    """The tasks whose files meet a condition; several files are read at once."""
+def check_foreign(tasks: Sequence[Task]) -> None:
+    """Raise InputError if a frame would replace a picture made by another program."""
+    theirs = _at_once(tasks, lambda task: is_file(task.path) and is_foreign(task.path))
+    if others := [task.path for task, is_theirs in zip(tasks, theirs, strict=True) if is_theirs]:
+        raise InputError(
+            f"{examples(others)}: exist, and clsplat did not make them; name other files, or give --overwrite to "
+            "replace them"
+        )
+
+
+def _at_once(tasks: Sequence[Task], look: Callable[[Task], T]) -> list[T]:
+    """Results of a function of each task's file; several files are read at once."""
     with ThreadPoolExecutor(MAX_FILE_THREADS) as pool:
-        return [task for task, met in zip(tasks, pool.map(condition, tasks), strict=True) if met]
+        return list(pool.map(look, tasks))
 
 
 def stamp(path: Path) -> tuple[int, ...] | None:

@@ -107,7 +107,7 @@ class FrameRenderer:
         several = self.options.encoding.parts != "one"
         held = HELD_PIXEL_BYTES if self.options.holdout is not None else 0
         for task in (task for task in tasks if not task.is_video and (several or task.right)):
-            for camera in (picture_camera(view, self.options) for view in task.views):
+            for camera in (picture_camera(view, self.options.pictures) for view in task.views):
                 if self._rows(camera, held) < camera.height:
                     check_parts(camera, self.options.encoding, views=len(task.views))
 
@@ -135,14 +135,14 @@ class FrameRenderer:
     def _frame(self, task: Task, views: int) -> RenderedFrame:
         self._trust(task.camera)
         start, options, pipeline = time.monotonic(), self.options, self._pipeline
-        camera, names, encoding = picture_camera(task, options), options.channels, options.encoding
+        camera, names, encoding = picture_camera(task, options.pictures), options.channels, options.encoding
         gaussians, moved = self._placed(task)
         frame = FrameRequest(
             task.at,
-            camera_after(task, options),
-            camera_before(task, options),
-            lens_of(task, options),
-            sampling_of(task, options),
+            camera_after(task, options.pictures),
+            camera_before(task, options.pictures),
+            lens_of(task, options.pictures),
+            sampling_of(task, options.pictures),
             cut := cut_of(task, options),
             gaussians,
             moved,
@@ -176,7 +176,7 @@ class FrameRenderer:
 
         These are for motion and backward motion, None if nothing moves or the channel is not requested.
         """
-        ensemble, middle = self._ensemble, sampling_of(task, self.options).middle
+        ensemble, middle = self._ensemble, sampling_of(task, self.options.pictures).middle
         if (placed := task.placed) is None:
             return lambda time: kind_of(ensemble.models[0]), (None, None)
 

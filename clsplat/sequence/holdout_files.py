@@ -50,14 +50,14 @@ def cut_of(task: Task, options: RenderOptions) -> Cut | None:
     """
     if task.holdout is None or options.holdout is None:
         return None
-    how, size = options.holdout, (task.camera.width, task.camera.height)
+    how, pictures, size = options.holdout, options.pictures, (task.camera.width, task.camera.height)
     holdout = read_holdout(task.holdout, size, how.channel, inverse=how.depths == "inverse")
     if how.depths == "ray":
         height, width = holdout.surfaces.counts.shape
         cosines = crop(task.camera, holdout.x, holdout.y, width, height).cosines()
         holdout = replace(holdout, surfaces=holdout.surfaces if cosines is None else holdout.surfaces.scaled(cosines))
-    cut, bent = Cut(holdout), warp_of(task, options) is not None
-    if _reaches_out(straight_camera(task, options), INTERPOLATION_MARGIN_PX + 1 if bent else 0) and cut.goes_on:
+    cut, bent = Cut(holdout), warp_of(task, pictures) is not None
+    if _reaches_out(straight_camera(task, pictures), INTERPOLATION_MARGIN_PX + 1 if bent else 0) and cut.goes_on:
         where = "where the warped picture extends beyond it" if bent else "in the overscan"
         warn(f"{task.holdout}: ends with the frame, and nothing is held out {where}; render the CG with overscan")
     return cut

@@ -5,10 +5,11 @@ device."""
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from clsplat.config.pictures import PictureConfig
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import digest
 from clsplat.gaussians import Gaussians
@@ -18,10 +19,13 @@ from clsplat.models.instances import Changing, Ensemble, Placement, State, Track
 from clsplat.models.series import ModelSeries
 from clsplat.runs.run import model_file
 from clsplat.sequence.numbered import digest_of_name, is_sequence, open_sequence
-from clsplat.sequence.task import RenderOptions, Task, end_before, model_times
+from clsplat.sequence.task import Task, end_before, model_times
 from clsplat.shots.frame_numbers import ranges
 from clsplat.shots.shot_file import KeyedTrack, Volume, Within, is_layout, read_layout
 from clsplat.shots.usd_models import read_stage
+
+Known = dict[Placement | State, Placement | State]
+"""Placements that are stored already, by themselves: equal ones are stored once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,24 +92,24 @@ class JobModels:
         state = self.state(frame)
         return self.one if state is None else Ensemble(self.models).at(state)
 
-    def seen(self, tasks: Sequence[Task], options: RenderOptions) -> list[Task]:
+    def seen(self, tasks: Sequence[Task], pictures: PictureConfig, channels: Collection[str]) -> list[Task]:
         """The tasks with placements of the models, and cameras adapted to these. Raises InputError."""
-        known: dict[Placement | State, Placement | State] = {}  # equal placements are stored once
+        known: Known = {}
         self._check_numbers([task.number for task in tasks])
         placed = []
         for task in tasks:
-            views = [self._seen(view, options, known) for view in task.views]
+            views = [self._seen(view, pictures, model_times(view, pictures, channels), known) for view in task.views]
             placed.append(replace(views[0], right=views[1] if views[1:] else None))
         return placed
 
-    def _seen(self, task: Task, options: RenderOptions, known: dict[Placement | State, Placement | State]) -> Task:
+    def _seen(self, task: Task, pictures: PictureConfig, times: Sequence[float], known: Known) -> Task:
         """A view with placements of the models."""
-        model, times = kind_of(self.models[0]), model_times(task, options)
+        model = kind_of(self.models[0])
         if self.tracks is None:
             return task.seen_by(model, dict.fromkeys(times, model.near))
         states: dict[float, State] = {}
         for time in times:
-            end, frame = end_before(task, time, options), task.number + time
+            end, frame = end_before(task, time, pictures), task.number + time
             if end is None:
                 state = [track.at(frame) for track in self.tracks]
             else:

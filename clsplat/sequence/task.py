@@ -5,11 +5,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
-from functools import lru_cache
-from glob import escape, glob
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -20,13 +17,12 @@ from clsplat.camera import DEFAULT_NEAR_PLANE, Camera
 from clsplat.config.channels import WRITABLE_CHANNELS
 from clsplat.config.holdout import HoldoutConfig
 from clsplat.config.pictures import DeepConfig, Encoding, PictureConfig, SamplingConfig
-from clsplat.errors import InputError, reason_of
-from clsplat.files.documents import digest, is_file
+from clsplat.errors import InputError
+from clsplat.files.documents import known_digest
 from clsplat.frame.lens import ByLens, ByMap, Places, Warp
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.frame.window import framed
 from clsplat.gaussians import Gaussians
-from clsplat.images.colour import CHROMATICITIES, COLOR_INTEROP_IDS, SRGB
+from clsplat.images.colour import CHROMATICITIES, COLOR_INTEROP_IDS, SRGB, configuration_digest
 from clsplat.images.cryptomatte import header_of
 from clsplat.images.frame_files import VIDEO_SUFFIXES, FrameFileHeader, camera_matrices, is_whole_panorama
 from clsplat.images.provenance import SETTINGS_DIGEST_ATTRIBUTE
@@ -36,8 +32,9 @@ from clsplat.scenes.dataset import Lens
 from clsplat.shots import Shot
 from clsplat.shots import motion as moving
 from clsplat.shots.frame_numbers import output_paths
-from clsplat.shots.motion import Moments, moments
+from clsplat.shots.motion import Moments
 from clsplat.shots.optics import Optics, headers, settled
+from clsplat.shots.shutter_times import sample_moments
 
 LATLONG_ATTRIBUTES: dict[str, str | int] = {"textureformat": "LatLong Environment", "openexr:levelmode": 0}
 """OpenImageIO's attributes for EXR's envmap. The level mode says that no mipmap levels follow, for which OpenImageIO
@@ -216,41 +213,17 @@ def make_tasks(
         own.check()
         if own.has_lens and not camera.is_pinhole:
             raise InputError(f"depth of field: frame {frame.number} is {camera.projection}, expected perspective")
-        index, after, earlier = indices[frame.number], None, None
-        looked_at: Shot | Moments | None = stretch(frame.number)
-        if whole.moment is not None:
-            if own.shutter != (0.0, 0.0):
-                times = [own.middle, *own.shutter, *(sample_moments(own) if own.moves else ())]
-                looked_at = moments(whole, resize, frame.number, times)
-            after = _beside_middle(whole, resize, frame.number, own.middle, 1) if motion else None
-            earlier = _beside_middle(whole, resize, frame.number, own.middle, -1) if backward else None
-        else:
-            after = moving.camera_after(whole, index) if motion else None
-            earlier = moving.camera_before(whole, index) if backward else None
-            after, earlier = (other and resize(other) for other in (after, earlier))
-        after, earlier = (other and other.resized(camera.width, camera.height) for other in (after, earlier))
+        looked_at = moving.moments(whole, resize, frame.number, own) or stretch(frame.number)
+        beside = moving.targets(whole, resize, indices[frame.number], own.middle, motion=motion, backward=backward)
+        after, earlier = (other and other.resized(camera.width, camera.height) for other in beside)
         looks = (after, earlier, looked_at, None, None if frame.optics is None else own, frame.optics)
         tasks.append(Task(frame.number, frame.name, camera, path, *looks, lens=frame.lens, ends=ends))
     return tasks
 
 
-def _beside_middle(shot: Shot, resize: Callable[[Camera], Camera], number: int, middle: float, way: int) -> Camera:
-    """Camera one frame after the middle of the shutter (way 1) or before it (-1).
-
-    Outside the shot, where its source has no values, the camera is extrapolated.
-    """
-    assert shot.moment is not None
-    time, first, last = number + middle, float(shot.frames[0].number), float(shot.frames[-1].number)
-    if shot.reach is not None:
-        first, last = min(first, shot.reach[0]), max(last, shot.reach[1])
-    if first <= time + way <= last or len(shot.frames) == 1:
-        return resize(shot.moment(time + way))
-    return moving.continued(resize(shot.moment(time - way)), resize(shot.moment(time)))
-
-
-def sampling_of(task: Task, options: RenderOptions) -> SamplingConfig:
+def sampling_of(task: Task, pictures: PictureConfig) -> SamplingConfig:
     """Shutter and lens of a frame."""
-    return task.sampling or options.pictures.sampling
+    return task.sampling or pictures.sampling
 
 
 @dataclass(frozen=True)
@@ -292,52 +265,52 @@ class RenderOptions:
     ids_from: str = ""
 
 
-def picture_camera(task: Task, options: RenderOptions) -> Camera:
+def picture_camera(task: Task, pictures: PictureConfig) -> Camera:
     """Camera of the written picture: its size, its window, and the middle of the shutter. For a warped picture only
     size and window count.
 
     Raises InputError for a region outside the frame.
     """
-    warp = warp_of(task, options)
-    shown = task.at(sampling_of(task, options).middle) if warp is None else warp.shown
-    return framed(shown, options.pictures.framing)
+    warp = warp_of(task, pictures)
+    shown = task.at(sampling_of(task, pictures).middle) if warp is None else warp.shown
+    return framed(shown, pictures.framing)
 
 
-def lens_of(task: Task, options: RenderOptions) -> Places | None:
+def lens_of(task: Task, pictures: PictureConfig) -> Places | None:
     """The lens or STMap that warps the picture, None if nothing does. Raises InputError for an unreadable map."""
-    if stmap := options.pictures.warp.stmap:
+    if stmap := pictures.warp.stmap:
         return ByMap(read_stmap(Path(stmap)))
     return ByLens(task.lens) if task.lens is not None else None
 
 
-def warp_of(task: Task, options: RenderOptions) -> Warp | None:
+def warp_of(task: Task, pictures: PictureConfig) -> Warp | None:
     """The warp of the picture, None for a straight one."""
-    lens = lens_of(task, options)
-    return None if lens is None else Warp(lens, task.at(sampling_of(task, options).middle))
+    lens = lens_of(task, pictures)
+    return None if lens is None else Warp(lens, task.at(sampling_of(task, pictures).middle))
 
 
-def straight_camera(task: Task, options: RenderOptions) -> Camera:
+def straight_camera(task: Task, pictures: PictureConfig) -> Camera:
     """Camera of the rendered picture: `picture_camera`, or for a warped picture the straight window that it is sampled
     from."""
-    camera, warp = picture_camera(task, options), warp_of(task, options)
+    camera, warp = picture_camera(task, pictures), warp_of(task, pictures)
     return camera if warp is None else warp.of_window(camera)[1] or camera
 
 
-def camera_after(task: Task, options: RenderOptions) -> Camera | None:
+def camera_after(task: Task, pictures: PictureConfig) -> Camera | None:
     """Camera of the whole frame that motion leads to: one frame after the middle of the shutter."""
-    middle = sampling_of(task, options).middle
+    middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.after is None or isinstance(task.stretch, Moments)
     return task.after if still else task.at(middle + 1)
 
 
-def camera_before(task: Task, options: RenderOptions) -> Camera | None:
+def camera_before(task: Task, pictures: PictureConfig) -> Camera | None:
     """Camera of the whole frame that backward motion leads to: one frame before the middle of the shutter."""
-    middle = sampling_of(task, options).middle
+    middle = sampling_of(task, pictures).middle
     still = middle == 0 or task.earlier is None or isinstance(task.stretch, Moments)
     return task.earlier if still else task.at(middle - 1)
 
 
-def end_before(task: Task, time: float, options: RenderOptions) -> float | None:
+def end_before(task: Task, time: float, pictures: PictureConfig) -> float | None:
     """The time from which the camera at another time is extrapolated, both in frames from the frame.
 
     None if the shot's source defines the camera at that time, and for a shot of one frame. A stage defines its camera
@@ -346,17 +319,17 @@ def end_before(task: Task, time: float, options: RenderOptions) -> float | None:
     if task.ends is None or task.ends[0] <= task.number + time <= task.ends[1]:
         return None
     if isinstance(task.stretch, Moments):
-        middle = sampling_of(task, options).middle
+        middle = sampling_of(task, pictures).middle
         return middle if time in (middle - 1, middle + 1) else None
     return task.ends[0] - task.number if time < 0 else task.ends[1] - task.number
 
 
-def model_times(task: Task, options: RenderOptions) -> list[float]:
+def model_times(task: Task, pictures: PictureConfig, channels: Collection[str]) -> list[float]:
     """Times at which the models of a frame are evaluated, in frames from it: the shutter's middle, its samples, and the
     targets of motion."""
-    sampling = sampling_of(task, options)
+    sampling = sampling_of(task, pictures)
     times = [sampling.middle, *(sample_moments(sampling) if sampling.moves else ())]
-    times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in options.channels]
+    times += [sampling.middle + by for name, by in (("motion", 1), ("backward", -1)) if name in channels]
     return list(dict.fromkeys(times))
 
 
@@ -394,14 +367,14 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     Includes cameras, channels, encoding, pictures, rasterizer, the content of its holdout, and the models' placements.
     For models with one file per frame, it includes the content of these files.
     """
-    pictures, sampling = options.pictures, sampling_of(task, options)
+    pictures, sampling = options.pictures, sampling_of(task, options.pictures)
     encoding = {
         name: getattr(options.encoding, name) for name in _ENCODING_FIELDS_BY_SUFFIX.get(task.path.suffix.lower(), ())
     }
-    cameras: list[Camera | Moments] = [picture_camera(task, options)]
-    if "motion" in options.channels and (after := camera_after(task, options)) is not None:
+    cameras: list[Camera | Moments] = [picture_camera(task, pictures)]
+    if "motion" in options.channels and (after := camera_after(task, pictures)) is not None:
         cameras.append(after)
-    if "backward" in options.channels and (before := camera_before(task, options)) is not None:
+    if "backward" in options.channels and (before := camera_before(task, pictures)) is not None:
         cameras.append(before)
     if sampling.moves and isinstance(task.stretch, Moments):
         cameras.append(task.stretch)
@@ -412,59 +385,19 @@ def settings_digest(task: Task, options: RenderOptions) -> str:
     made: tuple[Any, ...] = (options.channels, options.background, options.recorded, options.deep, options.drawn)
     made += (options.gains,) if options.gains else ()
     made += ("far",) if task.camera.far < inf else ()  # older frames of such a camera were not clipped at the far plane
+    colour = replace(pictures.colour, ocio_config=configuration_digest(pictures.colour.ocio_config))
     if task.holdout is not None:
-        made += ("holdout", _digest_at(str(task.holdout), _changed(task.holdout)), options.holdout)
+        made += ("holdout", known_digest(task.holdout), options.holdout)
     made += (options.mattes,) if options.mattes else ()
-    colour = replace(pictures.colour, ocio_config=_content(pictures.colour.ocio_config))
     more: list[Any] = [settings_digest(task.right, options)] if task.right is not None else []
-    if (lens := lens_of(task, options)) is not None:
+    if (lens := lens_of(task, pictures)) is not None:
         bends = lens.stmap.digest if isinstance(lens, ByMap) else task.lens
         more += [bends, task.at(sampling.middle)]
     if task.files:
-        made += ("files", [_digest_at(str(path), _changed(path)) for path in task.files])
+        made += ("files", [known_digest(path) for path in task.files])
     if task.placed is not None:
-        more.append([task.placed[time] for time in model_times(task, options)])
+        more.append([task.placed[time] for time in model_times(task, pictures, options.channels)])
     return digest_of(cameras, made, encoding, colour, pictures.framing, used, *more)
-
-
-def _content(source: str) -> str:
-    """SHA-256 of an OpenColorIO file and of the tables that it names; for any other configuration, its name."""
-    if not source or not is_file(Path(source)):
-        return source
-    patterns = _table_patterns(source, Path(source).stat().st_mtime_ns)
-    tables = sorted({path for pattern in patterns for path in glob(pattern) if is_file(Path(path))})  # noqa: PTH207
-    return " ".join(_digest_at(path, Path(path).stat().st_mtime_ns) for path in (source, *tables))
-
-
-def _changed(path: Path) -> int:
-    """Modification time of a file, in nanoseconds. Raises InputError."""
-    try:
-        return path.stat().st_mtime_ns
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason_of(error)}") from None
-
-
-@lru_cache(maxsize=4096)
-def _digest_at(path: str, changed: int) -> str:  # noqa: ARG001  # a cache key: a changed file is read again
-    return digest(path)
-
-
-@lru_cache(maxsize=8)
-def _table_patterns(source: str, changed: int) -> tuple[str, ...]:  # noqa: ARG001  # a cache key
-    """Glob patterns of the files that a configuration's FileTransforms name, in the folders of its search_path.
-
-    Its variables, which are set elsewhere, match anything.
-    """
-    text = Path(source).read_text("utf-8", "replace")
-    listed = re.search(r"^search_path:([^\n]*(?:\n[ \t]*- [^\n]*)*)", text, re.MULTILINE)
-    places = re.split(r"[\n\[\],:;]|\s-\s", listed[1]) if listed else []
-    names = re.findall(r"\bsrc:[ \t]*(\"[^\"]*\"|'[^']*'|[^,}\n]+)", text)
-    folders, files = (
-        {re.sub(r"\$\{\w+\}|\$\w+|%\w+%", "*", escape(text.strip(" \t\"'"))) for text in texts}
-        for texts in (places, names)
-    )
-    home = Path(escape(str(Path(source).parent)))
-    return tuple(sorted({str(home / folder / file) for folder in folders | {""} for file in files}))
 
 
 def header(task: Task, options: RenderOptions, whole: Task | None = None) -> FrameFileHeader:
@@ -474,9 +407,9 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Fra
     An EXR file also gets its window, and an attribute that marks a whole panorama.
     whole: the file's task, if the file has other views too.
     """
-    camera = picture_camera(task, options)
+    camera = picture_camera(task, options.pictures)
     matrices = camera_matrices(camera)
-    if warp_of(task, options) is not None:
+    if warp_of(task, options.pictures) is not None:
         matrices.pop("worldToNDC", None)  # no matrix describes a warp
     attributes = {
         **options.attributes,
@@ -492,7 +425,7 @@ def header(task: Task, options: RenderOptions, whole: Task | None = None) -> Fra
         attributes["colorInteropID"] = name
     if is_whole_panorama(camera):
         attributes |= LATLONG_ATTRIBUTES
-    sampling = sampling_of(task, options)
+    sampling = sampling_of(task, options.pictures)
     typed = headers(task.at(sampling.middle), task.number, task.optics, sampling)
     return FrameFileHeader(
         attributes, matrices, camera.window, CHROMATICITIES.get(space, ()), view=task.eye, typed=typed

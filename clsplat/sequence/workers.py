@@ -79,7 +79,7 @@ def record_of(
     skipped: bool = False,
 ) -> Record:
     """The record of a task's frame."""
-    camera = picture_camera(task, options)
+    camera = picture_camera(task, options.pictures)
     return Record(
         task.name,
         task.number,
@@ -97,11 +97,11 @@ def record_of(
 
 def frame_bytes(task: Task, options: RenderOptions) -> int:
     """Main memory that a frame takes until it is written. A frame in strips takes the memory of one strip."""
-    camera, framing = picture_camera(task, options), options.pictures.framing
+    camera, framing = picture_camera(task, options.pictures), options.pictures.framing
     pixels, finer = camera.width * camera.height * len(task.views), framing.supersample**2
     if not task.is_video:
         pixels = min(pixels, STRIP_PIXELS // finer)
-    sampling = sampling_of(task, options)
+    sampling = sampling_of(task, options.pictures)
     if options.deep is not None:
         floats = len(DEEP_CHANNELS) * options.deep.bins * pixels
         merged = min(floats * min(sampling.pictures, DEEP_PICTURES), DEEP_MERGE_FLOATS) if sampling.on else 0

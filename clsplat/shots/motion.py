@@ -13,8 +13,10 @@ import numpy as np
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
+from clsplat.config.pictures import SamplingConfig
 from clsplat.errors import InputError
 from clsplat.shots.shot import Frame, Shot
+from clsplat.shots.shutter_times import sample_moments
 
 NEIGHBOUR_FRAMES = 2
 """Number of frames on each side of a time that determine the camera there: a segment's end, and the neighbour that sets
@@ -66,18 +68,48 @@ def _values(camera: Camera) -> Float64:
     return np.concatenate([scalars, camera.rotation.ravel(), camera.translation])
 
 
-def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, times: Iterable[float]) -> Moments:
-    """Cameras of a shot that has `moment`, evaluated around the frame `number`.
+def moments(shot: Shot, resize: Callable[[Camera], Camera], number: int, sampling: SamplingConfig) -> Moments | None:
+    """Cameras of a shot that has `moment`, while the shutter of the frame `number` is open; None if it never is.
 
-    times: times in frames relative to that frame. Times at which the source has values are added if they lie
-    between the first and the last of these.
+    They are the cameras of the frame's samples, and those at the times in between at which the source has values.
     """
-    assert shot.moment is not None
-    moment, wanted = shot.moment, list(times)
+    if shot.moment is None or sampling.shutter == (0.0, 0.0):
+        return None
+    moment, times = shot.moment, sample_moments(sampling) if sampling.moves else ()
+    wanted = [sampling.middle, *sampling.shutter, *times]
     begin = bisect_left(shot.authored, number + min(wanted))
     end = bisect_right(shot.authored, number + max(wanted))
     wanted += [time - number for time in shot.authored[begin:end]]
     return Moments.of(lambda time: resize(moment(number + time)), wanted)
+
+
+def targets(
+    shot: Shot, resize: Callable[[Camera], Camera], index: int, middle: float, *, motion: bool, backward: bool
+) -> tuple[Camera | None, Camera | None]:
+    """Cameras that motion and backward motion of the frame at this index lead to, None unless requested.
+
+    They are one frame after and before it; for a shot that has `moment`, after and before the middle of the shutter.
+    """
+    if shot.moment is not None:
+        time = shot.frames[index].number + middle
+        after = _beside(shot, resize, time, 1) if motion else None
+        return after, _beside(shot, resize, time, -1) if backward else None
+    after = resize(camera_after(shot, index)) if motion else None
+    return after, resize(camera_before(shot, index)) if backward else None
+
+
+def _beside(shot: Shot, resize: Callable[[Camera], Camera], time: float, way: int) -> Camera:
+    """Camera one frame after a time (way 1) or before it (-1), for a shot that has `moment`.
+
+    Outside the shot, where its source has no values, the camera is extrapolated.
+    """
+    assert shot.moment is not None
+    first, last = float(shot.frames[0].number), float(shot.frames[-1].number)
+    if shot.reach is not None:
+        first, last = min(first, shot.reach[0]), max(last, shot.reach[1])
+    if first <= time + way <= last or len(shot.frames) == 1:
+        return resize(shot.moment(time + way))
+    return continued(resize(shot.moment(time - way)), resize(shot.moment(time)))
 
 
 def camera_after(shot: Shot, index: int) -> Camera:

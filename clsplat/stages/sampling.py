@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clsplat.camera import Camera
 from clsplat.cameras.model import CameraModel
@@ -31,13 +32,10 @@ class UploadedCameras:
 
 def upload_cameras(device: Device, cameras: Sequence[Camera]) -> list[UploadedCameras]:
     """Upload the cameras, grouped by model."""
-    by_model: dict[CameraModel, list[Camera]] = {}
+    packs: dict[CameraModel, list[NDArray[np.float32]]] = {}
     for camera in cameras:
-        by_model.setdefault(camera.model, []).append(camera)
-    return [
-        UploadedCameras(model, upload(device, np.stack([pack_camera(camera) for camera in group])))
-        for model, group in by_model.items()
-    ]
+        packs.setdefault(camera.model, []).append(pack_camera(camera))
+    return [UploadedCameras(model, upload(device, np.stack(group))) for model, group in packs.items()]
 
 
 @stage("sampling")

@@ -166,8 +166,7 @@ class Replica:
 
     def __init__(self, device: Device, config: TrainConfig, photographs: ImageCache) -> None:
         self.device, self.config, self.photographs = device, config, photographs.for_device(device)
-        self.rasterizer = Rasterizer(device, config.rasterizer)
-        self.rasterizer.antialias(on=config.antialiased)
+        self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
         self.thread = ThreadPoolExecutor(1, f"clsplat-{device.name}")
         self.plan: Plan | None = None
         self.parameters: AnyGaussians | None = None

@@ -257,8 +257,8 @@ def replay(bundle: Bundle, device: Device) -> dict[str, int]:
     """Repeat the step. Returns the number of non-finite values after each stage, and of the steps that `adam`
     refuses."""
     config, record = bundle.config, bundle.record
-    rasterizer, probe = Rasterizer(device, config.rasterizer), _Counts(bundle.inputs.camera)
-    rasterizer.antialias(on=config.antialiased)
+    rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
+    probe = _Counts(bundle.inputs.camera)
     parameters, first, second = (to_device(device, bundle.models[kind]) for kind in _MODEL_KINDS)
     gradients = allocate_gaussians(device, parameters.count, parameters.coefficients, zero=True)
     probe.counts["parameters"] = _wrong_in(parameters)

@@ -96,8 +96,7 @@ class Trainer:
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
-        self.rasterizer = Rasterizer(device, config.rasterizer)
-        self.rasterizer.antialias(on=config.antialiased)
+        self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
         self.photographs = ImageCache(self.views, device)
         self.renderer = Renderer(device, self.rasterizer)
         self.validation_views = ValidationViews(scene, device, config)

@@ -12,8 +12,8 @@ from calls import Capture, error_line
 from fakes import Pipeline, camera
 
 from clsplat.cli.main import main, parse
-from clsplat.cli.render.job import resizer
-from clsplat.cli.render.verb import RenderVerb
+from clsplat.cli.render.flags import RenderVerb
+from clsplat.cli.render.request import resizer
 from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import TrainConfig

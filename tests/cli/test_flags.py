@@ -16,8 +16,8 @@ from models import random_gaussians
 from clsplat.cli.flags import OTHER_FLAGS_TITLE, grouped_help, near, options
 from clsplat.cli.main import main
 from clsplat.cli.parsing import VERBS, _text_rules, verb_class
+from clsplat.cli.render.flags import RenderVerb
 from clsplat.cli.render.help_page import MOST_NEEDED_FLAGS, RENDER_GROUPS
-from clsplat.cli.render.verb import RenderVerb
 from clsplat.config.pictures import SamplingConfig
 
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")

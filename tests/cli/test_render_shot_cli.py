@@ -23,7 +23,6 @@ from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.pictures import SamplingConfig
 from clsplat.config.rasterizer import RasterizerConfig
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import linear_to_srgb, srgb_to_linear
 from clsplat.models import edit
@@ -36,6 +35,7 @@ from clsplat.sequence.job_models import load_cast
 from clsplat.sequence.task import RenderOptions, make_tasks
 from clsplat.shots import read_shot
 from clsplat.shots.shot_file import parse_transform, read_layout
+from clsplat.shots.shutter_times import sample_moments
 from clsplat.spherical_harmonics import SH_C0, sh_basis
 
 CLOSE = 1e-5
@@ -373,7 +373,8 @@ def test_a_worker_places_what_it_has_read(folder: Path, tmp_path: Path) -> None:
     shot, channels = layout(folder, "farm", **MOVING), ("rgb", "motion")
     cast, options = load_cast(shot), RenderOptions(channels)
     cameras = read_shot(folder / "cameras.json")
-    (task,) = cast.seen(make_tasks(cameras.only("2"), cameras, str(tmp_path / "#.exr"), lambda c: c, channels), options)
+    tasks = make_tasks(cameras.only("2"), cameras, str(tmp_path / "#.exr"), lambda c: c, channels)
+    (task,) = cast.seen(tasks, options.pictures, channels)
     layout(folder, "farm")  # changed meanwhile
     job = WorkerJob(str(shot), cast.digest, options, RasterizerConfig(), placed=True)
     assert not isinstance(render_frame(pickle.loads(pickle.dumps(task)), job), Failure)

@@ -19,12 +19,12 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.pictures import SamplingConfig
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.gaussians import Gaussians
 from clsplat.images.colour import LINEAR, SRGB, linear_to_srgb, srgb_to_linear
 from clsplat.models import edit
 from clsplat.models.formats import colour_space, load, usd
 from clsplat.rendering.renderer import Renderer
+from clsplat.shots.shutter_times import sample_moments
 from clsplat.spherical_harmonics import SH_C0
 
 require("pxr")

@@ -174,8 +174,8 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
 
     from clsplat.cli.convert import ConvertVerb
     from clsplat.cli.options import PageOptions
-    from clsplat.cli.render.job import bits_of
-    from clsplat.cli.render.verb import RenderVerb
+    from clsplat.cli.render.flags import RenderVerb
+    from clsplat.cli.render.request import bits_of
     from clsplat.config.pictures import Encoding
     from clsplat.scenes.loading import load_scene
     from clsplat.viewer.server import Address

@@ -15,11 +15,11 @@ from clsplat.config.pictures import FramingConfig, SamplingConfig
 from clsplat.errors import InputError
 from clsplat.frame.draw import drawn_by
 from clsplat.frame.samples import lens_points, lens_radius, sample_cameras, sampled, through_lens
-from clsplat.frame.shutter_times import sample_times
 from clsplat.frame.window import crop, framed
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
 from clsplat.shots.shot import Shot, numbered
+from clsplat.shots.shutter_times import sample_times
 
 CLOUD, CAMERA = scenes.random_cloud(1000, 8, 100, 70)
 

@@ -310,7 +310,7 @@ def test_the_open_job_description_runs(openjd: str, shot: list[str], whole: dict
 
 def test_the_opencue_example_calls_render_as_it_is() -> None:
     from clsplat.cli.main import parse
-    from clsplat.cli.render.verb import RenderVerb
+    from clsplat.cli.render.flags import RenderVerb
 
     tree = ast.parse((ROOT / "docs" / "farm" / "opencue_render.py").read_text())
     values = [

@@ -19,7 +19,6 @@ from tiny import HEIGHT, WIDTH, hidden_model
 from clsplat.arrays import Float32
 from clsplat.cli.main import main
 from clsplat.config.pictures import PictureConfig, SamplingConfig
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.images.frame_files import camera_matrices
 from clsplat.models import edit
 from clsplat.models.formats import usd
@@ -28,6 +27,7 @@ from clsplat.sequence.job_models import load_cast
 from clsplat.sequence.task import RenderOptions, Task, camera_after, camera_before, header, make_tasks, model_times
 from clsplat.shots import Shot, read_shot
 from clsplat.shots.shot_file import AnimatedProperty, KeyedTrack, Within
+from clsplat.shots.shutter_times import sample_moments
 
 KEY = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
 LATE = SamplingConfig(shutter_open=0.0, shutter_close=0.5, samples=2)
@@ -64,10 +64,10 @@ def assert_goes_along(model: Path, shot: Shot, sampling: SamplingConfig) -> None
     options = RenderOptions(BOTH_WAYS, pictures=PictureConfig(sampling=sampling))
     tasks = make_tasks(shot, shot, "#.exr", lambda camera: camera, BOTH_WAYS, sampling)
     wanted = None
-    for task in load_cast(model).seen(tasks, options):
+    for task in load_cast(model).seen(tasks, options.pictures, options.channels):
         middle = sampling.middle
         cameras = {time: task.at(time) for time in (middle, *(sample_moments(sampling) if sampling.moves else ()))}
-        around = camera_before(task, options), camera_after(task, options)
+        around = camera_before(task, options.pictures), camera_after(task, options.pictures)
         assert around[0] and around[1] and task.placed
         for time, camera in (*cameras.items(), (middle - 1, around[0]), (middle + 1, around[1])):
             cam_from_model = np.eye(4)
@@ -120,7 +120,8 @@ def test_where_keys_go_on_they_count(tmp_path: Path) -> None:
     options = RenderOptions(("motion",))
     tasks = make_tasks(shot, shot, "#.exr", lambda camera: camera, options.channels)
     for further, wanted in (([], 0.0), ([{"frame": 4, "translate": [2, 0, 0]}], 1.0)):
-        placed = load_cast(layout(tmp_path, keys=keys + further)).seen(tasks, options)[1].placed
+        cast = load_cast(layout(tmp_path, keys=keys + further))
+        placed = cast.seen(tasks, options.pictures, options.channels)[1].placed
         assert placed is not None
         assert placed[1][0].transform[0, 3] == wanted
 
@@ -171,7 +172,7 @@ def test_the_header_has_the_near_plane_of_the_middle(places: tuple[float, ...], 
     keys = [{"frame": 1, "scale": 1}, {"frame": 2, "scale": 5}]
     made = make_tasks(shot, shot, "#.exr", lambda camera: camera, options.channels, LATE)
     for model, near in ((tmp_path / "model.ply", 0.25), (layout(tmp_path, keys=keys), 0.5)):  # a quarter of a frame on
-        task = load_cast(model).seen(made[:1], options)[0]
+        task = load_cast(model).seen(made[:1], options.pictures, options.channels)[0]
         wanted = camera_matrices(replace(task.camera, near=near))["worldToNDC"]
         np.testing.assert_allclose(header(task, options).matrices["worldToNDC"], wanted, rtol=1e-12, atol=1e-12)
 
@@ -194,13 +195,13 @@ def test_a_shutter_that_is_an_instant_off_the_frame(tmp_path: Path, capsys: Capt
     tasks = make_tasks(shot, shot, "#.exr", lambda camera: camera, BOTH_WAYS, late)
 
     def places(task: Task) -> list[float]:
-        around = camera_before(task, options), task.at(late.middle), camera_after(task, options)
+        around = camera_before(task, options.pictures), task.at(late.middle), camera_after(task, options.pictures)
         return [float(camera.position[0]) for camera in around if camera]
 
     for task in tasks:
         x = task.number - 1 + 0.25
         np.testing.assert_allclose(places(task), [x - 1, x, x + 1], atol=1e-12)
-        assert model_times(task, options)[0] == 0.25
+        assert model_times(task, options.pictures, options.channels)[0] == 0.25
     hidden_model().save(tmp_path / "model.ply")
     flags = "--shutter-open 0.25 --shutter-close 0.25"
     assert render(tmp_path, tmp_path / "model.ply", tmp_path / "cameras.json", flags) == 2

@@ -102,7 +102,7 @@ def test_backward_motion_goes_to_the_frame_number_before() -> None:
     # of a shutter that is open after the frame: from its middle to the middle before
     late = SamplingConfig(shutter_open=0.0, shutter_close=0.5)
     (task,) = make_tasks(shot.only("1"), shot, "{frame}.exr", lambda camera: camera, ("rgb", "backward"), late)
-    before = sequence_task.camera_before(task, RenderOptions(pictures=PictureConfig(sampling=late)))
+    before = sequence_task.camera_before(task, PictureConfig(sampling=late))
     assert before is not None
     # a circle's cameras between frames are interpolated: within a thousandth of a frame's way
     np.testing.assert_allclose(before.rotation, turned(-0.075).rotation, atol=1e-4)

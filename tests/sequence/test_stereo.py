@@ -296,7 +296,7 @@ def test_a_map_is_looked_at_for_both_eyes(tmp_path: Path) -> None:
     camera = scenes.tilted_camera(96, 64)
     right = Task(1, "1", replace(camera, projection="equirectangular"), tmp_path / "a.exr", eye="right")
     with pytest.raises(InputError, match="frame 1 is a panorama"):
-        check_warps([Task(1, "1", camera, tmp_path / "a.exr", eye="left", right=right)], options)
+        check_warps([Task(1, "1", camera, tmp_path / "a.exr", eye="left", right=right)], options.pictures)
 
 
 def test_a_pair_in_strips_is_no_file_of_one_eye(tmp_path: Path) -> None:

@@ -14,12 +14,12 @@ from needs import require
 from clsplat.camera import Camera
 from clsplat.config.pictures import PictureConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.frame.shutter_times import sample_moments
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.sequence.task import RenderOptions, Task, camera_after, make_tasks, picture_camera, settings_digest
 from clsplat.shots import Shot, choose_shot, read_shot
 from clsplat.shots.optics import Optics, settled, time_code
 from clsplat.shots.readers.usd_settings import CONFORM_POLICIES
+from clsplat.shots.shutter_times import sample_moments
 
 LENS = "float fStop = 2\nfloat focusDistance = 5\n"
 SHUTTER = "double shutter:open = -0.25\ndouble shutter:close = 0.25\n"
@@ -248,7 +248,7 @@ def test_flags_go_before_the_stages_shutter(tmp_path: Path) -> None:
     instant = "double shutter:open = 0.15\ndouble shutter:close = 0.15"
     task = tasks_of(read_shot(write_stage(tmp_path / "shot.usda", instant)))[1]
     assert task.sampling is not None and not task.sampling.on
-    np.testing.assert_allclose(picture_camera(task, RenderOptions()).position, [5, 2, 5], atol=1e-12)
+    np.testing.assert_allclose(picture_camera(task, PictureConfig()).position, [5, 2, 5], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -273,7 +273,7 @@ def test_motion_of_the_stages_shutter(tmp_path: Path) -> None:
     tasks, options = tasks_of(shot, channels=("rgb", "motion")), RenderOptions(("rgb", "motion"))
     assert shot.moment is not None
     for task in tasks:
-        after = camera_after(task, options)
+        after = camera_after(task, options.pictures)
         assert after is not None
         here = shot.moment(task.number + 0.25)
         step = shot.moment(task.number + 1.25) if task.number < 3 else None

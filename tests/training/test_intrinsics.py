@@ -16,7 +16,7 @@ from tiny import HEIGHT, WIDTH, cameras, hidden_model, short, write_scene
 from clsplat.api import train
 from clsplat.camera import Camera
 from clsplat.cli.main import main, parse
-from clsplat.cli.render.verb import RenderVerb
+from clsplat.cli.render.flags import RenderVerb
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`clsplat render`: verb, cameras, models and plan."""
+"""`clsplat render`: flags, their request, its job, the plan, and the writing of frames."""

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from clsplat.cli.render.job import Job, frames_there
+from clsplat.cli.render.job import Job
 from clsplat.config.channels import light_and_rest
 from clsplat.config.pictures import DEFAULT_VIDEO_FPS
 from clsplat.device.context import open_device
@@ -18,10 +18,12 @@ from clsplat.frame.draw import feature_floats, on_tiles
 from clsplat.frame.samples import finer
 from clsplat.frame.strips import strip_rows
 from clsplat.frame.window import crop
+from clsplat.images.video import rate_of
 from clsplat.rendering.memory_needs import plan_frame
 from clsplat.rendering.memory_plan import Plan
 from clsplat.rendering.renderer import held_sh
 from clsplat.sequence import workers
+from clsplat.sequence.finished_frames import frames_there
 from clsplat.sequence.task import picture_camera, sampling_of, straight_camera
 from clsplat.shots.frame_numbers import ranges
 from clsplat.stages.deep import DEEP_FLOATS
@@ -40,23 +42,24 @@ class DevicePlan:
     strips: int
 
 
-def dry_run(job: Job, *, as_json: bool) -> int:
+def dry_run(job: Job) -> int:
     """Print the plan. Raises DeviceError, and CapacityError if a frame does not fit."""
-    plans = [] if job.on_farm else [_device_plan(job, selector) for selector in job.devices]
+    plans = [] if job.request.flags.on_farm else [_device_plan(job, selector) for selector in job.request.devices]
     document = _document(job, plans)
-    print(json.dumps(document, indent=2) if as_json else "\n".join(_lines(job, document, plans)))
+    print(json.dumps(document, indent=2) if job.request.flags.json else "\n".join(_lines(job, document, plans)))
     return 0
 
 
 def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
     """The plan as data, for --json."""
     tasks, options = job.tasks, job.options
-    skipped = frames_there(job)
-    writers, waiting = workers.frames_ahead(tasks, options, len(job.devices))
+    flags = job.request.flags
+    skipped = frames_there(tasks, options, job.video) if flags.skip_existing else set()
+    writers, waiting = workers.frames_ahead(tasks, options, len(job.request.devices))
     model, output = job.spaces
     frames = []
     for task in tasks:
-        camera = picture_camera(task, options)
+        camera = picture_camera(task, options.pictures)
         frame = {"name": task.name, "frame": task.number, "path": str(task.path)}
         frame |= {"width": camera.width, "height": camera.height, "skipped": task.key in skipped}
         if task.holdout is not None:
@@ -67,16 +70,16 @@ def _document(job: Job, plans: Sequence[DevicePlan]) -> dict[str, Any]:
             frame["eye"] = task.eye
         frames.append(frame)
     return {
-        "model": str(job.model),
-        "digest": job.digest,
+        "model": str(job.cast.path),
+        "digest": job.cast.digest,
         "gaussians": job.cast.count,
         "channels": list(options.channels),
         "deep_bins": options.deep.bins if options.deep else 0,
         "model_colorspace": model,
         "colorspace": output,
-        "samples": max(sampling_of(task, options).pictures for task in tasks),
+        "samples": max(sampling_of(task, options.pictures).pictures for task in tasks),
         "supersample": options.pictures.framing.supersample,
-        **({"fps": job.video.fps or DEFAULT_VIDEO_FPS} if job.is_video else {}),
+        **({"fps": job.video.fps or DEFAULT_VIDEO_FPS} if flags.is_video else {}),
         "frames": frames,
         "devices": [
             {
@@ -102,9 +105,7 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
     yield f"model     {document['model']}: {document['gaussians']:,} Gaussians, SHA-256 {document['digest'][:12]}"
     yield f"frames    {len(frames)}: {ranges(sorted({frame['frame'] for frame in frames}))}; {examples(_sizes(frames))}"
     yield f"files     {' to '.join(paths)}"
-    if job.is_video:
-        from clsplat.images.video import rate_of
-
+    if job.request.flags.is_video:
         yield f"video     {rate_of(document['fps'])} frames a second"
     yield f"channels  {', '.join(document['channels'])}{deep}"
     yield f"colour    {' to '.join(spaces)}"
@@ -116,20 +117,20 @@ def _lines(job: Job, document: dict[str, Any], plans: Sequence[DevicePlan]) -> I
         strips = f"; {device.strips} strips a frame" if device.strips > 1 else ""
         yield f"device    {device.device}: {device.plan}{strips}"
     yield f"host      about {amount(document['host_bytes'])} for frames that wait to be written"
-    if job.skip_existing:
+    if job.request.flags.skip_existing:
         skipped = [frame["frame"] for frame in frames if frame["skipped"]]
         yield f"skipped   {len(skipped)}" + (f": {ranges(sorted(set(skipped)))}" if skipped else "")
 
 
 def _device_plan(job: Job, selector: str | None) -> DevicePlan:
     """The plan for the device that `selector` names. Raises DeviceError and CapacityError."""
-    device, options = open_device(selector, job.memory_limit), job.options
+    device, options, config = open_device(selector, job.request.memory_limit), job.options, job.request.flags.rasterizer
     framing, names = options.pictures.framing, set(options.channels)
     gaussians = job.cast.at(job.tasks[0].number)
-    floats, moved = held_sh(gaussians, job.rasterizer).floats, job.cast.tracks is not None and "motion" in names
-    features, samples = feature_floats(names), max(sampling_of(task, options).pictures for task in job.tasks)
+    floats, moved = held_sh(gaussians, config).floats, job.cast.tracks is not None and "motion" in names
+    features, samples = feature_floats(names), max(sampling_of(task, options.pictures).pictures for task in job.tasks)
     plans = []
-    cameras = [straight_camera(task, options) for task in job.tasks]
+    cameras = [straight_camera(task, options.pictures) for task in job.tasks]
     for camera in {(camera.width, camera.height): camera for camera in cameras}.values():
         if options.deep:
             bins, planes = options.deep.bins, 4 * DEEP_FLOATS * options.deep.bins
@@ -142,7 +143,7 @@ def _device_plan(job: Job, selector: str | None) -> DevicePlan:
         if framing.supersample > 1 and light_and_rest(names)[0]:
             drawn.append((finer(strip, framing), feature_floats(light_and_rest(names)[0])))
         for part, floats_beside in drawn:
-            sizes = (on_tiles(part)[0], job.rasterizer, floats_beside, planes)
+            sizes = (on_tiles(part)[0], config, floats_beside, planes)
             plan = plan_frame(device, len(gaussians), floats, *sizes, moved)
             plans.append(DevicePlan(device.name, plan, -(-camera.height // rows)))
     return max(plans, key=lambda device: device.plan.need.total)
@@ -159,7 +160,7 @@ def _sizes(frames: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _samples(job: Job) -> str:
-    sampling, framing = sampling_of(job.tasks[0], job.options), job.options.pictures.framing
+    sampling, framing = sampling_of(job.tasks[0], job.options.pictures), job.options.pictures.framing
     words = [f"{sampling.samples} frames for one" if sampling.on else ""]
     if sampling.moves:
         opens, closes = sampling.shutter

@@ -1,175 +1,157 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Job of `clsplat render`, and the checks that need the job rather than the flags alone."""
+"""Job of `clsplat render`: tasks, models and options of a request, and the checks that need them."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from clsplat.camera import Camera, Window
-from clsplat.config.pictures import ColourConfig, VideoConfig, WarpConfig
-from clsplat.config.rasterizer import RasterizerConfig
+from clsplat.cli.render.flags import RenderVerb
+from clsplat.cli.render.request import Request
+from clsplat.cli.render.shots import shots_asked
+from clsplat.cli.render.usd_stage import with_stage
+from clsplat.config.pictures import PictureConfig, VideoConfig
 from clsplat.errors import InputError, examples, warn
-from clsplat.files.documents import is_file
+from clsplat.files.atomic import check_new
 from clsplat.frame.lens import ByMap
 from clsplat.frame.mattes import Matte
 from clsplat.frame.samples import finer
-from clsplat.images.alpha import background_colour
-from clsplat.images.colour import CHROMATICITIES, Colours
-from clsplat.images.frame_files import VIDEO_SUFFIXES
-from clsplat.images.video import video_record
-from clsplat.sequence import finished_frames
-from clsplat.sequence.job_models import JobModels
-from clsplat.sequence.mattes import names_of
-from clsplat.sequence.task import RenderOptions, Task, picture_camera, warp_of
+from clsplat.images.colour import Colours
+from clsplat.images.video import check_size, video_record
+from clsplat.runs.appearance import gains_of
+from clsplat.sequence.finished_frames import check_folders
+from clsplat.sequence.holdout_files import held_out
+from clsplat.sequence.job_models import JobModels, load_cast
+from clsplat.sequence.mattes import mattes_of, names_of
+from clsplat.sequence.numbered import is_sequence
+from clsplat.sequence.stereo_tasks import make_views
+from clsplat.sequence.task import RenderOptions, Task, digest_of, picture_camera, warp_of
+from clsplat.shots.shot_file import is_layout, parse_transform
 from clsplat.version import package_version
 
 
 @dataclass(frozen=True)
 class Job:
-    """Call of `clsplat render`, parsed and checked.
+    """Everything that is known before the first frame is rendered.
 
-    devices: selector of each device; None for the default device.
     spaces: colour space of the model and of the pictures.
-    video: encoding of the video, with its frame rate; None for pictures.
-    on_farm: True if other processes render: workers on this machine, or a Dask cluster.
+    video: encoding of the video, with its frame rate.
     """
 
-    options: RenderOptions
-    rasterizer: RasterizerConfig
+    request: Request
     cast: JobModels
     tasks: list[Task]
-    devices: tuple[str | None, ...]
-    memory_limit: int | None
+    options: RenderOptions
     spaces: tuple[str, str]
     video: VideoConfig
-    on_farm: bool
-    skip_existing: bool
-    mattes: Mapping[str, Matte] = field(default_factory=dict)
-
-    @property
-    def model(self) -> Path:
-        """The file that names the models, or the file of a single model."""
-        return self.cast.path
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the models (`JobModels.digest`)."""
-        return str(self.options.attributes["clsplat:model"])
-
-    @property
-    def is_video(self) -> bool:
-        """True if all frames go into one file."""
-        return self.tasks[0].is_video
+    mattes: Mapping[str, Matte]
 
 
-def frames_there(job: Job) -> set[str]:
-    """Keys of the frames that `--skip-existing` leaves out.
+def job_of(request: Request) -> Job:
+    """Read cameras and models, and check everything that can be checked without rendering.
 
-    Warns if files do not record their settings, and if existing frames have to be rendered again.
+    Raises InputError; writes nothing.
     """
-    if not job.skip_existing:
-        return set()
-    if job.is_video:
-        return _video_there(job)
-    there = finished_frames.complete(job.tasks, job.options)
-    if unknown := finished_frames.untold([task for task in job.tasks if task.key in there]):
-        warn(
-            f"--skip-existing: {len(unknown)} of the frames that are there do not say how they were made, such as "
-            f"{unknown[0]}: they are kept, whatever their cameras, precision and other settings are"
-        )
-    if changed := finished_frames.changed([task for task in job.tasks if task.key not in there], job.options):
-        warn(
-            f"--skip-existing: {len(changed)} of the frames that are there were made of another model, or with other "
-            f"cameras or settings, such as {changed[0]}: they are rendered again"
-        )
-    return there
+    flags, channels = request.flags, request.channels
+    models = cache(partial(_models, flags))
+    shots = shots_asked(flags, models)
+    sampling = request.pictures.sampling
+    tasks, chosen = make_views(shots, flags.frames, flags.output, request.resize, channels, sampling=sampling)
+    pictures, unapplied = with_stage(request.pictures, flags.cameras, chosen, tasks)
+    sizes = _picture_sizes(tasks, pictures, deep=flags.deep)
+    check_folders(tasks)
+    if flags.holdout is not None:
+        tasks = held_out(tasks, flags.holdout, flags.holding)
+    video = _video(flags, chosen.fps, tasks[0].path, sizes)
+    for text in (*request.unused(), *chosen.told(flags.cameras, *unapplied)):
+        warn(text)
+    cast = models()
+    gains = gains_of(flags.model, flags.appearance) if flags.appearance is not None else ()
+    tasks, mattes = cast.seen(tasks, pictures, channels), mattes_of(cast, channels, flags.ids_from or "")
+    colours = Colours(pictures.colour, cast.space)
+    colours.check_file(flags.output)
+    options = RenderOptions(
+        channels,
+        request.background,
+        request.encoding,
+        attributes={
+            "Software": f"clsplat {package_version()}",
+            "clsplat:model": cast.digest,
+            "clsplat:colorspace": colours.output,
+        },
+        pictures=pictures,
+        recorded=cast.space,
+        deep=flags.slices if flags.deep else None,
+        drawn=digest_of(flags.rasterizer),
+        gains=gains,
+        holdout=request.holdout,
+        mattes=names_of(mattes),
+        ids_from=flags.ids_from or "",
+    )
+    return Job(request, cast, tasks, options, (colours.model, colours.output), video, mattes)
 
 
-def _video_there(job: Job) -> set[str]:
-    """Keys of all frames, or of none: a video is complete only as a whole."""
-    path, wanted = job.tasks[0].path, finished_frames.made_of(job.tasks, job.options, job.video)
-    if is_file(path) and video_record(path, len(job.tasks)) == wanted:
-        return {task.key for task in job.tasks}
-    if is_file(path):
-        warn(
-            f"--skip-existing: {path} is not whole, or was made of another model or frames, or with other cameras or "
-            "settings: it is rendered again"
-        )
-    return set()
+def _models(flags: RenderVerb) -> JobModels:
+    """Load the models of MODEL and --transform. Raises InputError."""
+    wrong = f"--appearance {flags.appearance}: is for one run's model, but {flags.model}"
+    if flags.appearance is not None and is_layout(flags.model):
+        raise InputError(f"{wrong} is a shot of several")
+    if flags.appearance is not None and is_sequence(flags.model):
+        raise InputError(f"{wrong} has a file for each frame")
+    return load_cast(flags.model, None if flags.transform is None else parse_transform(flags.transform))
 
 
-def is_ours(path: Path) -> bool:
-    """True if clsplat made the video, according to its header."""
-    return is_file(path) and bool(video_record(path))
+def _video(flags: RenderVerb, fps: float | None, path: Path, sizes: Collection[tuple[int, int]]) -> VideoConfig:
+    """Video settings, with the shot's frame rate unless a flag sets another.
 
-
-def check_foreign(job: Job, there: Collection[str]) -> None:
-    """Raise InputError if a frame that is not in `there` would replace a picture made by another program."""
-    if others := finished_frames.foreign([task for task in job.tasks if task.key not in there]):
+    Raises InputError for a rate or sizes that no video has, and for a file that may not be replaced. --skip-existing
+    replaces clsplat's own.
+    """
+    if not flags.is_video:
+        return flags.video
+    if len(sizes) > 1:
+        texts = sorted(f"{width}x{height}" for width, height in sizes)
+        raise InputError(f"{path}: frames are of the sizes {examples(texts)}, expected one; give --width and --height")
+    check_size(path, *next(iter(sizes)))
+    if path.exists() or path.is_symlink():
+        ours = flags.skip_existing and bool(video_record(path))
+        check_new(path, overwrite=flags.overwrite or flags.dry_run or ours)
+    if flags.video.fps is not None or fps is None:
+        return flags.video
+    video = replace(flags.video, fps=fps)
+    try:
+        video.check()
+    except InputError:
         raise InputError(
-            f"{examples(others)}: exist, and clsplat did not make them; name other files, or give --overwrite to "
-            "replace them"
-        )
+            f"{flags.cameras}: has {fps:g} frames a second, expected 0.01 to 1000; give --video.fps"
+        ) from None
+    return video
 
 
-def for_workers(colour: ColourConfig) -> ColourConfig:
-    """Colour settings with the absolute path of the OCIO configuration, for processes in other folders."""
-    source = colour.ocio_config or os.environ.get("OCIO", "")
-    if source and "://" not in source:
-        source = str(Path(source).absolute())
-    return replace(colour, ocio_config=source)
+def _picture_sizes(tasks: Sequence[Task], pictures: PictureConfig, *, deep: bool) -> set[tuple[int, int]]:
+    """Sizes of the pictures, which are checked before rendering.
 
-
-def bits_of(path: str, bits: int | None, channels: Collection[str]) -> int:
-    """Bits per channel for files of that name, from --bits. Raises InputError if the format does not support them."""
-    extension = Path(path).suffix.lower()
-    if extension == ".dpx" and bits == 8:
-        raise InputError(f"--bits 8: {path} has 10 or 16 bits, expected one of them")
-    if extension != ".dpx" and bits == 10:
-        raise InputError(f"--bits 10: is for DPX, expected 8 or 16 for {path}")
-    chosen = bits or (10 if extension == ".dpx" else 8)
-    if extension == ".dpx" and chosen == 10 and "alpha" in channels:
-        raise InputError(f"{path}: a DPX of 10 bits is written without alpha here, expected --bits 16 with it")
-    return chosen
-
-
-def warp_for_workers(warp: WarpConfig) -> WarpConfig:
-    """Lens settings with the absolute path of the map, for processes in other folders."""
-    return replace(warp, stmap=str(Path(warp.stmap).absolute())) if warp.stmap else warp
-
-
-def check_pictures(tasks: list[Task], options: RenderOptions) -> None:
-    """Check all pictures before rendering.
-
-    Raises InputError in these cases: the framing does not suit a frame, a video has frames of several sizes, deep
-    stereo pairs are in one file, or two eyes cannot share a file.
+    Raises InputError if the framing does not suit a frame, if deep stereo pairs are in one file, or if two eyes cannot
+    share a file.
     """
-    if options.deep is not None and tasks[0].right is not None:
+    if deep and tasks[0].right is not None:
         raise InputError(f"--deep: {tasks[0].path} would hold both eyes, expected a file for each: {{eye}} in -o")
     sizes = set()
-    check_warps(tasks, options)
+    check_warps(tasks, pictures)
     for task in tasks:
-        cameras = [picture_camera(view, options) for view in task.views]
+        cameras = [picture_camera(view, pictures) for view in task.views]
         for camera in cameras:
-            if options.pictures.framing.supersample > 1:
-                finer(camera, options.pictures.framing)
-            sizes.add(f"{camera.width}x{camera.height}")
+            if pictures.framing.supersample > 1:
+                finer(camera, pictures.framing)
+            sizes.add((camera.width, camera.height))
         if len(cameras) > 1:
             _check_pair(task, *cameras)
-    if tasks[0].is_video and len(sizes) > 1:
-        raise InputError(
-            f"{tasks[0].path}: frames are of the sizes {examples(sorted(sizes))}, expected one; give --width and "
-            "--height"
-        )
-    if tasks[0].is_video:
-        from clsplat.images.video import check_size
-
-        check_size(tasks[0].path, camera.width, camera.height)
+    return sizes
 
 
 def _check_pair(task: Task, left: Camera, right: Camera) -> None:
@@ -186,20 +168,20 @@ def _check_pair(task: Task, left: Camera, right: Camera) -> None:
         raise InputError(f"--stereo: frame {task.number} {what} for the right; {advice}")
 
 
-def check_warps(tasks: list[Task], options: RenderOptions) -> None:
+def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
     """Raise InputError for panoramas, which cannot be distorted, and for a map that does not cover the picture.
 
     Warns if a part of the picture stays empty.
     """
-    flag = f"--stmap {options.pictures.warp.stmap}" if options.pictures.warp.stmap else "--distort"
+    flag = f"--stmap {pictures.warp.stmap}" if pictures.warp.stmap else "--distort"
     empty: dict[int, float] = {}
     for task in (view for whole in tasks for view in whole.views):
-        if (warp := warp_of(task, options)) is None:
+        if (warp := warp_of(task, pictures)) is None:
             continue
         if task.camera.model.wraps:
             raise InputError(f"{flag}: frame {task.number} is a panorama, expected a picture with edges")
         if isinstance(warp.source, ByMap):
-            camera, stmap = picture_camera(task, options), warp.source.stmap
+            camera, stmap = picture_camera(task, pictures), warp.source.stmap
             window = camera.window or Window(0, 0, camera.width, camera.height)
             if not stmap.covers(window.x, window.y, camera.width, camera.height):
                 raise InputError(
@@ -210,61 +192,8 @@ def check_warps(tasks: list[Task], options: RenderOptions) -> None:
             empty[task.number] = max(part, empty.get(task.number, 0.0))
     if empty:
         number, part = max(empty.items(), key=lambda item: item[1])
-        advice = "" if options.pictures.warp.stmap else "; --lenses native renders fisheyes without a straight picture"
+        advice = "" if pictures.warp.stmap else "; --lenses native renders fisheyes without a straight picture"
         warn(
             f"{flag}: {100 * part:.0f} % of frame {number} have no place in the straight picture, or one more than a "
             f"frame beyond its edges; they stay black and transparent{advice}"
         )
-
-
-def check_colours(output: str, colours: Colours) -> None:
-    """Raise InputError for files that cannot hold the colours. Warns if they do not record the chromaticities."""
-    extension = Path(output).suffix.lower()
-    colours.check_file(output, extension, VIDEO_SUFFIXES)
-    if extension == ".exr" and colours.is_linear(colours.output) and colours.output not in CHROMATICITIES:
-        warn(f"{output}: the chromaticities of {colours.output} are not known here, and are not in the files")
-
-
-def with_models(options: RenderOptions, cast: JobModels, mattes: Mapping[str, Matte], space: str) -> RenderOptions:
-    """The options with the models' colour space, digest and mattes.
-
-    space: colour space of the pictures.
-    """
-    attributes = {
-        "Software": f"clsplat {package_version()}",
-        "clsplat:model": cast.digest,
-        "clsplat:colorspace": space,
-    }
-    return replace(options, attributes=attributes, recorded=cast.space, mattes=names_of(mattes))
-
-
-def parse_colour(text: str) -> tuple[float, float, float]:
-    """Parse black, white or three numbers from 0 to 1. Raises InputError."""
-    if text in ("black", "white"):
-        return background_colour(text)
-    try:
-        red, green, blue = (float(word) for word in text.split(","))
-    except ValueError:
-        red = green = blue = -1.0
-    if not (0 <= red <= 1 and 0 <= green <= 1 and 0 <= blue <= 1):
-        raise InputError(f"--background {text}: expected black, white or three numbers from 0 to 1 such as 0.2,0.2,0.3")
-    return red, green, blue
-
-
-def resizer(width: int | None, height: int | None, scale: float) -> Callable[[Camera], Camera]:
-    """Function that resizes a camera by --width, --height and --scale. Raises InputError for impossible sizes."""
-    for flag, value in (("--width", width), ("--height", height), ("--scale", scale)):
-        if value is not None and not 0 < value < float("inf"):
-            raise InputError(f"{flag} {value}: expected a number above 0")
-    if scale != 1 and (width or height):
-        raise InputError("--scale and --width or --height exclude each other")
-
-    def resize(camera: Camera) -> Camera:
-        across, down = width, height
-        if across is None:
-            across = round(camera.width * (down / camera.height if down else scale))
-        if down is None:
-            down = round(camera.height * (across / camera.width if width else scale))
-        return camera.reshaped(max(1, across), max(1, down))
-
-    return resize

@@ -8,9 +8,9 @@ from dataclasses import replace
 from math import ceil
 
 from clsplat.camera import Camera
-from clsplat.config.pictures import FramingConfig
+from clsplat.config.pictures import FramingConfig, PictureConfig, SamplingConfig
 from clsplat.errors import InputError
-from clsplat.sequence.task import RenderOptions, Task
+from clsplat.sequence.task import Task
 from clsplat.shots import Shot
 from clsplat.shots.readers.usd_settings import FULL_DATA_WINDOW, window_named
 
@@ -21,14 +21,14 @@ _PIXEL_CENTRE_TOLERANCE_PX = 1e-3
 
 
 def with_stage(
-    options: RenderOptions, source: object, shot: Shot, tasks: Sequence[Task]
-) -> tuple[RenderOptions, tuple[str, ...]]:
-    """Options with the stage's data window and the first frame's shutter and lens, and the names of stage settings that
-    are not applied.
+    pictures: PictureConfig, source: object, shot: Shot, tasks: Sequence[Task]
+) -> tuple[PictureConfig, tuple[str, ...]]:
+    """Settings with the stage's data window and the first frame's shutter and lens; and the names of stage settings
+    that are not applied.
 
     Raises InputError for a data window without a pixel.
     """
-    pictures, unapplied = options.pictures, (*_lens_unapplied(options, tasks), *_shape_unsaid(tasks[0]))
+    unapplied = (*_lens_unapplied(pictures.sampling, tasks), *_shape_unsaid(tasks[0]))
     if (
         pictures.framing.region == ""
         and pictures.framing.overscan == "0"
@@ -40,7 +40,7 @@ def with_stage(
             unapplied += window_named(shot.window)
         else:
             pictures = replace(pictures, framing=framing)
-    return replace(options, pictures=replace(pictures, sampling=tasks[0].sampling or pictures.sampling)), unapplied
+    return replace(pictures, sampling=tasks[0].sampling or pictures.sampling), unapplied
 
 
 def _shape_unsaid(task: Task) -> tuple[str, ...]:
@@ -76,12 +76,11 @@ def _framing(
     return None
 
 
-def _lens_unapplied(options: RenderOptions, tasks: Sequence[Task]) -> tuple[str, ...]:
+def _lens_unapplied(flags: SamplingConfig, tasks: Sequence[Task]) -> tuple[str, ...]:
     """A note on the stage's lens, if no flag overrides it and no picture shows its blur.
 
     This happens if the lens has no focus distance, or the camera is orthographic.
     """
-    flags = options.pictures.sampling
     if flags.aperture is not None or flags.f_stop is not None:
         return ()
     for task in tasks:
