@@ -22,18 +22,9 @@ from clsplat.optimisation.density_rules import MarkRules
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
 from clsplat.reference import density as reference_density
-from clsplat.reference import loss as reference_loss
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters, project_model
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest.cases.appearance import of_appearance
-from clsplat.selftest.cases.depth import of_depth
-from clsplat.selftest.cases.grid import of_grid
-from clsplat.selftest.cases.library import LIBRARY_CASES
-from clsplat.selftest.cases.masks import MASK_CASES
-from clsplat.selftest.cases.pictures import PICTURE_CASES
-from clsplat.selftest.cases.poses import of_lens, of_pose
-from clsplat.selftest.cases.ppisp import of_ppisp
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped, joined
 from clsplat.selftest.scenes import evenly, keys, padded
 from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
@@ -42,7 +33,6 @@ from clsplat.stages.blend import blend, blend_grad
 from clsplat.stages.density import DensityStatistics, DeviceMarker, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
-from clsplat.stages.loss import loss
 from clsplat.stages.project import Projected, Screen, project, project_grad, project_step
 from clsplat.stages.ranges import tile_lists
 from clsplat.stages.sort import bitonic_sort, radix_sort
@@ -195,20 +185,6 @@ def _blend(bench: CaseBench) -> StageOutcome:
     image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
     exact = (wanted.image[clear], wanted.transmittance[clear])
     return outcome.compared({"image": (image, exact[0]), "transmittance": (transmittance, exact[1])})
-
-
-def _loss(bench: CaseBench) -> StageOutcome:
-    device, camera = bench.device, bench.camera
-    image, photograph = bench.blended.image, upload(device, bench.frozen.photograph)
-    sides = (camera.width, camera.height)
-    result, outcome = bench.twice(
-        lambda: loss(device, bench.work, image, photograph, *sides, 0.2),
-        lambda result: [result.gradient.get()[:, : camera.height]],  # the rows below are not written
-    )
-    x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
-    value, gradient = reference_loss.l1_dssim(x, y)
-    sums = (np.array(result.read()), np.array([value, np.square(x - y).mean()]))
-    return outcome.compared({"gradient": (_pixels(bench, outcome.arrays[0]), gradient), "loss and error": sums})
 
 
 def _pixels(bench: CaseBench, planes: Array) -> Float64:
@@ -406,25 +382,15 @@ def _marks_wrong(bench: CaseBench, statistics: DensityStatistics) -> int:
     return int((got.rows.get() != rows).sum()) + abs(got.halves - halves)
 
 
-CASES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
+CORE_STAGES: dict[str, Callable[[CaseBench], StageOutcome]] = {
     "arithmetic": _arithmetic,
     "project": _project,
     "duplicate": _duplicate,
     "sort": _sort,
     "ranges": _ranges,
     "blend": _blend,
-    **PICTURE_CASES,
-    **MASK_CASES,
-    "loss": _loss,
     "blend_grad": _blend_grad,
     "project_grad": _project_grad,
     "adam": _adam,
     "statistics": _statistics,
-    "appearance": of_appearance,
-    "ppisp": of_ppisp,
-    "grid": of_grid,
-    "depth": of_depth,
-    "pose": of_pose,
-    "lens": of_lens,
-    **LIBRARY_CASES,
 }
