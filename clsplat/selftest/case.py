@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import EllipsisType
-from typing import Any, Generic, TypeVar
+from types import EllipsisType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.random import Generator
@@ -21,12 +21,24 @@ from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
 from clsplat.selftest.harness import Array, CaseBench, StageOutcome, joined
 
-Inputs = TypeVar("Inputs")
 Arrays = dict[str, Array]
 Read = Callable[[], Arrays]
 """Function that reads the results of a launch, by name."""
 Sure = NDArray[np.bool_] | EllipsisType
 """Elements that are compared."""
+
+
+class Given(SimpleNamespace):
+    """Inputs of a case by name, arrays and numbers. Images are (H, W, ...)."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image."""
+        return self.image.shape[1], self.image.shape[0]
+
+    def wide(self, *names: str) -> list[NDArray[np.float64]]:
+        """These arrays in float64."""
+        return [getattr(self, name).astype(np.float64) for name in names]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +77,7 @@ def exactly(values: Array) -> Wanted:
 
 
 @dataclass(frozen=True, eq=False)
-class Case(Generic[Inputs]):
+class Case:
     """One stage.
 
     sizes: sizes at the seams of its kernels, each a number of rows or (width, height).
@@ -79,15 +91,15 @@ class Case(Generic[Inputs]):
     """
 
     sizes: Sequence[Any]
-    random: Callable[[Generator, Any], Inputs]
-    launch: Callable[[Device, Workspace, Inputs], Read]
-    twin: Callable[[Inputs, Arrays], Mapping[str, Wanted]]
+    random: Callable[[Generator, Any], Given]
+    launch: Callable[[Device, Workspace, Given], Read]
+    twin: Callable[[Given, Arrays], Mapping[str, Wanted]]
     bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)
-    frozen: Callable[[CaseBench], Sequence[Inputs]] | None = None
+    frozen: Callable[[CaseBench], Sequence[Given]] | None = None
     digested: tuple[str, ...] = ()
     by_shape: bool = True
 
-    def errors(self, device: Device, work: Workspace, given: Inputs) -> dict[str, float]:
+    def errors(self, device: Device, work: Workspace, given: Given) -> dict[str, float]:
         """Launch the kernels on the inputs; the errors by name."""
         got = self.launch(device, work, given)()
         return {name: wanted.error_of(got[name]) for name, wanted in self.twin(given, got).items()}
@@ -106,7 +118,7 @@ class Case(Generic[Inputs]):
         assert self.frozen is not None
         return joined([self._outcome(bench, given) for given in self.frozen(bench)])
 
-    def _outcome(self, bench: CaseBench, given: Inputs) -> StageOutcome:
+    def _outcome(self, bench: CaseBench, given: Given) -> StageOutcome:
         work = Workspace(bench.device)  # later stages need the results of earlier ones
         got: Arrays = {}
 
@@ -129,8 +141,3 @@ def read_of(**arrays: DeviceArray) -> Read:
 def fresh_readback(device: Device) -> DeviceArray:
     """The counts of a step in which nothing has stopped."""
     return upload(device, np.zeros(len(READBACK), np.uint32))
-
-
-def wide(*arrays: Array) -> tuple[NDArray[np.float64], ...]:
-    """The arrays in float64."""
-    return tuple(array.astype(np.float64) for array in arrays)

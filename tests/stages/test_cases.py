@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every stage that stands by itself against its float64 twin, on every driver, in every shape, at the seams of sizes."""
+"""Every stage that stands by itself against its float64 twin: every driver and shape, at the seams of sizes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ def check(device: Device, name: str, size: object) -> None:
         assert case.faults(case.errors(device, work, case.random(rng, size))) == []
 
 
-@pytest.mark.slow_in_groups
 @pytest.mark.parametrize(("name", "size"), cases(by_shape=True))
 def test_in_every_shape(shaped_device: Device, name: str, size: object) -> None:
     check(shaped_device, name, size)
@@ -47,7 +46,7 @@ def test_kernels_that_know_of_no_shape(device: Device, name: str, size: object) 
 def test_errors() -> None:
     """Relative to a size or in norm; a missing value, or one of another shape, is no small error."""
     values = np.array([1.0, 2.0, 0.0])
-    off = values + [0.0, 1e-3, 1e-3]
+    off = values + np.array([0.0, 1e-3, 1e-3])
     assert Wanted(values, 1.0).error_of(off) == pytest.approx(1e-3)
     assert Wanted(values, 1.0, sure=values == 1).error_of(off) == 0
     assert Wanted(values, np.abs(values) + 1e-3).error_of(off) == pytest.approx(1.0)

@@ -6,7 +6,7 @@ A stage's input is the device's own output of the stage before, so that errors d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +16,8 @@ from clsplat.arrays import Float64
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.launch import launch_items
-from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
-from clsplat.layouts.columns import READBACK, SPLAT, TILE
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import SPLAT, TILE
 from clsplat.optimisation.density_rules import MarkRules
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
@@ -25,17 +25,18 @@ from clsplat.reference import density as reference_density
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters, project_model
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped, joined
-from clsplat.selftest.scenes import evenly, keys, padded
+from clsplat.selftest.case import Given, fresh_readback
+from clsplat.selftest.cases.adam import ADAM_CASE, uploaded_groups
+from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped
+from clsplat.selftest.scenes import evenly, padded
 from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
-from clsplat.stages.adam import AdamStep, adam
+from clsplat.stages.adam import AdamStep
 from clsplat.stages.blend import blend, blend_grad
 from clsplat.stages.density import DensityStatistics, DeviceMarker, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
 from clsplat.stages.project import Projected, Screen, project, project_grad, project_step
 from clsplat.stages.ranges import tile_lists
-from clsplat.stages.sort import bitonic_sort, radix_sort
 
 
 def _arithmetic(bench: CaseBench) -> StageOutcome:
@@ -137,29 +138,6 @@ def _duplicate(bench: CaseBench) -> StageOutcome:
     return outcome.compared({}, pairs=wrong + missing)
 
 
-def _sort(bench: CaseBench) -> StageOutcome:
-    """Test both sorts on synthetic keys, as another scene may use the sort that this one does not."""
-    device, work = bench.device, bench.work
-    sizes = [(400, 12, False), (3000, 20, True), (30_000 if bench.frozen.name == "crowd" else 5000, 32, True)]
-    given = [keys(51 + index, n, bits) for index, (n, bits, _) in enumerate(sizes)]
-    on_device = [upload(device, values) for values in given]
-
-    def launch() -> list[DeviceArray]:
-        results: list[DeviceArray] = []
-        for index, ((_, bits, radix), values) in enumerate(zip(sizes, on_device, strict=True)):
-            name = f"sorted{index}"
-            both = radix_sort(device, work, name, values, bits) if radix else bitonic_sort(device, work, name, values)
-            results += both
-        return results
-
-    _, outcome = bench.twice(launch, lambda results: [array.get() for array in results])
-    arrays, wrong = outcome.arrays, 0
-    for values, got, positions in zip(given, arrays[::2], arrays[1::2], strict=True):
-        order = np.argsort(values, kind="stable")
-        wrong += int((got != values[order]).sum()) + int((positions != order).sum())
-    return outcome.compared({}, sorted_keys=wrong)
-
-
 def _ranges(bench: CaseBench) -> StageOutcome:
     bench.lists, outcome = bench.twice(
         lambda: tile_lists(bench.device, bench.work, bench.pairs, bench.band),
@@ -259,65 +237,18 @@ def _project_grad(bench: CaseBench) -> StageOutcome:
     return outcome.compared(parts)
 
 
-_RATES_BY_GROUP = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3)}
-
-
 def _adam(bench: CaseBench) -> StageOutcome:
-    device, step = bench.device, 7
-    count, coefficients = bench.model.count, bench.model.coefficients
-    shapes = group_shapes(count, coefficients)
-    ends = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
-    made = {
-        kind: {
-            g: evenly(60 + 8 * i + j, shapes[g], *ends[kind]).astype(np.float32) for j, g in enumerate(PARAMETER_GROUPS)
-        }
-        for i, kind in enumerate(ends)
-    }
-    outcomes = []
-    moving = bench.projected.tile_counts
-    for sparse in (False, True):
-        config = OptimiserConfig(sparse=sparse)
-        if sparse:
-            for values in made["gradients"].values():
-                values[~bench.visible] = 0.0  # as project_grad leaves them
-
-        def launch(config: OptimiserConfig = config) -> list[DeviceGaussians]:
-            models = [
-                DeviceGaussians(
-                    count, coefficients, {group: upload(device, values) for group, values in arrays.items()}
-                )
-                for arrays in made.values()
-            ]
-            parameters, gradients, first, second = models
-            adam(device, AdamStep(config, step, _RATES_BY_GROUP), parameters, gradients, first, second, moving)
-            return models
-
-        def take(models: list[DeviceGaussians]) -> list[Array]:
-            return [model[group].get() for model in models for group in PARAMETER_GROUPS]
-
-        _, outcome = bench.twice(launch, take)
-        rows = bench.visible if sparse else np.ones(count, np.bool_)
-        after = dict(zip(((kind, group) for kind in made for group in PARAMETER_GROUPS), outcome.arrays, strict=True))
-        parts: dict[str, tuple[Array, Array]] = {}
-        kept = 0
-        for group in PARAMETER_GROUPS:
-            p, g, m, v = (made[kind][group].astype(np.float64) for kind in made)
-            wanted = reference_adam.adam(
-                p, g, m, v, step, _RATES_BY_GROUP[group], config.beta1, config.beta2, config.epsilon
-            )
-            for kind, exact in zip(("parameters", "first", "second"), wanted, strict=True):
-                got = after[kind, group]
-                parts[f"{kind} of {group}"] = (got[rows], exact[rows])
-                kept += int((got[~rows] != made[kind][group][~rows]).sum())
-        wrong = _steps_off(bench, config, made)
-        outcomes.append(outcome.compared(parts, hidden_rows=kept, with_projection=wrong))
-    return joined(outcomes)
+    """Test Adam by itself, and as a part of projection's gradient."""
+    outcome = ADAM_CASE.outcome(bench)
+    assert ADAM_CASE.frozen is not None
+    wrong = sum(_steps_off(bench, given) for given in ADAM_CASE.frozen(bench))
+    return replace(outcome, trouble=outcome.trouble or (f"{wrong} with projection wrong" if wrong else ""))
 
 
-def _steps_off(bench: CaseBench, config: OptimiserConfig, made: Mapping[str, Mapping[str, Array]]) -> int:
+def _steps_off(bench: CaseBench, given: Given) -> int:
     """Count the elements that `project_step` moves differently from float64 Adam with the gradients of
     `project_grad`."""
-    device, step, (n, coefficients) = bench.device, 7, (bench.model.count, bench.model.coefficients)
+    device, (n, coefficients) = bench.device, (bench.model.count, bench.model.coefficients)
     view = (bench.camera_array, bench.projected, MadeUpSlots.of(bench).slots)
     gradients, screen = (
         allocate_gaussians(device, n, coefficients, zero=True),
@@ -325,21 +256,17 @@ def _steps_off(bench: CaseBench, config: OptimiserConfig, made: Mapping[str, Map
     )
     project_grad(device, bench.model, *view, gradients, screen)
     before = {"parameters": {group: bench.model[group].get() for group in PARAMETER_GROUPS}}
-    before |= {kind: dict(made[kind]) for kind in ("first", "second")}
-    model = {
-        kind: DeviceGaussians(n, coefficients, {group: upload(device, array) for group, array in arrays.items()})
-        for kind, arrays in before.items()
-    }
-    readback = upload(device, np.zeros(len(READBACK), np.uint32))
-    three = (model["parameters"], model["first"], model["second"])
-    project_step(device, AdamStep(config, step, _RATES_BY_GROUP), three, *view, screen, readback)
-    wrong, rows = int(readback.get().sum()), bench.visible if config.sparse else np.ones(n, np.bool_)
-    for group, rate in _RATES_BY_GROUP.items():
+    before |= {kind: dict(given.arrays[kind]) for kind in ("first", "second")}
+    parameters, first, second = uploaded_groups(device, before)
+    readback, step = fresh_readback(device), AdamStep(OptimiserConfig(sparse=given.sparse), given.step, given.rates)
+    project_step(device, step, (parameters, first, second), *view, screen, readback)
+    wrong, rows = int(readback.get().sum()), bench.visible if given.sparse else np.ones(n, np.bool_)
+    for group, rate in given.rates.items():
         p, m, v = (before[kind][group].astype(np.float64) for kind in before)
         g = gradients[group].get().astype(np.float64)
-        exact = reference_adam.adam(p, g, m, v, step, rate, config.beta1, config.beta2, config.epsilon)
-        for kind, wanted in zip(before, exact, strict=True):
-            got = model[kind][group].get()
+        exact = reference_adam.adam(p, g, m, v, given.step, rate)
+        for kind, model, wanted in zip(before, (parameters, first, second), exact, strict=True):
+            got = model[group].get()
             # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step or of a new moment.
             off = np.abs(got - wanted) > 1e-5 * np.abs(wanted) + 1e-4 * (rate if kind == "parameters" else g**2 + 1e-6)
             wrong += int(off[rows].sum()) + int((got[~rows] != before[kind][group][~rows]).sum())
@@ -386,7 +313,6 @@ CORE_STAGES: dict[str, Callable[[CaseBench], StageOutcome]] = {
     "arithmetic": _arithmetic,
     "project": _project,
     "duplicate": _duplicate,
-    "sort": _sort,
     "ranges": _ranges,
     "blend": _blend,
     "blend_grad": _blend_grad,

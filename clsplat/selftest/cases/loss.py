@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.random import Generator
 
@@ -13,7 +11,7 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference.depth import depth_loss
 from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
-from clsplat.selftest.case import Arrays, Case, Read, Wanted, exactly, wide
+from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.blend import Blended
@@ -41,13 +39,8 @@ def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
     return x.astype(np.float32), np.clip(y, 0, 1).astype(np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class LossInputs:
-    """A render and a photograph (H, W, 3), and the weight of D-SSIM."""
-
-    image: Float32
-    photograph: Float32
-    weight: float = 0.2
+def _given(image: Float32, photograph: Float32, weight: float = 0.2) -> Given:
+    return Given(image=image, photograph=photograph, weight=weight)
 
 
 def _read(result: Loss, size: Size) -> Arrays:
@@ -62,15 +55,14 @@ def _read(result: Loss, size: Size) -> Arrays:
     }
 
 
-def _launch(device: Device, work: Workspace, given: LossInputs) -> Read:
-    height, width, _ = given.image.shape
-    planes = (upload(device, planes_of(image)) for image in (given.image, given.photograph))
-    result = loss(device, work, *planes, width, height, given.weight)
-    return lambda: _read(result, (width, height))
+def _launch(device: Device, work: Workspace, given: Given) -> Read:
+    image, photograph = (upload(device, planes_of(each)) for each in (given.image, given.photograph))
+    result = loss(device, work, image, photograph, *given.size, given.weight)
+    return lambda: _read(result, given.size)
 
 
-def _twin(given: LossInputs, got: Arrays) -> dict[str, Wanted]:
-    x, y = wide(given.image, given.photograph)
+def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
+    x, y = given.wide("image", "photograph")
     value, gradient = l1_dssim(x, y, given.weight)
     squared = np.square(x - y).mean()
     return {
@@ -84,7 +76,7 @@ def _twin(given: LossInputs, got: Arrays) -> dict[str, Wanted]:
 LOSS_CASE = Case(
     # below and over the window's 11, vectors of 16 columns, blocks of 32 columns or rows
     sizes=((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65)),
-    random=lambda rng, size: LossInputs(*random_pictures(rng, size), weight=float(rng.choice([0.0, 0.2, 0.2]))),
+    random=lambda rng, size: _given(*random_pictures(rng, size), float(rng.choice([0.0, 0.2, 0.2]))),
     launch=_launch,
     twin=_twin,
     bounds={
@@ -93,25 +85,10 @@ LOSS_CASE = Case(
         "squared error": (1e-5, "a sum of partial sums"),
     },
     frozen=lambda bench: [
-        LossInputs(cropped(bench.blended.image.get(), bench.camera), cropped(bench.frozen.photograph, bench.camera))
+        _given(cropped(bench.blended.image.get(), bench.camera), cropped(bench.frozen.photograph, bench.camera))
     ],
     digested=("planes",),
 )
-
-
-@dataclass(frozen=True, eq=False)
-class MaskInputs:
-    """A render, with the light that it leaves (H, W), and a photograph (H, W, 5) with alpha and mask."""
-
-    image: Float32
-    left: Float32
-    photograph: Float32
-    background: Float32
-
-    @property
-    def size(self) -> Size:
-        """(width, height)."""
-        return self.image.shape[1], self.image.shape[0]
 
 
 def _blended(device: Device, size: Size, image: Float32, left: Float32, nearness: Float32 | None = None) -> Blended:
@@ -121,25 +98,26 @@ def _blended(device: Device, size: Size, image: Float32, left: Float32, nearness
     return Blended(upload(device, planes_of(image)), next(planes), upload(device, stops), None, next(planes, None))
 
 
-def _random_masks(rng: Generator, size: Size) -> MaskInputs:
+def _random_masks(rng: Generator, size: Size) -> Given:
     x, y = random_pictures(rng, size)
     counts = (rng.random((*y.shape[:2], 1)) < rng.choice([0.0, 0.1, 0.5, 1.0])).astype(np.float32)
     counts[0, 0] = 1
     alpha = (rng.random(counts.shape) ** rng.choice([0.0, 1.0, 8.0])).astype(np.float32)
     left = (rng.random(y.shape[:2]) ** rng.choice([0.0, 1.0, 8.0])).astype(np.float32)
-    return MaskInputs(x, left, np.concatenate([y, alpha, counts], axis=2), np.array([0.1, 0.5, 0.9], np.float32))
+    photograph, background = np.concatenate([y, alpha, counts], axis=2), np.array([0.1, 0.5, 0.9], np.float32)
+    return Given(image=x, left=left, photograph=photograph, background=background)
 
 
-def _frozen_masks(bench: CaseBench) -> list[MaskInputs]:
+def _frozen_masks(bench: CaseBench) -> list[Given]:
     width, height = bench.camera.width, bench.camera.height
     photograph = evenly(35, (height, width, 5), 0.0, 1.0).astype(np.float32)
     photograph[:, :, 4] = 1
     photograph[: height // 2 + 3, : width // 2 + 5, 4] = 0
-    render = (cropped(planes.get(), bench.camera) for planes in (bench.blended.image, bench.blended.transmittance))
-    return [MaskInputs(*render, photograph, bench.frozen.background)]
+    image, left = (cropped(planes.get(), bench.camera) for planes in (bench.blended.image, bench.blended.transmittance))
+    return [Given(image=image, left=left, photograph=photograph, background=bench.frozen.background)]
 
 
-def _launch_masks(device: Device, work: Workspace, given: MaskInputs) -> Read:
+def _launch_masks(device: Device, work: Workspace, given: Given) -> Read:
     blended = _blended(device, given.size, given.image, given.left)
     planes = target(device, work, given.photograph, upload(device, given.background), blended, alpha=True)
     kept, terms = int(given.photograph[:, :, 4].sum()), (AlphaTerm(ALPHA_LOSS_WEIGHT),)
@@ -153,8 +131,8 @@ def _launch_masks(device: Device, work: Workspace, given: MaskInputs) -> Read:
     return read
 
 
-def _twin_of_masks(given: MaskInputs, got: Arrays) -> dict[str, Wanted]:
-    seen, left, parts, background = wide(given.image, given.left, given.photograph, given.background)
+def _twin_of_masks(given: Given, got: Arrays) -> dict[str, Wanted]:
+    seen, left, parts, background = given.wide("image", "left", "photograph", "background")
     alpha, counts = parts[:, :, 3], parts[:, :, 4]
     truth = parts[:, :, :3] * alpha[:, :, None] + (1 - alpha)[:, :, None] * background
     value, gradient = masked_l1_dssim(seen, truth, counts)
@@ -184,29 +162,18 @@ MASKS_CASE = Case(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class DepthLossInputs:
-    """A render's nearness, and the known one with weights, (H, W) each, and the weight of the sum."""
-
-    image: Float32
-    nearness: Float32
-    aims: Float32
-    weights: Float32
-    factor: float
-
-
-def _random_depths(rng: Generator, size: Size) -> DepthLossInputs:
+def _random_depths(rng: Generator, size: Size) -> Given:
     """Nearness of 1e-6 to 1e6 against known ones, of which some, all or none are known."""
     image, _ = random_pictures(rng, size)
     scale = 10 ** rng.uniform(-6, 6)
-    nearness, aims, weights = (rng.random(image.shape[:2]).astype(np.float32) for _ in range(3))
-    weights *= rng.random(weights.shape) < rng.choice([0.0, 0.1, 1.0])
+    nearness, aims = (np.float32(scale) * rng.random(image.shape[:2]).astype(np.float32) for _ in range(2))
+    weights = rng.random(aims.shape) * (rng.random(aims.shape) < rng.choice([0.0, 0.1, 1.0]))
     factor = float(10 ** rng.uniform(-3, 3) / scale)
-    return DepthLossInputs(image, np.float32(scale) * nearness, np.float32(scale) * aims, weights, factor)
+    return Given(image=image, nearness=nearness, aims=aims, weights=weights.astype(np.float32), factor=factor)
 
 
-def _launch_depth_loss(device: Device, work: Workspace, given: DepthLossInputs) -> Read:
-    size = given.image.shape[1], given.image.shape[0]
+def _launch_depth_loss(device: Device, work: Workspace, given: Given) -> Read:
+    size = given.size
     blended = _blended(device, size, given.image, np.zeros_like(given.nearness), given.nearness)
     known = DepthTerm(planes_of(np.stack([given.aims, given.weights], axis=2)), given.factor)
     render = blended.image
@@ -217,8 +184,9 @@ def _launch_depth_loss(device: Device, work: Workspace, given: DepthLossInputs) 
     }
 
 
-def _twin_of_depth_loss(given: DepthLossInputs, _: Arrays) -> dict[str, Wanted]:
-    value, gradient = depth_loss(*wide(given.nearness, given.aims, given.weights), given.factor)
+def _twin_of_depth_loss(given: Given, _: Arrays) -> dict[str, Wanted]:
+    nearness, aims, weights = given.wide("nearness", "aims", "weights")
+    value, gradient = depth_loss(nearness, aims, weights, given.factor)
     return {
         "gradient": Wanted(gradient, np.abs(gradient)),
         "loss": Wanted(np.array([value]), max(1.0, value)),  # of equal pictures nothing else is lost

@@ -4,36 +4,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from clsplat.selftest.case import Case
+from clsplat.selftest.cases.adam import ADAM_CASE
 from clsplat.selftest.cases.appearance import APPEARANCE_CASE
 from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.depth import of_depth
 from clsplat.selftest.cases.grid import GRID_CASE
 from clsplat.selftest.cases.library import LIBRARY_CASES
 from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
+from clsplat.selftest.cases.noise import NOISE_CASE, PENALTIES_CASE
 from clsplat.selftest.cases.pictures import PICTURE_CASES
-from clsplat.selftest.cases.poses import of_lens, of_pose
+from clsplat.selftest.cases.poses import POSE_CASE, of_lens
 from clsplat.selftest.cases.ppisp import PPISP_CASE
+from clsplat.selftest.cases.sort import BITONIC_CASE, SCAN_CASE, SORT_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
 
-CASES: dict[str, Case[Any]] = {
+CASES: dict[str, Case] = {
+    "sort": SORT_CASE,
+    "bitonic sort": BITONIC_CASE,
+    "scan": SCAN_CASE,
     "loss": LOSS_CASE,
     "masks": MASKS_CASE,
     "depth loss": DEPTH_LOSS_CASE,
+    "penalties": PENALTIES_CASE,
+    "adam": ADAM_CASE,
+    "noise": NOISE_CASE,
     "appearance": APPEARANCE_CASE,
     "ppisp": PPISP_CASE,
     "grid": GRID_CASE,
+    "pose": POSE_CASE,
 }
 """Cases that stand by themselves. One with inputs from a frozen scene is the self-test's stage of that name."""
 
 OUTCOMES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
+    **{name: case.outcome for name, case in CASES.items() if case.frozen is not None},
     **CORE_STAGES,
     **PICTURE_CASES,
     "depth": of_depth,
-    "pose": of_pose,
     "lens": of_lens,
     **LIBRARY_CASES,
-    **{name: case.outcome for name, case in CASES.items() if case.frozen is not None},
 }
