@@ -99,9 +99,9 @@ class Case:
     digested: tuple[str, ...] = ()
     by_shape: bool = True
 
-    def errors(self, device: Device, work: Workspace, given: Given) -> dict[str, float]:
+    def errors(self, device: Device, given: Given, work: Workspace | None = None) -> dict[str, float]:
         """Launch the kernels on the inputs; the errors by name."""
-        got = self.launch(device, work, given)()
+        got = self.launch(device, work or Workspace(device), given)()
         return {name: wanted.error_of(got[name]) for name, wanted in self.twin(given, got).items()}
 
     def bound(self, name: str) -> float:

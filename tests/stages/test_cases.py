@@ -30,7 +30,7 @@ def check(device: Device, name: str, size: object) -> None:
     case, work = CASES[name], Workspace(device)
     for draw in range(DRAWS):
         rng = np.random.default_rng([draw, *np.atleast_1d(np.array(size)), *name.encode()])
-        assert case.faults(case.errors(device, work, case.random(rng, size))) == []
+        assert case.faults(case.errors(device, case.random(rng, size), work)) == []
 
 
 @pytest.mark.parametrize(("name", "size"), cases(by_shape=True))

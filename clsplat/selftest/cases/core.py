@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.config.training import OptimiserConfig
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.launch import launch_items
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import SPLAT, TILE
-from clsplat.optimisation.density_rules import MarkRules
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
-from clsplat.reference import density as reference_density
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters, project_model
 from clsplat.reference.tiles import touched_tiles
@@ -32,7 +30,6 @@ from clsplat.selftest.scenes import evenly, padded
 from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.blend import blend, blend_grad
-from clsplat.stages.density import DensityStatistics, DeviceMarker, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
 from clsplat.stages.project import Projected, Screen, project, project_grad, project_step
@@ -273,42 +270,6 @@ def _steps_off(bench: CaseBench, given: Given) -> int:
     return wrong
 
 
-def _statistics(bench: CaseBench) -> StageOutcome:
-    device, n, camera, visible = bench.device, bench.model.count, bench.camera, bench.visible
-    values = evenly(34, (n, 2), -0.0625, 0.0625).astype(np.float32)
-    screen = Screen(upload(device, values))
-
-    def launch() -> DensityStatistics:
-        statistics = new_statistics(device, n)
-        for _ in range(2):
-            add_statistics(device, statistics, camera, bench.projected, screen)
-        return statistics
-
-    statistics, outcome = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
-    got = dict(zip(statistics.named(), outcome.arrays, strict=True))
-    norms = np.hypot(*(0.5 * np.array([camera.width, camera.height]) * values.astype(np.float64)).T) * visible
-    sxx, sxy, syy = bench.splats().covariances.T
-    radii = np.ceil(3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))) * visible
-    wrong = int((got["seen"] != 2 * visible).sum())
-    wrong += _marks_wrong(bench, statistics)
-    wrong += int((np.abs(got["radii"] - radii) > 1).sum()) + int((got["radii"] != radii).sum() > 1 + n // 100)
-    return outcome.compared({"gradient sums": (got["gradient_sums"], 2 * norms)}, counts=wrong)
-
-
-def _marks_wrong(bench: CaseBench, statistics: DensityStatistics) -> int:
-    """Count wrong entries in the list of rows, with thresholds that divide the Gaussians by every statistic."""
-    device, model = bench.device, bench.model
-    known = {name: array.get() for name, array in statistics.named().items()}
-    scales, logits = model["log_scales"].get(), model["opacity_logits"].get()
-    middle, limit = 0.500001 * float(np.median(known["gradient_sums"])), float(np.median(scales.max(axis=1)))
-    rules = MarkRules(gradient=middle, large=limit, transparent=float(np.median(logits)) - 1, oversized=limit + 2)
-    rows, halves = reference_density.rows(rules, known, scales, logits)
-    got = DeviceMarker(device, Workspace(device), model, statistics).rows(rules)
-    if got.count != len(rows):
-        return abs(got.count - len(rows))
-    return int((got.rows.get() != rows).sum()) + abs(got.halves - halves)
-
-
 CORE_STAGES: dict[str, Callable[[CaseBench], StageOutcome]] = {
     "arithmetic": _arithmetic,
     "project": _project,
@@ -318,5 +279,4 @@ CORE_STAGES: dict[str, Callable[[CaseBench], StageOutcome]] = {
     "blend_grad": _blend_grad,
     "project_grad": _project_grad,
     "adam": _adam,
-    "statistics": _statistics,
 }

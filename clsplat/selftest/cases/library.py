@@ -9,16 +9,17 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 
 import numpy as np
+from numpy.random import Generator
 
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.buffers import DeviceArray, Workspace, from_host, upload
+from clsplat.device.context import Device
 from clsplat.layouts.columns import SPLAT
 from clsplat.reference import ewa as reference_ewa
 from clsplat.reference import splats as reference_splats
 from clsplat.reference import values as reference_values
-from clsplat.reference.sh import sh_basis_grad
+from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
-from clsplat.spherical_harmonics import sh_basis
 from clsplat.stages.ewa import (
     Ewa,
     EwaCamera,
@@ -30,8 +31,6 @@ from clsplat.stages.ewa import (
     ewa,
     ewa_grad,
 )
-from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE, Harmonics, HarmonicsGradients, harmonics, harmonics_grad
-from clsplat.stages.project import Projected
 from clsplat.stages.splats import ScreenGaussians, ScreenGradients, splats
 from clsplat.stages.values import ValuePass, values, values_grad
 
@@ -99,71 +98,86 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
     return outcome.compared({**parts, "by lens": (by_lens, back["intrinsics"])}, radii=wrong)
 
 
-def of_harmonics(bench: CaseBench) -> StageOutcome:
-    """Test colours of the highest degree in synthetic directions."""
-    device, n, coefficients = bench.device, bench.model.count, (MAX_SH_BASIS_DEGREE + 1) ** 2
-    away, sh, by = (
-        evenly(71 + index, shape, -1.0, 1.0).astype(np.float32)
-        for index, shape in enumerate(((n, 3), (n, coefficients, 3), (n, 3)))
-    )
-    away[:, 2] += 1.5
-    given = Harmonics(upload(device, away), upload(device, sh), MAX_SH_BASIS_DEGREE)
-
-    def launch() -> list[DeviceArray]:
-        found = [bench.work.array(f"sh_{k}", array.shape) for k, array in enumerate((by, sh, away))]
-        harmonics(device, given, found[0])
-        harmonics_grad(device, bench.work, given, found[0], upload(device, by), HarmonicsGradients(*found[1:]))
-        return found
-
-    def take(found: list[DeviceArray]) -> list[Array]:
-        return [array.get() for array in found]
-
-    _, outcome = bench.twice(launch, take)
-    length = np.linalg.norm(away.astype(np.float64), axis=1, keepdims=True)
-    unit, exact, back = away / length, sh.astype(np.float64), by.astype(np.float64)
-    basis = sh_basis(unit, MAX_SH_BASIS_DEGREE)
-    by_unit = np.einsum("nkd,nkc,nc->nd", sh_basis_grad(unit, MAX_SH_BASIS_DEGREE), exact, back)
-    by_direction = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
-    wanted = (np.einsum("nk,nkc->nc", basis, exact), basis[:, :, None] * back[:, None], by_direction)
-    names = ("colours", "by coefficients", "by directions")
-    return outcome.compared(dict(zip(names, zip(outcome.arrays, wanted, strict=True), strict=True)))
+def _random_splats(rng: Generator, count: int) -> Given:
+    """Ellipses of a few pixels all over an image and a little beyond, a tenth culled by a radius, some at the cap."""
+    sides, angles = np.exp(rng.normal(0.9, 0.5, (count, 2))), rng.uniform(0, np.pi, count)
+    axes = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1).reshape(-1, 2, 2)
+    inverse = (axes / sides[:, None, :] ** 2) @ axes.transpose(0, 2, 1)
+    arrays = {
+        "means2d": rng.uniform(-0.1, 1.1, (count, 2)) * [70, 50],
+        "conics": inverse.reshape(-1, 4)[:, [0, 1, 3]],
+        "opacities": np.where(rng.random(count) < 0.1, 1.0, rng.uniform(0.02, 0.95, count)),
+        "depths": rng.uniform(1, 9, count),
+        "values": rng.random((count, 3)),
+    }
+    radii = np.where(rng.random((count, 2)) < 0.05, 0, 9).astype(np.int32)
+    return Given(radii=radii, width=70, height=50, **{name: each.astype(np.float32) for name, each in arrays.items()})
 
 
-def of_splats(bench: CaseBench) -> StageOutcome:
-    """Test splats of the scene's projected Gaussians, given as arrays."""
-    device, camera, seen = bench.device, bench.camera, bench.visible
-    rows = bench.splats()
-    count = len(seen)
+def _frozen_splats(bench: CaseBench) -> list[Given]:
+    """The scene's projected Gaussians, given as arrays."""
+    camera, seen, rows = bench.camera, bench.visible, bench.splats()
+    arrays = {
+        "means2d": rows.means2d,
+        "conics": np.where(seen[:, None], rows.conics, (1.0, 0.0, 1.0)),
+        "opacities": np.where(seen, rows.opacities, 0.5),
+        "depths": rows.depths,
+        "values": evenly(81, (len(seen), 3), 0.0, 1.0),
+    }
     radii = np.repeat(np.where(seen, 9, 0)[:, None], 2, axis=1).astype(np.int32)
-    conics = np.where(seen[:, None], rows.conics, (1.0, 0.0, 1.0)).astype(np.float32)
-    opacities = np.where(seen, rows.opacities, 0.5).astype(np.float32)
-    arrays = (radii, rows.means2d, conics, opacities, rows.depths, evenly(81, (count, 3), 0.0, 1.0))
-    kinds = (np.int32, *[np.float32] * 5)
-    given = ScreenGaussians(
-        *(upload(device, np.ascontiguousarray(each, kind)) for each, kind in zip(arrays, kinds, strict=True))
-    )
+    single = {name: np.ascontiguousarray(each, np.float32) for name, each in arrays.items()}
+    return [Given(radii=radii, width=camera.width, height=camera.height, **single)]
 
-    work = Workspace(device)  # so that the scene's own splats are not overwritten
 
-    def launch() -> Projected:
-        return splats(device, work, given, camera.width, camera.height)
+def _launch_splats(device: Device, work: Workspace, given: Given) -> Read:
+    names = ("radii", "means2d", "conics", "opacities", "depths", "values")
+    inputs = ScreenGaussians(*(from_host(device, getattr(given, name)) for name in names))
+    found = splats(device, work, inputs, given.width, given.height)
 
-    def take(found: Projected) -> list[Array]:
+    def read() -> Arrays:
         tiles = found.tile_counts.get()
         rows = np.where(tiles[:, None] > 0, found.splats.get(), 0)
-        return [tiles, *(rows[:, k] for k in WRITTEN_SPLAT_COLUMNS.values())]
+        return {"tiles": tiles, **{name: rows[:, k] for name, k in WRITTEN_SPLAT_COLUMNS.items()}}
 
-    _, outcome = bench.twice(launch, take)
-    tiles, *columns = outcome.arrays
-    both = seen & (tiles > 0)
-    wrong = max(int((seen != (tiles > 0)).sum()) - 2, 0)  # for ellipses that end at a tile's first pixel
-    column = {name: values[both] for name, values in zip(WRITTEN_SPLAT_COLUMNS, columns, strict=True)}
-    wanted = reference_splats.splats(conics.astype(np.float64), opacities.astype(np.float64), radii)
+    return read
+
+
+def _twin_of_splats(given: Given, got: Arrays) -> dict[str, Wanted]:
+    conics, opacities = given.wide("conics", "opacities")
+    wanted = reference_splats.splats(conics, opacities, given.radii)
+    seen = wanted.drawn & (got["tiles"] > 0)
+    column = {name: got[name] for name in WRITTEN_SPLAT_COLUMNS}
     whitening = np.stack([column[name] for name in ("L11", "L12", "L22")], axis=1) / WHITENING_FACTOR
-    half = np.stack([column["HALF_W"], column["HALF_H"]], axis=1)
-    parts = {"whitening": (whitening, wanted.whitenings[both]), "half extents": (half, wanted.half_extents[both])}
-    logs = (column["LOG2O"], np.log2(opacities[both].astype(np.float64)))
-    return outcome.compared({**parts, "log2 opacities": logs}, shown=wrong)
+    got |= {"whitening": whitening, "half extents": np.stack([column["HALF_W"], column["HALF_H"]], axis=1)}
+    got["means"] = np.stack([column["PIXEL_X"] + column["SUB_X"], column["PIXEL_Y"] + column["SUB_Y"]], axis=1)[seen]
+    got["values"] = np.stack([column["RED"], column["GREEN"], column["BLUE"]], axis=1)[seen]
+    got["shown"] = (got["tiles"] > 0) & ~wanted.drawn
+    size = np.abs(wanted.whitenings).max(axis=1, keepdims=True, initial=0)
+    logs = np.log2(opacities)
+    return {
+        "whitening": Wanted(wanted.whitenings, np.broadcast_to(size, wanted.whitenings.shape), seen),
+        "half extents": Wanted(wanted.half_extents, 1 + np.abs(wanted.half_extents), seen),
+        "LOG2O": Wanted(logs, 1.0, seen),
+        "means": Wanted(given.means2d[seen], 1.0),
+        "values": exactly(given.values[seen]),
+        "shown": exactly(np.zeros_like(got["shown"])),
+    }
+
+
+SPLATS_CASE = Case(
+    sizes=(1, 63, 64, 65, 0, 200),
+    random=_random_splats,
+    launch=_launch_splats,
+    twin=_twin_of_splats,
+    bounds={
+        "whitening": (5e-7, "three roundings of a root and two quotients; l12 may be near 0 beside the others"),
+        "half extents": (1e-4, "the budget is a difference of logarithms; the tile test has 0.01 px more"),
+        "means": (6e-8, "the place in a pixel is a float32 under 1"),
+        "LOG2O": (1.4e-6, "an ulp of the logarithm is 1e-6 of the opacity"),
+    },
+    frozen=_frozen_splats,
+    digested=("tiles", *WRITTEN_SPLAT_COLUMNS),
+)
 
 
 def of_values(bench: CaseBench) -> StageOutcome:
@@ -206,6 +220,3 @@ def of_values(bench: CaseBench) -> StageOutcome:
     parts = {"pixels": (pixels[sure], wanted.image[sure])}
     parts |= {f"by {name}": (got[seen], back[name][seen]) for name, got in zip(widths, gradients, strict=True)}
     return outcome.compared(parts)
-
-
-LIBRARY_CASES = {"ewa": of_ewa, "harmonics": of_harmonics, "splats": of_splats, "values": of_values}

@@ -9,18 +9,22 @@ from clsplat.selftest.case import Case
 from clsplat.selftest.cases.adam import ADAM_CASE
 from clsplat.selftest.cases.appearance import APPEARANCE_CASE
 from clsplat.selftest.cases.core import CORE_STAGES
+from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
 from clsplat.selftest.cases.depth import of_depth
+from clsplat.selftest.cases.elementary import ELEMENTARY_CASE
 from clsplat.selftest.cases.grid import GRID_CASE
-from clsplat.selftest.cases.library import LIBRARY_CASES
+from clsplat.selftest.cases.harmonics import HARMONICS_CASE
+from clsplat.selftest.cases.library import SPLATS_CASE, of_ewa, of_values
 from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
 from clsplat.selftest.cases.noise import NOISE_CASE, PENALTIES_CASE
-from clsplat.selftest.cases.pictures import PICTURE_CASES
+from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
 from clsplat.selftest.cases.ppisp import PPISP_CASE
 from clsplat.selftest.cases.sort import BITONIC_CASE, SCAN_CASE, SORT_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
 
 CASES: dict[str, Case] = {
+    "elementary": ELEMENTARY_CASE,
     "sort": SORT_CASE,
     "bitonic sort": BITONIC_CASE,
     "scan": SCAN_CASE,
@@ -34,14 +38,21 @@ CASES: dict[str, Case] = {
     "ppisp": PPISP_CASE,
     "grid": GRID_CASE,
     "pose": POSE_CASE,
+    "harmonics": HARMONICS_CASE,
+    "splats": SPLATS_CASE,
+    "deep_merge": DEEP_MERGE_CASE,
+    "statistics": STATISTICS_CASE,
+    "marks": MARKS_CASE,
 }
 """Cases that stand by themselves. One with inputs from a frozen scene is the self-test's stage of that name."""
 
 OUTCOMES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
     **{name: case.outcome for name, case in CASES.items() if case.frozen is not None},
     **CORE_STAGES,
+    "statistics": of_statistics,
     **PICTURE_CASES,
     "depth": of_depth,
     "lens": of_lens,
-    **LIBRARY_CASES,
+    "ewa": of_ewa,
+    "values": of_values,
 }
