@@ -8,9 +8,9 @@ The self-test runs every case on the frozen scenes, `tests/stages/test_cases.py`
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import EllipsisType, SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -45,35 +45,50 @@ class Given(SimpleNamespace):
 class Wanted:
     """The twin's values of a result.
 
-    size: magnitude that an error is relative to. None: the error is that of all values together, in the 2-norm.
+    bound: the largest error; its reason is beside it.
+    of: magnitude that an error is relative to. None: the error is that of all values together, in the 2-norm.
     sure: the elements that are compared, where rounding decides the others.
     exact: True for results without an error, such as integers.
     """
 
     values: Array
-    size: ArrayLike | None = None
+    bound: float
+    of: ArrayLike | None = None
     sure: Sure = ...
     exact: bool = False
 
     def error_of(self, got: Array) -> float:
-        """The largest error relative to the size; of exact results the number of wrong elements."""
+        """The largest error, relative to `of`; of exact results the number of wrong elements."""
         if got.shape != self.values.shape:
             return float("inf")
         found, wanted = got[self.sure], self.values[self.sure]
         if self.exact:
             return float(np.count_nonzero(found != wanted))
+        if not np.isfinite(found).all():
+            return float("inf")
         off = np.abs(found.astype(np.float64) - wanted)
-        if self.size is None:
+        if self.of is None:
             error, scale = np.linalg.norm(off), np.linalg.norm(wanted)
             return float(error / scale) if scale > 0 else float("inf") if error > 0 else 0.0
-        size = np.broadcast_to(np.asarray(self.size, np.float64), self.values.shape)[self.sure]
-        worst = (off / np.maximum(size, 1e-30)).max(initial=0.0)
-        return float(worst) if np.isfinite(found).all() else float("inf")
+        size = np.broadcast_to(np.asarray(self.of, np.float64), self.values.shape)[self.sure]
+        return float((off / np.maximum(size, 1e-30)).max(initial=0.0))
 
 
 def exactly(values: Array) -> Wanted:
     """Values without an error."""
-    return Wanted(values, exact=True)
+    return Wanted(values, 0.0, exact=True)
+
+
+class Deviation(NamedTuple):
+    """An error, and the largest that there may be."""
+
+    error: float
+    bound: float
+
+
+def faults(found: Mapping[str, Deviation]) -> list[str]:
+    """Errors over their bounds, in words."""
+    return [f"{name} {error:.2g} over {bound:g}" for name, (error, bound) in found.items() if not error <= bound]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +99,6 @@ class Case:
     random: inputs of a size.
     launch: function that launches the kernels, and returns the function that reads the results.
     twin: the wanted values by name, from the inputs and the results, as for a gradient of what the device projected.
-    bounds: the largest error of each wanted value with its reason; exact ones have none.
     frozen: inputs from a frozen scene, each of which the self-test launches; None if it has no such stage.
     digested: names of the results in the self-test's digest, in order.
     by_shape: True if the kernels or their launches depend on the kernel shape.
@@ -94,24 +108,14 @@ class Case:
     random: Callable[[Generator, Any], Given]
     launch: Callable[[Device, Workspace, Given], Read]
     twin: Callable[[Given, Arrays], Mapping[str, Wanted]]
-    bounds: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     frozen: Callable[[CaseBench], Sequence[Given]] | None = None
     digested: tuple[str, ...] = ()
     by_shape: bool = True
 
-    def errors(self, device: Device, given: Given, work: Workspace | None = None) -> dict[str, float]:
+    def errors(self, device: Device, given: Given, work: Workspace | None = None) -> dict[str, Deviation]:
         """Launch the kernels on the inputs; the errors by name."""
         got = self.launch(device, work or Workspace(device), given)()
-        return {name: wanted.error_of(got[name]) for name, wanted in self.twin(given, got).items()}
-
-    def bound(self, name: str) -> float:
-        """The largest error of the wanted values of that name."""
-        return self.bounds[name][0] if name in self.bounds else 0.0
-
-    def faults(self, errors: Mapping[str, float]) -> list[str]:
-        """Errors over their bounds, in words."""
-        over = {name: error for name, error in errors.items() if not error <= self.bound(name)}
-        return [f"{name} {error:.2g} over {self.bound(name):g}" for name, error in over.items()]
+        return {name: Deviation(of.error_of(got[name]), of.bound) for name, of in self.twin(given, got).items()}
 
     def outcome(self, bench: CaseBench) -> StageOutcome:
         """Outcome of the self-test's stage."""

@@ -9,7 +9,7 @@ from _pytest.mark.structures import ParameterSet
 
 from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
-from clsplat.selftest.case import Wanted
+from clsplat.selftest.case import Wanted, faults
 from clsplat.selftest.cases.table import CASES
 
 DRAWS = 2
@@ -30,7 +30,7 @@ def check(device: Device, name: str, size: object) -> None:
     case, work = CASES[name], Workspace(device)
     for draw in range(DRAWS):
         rng = np.random.default_rng([draw, *np.atleast_1d(np.array(size)), *name.encode()])
-        assert case.faults(case.errors(device, case.random(rng, size), work)) == []
+        assert faults(case.errors(device, case.random(rng, size), work)) == []
 
 
 @pytest.mark.parametrize(("name", "size"), cases(by_shape=True))
@@ -47,11 +47,11 @@ def test_errors() -> None:
     """Relative to a size or in norm; a missing value, or one of another shape, is no small error."""
     values = np.array([1.0, 2.0, 0.0])
     off = values + np.array([0.0, 1e-3, 1e-3])
-    assert Wanted(values, 1.0).error_of(off) == pytest.approx(1e-3)
-    assert Wanted(values, 1.0, sure=values == 1).error_of(off) == 0
-    assert Wanted(values, np.abs(values) + 1e-3).error_of(off) == pytest.approx(1.0)
-    assert Wanted(values).error_of(off) == pytest.approx(1e-3 * (2 / 5) ** 0.5)
-    assert Wanted(np.zeros(3)).error_of(off) == np.inf
-    assert Wanted(values, 1.0).error_of(np.array([1.0, np.nan, 0.0])) == np.inf
-    assert Wanted(values, 1.0).error_of(off[:2]) == np.inf
-    assert Wanted(values, exact=True).error_of(off) == 2
+    assert Wanted(values, 0, 1.0).error_of(off) == pytest.approx(1e-3)
+    assert Wanted(values, 0, 1.0, sure=values == 1).error_of(off) == 0
+    assert Wanted(values, 0, np.abs(values) + 1e-3).error_of(off) == pytest.approx(1.0)
+    assert Wanted(values, 0).error_of(off) == pytest.approx(1e-3 * (2 / 5) ** 0.5)
+    assert Wanted(np.zeros(3), 0).error_of(off) == np.inf
+    assert Wanted(values, 0, 1.0).error_of(np.array([1.0, np.nan, 0.0])) == np.inf
+    assert Wanted(values, 0, 1.0).error_of(off[:2]) == np.inf
+    assert Wanted(values, 0, exact=True).error_of(off) == 2

@@ -12,7 +12,7 @@ from clsplat.arrays import Float32
 from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
 from clsplat.layouts.columns import DEEP_PICTURES
-from clsplat.selftest.case import Given
+from clsplat.selftest.case import Given, faults
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, launch_deep_merge, random_deep_pictures
 
 
@@ -29,7 +29,7 @@ def merged(device: Device, pictures: Float32, weights: Float32) -> Float32:
 @pytest.mark.parametrize(("count", "bins"), [(1, 1), (1, 5), (2, 1), (3, 7), (DEEP_PICTURES, 4), (2, 40)])
 def test_every_number_of_pictures_and_slices(device: Device, count: int, bins: int) -> None:
     given = random_deep_pictures(np.random.default_rng(0), (13, 5), count, bins)
-    assert DEEP_MERGE_CASE.faults(DEEP_MERGE_CASE.errors(device, given)) == []
+    assert faults(DEEP_MERGE_CASE.errors(device, given)) == []
 
 
 def test_at_any_depth_it_is_the_mean(default_device: Device) -> None:

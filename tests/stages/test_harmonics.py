@@ -11,7 +11,7 @@ from quick import quick
 from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.selftest.case import Arrays, Given
+from clsplat.selftest.case import Arrays, Given, faults
 from clsplat.selftest.cases.harmonics import HARMONICS_CASE, harmonics_inputs, launch_harmonics, random_harmonics
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE
@@ -29,7 +29,7 @@ def run(device: Device, given: Given, *, add: bool = False, start: float = -7.0)
 @pytest.mark.parametrize("degree", range(MAX_SH_BASIS_DEGREE + 1))
 def test_every_degree(shaped_device: Device, degree: int, camera: bool) -> None:
     given = subject(300, degree, camera=camera)
-    assert HARMONICS_CASE.faults(HARMONICS_CASE.errors(shaped_device, given)) == []
+    assert faults(HARMONICS_CASE.errors(shaped_device, given)) == []
 
 
 def test_every_shape_has_the_same_bits(device: Device) -> None:

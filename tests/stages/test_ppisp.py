@@ -6,14 +6,13 @@ from __future__ import annotations
 import numpy as np
 from compare import assert_close, assert_close_gradient
 
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
 from clsplat.reference import ppisp
 from clsplat.runs.appearance import held_out_looks, unmixing
-from clsplat.selftest.harness import planes_of
 from clsplat.stages.appearance import Gains, step_gains
-from clsplat.stages.ppisp import COLOUR_ENTRIES, VIGNETTE_ENTRIES, PhotoLens, camera_gradient, develop
+from clsplat.stages.ppisp import COLOUR_ENTRIES, VIGNETTE_ENTRIES
 
 Array = np.ndarray
 
@@ -35,22 +34,6 @@ def test_mixes_stay_where_they_can_be_undone(shaped_device: Device) -> None:
     logs = colours.logs.get().astype(np.float64)
     assert np.abs(logs[:, 3:]).max() == np.float32(0.2)
     assert np.linalg.cond(unmixing(logs[0, 3:])) < 10
-
-
-def test_a_panorama_has_no_vignette(default_device: Device) -> None:
-    rng = np.random.default_rng(5)
-    image = rng.random((16, 16, 3)).astype(np.float32)
-    entries, lenses = made_up(rng, 1, 1)
-    taken = PhotoLens(0, 0, (0.5, 0.5), flat=False)
-    colours, vignettes = Gains.on(default_device, entries), Gains.on(default_device, lenses)
-    target = upload(default_device, planes_of(image))
-    develop(default_device, colours, vignettes, taken, target, 16, 16)
-    wide = image.astype(np.float64), entries[0].astype(np.float64)
-    wanted = ppisp.developed(*wide, np.zeros(3), np.zeros((16, 16)))
-    assert_close(target.get().transpose(1, 2, 0), wanted, absolute=4e-6)  # as above
-    planes = upload(default_device, planes_of(image))
-    columns = camera_gradient(default_device, Workspace(default_device), taken, planes, planes, 16, 16)
-    assert not columns.get()[COLOUR_ENTRIES:].any()
 
 
 def test_the_twin_against_finite_differences() -> None:

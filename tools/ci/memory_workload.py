@@ -42,7 +42,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.supervision.depth_samples import KnownDepth
-from clsplat.selftest.case import Case, Given
+from clsplat.selftest.case import Case, Given, faults
 from clsplat.selftest.cases.table import CASES
 from clsplat.stages import scan as stages_scan
 from clsplat.stages.adam import add_view
@@ -164,8 +164,8 @@ def cases(device: Device) -> None:
 
 def check(name: str, case: Case, device: Device, given: Given) -> None:
     """Raise SystemExit where a case is over its bounds."""
-    if faults := case.faults(case.errors(device, given)):
-        raise SystemExit(f"{name}: {', '.join(faults)}")
+    if wrong := faults(case.errors(device, given)):
+        raise SystemExit(f"{name}: {', '.join(wrong)}")
 
 
 def rendering(device: Device) -> None:

@@ -209,8 +209,8 @@ def table(result: Result) -> list[str]:
     lines.append(f"{'all':15} {'':55}{tail:8.1e}")
     if "stages" in result:
         lines += ["", f"{'by themselves':32}     error     bound"]
-        errors, bounds = result["stages"]["errors"], result["stages"]["bounds"]
-        lines += [f"{name:32}  {errors[name]:8.1e}  {bound:8.1e}" for name, bound in bounds.items() if bound > 0]
+        for name, row in result["stages"]["errors"].items():
+            lines += [f"{name:32}  {row['error']:8.1e}  {row['bound']:8.1e}"] if row["bound"] else []
     rows = {**result["projection"], **result["frames"], "frames": {"faults": result["frame_faults"]}}
     rows["stages"] = result.get("stages", {"faults": []})
     faults = [f"{name}: {fault}" for name, row in rows.items() for fault in row["faults"]]

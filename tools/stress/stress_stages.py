@@ -12,7 +12,7 @@ from stress_projection import exact, in_order, on_image, random_sums
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference.project import lens_grad, project
-from clsplat.selftest.case import Case
+from clsplat.selftest.case import Case, Deviation, faults
 from clsplat.selftest.cases.table import CASES
 from clsplat.stages import project as stages_project
 from clsplat.stages.device_camera import pack_camera
@@ -24,16 +24,16 @@ LENS_BOUND = 1e-5
 KINDS = (ordinary, anisotropy, edge_on, off_centre, focal_lengths)
 
 
-def worst_errors(device: Device, case: Case, rng: Generator, many: int) -> dict[str, float]:
+def worst_errors(device: Device, case: Case, rng: Generator, many: int) -> dict[str, Deviation]:
     """The largest errors of random inputs, of the case's sizes and of sizes between."""
-    worst: dict[str, float] = {}
+    worst: dict[str, Deviation] = {}
     work = Workspace(device)
     for turn in range(many):
         size = case.sizes[int(rng.integers(len(case.sizes)))]
         if turn % 2:
             size = tuple(map(int, rng.integers(1, 41, 2))) if isinstance(size, tuple) else int(rng.integers(1, 2000))
         for name, error in case.errors(device, case.random(rng, size), work).items():
-            worst[name] = float(np.maximum(worst.get(name, 0.0), error))  # a NaN stays one
+            worst[name] = max(worst.get(name, error), error)
     return worst
 
 
@@ -66,15 +66,8 @@ def lenses(device: Device, rng: Generator, many: int) -> float:
 def stages(device: Device, seed: int, many: int) -> Result:
     """Errors by name, with their bounds and what is over one."""
     rng = np.random.default_rng([seed, 77])
-    errors: dict[str, float] = {}
-    bounds: dict[str, float] = {}
-    faults: list[str] = []
+    worst = {"lens": Deviation(lenses(device, rng, many), LENS_BOUND)}
     for name, case in CASES.items():
-        worst = worst_errors(device, case, rng, many)
-        faults += [f"{name}: {fault}" for fault in case.faults(worst)]
-        errors |= {f"{name}: {part}": error for part, error in worst.items()}
-        bounds |= {f"{name}: {part}": case.bound(part) for part in worst}
-    errors["lens"], bounds["lens"] = lenses(device, rng, many), LENS_BOUND
-    if not errors["lens"] <= LENS_BOUND:
-        faults.append(f"lens {errors['lens']:.2g} over {LENS_BOUND:g}")
-    return {"errors": errors, "bounds": bounds, "faults": faults}
+        worst |= {f"{name}: {part}": error for part, error in worst_errors(device, case, rng, many).items()}
+    errors = {name: {"error": error, "bound": bound} for name, (error, bound) in worst.items()}
+    return {"errors": errors, "faults": faults(worst)}

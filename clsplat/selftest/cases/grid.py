@@ -12,7 +12,7 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import grid as reference
 from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly, fresh_readback, read_of
-from clsplat.selftest.cases.appearance import MOMENT_BOUND, STEP_BOUND, random_gradient, random_moments
+from clsplat.selftest.cases.appearance import moment, random_gradient, random_moments, stepped
 from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
@@ -76,12 +76,13 @@ def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
     level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
     centred = reference.centre(held)
     return {
-        "seen": Wanted(seen, max(1.0, terms.max())),
-        "gradient": Wanted(by_image, sure=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
-        "by grid": Wanted(by_grid),
-        "first": Wanted(first, np.abs(first[at]).max()),
-        "second": Wanted(second, np.abs(second[at]).max()),
-        "grids": Wanted(centred, given.rate + 1e-2 * np.abs(centred)),
+        "seen": Wanted(seen, 1.2e-6, max(1.0, terms.max())),  # a dozen roundings
+        # a hundred terms of either sign
+        "gradient": Wanted(by_image, 1e-5, sure=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
+        "by grid": Wanted(by_grid, 1e-5),
+        "first": moment(first),
+        "second": moment(second),
+        "grids": stepped(centred, given.rate),
         **{f"{name} of another": exactly(given.moments[k][0]) for k, name in enumerate(("first", "second"))},
     }
 
@@ -91,14 +92,6 @@ GRID_CASE = Case(
     random=_random,
     launch=_launch,
     twin=_twin,
-    bounds={
-        "seen": (1.2e-6, "relative to the largest sum of terms, a dozen roundings"),
-        "gradient": (1e-5, "where the level's slope is sure; a hundred terms of either sign"),
-        "by grid": (1e-5, "a hundred terms of either sign"),
-        "first": MOMENT_BOUND,
-        "second": MOMENT_BOUND,
-        "grids": STEP_BOUND,
-    },
     frozen=_frozen,
     digested=("grids", "first", "second", "by grid", "seen", "gradient"),
     by_shape=False,

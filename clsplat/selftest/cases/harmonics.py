@@ -84,10 +84,11 @@ def _twin(given: Given, _: Arrays) -> dict[str, Wanted]:
     d_sh[:, :used] = basis[:, :, None] * d_colours[:, None]
     by_unit = np.einsum("nkd,nkc,nc->nd", slopes, sh, d_colours)
     d_directions = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
-    wanted = {"colours": Wanted(colours, 1.0), "sh": Wanted(d_sh)}
-    wanted["directions"] = Wanted(d_directions) if given.degree else exactly(np.zeros_like(d_directions))
+    # sums of up to 25 products of size 1, each off by 1e-7
+    wanted = {"colours": Wanted(colours, 4e-6, 1.0), "sh": Wanted(d_sh, 2e-6)}
+    wanted["directions"] = Wanted(d_directions, 2e-6) if given.degree else exactly(np.zeros_like(d_directions))
     if given.centre is not None:
-        wanted["centre"] = Wanted(-d_directions.sum(axis=0), (np.abs(by_unit) / length).sum(axis=0))
+        wanted["centre"] = Wanted(-d_directions.sum(axis=0), 2e-6, (np.abs(by_unit) / length).sum(axis=0))
     return wanted
 
 
@@ -96,12 +97,6 @@ HARMONICS_CASE = Case(
     random=random_harmonics,
     launch=launch_harmonics,
     twin=_twin,
-    bounds={
-        "colours": (4e-6, "sums of up to 25 products of size 1, each off by 1e-7"),
-        "sh": (2e-6, "as the colours, in norm"),
-        "directions": (2e-6, "as the colours, in norm"),
-        "centre": (2e-6, "relative to the magnitudes of the terms"),
-    },
     frozen=_frozen,
     digested=("colours", "sh", "directions"),
 )

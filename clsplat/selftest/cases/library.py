@@ -155,10 +155,12 @@ def _twin_of_splats(given: Given, got: Arrays) -> dict[str, Wanted]:
     size = np.abs(wanted.whitenings).max(axis=1, keepdims=True, initial=0)
     logs = np.log2(opacities)
     return {
-        "whitening": Wanted(wanted.whitenings, np.broadcast_to(size, wanted.whitenings.shape), seen),
-        "half extents": Wanted(wanted.half_extents, 1 + np.abs(wanted.half_extents), seen),
-        "LOG2O": Wanted(logs, 1.0, seen),
-        "means": Wanted(given.means2d[seen], 1.0),
+        # three roundings of a root and two quotients; l12 may be near 0 beside the others
+        "whitening": Wanted(wanted.whitenings, 5e-7, size, seen),
+        # the budget is a difference of logarithms; the tile test has 0.01 px more
+        "half extents": Wanted(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
+        "LOG2O": Wanted(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm is 1e-6 of the opacity
+        "means": Wanted(given.means2d[seen], 6e-8, 1.0),  # the place in a pixel is a float32 under 1
         "values": exactly(given.values[seen]),
         "shown": exactly(np.zeros_like(got["shown"])),
     }
@@ -169,12 +171,6 @@ SPLATS_CASE = Case(
     random=_random_splats,
     launch=_launch_splats,
     twin=_twin_of_splats,
-    bounds={
-        "whitening": (5e-7, "three roundings of a root and two quotients; l12 may be near 0 beside the others"),
-        "half extents": (1e-4, "the budget is a difference of logarithms; the tile test has 0.01 px more"),
-        "means": (6e-8, "the place in a pixel is a float32 under 1"),
-        "LOG2O": (1.4e-6, "an ulp of the logarithm is 1e-6 of the opacity"),
-    },
     frozen=_frozen_splats,
     digested=("tiles", *WRITTEN_SPLAT_COLUMNS),
 )

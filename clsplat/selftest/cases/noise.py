@@ -67,8 +67,8 @@ def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
     got |= {"moves": got["means"][~stays], "means of the opaque": got["means"][stays]}
     size = np.abs(wanted) + 0.1 * np.abs(wanted).max(initial=0)
     return {
-        "means": Wanted(wanted),
-        "moves": Wanted(wanted[~stays], size[~stays]),
+        "means": Wanted(wanted, 5e-6),  # of 100 (o - dead), up to 16, a digit of o is 1e-6 of the weight
+        "moves": Wanted(wanted[~stays], 1e-4, size[~stays]),
         "means of the opaque": exactly(np.zeros_like(got["means of the opaque"])),
         **{name: exactly(getattr(given, name)) for name in GEOMETRY_ARRAYS},
     }
@@ -79,10 +79,6 @@ NOISE_CASE = Case(
     random=_random,
     launch=_launch,
     twin=_twin,
-    bounds={
-        "means": (5e-6, "of 100 (o - dead), up to 16, a digit of o is 1e-6 of the weight"),
-        "moves": (1e-4, "relative to the move and a tenth of the largest; as above"),
-    },
     frozen=_frozen,
     digested=("means",),
     by_shape=False,
@@ -124,7 +120,10 @@ def _twin_of_penalties(given: Given, got: Arrays) -> dict[str, Wanted]:
     wanted: dict[str, Wanted] = {}
     for name, values in zip(GEOMETRY_ARRAYS[1:], parts, strict=True):
         got[f"{name} out of view"] = got[name][~shown]
-        wanted |= {name: Wanted(values, sure=shown), f"{name} out of view": exactly(np.zeros_like(values[~shown]))}
+        wanted |= {
+            name: Wanted(values, 1e-6, sure=shown),
+            f"{name} out of view": exactly(np.zeros_like(values[~shown])),
+        }
     others = [group for group in PARAMETER_GROUPS if group not in GEOMETRY_ARRAYS[1:]]
     return wanted | {group: exactly(np.zeros_like(got[group])) for group in others}
 
@@ -134,7 +133,6 @@ PENALTIES_CASE = Case(
     random=random_scene,
     launch=_launch_penalties,
     twin=_twin_of_penalties,
-    bounds=dict.fromkeys(GEOMETRY_ARRAYS[1:], (1e-6, "an exponential, a product and a sum")),
     frozen=lambda bench: [
         Given(gaussians=bench.frozen.gaussians, camera=bench.camera, explore=Exploration(opacity=0.3125, scale=0.6875))
     ],

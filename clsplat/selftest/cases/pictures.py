@@ -168,7 +168,9 @@ def _twin_of_deep_merge(given: Given, _: Arrays) -> dict[str, Wanted]:
     pictures, weights = given.wide("pictures", "weights")
     twin = reference_deep_merge.deep_merge(pictures, weights)
     sure = np.broadcast_to(twin.margin > MIN_MERGED_MARGIN, twin.slices.shape[:3])
-    return {name: Wanted(twin.slices[..., at], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
+    # a slice's colour is a sum of up to 16 x bins products, over light that has lost as many; its depth is one of them
+    bounds = {"colour": 1e-5, "alpha": 1e-5, "depth": 0.0}
+    return {name: Wanted(twin.slices[..., at], bounds[name], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
 
 
 DEEP_MERGE_CASE = Case(
@@ -176,10 +178,6 @@ DEEP_MERGE_CASE = Case(
     random=random_deep_pictures,
     launch=launch_deep_merge,
     twin=_twin_of_deep_merge,
-    bounds={
-        "colour": (1e-5, "a sum of up to 16 x bins products, over light that has lost as many"),
-        "alpha": (1e-5, "as the colour"),
-    },
     frozen=_frozen_deep_pictures,
     digested=("planes",),
     by_shape=False,

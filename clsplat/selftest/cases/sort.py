@@ -12,7 +12,7 @@ from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly, re
 from clsplat.selftest.harness import CaseBench
 from clsplat.selftest.scenes import keys
 from clsplat.stages.scan import MAX_SINGLE_CHUNK_ELEMENTS, scan
-from clsplat.stages.sort import bitonic_sort, radix_sort
+from clsplat.stages.sort import MIN_WIDE_DIGIT_KEYS, bitonic_sort, radix_sort
 
 SCAN_SIZES = (
     *(1, 63, 65, 1025, 0, 2, 64, 1023, 1024, 4096, 4097, 100_003),
@@ -22,7 +22,7 @@ SCAN_SIZES = (
 
 def _random(rng: Generator, count: int) -> Given:
     """Keys of few bits, or of many, which begin at a base."""
-    bits = int(rng.choice([1, 4, 5, 11, 12, 22, 23, 31, 32, 32]))
+    bits = int(rng.choice([1, 4, 5, 11, 12, 13, 22, 23, 24, 26, 27, 31, 32, 32]))
     base = int(rng.choice([0, 0, 2**32 - 2**bits, rng.integers(2**32 - 2**bits + 1)]))
     values = (base + rng.integers(0, 2**bits, count)).astype(np.uint32)
     return Given(keys=values, bits=bits, base=base)
@@ -51,7 +51,7 @@ def _twin(given: Given, _: Arrays) -> dict[str, Wanted]:
 
 
 SORT_CASE = Case(
-    sizes=(*SCAN_SIZES, 127, 128, 129, 2048, 4095, 8 * 1024 + 1, 70_001),
+    sizes=(*SCAN_SIZES, *(127, 128, 129, 2048, 8 * 1024 + 1, MIN_WIDE_DIGIT_KEYS - 1, MIN_WIDE_DIGIT_KEYS)),
     random=_random,
     launch=_launch,
     twin=_twin,
