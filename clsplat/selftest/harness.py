@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
@@ -19,7 +20,7 @@ from clsplat.reference import blend as reference_blend
 from clsplat.reference import project as reference_project
 from clsplat.selftest.scenes import Frozen
 from clsplat.stages.blend import Blended, ImageInputs
-from clsplat.stages.device_camera import pack_camera, tiles_of
+from clsplat.stages.device_camera import pack_camera, padded_size, tiles_of
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.stages.duplicate import Band, Counted, Pairs
 from clsplat.stages.project import Projected
@@ -94,10 +95,19 @@ def digest_of(arrays: Sequence[Array]) -> str:
     return f"{total:08x}"
 
 
-def cropped(planes: Array, camera: Camera) -> Array:
-    """Crop padded planes to (H, W) or (H, W, fields)."""
-    inside = planes[..., : camera.height, : camera.width]
+def cropped(planes: Array, size: Camera | tuple[int, int]) -> Array:
+    """Crop padded planes to (H, W) or (H, W, fields). size: (width, height), or a camera with it."""
+    width, height = (size.width, size.height) if isinstance(size, Camera) else size
+    inside = planes[..., :height, :width]
     return inside.transpose(1, 2, 0) if inside.ndim == 3 else inside
+
+
+def planes_of(image: Array, beside: float = 0.0) -> Float32:
+    """Planes (C, rows, stride) of an image (H, W, C). beside: the value of the padding."""
+    height, width, channels = image.shape
+    planes = np.full((channels, *padded_size(width, height)), beside, np.float32)
+    planes[:, :height, :width] = image.transpose(2, 0, 1)
+    return planes
 
 
 class CaseBench:

@@ -17,7 +17,7 @@ RAY_STAGES = ("rays",)
 """The stage of a frame of an equirectangular or fisheye camera."""
 MASK_STAGES = ("masks",)
 """Stages for training photographs with masks or alpha, in addition to TRAINING_STAGES."""
-BACKWARD_STAGES = ("loss", "blend_grad", "project_grad", "adam", "statistics")
+BACKWARD_STAGES = ("loss", "blend_grad", "project_grad", "penalties", "adam", "noise", "statistics")
 """Stages that training needs in addition to a frame's."""
 APPEARANCE_STAGES = ("appearance", "ppisp", "grid")
 """Stages that training with learnt appearance needs, in addition to TRAINING_STAGES."""
@@ -54,7 +54,9 @@ STAGE_BOUNDS_ULP: dict[str, tuple[float, str]] = {
     "loss": (128, "9 found; the SSIM's quotients may have six times that"),
     "blend_grad": (1024, "32 found; up to 64 divisions one after the other recover the transmittance"),
     "project_grad": (512, "39 found, at opacities near 1; six times that for sloppy divisions"),
+    "penalties": (32, "2 found; an exponential and a product"),
     "adam": (32, "2 found; one root and one division"),
+    "noise": (256, "15 found; of 100 (o - dead) a digit of o is 16 ulp, and turned axes cancel"),
     "statistics": (32, "1 found; one root"),
     "appearance": (1024, "202 found; beta2 in float32 is 1e-5 off in 1 - beta2, 84 ulp, and a picture is added up"),
     "ppisp": (1024, "as appearance"),

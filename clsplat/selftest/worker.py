@@ -20,7 +20,7 @@ from clsplat.device.context import Device, all_devices
 from clsplat.device.drivers.worker_process import end_with_parent, tell
 from clsplat.device.source import kernel_root
 from clsplat.errors import DriverError
-from clsplat.selftest.cases.core import CASES_BY_STAGE
+from clsplat.selftest.cases.table import OUTCOMES_BY_STAGE
 from clsplat.selftest.harness import CaseBench, StageOutcome, digest_of
 from clsplat.selftest.result import INDEX_STAGES, SELFTEST_STAGES, STAGE_BOUNDS_ULP, Result
 from clsplat.selftest.scenes import scenes
@@ -79,7 +79,7 @@ def run(
         outcomes = []
         for bench in benches:
             try:
-                outcomes.append(CASES_BY_STAGE[name](bench))
+                outcomes.append(OUTCOMES_BY_STAGE[name](bench))
             except DriverError:  # another shape may work
                 raise
             except Exception as error:  # noqa: BLE001  # drivers, and sizes from a wrong kernel, raise anything

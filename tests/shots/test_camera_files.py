@@ -264,7 +264,7 @@ def test_lenses_of_own_format(tmp_path: Path) -> None:
             "key 0: 'fov_x': angle of view is 9.90602e-321 degrees, which gives a focal length over 1e+12",
         ),
         ({"fov_x": None, "fx": 1e13}, "key 0: has a focal length of 1e+13, expected at most 1e+12"),
-        ({"projection": "equirectangular", "fov_x": 1e-320}, "key 0: has a focal length of inf, expected at most 1e+12"),
+        ({"projection": "equirectangular", "fov_x": 1e-320}, "key 0: has a focal length of inf, expected at most"),
         ({"projection": "orthographic"}, "key 0: has 'fov_x' 90, expected one of 'fx' (with 'fy' if that differs), 'p"),
         ({"projection": "equirectangular", "fov_x": 400}, "expected only 'fov_x' up to 360"),
         ({"projection": "equirectangular", "fov_x": 0}, "expected only 'fov_x' up to 360"),

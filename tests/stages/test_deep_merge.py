@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deep pictures merged into one, against the float64 twin and closed forms."""
+"""Deep pictures merged into one: every number of pictures and slices, and closed forms."""
 
 from __future__ import annotations
 
@@ -9,47 +9,27 @@ from compare import assert_close, assert_same_bits
 from slices import flattened, in_front
 
 from clsplat.arrays import Float32
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
 from clsplat.layouts.columns import DEEP_PICTURES
-from clsplat.reference.deep_merge import deep_merge as twin
-from clsplat.stages.deep_merge import deep_merge
+from clsplat.selftest.case import Inputs, faults
+from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, launch_deep_merge, random_deep_pictures
 
 
-def random_pictures(count: int, bins: int, height: int, width: int, seed: int = 0) -> tuple[Float32, Float32]:
-    """Pictures (P, bins, H, W, 5) whose pixels have 0 to `bins` slices, and weights (P, H, W) of the sum 1."""
-    random = np.random.default_rng(seed)
-    shape = (count, bins, height, width)
-    alpha = (random.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)  # so that light is left
-    depth = np.cumsum(random.uniform(0.01, 1, shape), axis=1).astype(np.float32)
-    depth[:, :, ::3] = np.round(depth[:, :, ::3]) + np.arange(bins, dtype=np.float32)[:, None, None]  # equal ones too
-    colours = random.uniform(-0.2, 1.5, (*shape, 3)).astype(np.float32) * alpha[..., None]
-    pictures = np.concatenate([colours, alpha[..., None], depth[..., None]], axis=4)
-    slices = random.integers(0, bins + 1, (count, height, width))
-    pictures[np.arange(bins)[None, :, None, None] >= slices[:, None]] = 0
-    weights = random.uniform(0.1, 1, (count, height, width))
-    return pictures, (weights / weights.sum(axis=0)).astype(np.float32)
+def random_pictures(count: int, bins: int, height: int, width: int) -> tuple[Float32, Float32]:
+    given = random_deep_pictures(np.random.default_rng(0), (width, height), count, bins)
+    return given.pictures, given.weights
 
 
 def merged(device: Device, pictures: Float32, weights: Float32) -> Float32:
     """(bins, H, W, 5) by the kernel."""
-    count, bins, height, width, floats = pictures.shape
-    planes = np.ascontiguousarray(pictures.transpose(0, 1, 4, 2, 3)).reshape(count, bins, floats, -1)
-    arrays = (upload(device, planes), upload(device, np.ascontiguousarray(weights.reshape(count, -1))))
-    got = deep_merge(device, Workspace(device), *arrays).get()
-    return np.asarray(got.reshape(bins, floats, height, width).transpose(0, 2, 3, 1))
+    return launch_deep_merge(device, Workspace(device), Inputs(pictures=pictures, weights=weights))()["slices"]
 
 
 @pytest.mark.parametrize(("count", "bins"), [(1, 1), (1, 5), (2, 1), (3, 7), (DEEP_PICTURES, 4), (2, 40)])
-def test_against_the_twin(device: Device, count: int, bins: int) -> None:
-    pictures, weights = random_pictures(count, bins, 5, 13)
-    got, wanted = merged(device, pictures, weights), twin(pictures.astype(np.float64), weights.astype(np.float64))
-    # light is a float32 sum of up to 16 products: where it is this near to a threshold, a slice may begin elsewhere
-    sure = wanted.margin > 1e-6
-    assert sure.mean() > 0.9
-    assert_close(got[:, sure, 4], wanted.slices[:, sure, 4])
-    # a slice's colour is a sum of up to 16 x bins products, over light that has lost as many
-    assert_close(got[:, sure, :4], wanted.slices[:, sure, :4], absolute=1e-5)
+def test_every_number_of_pictures_and_slices(device: Device, count: int, bins: int) -> None:
+    given = random_deep_pictures(np.random.default_rng(0), (13, 5), count, bins)
+    assert faults(DEEP_MERGE_CASE.errors(device, given)) == []
 
 
 def test_at_any_depth_it_is_the_mean(default_device: Device) -> None:

@@ -3,25 +3,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scenes
-from compare import assert_close, assert_same_bits
+from compare import assert_same_bits
 from pipeline import Pipeline
 
 from clsplat.camera import Camera
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, group_shapes
-from clsplat.layouts.columns import SPLAT
 from clsplat.optimisation.density_rules import MarkRules
-from clsplat.reference import density as twin
 from clsplat.reference import render as reference
-from clsplat.stages.density import DeviceMarker, add_statistics, gather, list_rows, new_statistics, widen
+from clsplat.stages.density import add_statistics, gather, list_rows, new_statistics, widen
 from clsplat.stages.device_gaussians import DeviceGaussians, to_host
-from clsplat.stages.project import Projected, Screen
+from clsplat.stages.project import Screen
 
 SIZES = (1, 2, 63, 64, 65, 127, 129, 1025)
 """A launch is rounded up to groups of 64."""
@@ -65,43 +61,6 @@ RULES = MarkRules(gradient=2.0, cut_off=(3.0, 40), large=0.5, transparent=-1.0, 
 
 
 @pytest.mark.parametrize("count", SIZES)
-@pytest.mark.parametrize("wide", [False, True])
-@pytest.mark.parametrize("streamed", [False, True])
-def test_marks_are_the_twins(device: Device, count: int, wide: bool, streamed: bool) -> None:
-    """Every statistic, scale and opacity is at an edge, next to it, or not a number, for some Gaussian."""
-    rng = np.random.default_rng(count)
-
-    def values(*around: float, size: tuple[int, ...] = (count,)) -> np.ndarray:
-        at = np.array(around, np.float32)
-        near = (at, *(np.nextafter(at, np.float32(side)) for side in (-np.inf, np.inf)))
-        return rng.choice(np.concatenate([*near, [-9, 0, 9, np.nan, np.inf, -np.inf]]).astype(np.float32), size)
-
-    statistics = new_statistics(device, count, contributions=wide)
-    host = {name: values(0.25, 1, 4) for name in statistics.named()}
-    host["gradient_sums"], host["seen"] = values(2, 3, 6, 9), rng.integers(0, 4, count).astype(np.float32)
-    statistics.load(host)
-    source, parameters = numbered(device, count, 1)
-    parameters["log_scales"] = values(0.5, 1.5, 2, size=(count, 3))
-    parameters["opacity_logits"] = values(-1)
-    for name in ("log_scales", "opacity_logits"):
-        source[name].set(parameters[name])
-    work = Workspace(device)
-    model = replace(to_host(source), rows=device.row_alignment) if streamed else source
-    marker = DeviceMarker(device, work, model, statistics)
-    limits = (MarkRules(), RULES, replace(RULES, radius=4.0, contribution=0.25))
-    for limit in (*limits, replace(limits[2], gradient=0.0, cut_off=(-np.inf, 0))):
-        rules = limit
-        if not wide:
-            rules = replace(rules, contribution=-np.inf)
-        scored = twin.scores(rules, host)
-        np.testing.assert_array_equal(marker.scores(rules), scored)
-        entries, halves = twin.rows(rules, host, parameters["log_scales"], parameters["opacity_logits"])
-        got = marker.rows(rules)
-        np.testing.assert_array_equal(got.rows.get(), entries)
-        assert (got.count, got.halves) == (len(entries), halves)
-
-
-@pytest.mark.parametrize("count", SIZES)
 def test_any_rows_are_read_and_written(device: Device, count: int) -> None:
     host = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
     array = upload(device, host)
@@ -123,35 +82,6 @@ def test_widen_keeps_values_and_adds_zeros(device: Device, before: int, after: i
     assert not rest[:, before - 1 :].any()
     for name in list(PARAMETER_GROUPS)[:-1]:
         np.testing.assert_array_equal(got[name].get(), host[name], err_msg=name)
-
-
-@pytest.mark.parametrize("count", SIZES)
-def test_statistics_at_the_seams(device: Device, count: int) -> None:
-    """Three views: what is seen in each adds up, the radius is the largest; what has no tiles stays as it is."""
-    rng = np.random.default_rng(count)
-    camera = scenes.straight_camera(60, 40)
-    statistics = new_statistics(device, count)
-    sums, seen, largest = np.zeros(count), np.zeros(count), np.zeros(count)
-    whiten = np.sqrt(np.log2(np.e) / 2)
-    wide = 0.9 + np.arange(count) % 9
-    for factor in (1.0, 1.0, 2.0):
-        tiles = rng.integers(0, 3, count).astype(np.uint32)
-        screen = rng.normal(size=(count, 2)).astype(np.float32)
-        splats = rng.normal(size=(count, len(SPLAT))).astype(np.float32)
-        # axis-aligned ellipses of 3 sigma = 2.7 to 26.7 and 5.7 pixels, or half of these: never near a whole number
-        splats[:, SPLAT.index("L11")] = whiten * factor / wide
-        splats[:, SPLAT.index("L12")] = 0
-        splats[:, SPLAT.index("L22")] = whiten * factor / 1.9
-        projected = Projected(upload(device, splats), upload(device, tiles))
-        add_statistics(device, statistics, camera, projected, Screen(upload(device, screen)))
-        shown = tiles > 0
-        sums += np.where(shown, np.hypot(30 * screen[:, 0].astype(float), 20 * screen[:, 1].astype(float)), 0)
-        seen += shown
-        largest = np.where(shown, np.maximum(largest, np.ceil(3 / factor * np.maximum(wide, 1.9))), largest)
-    # a square root and two sums in float32
-    assert_close(statistics.gradient_sums.get(), sums, relative=1e-6)
-    np.testing.assert_array_equal(statistics.seen.get(), seen)
-    np.testing.assert_array_equal(statistics.radii.get(), largest)
 
 
 def statistics_of(device: Device, scene: tuple[Gaussians, Camera]) -> tuple[Pipeline, np.ndarray, np.ndarray]:

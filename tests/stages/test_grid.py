@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
-from planes import padded
 
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import READBACK
 from clsplat.reference import grid as reference
+from clsplat.selftest.harness import planes_of
 from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
 
 
@@ -27,71 +26,21 @@ def some_image(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
     return image + ((low + 0.05 + 0.9 * (level - low) - level) / (GRID_SHAPE[0] - 1))[..., None]
 
 
-@pytest.mark.slow_in_groups
-@pytest.mark.parametrize(
-    ("width", "height"),
-    [
-        pytest.param(1, 1, marks=pytest.mark.slow),
-        (16, 16),
-        (17, 33),
-        pytest.param(70, 15, marks=pytest.mark.slow),
-    ],
-)
-def test_a_grid_and_its_gradient(shaped_device: Device, width: int, height: int) -> None:
-    rng = np.random.default_rng(width)
-    image = some_image(rng, height, width).astype(np.float32)
-    by_seen = rng.normal(0.3, 1, image.shape).astype(np.float32)
-    values = some_grids(rng, 3)
-    work, grids = Workspace(shaped_device), Grids.on(shaped_device, values)
-    planes = upload(shaped_device, padded(image, np.nan))
-    wide, held = image.astype(np.float64), values[1].astype(np.float64)
-    seen = apply_grid(shaped_device, work, grids, 1, planes, width, height)
-    assert_close(seen.get()[:, :height, :width].transpose(1, 2, 0), reference.apply(wide, held), absolute=2e-6)
-    gradient = upload(shaped_device, padded(by_seen, np.nan))
-    by_grid = grid_gradient(shaped_device, work, grids, 1, planes, gradient, width, height, 10.0)
-    wanted_image, wanted_grid = reference.gradient(wide, held, by_seen.astype(np.float64))
-    assert_close_gradient(gradient.get()[:, :height, :width].transpose(1, 2, 0), wanted_image, 1e-5)
-    wanted_grid += 10 * reference.variation_gradient(held)
-    assert_close_gradient(by_grid.get(), wanted_grid, 1e-5)
-
-
 def test_a_grid_of_identities_changes_nothing(shaped_device: Device) -> None:
     image = np.random.default_rng(3).random((20, 30, 3)).astype(np.float32)
     work = Workspace(shaped_device)
     grids = Grids.on(shaped_device, reference.identity(GRID_SHAPE[:3])[None].astype(np.float32))
-    seen = apply_grid(shaped_device, work, grids, 0, upload(shaped_device, padded(image, np.nan)), 30, 20)
+    seen = apply_grid(shaped_device, work, grids, 0, upload(shaped_device, planes_of(image, np.nan)), 30, 20)
     assert_close(seen.get()[:, :20, :30].transpose(1, 2, 0), image, relative=3e-7)
 
 
 def test_the_variations_gradient_alone(shaped_device: Device) -> None:
     values = some_grids(np.random.default_rng(4), 2)
     work, grids = Workspace(shaped_device), Grids.on(shaped_device, values)
-    planes = upload(shaped_device, padded(np.full((8, 8, 3), 0.4, np.float32), np.nan))
-    none = upload(shaped_device, padded(np.zeros((8, 8, 3), np.float32), np.nan))
+    planes = upload(shaped_device, planes_of(np.full((8, 8, 3), 0.4, np.float32), np.nan))
+    none = upload(shaped_device, planes_of(np.zeros((8, 8, 3), np.float32), np.nan))
     by_grid = grid_gradient(shaped_device, work, grids, 1, planes, none, 8, 8, 10.0)
     assert_close_gradient(by_grid.get(), 10 * reference.variation_gradient(values[1].astype(np.float64)), 1e-6)
-
-
-def test_steps_of_one_photograph(shaped_device: Device) -> None:
-    rng = np.random.default_rng(5)
-    values = some_grids(rng, 3)
-    grids = Grids.on(shaped_device, values)
-    readback = upload(shaped_device, np.zeros(len(READBACK), np.uint32))
-    state = (values[2].astype(np.float64), np.zeros(GRID_SHAPE), np.zeros(GRID_SHAPE))
-    for visit in range(1, 6):
-        by_grid = rng.normal(0, 1, GRID_SHAPE).astype(np.float32)
-        state = reference.step(*state, by_grid.astype(np.float64), visit, 0.01)
-        step_grid(shaped_device, grids, 2, upload(shaped_device, by_grid), visit, 0.01, readback)
-    assert_close(grids.grids.get()[2], state[0], absolute=1e-6)
-    assert_same_bits(grids.grids.get()[:2], values[:2])
-    assert not grids.first.get()[:2].any()
-
-
-def test_the_mean_of_grids_is_the_identity(shaped_device: Device) -> None:
-    values = some_grids(np.random.default_rng(9), 5)
-    grids = Grids.on(shaped_device, values)
-    centre_grids(shaped_device, grids, upload(shaped_device, np.zeros(len(READBACK), np.uint32)))
-    assert_close(grids.grids.get(), reference.centre(values.astype(np.float64)), absolute=1e-6)
 
 
 def test_a_step_that_stopped_or_is_not_finite(shaped_device: Device) -> None:

@@ -18,24 +18,10 @@ from clsplat.stages.scan import CHUNK_ELEMENTS_PER_ITEM, MAX_SINGLE_CHUNK_ELEMEN
 from clsplat.stages.sort import (
     BITONIC_KEYS_BY_KIND,
     MAX_BITONIC_KEYS,
-    MIN_WIDE_DIGIT_KEYS,
     WIDE_DIGIT_BITS,
     bitonic_sort,
     radix_sort,
     sort,
-)
-
-SIZES = (0, 1, 2, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 2048)
-RADIX_SIZES = (
-    *SIZES,
-    4095,
-    4096,
-    4097,
-    8 * 1024 + 1,
-    MAX_SINGLE_CHUNK_ELEMENTS - 1,
-    MAX_SINGLE_CHUNK_ELEMENTS,
-    MAX_SINGLE_CHUNK_ELEMENTS + 1,
-    70_001,
 )
 
 
@@ -55,40 +41,6 @@ def radix(
 def bitonic(device: Device, keys: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     out = bitonic_sort(device, Workspace(device), "test", upload(device, keys))
     return out[0].get(), out[1].get()
-
-
-@pytest.mark.parametrize("n", RADIX_SIZES)
-def test_radix_random(shaped_device: Device, n: int) -> None:
-    keys = np.random.default_rng(n).integers(0, 2**32, n, dtype=np.uint32)
-    check(keys, radix(shaped_device, keys, 32))
-
-
-@pytest.mark.parametrize("n", SIZES)
-def test_bitonic_random(shaped_device: Device, n: int) -> None:
-    keys = np.random.default_rng(n).integers(0, 2**32, n, dtype=np.uint32)
-    check(keys, bitonic(shaped_device, keys))
-
-
-@pytest.mark.parametrize("bits", [1, 4, 5, 11, 12, 22, 23, 31])
-def test_radix_few_bits_is_stable(shaped_device: Device, bits: int) -> None:
-    keys = np.random.default_rng(bits).integers(0, 2**bits, 5000, dtype=np.uint32)
-    check(keys, radix(shaped_device, keys, bits))
-
-
-@pytest.mark.parametrize(("base", "bits"), [(1, 11), (0x3FC00123, 24), (0x3FC00123, 27), (2**32 - 2**13, 13)])
-def test_radix_of_keys_that_begin_at_a_base(shaped_device: Device, base: int, bits: int) -> None:
-    """Two keys differ by as much as `bits` can hold, and across a multiple of it."""
-    rest = np.random.default_rng(bits).integers(0, 2**bits, 5000, dtype=np.uint32)
-    rest[[7, 4000]] = 2**bits - 1, 0
-    keys = np.uint32(base) + rest
-    check(keys, radix(shaped_device, keys, bits, base))
-
-
-@pytest.mark.parametrize("bits", [13, 26])
-@pytest.mark.parametrize("n", [MIN_WIDE_DIGIT_KEYS - 1, MIN_WIDE_DIGIT_KEYS])
-def test_radix_by_wide_digits(shaped_device: Device, n: int, bits: int) -> None:
-    keys = np.uint32(12345) + np.random.default_rng(n).integers(0, 2**bits, n, dtype=np.uint32)
-    check(keys, radix(shaped_device, keys, bits, 12345))
 
 
 def test_one_item_sorts_a_chunk_in_one_launch(device: Device) -> None:
@@ -121,19 +73,6 @@ def test_radix_of_several_tiles_a_group(device: Device, monkeypatch: pytest.Monk
     for n in (5 * CHUNK_ELEMENTS_PER_ITEM * items, 12 * CHUNK_ELEMENTS_PER_ITEM * items - 3):
         keys = np.random.default_rng(n).integers(0, 2**12, n, dtype=np.uint32)
         check(keys, radix(shaped(device, 1, items), keys, 12))
-
-
-@pytest.mark.smoke
-@pytest.mark.parametrize("value", [0, 1, 0x7FFFFFFF, 0xFFFFFFFF])
-def test_equal_keys_keep_their_order(shaped_device: Device, value: int) -> None:
-    keys = np.full(1500, value, np.uint32)
-    check(keys, radix(shaped_device, keys, 32))
-    check(keys, bitonic(shaped_device, keys))
-
-
-def test_positive_floats_sort_as_their_bits(shaped_device: Device) -> None:
-    depths = np.random.default_rng(0).lognormal(0, 5, 3000).astype(np.float32)
-    check(depths.view(np.uint32), radix(shaped_device, depths.view(np.uint32), 31))
 
 
 def test_sort_takes_the_one_that_wins(device: Device) -> None:

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
-from flat import Flat, cloud, conics_of
+from flat import Flat, cloud
 from numpy.typing import NDArray
 
 from clsplat.device.buffers import Workspace, from_host, hosted, upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import SPLAT, TILE, SlotFields
 from clsplat.reference import splats as twin
+from clsplat.selftest.cases.library import conics_of
 from clsplat.stages.project import Projected, Slots
 from clsplat.stages.splats import ScreenGaussians, ScreenGradients, add_values, splats, splats_grad
 
@@ -34,27 +35,6 @@ def run(
     projected = splats(device, Workspace(device), screen(device, flat), WIDTH, HEIGHT, listed=listed)
     rows = projected.splats.get()
     return {name: rows[:, k] for k, name in enumerate(SPLAT)}, projected.tile_counts.get()
-
-
-@pytest.mark.parametrize("count", [0, 1, 63, 64, 65])
-def test_against_the_twin(device: Device, count: int) -> None:
-    flat = cloud(count, WIDTH, HEIGHT, seed=count)
-    got, tiles = run(device, flat)
-    wanted = twin.splats(*(array.astype(np.float64) for array in (flat.conics, flat.opacities)), flat.radii)
-    seen = tiles > 0
-    assert not (seen & ~wanted.drawn).any()
-    columns = np.stack([got[name] for name in ("L11", "L12", "L22")], axis=1) / WHITEN
-    # Three roundings of a root and two quotients; l12 may be near 0 beside the others.
-    size = np.abs(wanted.whitenings[seen]).max(axis=1, keepdims=True, initial=0)
-    assert_close(columns[seen] / size, wanted.whitenings[seen] / size, absolute=5e-7)
-    half = np.stack([got["HALF_W"], got["HALF_H"]], axis=1)
-    # the budget is a difference of logarithms, and of what is hardly seen that cancels; the tile test has 0.01 px more
-    assert_close(half[seen], wanted.half_extents[seen], relative=1e-4, absolute=1e-4)
-    middle = np.stack([got["PIXEL_X"] + got["SUB_X"], got["PIXEL_Y"] + got["SUB_Y"]], axis=1)
-    assert_same_bits(middle[seen], flat.means2d[seen])
-    assert_close(np.exp2(got["LOG2O"][seen]), flat.opacities[seen], relative=1e-6)  # an ulp of the logarithm
-    colours = np.stack([got["RED"], got["GREEN"], got["BLUE"]], axis=1)
-    assert_same_bits(colours[seen], flat.colours[seen])
 
 
 def test_tiles_are_those_that_the_box_or_the_ellipse_reaches(device: Device) -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import stress_kernels
-import stress_stages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stress_cases import GRADIENT_NORM, GRADIENT_TAIL, PROJECTION, STRESSORS
@@ -24,6 +23,7 @@ from clsplat import camera as clsplat_camera
 from clsplat.device.context import Device
 from clsplat.layouts import columns
 from clsplat.reference.loss import l1_dssim
+from clsplat.selftest.cases import loss
 from clsplat.stages import device_camera, project
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,9 +120,9 @@ def test_stages_by_themselves(device: Device) -> None:
 
 
 def test_a_wrong_loss_is_found(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stress_stages, "l1_dssim", lambda x, y, weight: l1_dssim(x, y, weight + 1e-3))
+    monkeypatch.setattr(loss, "l1_dssim", lambda x, y, weight: l1_dssim(x, y, weight + 1e-3))
     faults = stages(default_device, seed=1, many=2)["faults"]
-    assert any(fault.startswith("loss gradient") for fault in faults)
+    assert any(fault.startswith("loss: gradient") for fault in faults)
 
 
 @pytest.mark.slow

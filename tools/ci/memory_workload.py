@@ -42,15 +42,15 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.supervision.depth_samples import KnownDepth
+from clsplat.selftest.case import Case, Inputs, faults
+from clsplat.selftest.cases.table import CASES
 from clsplat.stages import scan as stages_scan
-from clsplat.stages.adam import AdamStep, adam, add_view
+from clsplat.stages.adam import add_view
 from clsplat.stages.appearance import Gains, step_gains
 from clsplat.stages.blend import count_pairs, tile_items
 from clsplat.stages.density import DeviceMarker, carry, gather, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, host_gaussians, upload_gaussians
 from clsplat.stages.peak import _splats
-from clsplat.stages.scan import scan
-from clsplat.stages.sort import bitonic_sort, radix_sort
 from clsplat.training.trainer import Trainer
 
 STAND_INS = (
@@ -147,20 +147,25 @@ def subgroups(device: Device) -> None:
         raise SystemExit("a sum by sub-groups is not finite")
 
 
-def by_two_launches(device: Device) -> None:
-    """Adam by gradients that are in memory, as where a step is looked at: all rows, and those in view. Gradients of
-    several views."""
-    model, gradients, first, second = (allocate_gaussians(device, 11, 4, zero=True) for _ in range(4))
-    counts, readback = (
-        upload(device, np.arange(11, dtype=np.uint32) % 3),
-        upload(device, np.zeros(len(READBACK), np.uint32)),
-    )
-    for sparse in (False, True):
-        rates, config = dict.fromkeys(PARAMETER_GROUPS, 0.1), OptimiserConfig(sparse=sparse)
-        adam(device, AdamStep(config, 1, rates), model, gradients, first, second, counts, readback)
-    add_view(device, counts, gradients, first, upload(device, np.zeros(11, np.uint32)))
-    if not all(np.isfinite(model[group].get()).all() for group in PARAMETER_GROUPS):
-        raise SystemExit("Adam's step is not finite")
+def cases(device: Device) -> None:
+    """Cases of stages by themselves, on a few rows or pixels, some of them twice for their builds that differ."""
+    for name, case in CASES.items():
+        size = (17, 7) if isinstance(case.sizes[0], tuple) else 9
+        for draw in range(2 if name in ("adam", "marks", "harmonics") else 1):
+            given = case.random(np.random.default_rng([draw, *name.encode()]), size)
+            if name == "adam":
+                given.sparse = draw == 1
+            check(f"{name}, {size}", case, device, given)
+    gradients, sums = (allocate_gaussians(device, 9, 4, zero=True) for _ in range(2))
+    shown = upload(device, np.arange(9, dtype=np.uint32) % 3)
+    add_view(device, shown, gradients, sums, upload(device, np.zeros(9, np.uint32)))
+    sums["means"].get()
+
+
+def check(name: str, case: Case, device: Device, given: Inputs) -> None:
+    """Raise SystemExit where a case is over its bounds."""
+    if wrong := faults(case.errors(device, given)):
+        raise SystemExit(f"{name}: {', '.join(wrong)}")
 
 
 def rendering(device: Device) -> None:
@@ -292,29 +297,14 @@ def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene
 
 
 def sorts(device: Device) -> None:
-    """Both sorts, the radix sort with several groups and passes, and of one item alone; scans with them."""
-    rng, work = np.random.default_rng(4), Workspace(device)
-    few = stages_scan.MAX_SINGLE_CHUNK_ELEMENTS
-    for alone, n, bits, sort in (
-        (few, 300, 16, None),
-        (few, 700, 20, radix_sort),
-        (0, 2500, 13, radix_sort),
-        (0, 77, 5, radix_sort),
-        (few, 1, 1, radix_sort),
-    ):
+    """The radix sort and scans with several groups and passes."""
+    rng, few = np.random.default_rng(4), stages_scan.MAX_SINGLE_CHUNK_ELEMENTS
+    for alone, n, bits in ((few, 700, 20), (0, 2500, 13), (0, 77, 5), (few, 1, 1)):
         stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = alone
         keys = rng.integers(0, 1 << bits, n).astype(np.uint32)
-        on_device = upload(device, keys)
-        done = sort(device, work, "keys", on_device, bits) if sort else bitonic_sort(device, work, "keys", on_device)
-        order = np.argsort(keys, kind="stable")
-        if not (np.array_equal(done[0].get(), keys[order]) and np.array_equal(done[1].get(), order)):
-            raise SystemExit(f"{n} keys were not sorted")
-    values, total = upload(device, np.ones(2100, np.uint32)), allocate(device, (1,), np.uint32)
-    stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = 0
-    scan(device, work, values, values, total)  # more than one chunk
+        check(f"sort of {n} keys", CASES["sort"], device, Inputs(keys=keys, bits=bits, base=0))
+    check("scan", CASES["scan"], device, Inputs(values=np.ones(2100, np.uint32), in_place=True))  # more than one chunk
     stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = few
-    if int(total.get()[0]) != 2100:
-        raise SystemExit("2100 values were not added up")
 
 
 def density(device: Device) -> None:
@@ -347,14 +337,9 @@ def limits(device: Device) -> None:
     source, copy = upload(device, np.ones(16 * copied, np.float32)), allocate(device, (16 * copied,), np.float32)
     launch.launch_items(device, device.kernels("peak").limit_copy, 16, 16 * copied, source, copy)
     probe = device.kernels("probe")
-    for name, values, rows in (
-        ("probe_elementary", np.linspace(0.1, 0.9, 5, dtype=np.float32), 4),
-        ("probe_half", np.arange(5, dtype=np.uint16), 4),
-    ):
-        out = allocate(device, (rows, len(values)), np.float32)
-        extra = (len(values),) if name == "probe_elementary" else ()
-        launch.launch_grid(device, getattr(probe, name), (len(values),), upload(device, values), out, *extra)
-        out.get()
+    out = allocate(device, (5, 4), np.float32)
+    launch.launch_grid(device, probe.probe_half, (5,), upload(device, np.arange(5, dtype=np.uint16)), out)
+    out.get()
     copy.get()
     numbers = [upload(device, np.full(lanes, value, np.float32)) for value in (1.5, 2.5, -0.5)]
     results = allocate(device, (4, lanes), np.float32)
@@ -432,7 +417,8 @@ PARTS = {
     "training": (training,),
     "methods": (methods,),
     "library": (library,),
-    "passes": (sorts, limits, frames, subgroups, by_two_launches, rendering, pictures, density),
+    "cases": (cases, sorts),
+    "passes": (limits, frames, subgroups, rendering, pictures, density),
 }
 """The workload in parts that take a child each, by name."""
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from planes import padded
 from stress_cases import DEGREE, Cloud, camera_of
 from stress_projection import in_order
 
@@ -22,6 +21,7 @@ from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.selftest.harness import planes_of
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
 
 Array = NDArray[Any]
@@ -200,7 +200,7 @@ def back(rasterizer: Rasterizer, on_device: Any, frame: ForwardPass, d_image: Ar
     """Gradients of the parameters."""
     device = rasterizer.device
     gradients = allocate_gaussians(device, on_device.count, on_device.coefficients, zero=True)
-    rasterizer.backward(on_device, frame, upload(device, padded(d_image)), gradients)
+    rasterizer.backward(on_device, frame, upload(device, planes_of(d_image)), gradients)
     return download_gaussians(gradients)
 
 

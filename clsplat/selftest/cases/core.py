@@ -6,7 +6,7 @@ A stage's input is the device's own output of the stage before, so that errors d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,38 +14,26 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.config.training import OptimiserConfig
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.buffers import DeviceArray, upload
 from clsplat.device.launch import launch_items
-from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
-from clsplat.layouts.columns import READBACK, SPLAT, TILE
-from clsplat.optimisation.density_rules import MarkRules
+from clsplat.gaussians import PARAMETER_GROUPS
+from clsplat.layouts.columns import SPLAT, TILE
 from clsplat.reference import adam as reference_adam
 from clsplat.reference import blend as reference_blend
-from clsplat.reference import density as reference_density
-from clsplat.reference import loss as reference_loss
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters, project_model
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest.cases.appearance import of_appearance
-from clsplat.selftest.cases.depth import of_depth
-from clsplat.selftest.cases.grid import of_grid
-from clsplat.selftest.cases.library import LIBRARY_CASES
-from clsplat.selftest.cases.masks import MASK_CASES
-from clsplat.selftest.cases.pictures import PICTURE_CASES
-from clsplat.selftest.cases.poses import of_lens, of_pose
-from clsplat.selftest.cases.ppisp import of_ppisp
-from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped, joined
-from clsplat.selftest.scenes import evenly, keys, padded
+from clsplat.selftest.case import Inputs, fresh_readback
+from clsplat.selftest.cases.steps import ADAM_CASE, uploaded_groups
+from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped
+from clsplat.selftest.scenes import evenly, padded
 from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
-from clsplat.stages.adam import AdamStep, adam
+from clsplat.stages.adam import AdamStep
 from clsplat.stages.blend import blend, blend_grad
-from clsplat.stages.density import DensityStatistics, DeviceMarker, add_statistics, new_statistics
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
 from clsplat.stages.duplicate import Pairs, count, duplicate
-from clsplat.stages.loss import loss
 from clsplat.stages.project import Projected, Screen, project, project_grad, project_step
 from clsplat.stages.ranges import tile_lists
-from clsplat.stages.sort import bitonic_sort, radix_sort
 
 
 def _arithmetic(bench: CaseBench) -> StageOutcome:
@@ -147,29 +135,6 @@ def _duplicate(bench: CaseBench) -> StageOutcome:
     return outcome.compared({}, pairs=wrong + missing)
 
 
-def _sort(bench: CaseBench) -> StageOutcome:
-    """Test both sorts on synthetic keys, as another scene may use the sort that this one does not."""
-    device, work = bench.device, bench.work
-    sizes = [(400, 12, False), (3000, 20, True), (30_000 if bench.frozen.name == "crowd" else 5000, 32, True)]
-    given = [keys(51 + index, n, bits) for index, (n, bits, _) in enumerate(sizes)]
-    on_device = [upload(device, values) for values in given]
-
-    def launch() -> list[DeviceArray]:
-        results: list[DeviceArray] = []
-        for index, ((_, bits, radix), values) in enumerate(zip(sizes, on_device, strict=True)):
-            name = f"sorted{index}"
-            both = radix_sort(device, work, name, values, bits) if radix else bitonic_sort(device, work, name, values)
-            results += both
-        return results
-
-    _, outcome = bench.twice(launch, lambda results: [array.get() for array in results])
-    arrays, wrong = outcome.arrays, 0
-    for values, got, positions in zip(given, arrays[::2], arrays[1::2], strict=True):
-        order = np.argsort(values, kind="stable")
-        wrong += int((got != values[order]).sum()) + int((positions != order).sum())
-    return outcome.compared({}, sorted_keys=wrong)
-
-
 def _ranges(bench: CaseBench) -> StageOutcome:
     bench.lists, outcome = bench.twice(
         lambda: tile_lists(bench.device, bench.work, bench.pairs, bench.band),
@@ -195,20 +160,6 @@ def _blend(bench: CaseBench) -> StageOutcome:
     image, transmittance = (cropped(planes, camera)[clear] for planes in outcome.arrays[:2])
     exact = (wanted.image[clear], wanted.transmittance[clear])
     return outcome.compared({"image": (image, exact[0]), "transmittance": (transmittance, exact[1])})
-
-
-def _loss(bench: CaseBench) -> StageOutcome:
-    device, camera = bench.device, bench.camera
-    image, photograph = bench.blended.image, upload(device, bench.frozen.photograph)
-    sides = (camera.width, camera.height)
-    result, outcome = bench.twice(
-        lambda: loss(device, bench.work, image, photograph, *sides, 0.2),
-        lambda result: [result.gradient.get()[:, : camera.height]],  # the rows below are not written
-    )
-    x, y = (_pixels(bench, planes) for planes in (image.get(), bench.frozen.photograph))
-    value, gradient = reference_loss.l1_dssim(x, y)
-    sums = (np.array(result.read()), np.array([value, np.square(x - y).mean()]))
-    return outcome.compared({"gradient": (_pixels(bench, outcome.arrays[0]), gradient), "loss and error": sums})
 
 
 def _pixels(bench: CaseBench, planes: Array) -> Float64:
@@ -283,65 +234,18 @@ def _project_grad(bench: CaseBench) -> StageOutcome:
     return outcome.compared(parts)
 
 
-_RATES_BY_GROUP = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3)}
-
-
 def _adam(bench: CaseBench) -> StageOutcome:
-    device, step = bench.device, 7
-    count, coefficients = bench.model.count, bench.model.coefficients
-    shapes = group_shapes(count, coefficients)
-    ends = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
-    made = {
-        kind: {
-            g: evenly(60 + 8 * i + j, shapes[g], *ends[kind]).astype(np.float32) for j, g in enumerate(PARAMETER_GROUPS)
-        }
-        for i, kind in enumerate(ends)
-    }
-    outcomes = []
-    moving = bench.projected.tile_counts
-    for sparse in (False, True):
-        config = OptimiserConfig(sparse=sparse)
-        if sparse:
-            for values in made["gradients"].values():
-                values[~bench.visible] = 0.0  # as project_grad leaves them
-
-        def launch(config: OptimiserConfig = config) -> list[DeviceGaussians]:
-            models = [
-                DeviceGaussians(
-                    count, coefficients, {group: upload(device, values) for group, values in arrays.items()}
-                )
-                for arrays in made.values()
-            ]
-            parameters, gradients, first, second = models
-            adam(device, AdamStep(config, step, _RATES_BY_GROUP), parameters, gradients, first, second, moving)
-            return models
-
-        def take(models: list[DeviceGaussians]) -> list[Array]:
-            return [model[group].get() for model in models for group in PARAMETER_GROUPS]
-
-        _, outcome = bench.twice(launch, take)
-        rows = bench.visible if sparse else np.ones(count, np.bool_)
-        after = dict(zip(((kind, group) for kind in made for group in PARAMETER_GROUPS), outcome.arrays, strict=True))
-        parts: dict[str, tuple[Array, Array]] = {}
-        kept = 0
-        for group in PARAMETER_GROUPS:
-            p, g, m, v = (made[kind][group].astype(np.float64) for kind in made)
-            wanted = reference_adam.adam(
-                p, g, m, v, step, _RATES_BY_GROUP[group], config.beta1, config.beta2, config.epsilon
-            )
-            for kind, exact in zip(("parameters", "first", "second"), wanted, strict=True):
-                got = after[kind, group]
-                parts[f"{kind} of {group}"] = (got[rows], exact[rows])
-                kept += int((got[~rows] != made[kind][group][~rows]).sum())
-        wrong = _steps_off(bench, config, made)
-        outcomes.append(outcome.compared(parts, hidden_rows=kept, with_projection=wrong))
-    return joined(outcomes)
+    """Test Adam by itself, and as a part of projection's gradient."""
+    outcome = ADAM_CASE.outcome(bench)
+    assert ADAM_CASE.frozen is not None
+    wrong = sum(_steps_off(bench, given) for given in ADAM_CASE.frozen(bench))
+    return replace(outcome, trouble=outcome.trouble or (f"{wrong} with projection wrong" if wrong else ""))
 
 
-def _steps_off(bench: CaseBench, config: OptimiserConfig, made: Mapping[str, Mapping[str, Array]]) -> int:
+def _steps_off(bench: CaseBench, given: Inputs) -> int:
     """Count the elements that `project_step` moves differently from float64 Adam with the gradients of
     `project_grad`."""
-    device, step, (n, coefficients) = bench.device, 7, (bench.model.count, bench.model.coefficients)
+    device, (n, coefficients) = bench.device, (bench.model.count, bench.model.coefficients)
     view = (bench.camera_array, bench.projected, MadeUpSlots.of(bench).slots)
     gradients, screen = (
         allocate_gaussians(device, n, coefficients, zero=True),
@@ -349,82 +253,30 @@ def _steps_off(bench: CaseBench, config: OptimiserConfig, made: Mapping[str, Map
     )
     project_grad(device, bench.model, *view, gradients, screen)
     before = {"parameters": {group: bench.model[group].get() for group in PARAMETER_GROUPS}}
-    before |= {kind: dict(made[kind]) for kind in ("first", "second")}
-    model = {
-        kind: DeviceGaussians(n, coefficients, {group: upload(device, array) for group, array in arrays.items()})
-        for kind, arrays in before.items()
-    }
-    readback = upload(device, np.zeros(len(READBACK), np.uint32))
-    three = (model["parameters"], model["first"], model["second"])
-    project_step(device, AdamStep(config, step, _RATES_BY_GROUP), three, *view, screen, readback)
-    wrong, rows = int(readback.get().sum()), bench.visible if config.sparse else np.ones(n, np.bool_)
-    for group, rate in _RATES_BY_GROUP.items():
+    before |= {kind: dict(given.arrays[kind]) for kind in ("first", "second")}
+    parameters, first, second = uploaded_groups(device, before)
+    readback, step = fresh_readback(device), AdamStep(OptimiserConfig(sparse=given.sparse), given.step, given.rates)
+    project_step(device, step, (parameters, first, second), *view, screen, readback)
+    wrong, rows = int(readback.get().sum()), bench.visible if given.sparse else np.ones(n, np.bool_)
+    for group, rate in given.rates.items():
         p, m, v = (before[kind][group].astype(np.float64) for kind in before)
         g = gradients[group].get().astype(np.float64)
-        exact = reference_adam.adam(p, g, m, v, step, rate, config.beta1, config.beta2, config.epsilon)
-        for kind, wanted in zip(before, exact, strict=True):
-            got = model[kind][group].get()
+        exact = reference_adam.adam(p, g, m, v, given.step, rate)
+        for kind, model, wanted in zip(before, (parameters, first, second), exact, strict=True):
+            got = model[group].get()
             # beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3: 1e-5 of a step or of a new moment.
             off = np.abs(got - wanted) > 1e-5 * np.abs(wanted) + 1e-4 * (rate if kind == "parameters" else g**2 + 1e-6)
             wrong += int(off[rows].sum()) + int((got[~rows] != before[kind][group][~rows]).sum())
     return wrong
 
 
-def _statistics(bench: CaseBench) -> StageOutcome:
-    device, n, camera, visible = bench.device, bench.model.count, bench.camera, bench.visible
-    values = evenly(34, (n, 2), -0.0625, 0.0625).astype(np.float32)
-    screen = Screen(upload(device, values))
-
-    def launch() -> DensityStatistics:
-        statistics = new_statistics(device, n)
-        for _ in range(2):
-            add_statistics(device, statistics, camera, bench.projected, screen)
-        return statistics
-
-    statistics, outcome = bench.twice(launch, lambda s: [array.get() for array in s.named().values()])
-    got = dict(zip(statistics.named(), outcome.arrays, strict=True))
-    norms = np.hypot(*(0.5 * np.array([camera.width, camera.height]) * values.astype(np.float64)).T) * visible
-    sxx, sxy, syy = bench.splats().covariances.T
-    radii = np.ceil(3 * np.sqrt(0.5 * (sxx + syy) + np.hypot(0.5 * (sxx - syy), sxy))) * visible
-    wrong = int((got["seen"] != 2 * visible).sum())
-    wrong += _marks_wrong(bench, statistics)
-    wrong += int((np.abs(got["radii"] - radii) > 1).sum()) + int((got["radii"] != radii).sum() > 1 + n // 100)
-    return outcome.compared({"gradient sums": (got["gradient_sums"], 2 * norms)}, counts=wrong)
-
-
-def _marks_wrong(bench: CaseBench, statistics: DensityStatistics) -> int:
-    """Count wrong entries in the list of rows, with thresholds that divide the Gaussians by every statistic."""
-    device, model = bench.device, bench.model
-    known = {name: array.get() for name, array in statistics.named().items()}
-    scales, logits = model["log_scales"].get(), model["opacity_logits"].get()
-    middle, limit = 0.500001 * float(np.median(known["gradient_sums"])), float(np.median(scales.max(axis=1)))
-    rules = MarkRules(gradient=middle, large=limit, transparent=float(np.median(logits)) - 1, oversized=limit + 2)
-    rows, halves = reference_density.rows(rules, known, scales, logits)
-    got = DeviceMarker(device, Workspace(device), model, statistics).rows(rules)
-    if got.count != len(rows):
-        return abs(got.count - len(rows))
-    return int((got.rows.get() != rows).sum()) + abs(got.halves - halves)
-
-
-CASES_BY_STAGE: dict[str, Callable[[CaseBench], StageOutcome]] = {
+CORE_STAGES: dict[str, Callable[[CaseBench], StageOutcome]] = {
     "arithmetic": _arithmetic,
     "project": _project,
     "duplicate": _duplicate,
-    "sort": _sort,
     "ranges": _ranges,
     "blend": _blend,
-    **PICTURE_CASES,
-    **MASK_CASES,
-    "loss": _loss,
     "blend_grad": _blend_grad,
     "project_grad": _project_grad,
     "adam": _adam,
-    "statistics": _statistics,
-    "appearance": of_appearance,
-    "ppisp": of_ppisp,
-    "grid": of_grid,
-    "depth": of_depth,
-    "pose": of_pose,
-    "lens": of_lens,
-    **LIBRARY_CASES,
 }

@@ -1,63 +1,98 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-test of the bilateral grids: a photograph's colours, their gradient and Adam's step."""
+"""Bilateral grids: a photograph's colours, their gradient and Adam's step."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from clsplat.device.buffers import DeviceArray, upload
-from clsplat.layouts.columns import READBACK
+import numpy as np
+from numpy.random import Generator
+
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
 from clsplat.reference import grid as reference
-from clsplat.selftest.harness import Array, CaseBench, StageOutcome, cropped
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
+from clsplat.selftest.cases.appearance import moment, random_gradient, random_moments, stepped
+from clsplat.selftest.cases.loss import random_pictures
+from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.grid import GRID_SHAPE, Grids, apply_grid, centre_grids, grid_gradient, step_grid
 
-GRID_PHOTOGRAPH, GRID_VISIT, GRID_RATE, CASE_VARIATION_WEIGHT = 1, 5, 0.03125, 10.0
+GRID_PHOTOGRAPH = 1
 MIN_LEVEL_DISTANCE = 1e-4
 """Distance from a luminance level below which rounding decides the slope."""
 
 
-def of_grid(bench: CaseBench) -> StageOutcome:
-    """Test the grid of one of two photographs, with the scene's blended image as the render."""
-    device, camera, image = bench.device, bench.camera, bench.blended.image
-    size = (camera.width, camera.height)
-    values = (reference.identity(GRID_SHAPE[:3]) + evenly(43, (2, *GRID_SHAPE), -0.25, 0.25)).astype(np.float32)
-    by_seen = evenly(44, tuple(image.shape), -0.25, 1.0).astype(np.float32)
-    readback = upload(device, np.zeros(len(READBACK), np.uint32))
-
-    def launch() -> tuple[Grids, DeviceArray, DeviceArray, DeviceArray]:
-        grids, gradient = Grids.on(device, values), upload(device, by_seen)
-        seen = apply_grid(device, bench.work, grids, GRID_PHOTOGRAPH, image, *size)
-        by_grid = grid_gradient(
-            device, bench.work, grids, GRID_PHOTOGRAPH, image, gradient, *size, CASE_VARIATION_WEIGHT
-        )
-        step_grid(device, grids, GRID_PHOTOGRAPH, by_grid, GRID_VISIT, GRID_RATE, readback)
-        centre_grids(device, grids, readback)
-        return grids, seen, gradient, by_grid
-
-    def take(results: tuple[Grids, DeviceArray, DeviceArray, DeviceArray]) -> list[Array]:
-        grids, seen, gradient, by_grid = results
-        made = (grids.grids, grids.first, grids.second, by_grid)
-        return [*(array.get() for array in made), cropped(seen.get(), camera), cropped(gradient.get(), camera)]
-
-    _, outcome = bench.twice(launch, take)
-    got = dict(zip(("grids", "first", "second", "by grid", "seen", "gradient"), outcome.arrays, strict=True))
-    picture, held = cropped(image.get(), camera).astype(np.float64), values.astype(np.float64)
-    by_image, by_grid = reference.gradient(picture, held[GRID_PHOTOGRAPH], cropped(by_seen, camera).astype(np.float64))
-    by_grid += CASE_VARIATION_WEIGHT * reference.variation_gradient(held[GRID_PHOTOGRAPH])
-    zeros = np.zeros(GRID_SHAPE)
-    moved, first, second = reference.step(held[GRID_PHOTOGRAPH], zeros, zeros, by_grid, GRID_VISIT, GRID_RATE)
-    after = held.copy()
-    after[GRID_PHOTOGRAPH] = moved
-    level = picture @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
-    sure = np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE
-    return outcome.compared(
-        {
-            "seen": (got["seen"], reference.apply(picture, held[GRID_PHOTOGRAPH])),
-            "gradient": (got["gradient"][sure], by_image[sure]),
-            "gradient by the grid": (got["by grid"], by_grid),
-            "first": (got["first"][GRID_PHOTOGRAPH], first),
-            "second": (got["second"][GRID_PHOTOGRAPH], second),
-            "grids": (got["grids"], reference.centre(after)),
-        }
+def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
+    """Grids from next to none to wild ones; colours under 0 and over 1 among those between."""
+    image, _ = random_pictures(rng, size)
+    image = (image * rng.uniform(1.0, 1.5) - rng.choice([0.0, 0.2])).astype(np.float32)
+    noise = rng.standard_normal((2, *GRID_SHAPE)) * 10 ** rng.uniform(-4, 0.5)
+    by_seen = random_gradient(rng, image)
+    return Inputs(
+        image=image,
+        by_seen=by_seen,
+        grids=(reference.identity(GRID_SHAPE[:3]) + noise).astype(np.float32),
+        moments=random_moments(rng, noise.shape, float(np.abs(by_seen).mean())),
+        weight=float(rng.choice([0.0, 10.0])),
+        visit=int(rng.integers(1, 500)),
+        rate=0.01,
     )
+
+
+def _frozen(bench: CaseBench) -> list[Inputs]:
+    """One of two photographs, with the scene's blended image as the render."""
+    grids = (reference.identity(GRID_SHAPE[:3]) + evenly(43, (2, *GRID_SHAPE), -0.25, 0.25)).astype(np.float32)
+    by_seen = evenly(44, tuple(bench.blended.image.shape), -0.25, 1.0).astype(np.float32)
+    image, by_seen = (cropped(each, bench.camera) for each in (bench.blended.image.get(), by_seen))
+    step = {"moments": np.zeros((2, *grids.shape), np.float32), "weight": 10.0, "visit": 5, "rate": 0.03125}
+    return [Inputs(image=image, by_seen=by_seen, grids=grids, **step)]
+
+
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
+    first, second = (upload(device, moment) for moment in given.moments)
+    grids, readback = replace(Grids.on(device, given.grids), first=first, second=second), fresh_readback(device)
+    image, gradient = (upload(device, planes_of(each, np.nan)) for each in (given.image, given.by_seen))
+    own = (grids, GRID_PHOTOGRAPH, image)
+    seen = apply_grid(device, work, *own, *given.size)
+    by_grid = grid_gradient(device, work, *own, gradient, *given.size, given.weight)
+    step_grid(device, grids, GRID_PHOTOGRAPH, by_grid, given.visit, given.rate, readback)
+    centre_grids(device, grids, readback)
+    read = read_of(**{"grids": grids.grids, "first": first, "second": second, "by grid": by_grid})
+    planes = {"seen": seen, "gradient": gradient}
+    return lambda: {**read(), **{name: cropped(array.get(), given.size) for name, array in planes.items()}}
+
+
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    image, held, by_seen, moments = given.wide("image", "grids", "by_seen", "moments")
+    at, (first, second) = GRID_PHOTOGRAPH, moments
+    own = held[at].copy()
+    seen, terms = reference.apply(image, own), reference.apply(np.abs(image), np.abs(own))
+    by_image, by_grid = reference.gradient(image, own, by_seen)
+    by_grid += given.weight * reference.variation_gradient(own)
+    step = (got["by grid"].astype(np.float64), given.visit, given.rate)  # so that no error counts twice
+    got |= {f"{name} of another": got[name][0] for name in ("first", "second")}
+    held[at], first[at], second[at] = reference.step(own, first[at], second[at], *step)
+    level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)
+    centred = reference.centre(held)
+    return {
+        "seen": Wanted(seen, 1.2e-6, max(1.0, terms.max())),  # a dozen roundings
+        # a hundred terms of either sign
+        "gradient": Wanted(by_image, 1e-5, sure=np.abs(level - np.rint(level)) > MIN_LEVEL_DISTANCE),
+        "by grid": Wanted(by_grid, 1e-5),
+        "first": moment(first),
+        "second": moment(second),
+        "grids": stepped(centred, given.rate),
+        **{f"{name} of another": exactly(given.moments[k][0]) for k, name in enumerate(("first", "second"))},
+    }
+
+
+GRID_CASE = Case(
+    sizes=((16, 16), (17, 33), (1, 1), (70, 15)),
+    random=_random,
+    launch=_launch,
+    twin=_twin,
+    frozen=_frozen,
+    digested=("grids", "first", "second", "by grid", "seen", "gradient"),
+    by_shape=False,
+)

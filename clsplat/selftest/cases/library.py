@@ -9,13 +9,17 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 
 import numpy as np
+from numpy.random import Generator
 
-from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.arrays import Float32, Float64
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, from_host, upload
+from clsplat.device.context import Device
 from clsplat.layouts.columns import SPLAT
 from clsplat.reference import ewa as reference_ewa
 from clsplat.reference import splats as reference_splats
 from clsplat.reference import values as reference_values
 from clsplat.reference.sh import sh_basis_grad
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
 from clsplat.spherical_harmonics import sh_basis
@@ -30,8 +34,14 @@ from clsplat.stages.ewa import (
     ewa,
     ewa_grad,
 )
-from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE, Harmonics, HarmonicsGradients, harmonics, harmonics_grad
-from clsplat.stages.project import Projected
+from clsplat.stages.harmonics import (
+    MAX_SH_BASIS_DEGREE,
+    Harmonics,
+    HarmonicsGradients,
+    centre_array,
+    harmonics,
+    harmonics_grad,
+)
 from clsplat.stages.splats import ScreenGaussians, ScreenGradients, splats
 from clsplat.stages.values import ValuePass, values, values_grad
 
@@ -99,71 +109,90 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
     return outcome.compared({**parts, "by lens": (by_lens, back["intrinsics"])}, radii=wrong)
 
 
-def of_harmonics(bench: CaseBench) -> StageOutcome:
-    """Test colours of the highest degree in synthetic directions."""
-    device, n, coefficients = bench.device, bench.model.count, (MAX_SH_BASIS_DEGREE + 1) ** 2
-    away, sh, by = (
-        evenly(71 + index, shape, -1.0, 1.0).astype(np.float32)
-        for index, shape in enumerate(((n, 3), (n, coefficients, 3), (n, 3)))
-    )
-    away[:, 2] += 1.5
-    given = Harmonics(upload(device, away), upload(device, sh), MAX_SH_BASIS_DEGREE)
-
-    def launch() -> list[DeviceArray]:
-        found = [bench.work.array(f"sh_{k}", array.shape) for k, array in enumerate((by, sh, away))]
-        harmonics(device, given, found[0])
-        harmonics_grad(device, bench.work, given, found[0], upload(device, by), HarmonicsGradients(*found[1:]))
-        return found
-
-    def take(found: list[DeviceArray]) -> list[Array]:
-        return [array.get() for array in found]
-
-    _, outcome = bench.twice(launch, take)
-    length = np.linalg.norm(away.astype(np.float64), axis=1, keepdims=True)
-    unit, exact, back = away / length, sh.astype(np.float64), by.astype(np.float64)
-    basis = sh_basis(unit, MAX_SH_BASIS_DEGREE)
-    by_unit = np.einsum("nkd,nkc,nc->nd", sh_basis_grad(unit, MAX_SH_BASIS_DEGREE), exact, back)
-    by_direction = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
-    wanted = (np.einsum("nk,nkc->nc", basis, exact), basis[:, :, None] * back[:, None], by_direction)
-    names = ("colours", "by coefficients", "by directions")
-    return outcome.compared(dict(zip(names, zip(outcome.arrays, wanted, strict=True), strict=True)))
+def conics_of(sides: Float64, angles: Float64) -> Float32:
+    """Conics (n, 3) of ellipses with these standard deviations (n, 2) in pixels, turned by the angles (n,)."""
+    axes = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1).reshape(-1, 2, 2)
+    inverse = (axes / sides[:, None, :] ** 2) @ axes.transpose(0, 2, 1)
+    return np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=1).astype(np.float32)
 
 
-def of_splats(bench: CaseBench) -> StageOutcome:
-    """Test splats of the scene's projected Gaussians, given as arrays."""
-    device, camera, seen = bench.device, bench.camera, bench.visible
-    rows = bench.splats()
-    count = len(seen)
+def random_splats(
+    rng: Generator, count: int, *, width: int = 70, height: int = 50, depth: int = 3, opaque: float = 0.1
+) -> Inputs:
+    """Gaussians of a few pixels all over an image and a little beyond, a tenth culled by a radius, and a part as opaque
+    as the cap; two of the same depth. They have `depth` values each."""
+    sides = np.exp(rng.normal(0.9, 0.5, (count, 2)))
+    opacities = np.where(rng.random(count) < opaque, 1.0, rng.uniform(0.02, 0.95, count))
+    depths = rng.uniform(1, 9, count)
+    depths[: count // 2 * 2 : 2] = depths[1 : count // 2 * 2 : 2]
+    radii = np.where(rng.random((count, 2)) < 0.05, 0, 9).astype(np.int32)
+    means2d = (rng.uniform(-0.1, 1.1, (count, 2)) * [width, height]).astype(np.float32)
+    conics, values = conics_of(sides, rng.uniform(0, np.pi, count)), rng.uniform(0, 1, (count, depth))
+    single = {"opacities": opacities, "depths": depths, "values": values}
+    floats = {name: each.astype(np.float32) for name, each in single.items()}
+    return Inputs(radii=radii, means2d=means2d, conics=conics, **floats, width=width, height=height)
+
+
+def _frozen_splats(bench: CaseBench) -> list[Inputs]:
+    """The scene's projected Gaussians, given as arrays."""
+    camera, seen, rows = bench.camera, bench.visible, bench.splats()
+    arrays = {
+        "means2d": rows.means2d,
+        "conics": np.where(seen[:, None], rows.conics, (1.0, 0.0, 1.0)),
+        "opacities": np.where(seen, rows.opacities, 0.5),
+        "depths": rows.depths,
+        "values": evenly(81, (len(seen), 3), 0.0, 1.0),
+    }
     radii = np.repeat(np.where(seen, 9, 0)[:, None], 2, axis=1).astype(np.int32)
-    conics = np.where(seen[:, None], rows.conics, (1.0, 0.0, 1.0)).astype(np.float32)
-    opacities = np.where(seen, rows.opacities, 0.5).astype(np.float32)
-    arrays = (radii, rows.means2d, conics, opacities, rows.depths, evenly(81, (count, 3), 0.0, 1.0))
-    kinds = (np.int32, *[np.float32] * 5)
-    given = ScreenGaussians(
-        *(upload(device, np.ascontiguousarray(each, kind)) for each, kind in zip(arrays, kinds, strict=True))
-    )
+    single = {name: np.ascontiguousarray(each, np.float32) for name, each in arrays.items()}
+    return [Inputs(radii=radii, width=camera.width, height=camera.height, **single)]
 
-    work = Workspace(device)  # so that the scene's own splats are not overwritten
 
-    def launch() -> Projected:
-        return splats(device, work, given, camera.width, camera.height)
+def _launch_splats(device: Device, work: Workspace, given: Inputs) -> Read:
+    names = ("radii", "means2d", "conics", "opacities", "depths", "values")
+    inputs = ScreenGaussians(*(from_host(device, getattr(given, name)) for name in names))
+    found = splats(device, work, inputs, given.width, given.height)
 
-    def take(found: Projected) -> list[Array]:
+    def read() -> Arrays:
         tiles = found.tile_counts.get()
         rows = np.where(tiles[:, None] > 0, found.splats.get(), 0)
-        return [tiles, *(rows[:, k] for k in WRITTEN_SPLAT_COLUMNS.values())]
+        return {"tiles": tiles, **{name: rows[:, k] for name, k in WRITTEN_SPLAT_COLUMNS.items()}}
 
-    _, outcome = bench.twice(launch, take)
-    tiles, *columns = outcome.arrays
-    both = seen & (tiles > 0)
-    wrong = max(int((seen != (tiles > 0)).sum()) - 2, 0)  # for ellipses that end at a tile's first pixel
-    column = {name: values[both] for name, values in zip(WRITTEN_SPLAT_COLUMNS, columns, strict=True)}
-    wanted = reference_splats.splats(conics.astype(np.float64), opacities.astype(np.float64), radii)
+    return read
+
+
+def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    conics, opacities = given.wide("conics", "opacities")
+    wanted = reference_splats.splats(conics, opacities, given.radii)
+    seen = wanted.drawn & (got["tiles"] > 0)
+    column = {name: got[name] for name in WRITTEN_SPLAT_COLUMNS}
     whitening = np.stack([column[name] for name in ("L11", "L12", "L22")], axis=1) / WHITENING_FACTOR
-    half = np.stack([column["HALF_W"], column["HALF_H"]], axis=1)
-    parts = {"whitening": (whitening, wanted.whitenings[both]), "half extents": (half, wanted.half_extents[both])}
-    logs = (column["LOG2O"], np.log2(opacities[both].astype(np.float64)))
-    return outcome.compared({**parts, "log2 opacities": logs}, shown=wrong)
+    got |= {"whitening": whitening, "half extents": np.stack([column["HALF_W"], column["HALF_H"]], axis=1)}
+    got["means"] = np.stack([column["PIXEL_X"] + column["SUB_X"], column["PIXEL_Y"] + column["SUB_Y"]], axis=1)[seen]
+    got["values"] = np.stack([column["RED"], column["GREEN"], column["BLUE"]], axis=1)[seen]
+    got["shown"] = (got["tiles"] > 0) & ~wanted.drawn
+    size = np.abs(wanted.whitenings).max(axis=1, keepdims=True, initial=0)
+    logs = np.log2(opacities)
+    return {
+        # three roundings of a root and two quotients; l12 may be near 0 beside the others
+        "whitening": Wanted(wanted.whitenings, 5e-7, size, seen),
+        # the budget is a difference of logarithms; the tile test has 0.01 px more
+        "half extents": Wanted(wanted.half_extents, 1e-4, 1 + wanted.half_extents, seen),
+        "LOG2O": Wanted(logs, 1.4e-6, 1.0, seen),  # an ulp of the logarithm is 1e-6 of the opacity
+        "means": Wanted(given.means2d[seen], 6e-8, 1.0),  # the place in a pixel is a float32 under 1
+        "values": exactly(given.values[seen]),
+        "shown": exactly(np.zeros_like(got["shown"])),
+    }
+
+
+SPLATS_CASE = Case(
+    sizes=(1, 63, 64, 65, 0, 200),
+    random=random_splats,
+    launch=_launch_splats,
+    twin=_twin_of_splats,
+    frozen=_frozen_splats,
+    digested=("tiles", *WRITTEN_SPLAT_COLUMNS),
+)
 
 
 def of_values(bench: CaseBench) -> StageOutcome:
@@ -208,4 +237,81 @@ def of_values(bench: CaseBench) -> StageOutcome:
     return outcome.compared(parts)
 
 
-LIBRARY_CASES = {"ewa": of_ewa, "harmonics": of_harmonics, "splats": of_splats, "values": of_values}
+SH_CENTRE = np.array([0.1, 0.2, 3.3])
+"""Of a camera; not one of float32's numbers."""
+
+
+def random_harmonics(rng: Generator, count: int, degree: int | None = None, *, camera: bool | None = None) -> Inputs:
+    """Colours of a degree, seen from a camera or not, each random unless it is given."""
+    degree = int(rng.integers(MAX_SH_BASIS_DEGREE + 1)) if degree is None else degree
+    shapes = ((count, 3), (count, 25 if degree == MAX_SH_BASIS_DEGREE else 16, 3), (count, 3))
+    directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
+    mask = np.repeat((rng.random((count, 1)) < 0.8).astype(np.int32), 2, axis=1)
+    centre = SH_CENTRE if (rng.random() < 0.5 if camera is None else camera) else None
+    return Inputs(directions=directions, sh=sh, by=by, mask=mask, degree=degree, centre=centre)
+
+
+def _frozen_harmonics(bench: CaseBench) -> list[Inputs]:
+    """Colours of the highest degree in synthetic directions."""
+    n = bench.model.count
+    shapes = ((n, 3), (n, (MAX_SH_BASIS_DEGREE + 1) ** 2, 3), (n, 3))
+    away, sh, by = (evenly(71 + index, shape, -1.0, 1.0).astype(np.float32) for index, shape in enumerate(shapes))
+    away[:, 2] += 1.5
+    return [Inputs(directions=away, sh=sh, by=by, mask=None, degree=MAX_SH_BASIS_DEGREE, centre=None)]
+
+
+def harmonics_inputs(device: Device, given: Inputs) -> Harmonics:
+    """The inputs on the device."""
+    mask, centre = None, None
+    if given.centre is not None:
+        mask, centre = upload(device, given.mask), centre_array(device, given.centre)
+    return Harmonics(upload(device, given.directions), upload(device, given.sh), given.degree, mask, centre)
+
+
+def launch_harmonics(device: Device, work: Workspace, given: Inputs, *, add: bool = False, start: float = -7.0) -> Read:
+    """Launch both kernels, with gradients in arrays that are full of `start`."""
+    inputs = harmonics_inputs(device, given)
+    shapes = ((inputs.count, 3), given.sh.shape, (inputs.count, 3))
+    colours, d_sh, d_directions = (allocate(device, shape, np.float32) for shape in shapes)
+    for array in (colours, d_sh, d_directions):
+        array.fill(start)
+    harmonics(device, inputs, colours)
+    by = (colours, upload(device, given.by), HarmonicsGradients(d_sh, d_directions))
+    from_centre = given.centre is not None
+    by_centre = harmonics_grad(device, work, inputs, *by, add=add, add_directions=add, by_centre=from_centre)
+    made = {"colours": colours, "sh": d_sh, "directions": d_directions}
+    made |= {} if by_centre is None else {"centre": by_centre}
+    return lambda: {name: array.get() for name, array in made.items()}
+
+
+def _twin_of_harmonics(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+    directions, sh, d_colours = given.wide("directions", "sh", "by")
+    away, used = directions - (0.0 if given.centre is None else given.centre), (given.degree + 1) ** 2
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    unit, sh = away / length, sh[:, :used]
+    basis, slopes = sh_basis(unit, given.degree), sh_basis_grad(unit, given.degree)
+    colours = np.einsum("nk,nkc->nc", basis, sh)
+    if given.centre is not None:
+        shown = given.mask[:, :1] > 0
+        colours = np.where(shown, np.maximum(colours + 0.5, 0.0), 0.0)
+        d_colours = np.where(colours > 0, d_colours, 0.0)
+    d_sh = np.zeros(given.sh.shape)
+    d_sh[:, :used] = basis[:, :, None] * d_colours[:, None]
+    by_unit = np.einsum("nkd,nkc,nc->nd", slopes, sh, d_colours)
+    d_directions = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
+    # sums of up to 25 products of size 1, each off by 1e-7
+    wanted = {"colours": Wanted(colours, 4e-6, 1.0), "sh": Wanted(d_sh, 2e-6)}
+    wanted["directions"] = Wanted(d_directions, 2e-6) if given.degree else exactly(np.zeros_like(d_directions))
+    if given.centre is not None:
+        wanted["centre"] = Wanted(-d_directions.sum(axis=0), 2e-6, (np.abs(by_unit) / length).sum(axis=0))
+    return wanted
+
+
+HARMONICS_CASE = Case(
+    sizes=(1, 64, 65, 300, 63, 0, 513),
+    random=random_harmonics,
+    launch=launch_harmonics,
+    twin=_twin_of_harmonics,
+    frozen=_frozen_harmonics,
+    digested=("colours", "sh", "directions"),
+)

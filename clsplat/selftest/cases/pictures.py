@@ -11,12 +11,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from clsplat.camera import CAMERA_MODELS, Camera
 from clsplat.cameras.model import CameraModel
-from clsplat.device.buffers import upload
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
 from clsplat.images.holdouts import surfaces_of
-from clsplat.layouts.columns import RAY
+from clsplat.layouts.columns import DEEP_PICTURES, RAY
 from clsplat.reference import channels as reference_channels
 from clsplat.reference import deep as reference_deep
 from clsplat.reference import deep_merge as reference_deep_merge
@@ -24,6 +26,7 @@ from clsplat.reference import every_pixel
 from clsplat.reference import holdout as reference_holdout
 from clsplat.reference import rays as reference_rays
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted
 from clsplat.selftest.harness import (
     MIN_DECISION_MARGIN,
     WHITENING_FACTOR,
@@ -47,6 +50,8 @@ MIN_NORMAL_COSINE = 1e-4
 MIN_TRANSMITTANCE_MARGIN = 1e-5
 """Margin like `harness.MARGIN`, as differences: of the transmittance to one half, of a slice's cut, and between the two
 largest weights."""
+MIN_MERGED_MARGIN = 1e-6
+"""Margin of merged slices: light is a sum of up to 16 products."""
 DEEP_CASE_SLICES = 4
 """Slices per pixel."""
 DEEP_SLICE_PARTS = {"colour": slice(0, 3), "alpha": slice(3, 4), "depth": slice(4, 5)}
@@ -120,18 +125,63 @@ def _deep(bench: CaseBench) -> StageOutcome:
     return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in DEEP_SLICE_PARTS.items()})
 
 
-def _deep_merge(bench: CaseBench) -> StageOutcome:
-    """Test a merge of the sliced picture with itself, shifted and upside down: depths are equal, and there are too many
-    slices."""
-    device, planes = bench.device, bench.slices.get()
-    pictures = np.stack([planes, np.roll(planes, 3, axis=3), planes[:, :, ::-1], planes])
-    weights = np.full((4, *planes.shape[2:]), 0.25, np.float32)
-    arrays = upload(device, pictures.reshape(*pictures.shape[:3], -1)), upload(device, weights.reshape(4, -1))
-    _, outcome = bench.twice(lambda: deep_merge(device, bench.work, *arrays), lambda merged: [merged.get()])
-    twin = reference_deep_merge.deep_merge(pictures.transpose(0, 1, 3, 4, 2).astype(np.float64), weights)
-    sure = twin.margin > MIN_TRANSMITTANCE_MARGIN
-    got, wanted = outcome.arrays[0].reshape(planes.shape).transpose(0, 2, 3, 1)[:, sure], twin.slices[:, sure]
-    return outcome.compared({name: (got[..., at], wanted[..., at]) for name, at in DEEP_SLICE_PARTS.items()})
+def random_deep_pictures(
+    rng: Generator, size: tuple[int, int], count: int | None = None, bins: int | None = None
+) -> Inputs:
+    """Pictures (P, bins, H, W, 5) whose pixels have 0 to `bins` slices, and weights (P, H, W) of the sum 1."""
+    count, bins = count or int(rng.choice([1, 2, 3, DEEP_PICTURES])), bins or int(rng.choice([1, 4, 7, 40]))
+    shape = (count, bins, size[1], size[0])
+    alpha = (rng.uniform(0.02, 0.95, shape) * min(1, 8 / bins)).astype(np.float32)  # so that light is left
+    depth = np.cumsum(rng.uniform(0.01, 1, shape), axis=1).astype(np.float32)
+    depth[:, :, ::3] = np.round(depth[:, :, ::3]) + np.arange(bins, dtype=np.float32)[:, None, None]  # equal ones too
+    colours = rng.uniform(-0.2, 1.5, (*shape, 3)).astype(np.float32) * alpha[..., None]
+    pictures = np.concatenate([colours, alpha[..., None], depth[..., None]], axis=4)
+    slices = rng.integers(0, bins + 1, (count, *shape[2:]))
+    pictures[np.arange(bins)[None, :, None, None] >= slices[:, None]] = 0
+    weights = rng.uniform(0.1, 1, (count, *shape[2:]))
+    return Inputs(pictures=pictures, weights=(weights / weights.sum(axis=0)).astype(np.float32))
+
+
+def _frozen_deep_pictures(bench: CaseBench) -> list[Inputs]:
+    """The sliced picture with itself, shifted and upside down: depths are equal, and there are too many slices."""
+    planes = bench.slices.get()
+    pictures = np.stack([planes, np.roll(planes, 3, axis=3), planes[:, :, ::-1], planes]).transpose(0, 1, 3, 4, 2)
+    return [Inputs(pictures=pictures, weights=np.full((4, *planes.shape[2:]), 0.25, np.float32))]
+
+
+def launch_deep_merge(device: Device, work: Workspace, given: Inputs) -> Read:
+    """Launch deep_merge.cl."""
+    count, bins, height, width, floats = given.pictures.shape
+    planes = np.ascontiguousarray(given.pictures.transpose(0, 1, 4, 2, 3)).reshape(count, bins, floats, -1)
+    weights = upload(device, np.ascontiguousarray(given.weights.reshape(count, -1)))
+    merged = deep_merge(device, work, upload(device, planes), weights)
+
+    def read() -> Arrays:
+        planes = merged.get()
+        slices = planes.reshape(bins, floats, height, width).transpose(0, 2, 3, 1)
+        return {"planes": planes, "slices": slices, **{name: slices[..., at] for name, at in DEEP_SLICE_PARTS.items()}}
+
+    return read
+
+
+def _twin_of_deep_merge(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+    pictures, weights = given.wide("pictures", "weights")
+    twin = reference_deep_merge.deep_merge(pictures, weights)
+    sure = np.broadcast_to(twin.margin > MIN_MERGED_MARGIN, twin.slices.shape[:3])
+    # a slice's colour is a sum of up to 16 x bins products, over light that has lost as many; its depth is one of them
+    bounds = {"colour": 1e-5, "alpha": 1e-5, "depth": 0.0}
+    return {name: Wanted(twin.slices[..., at], bounds[name], 1.0, sure) for name, at in DEEP_SLICE_PARTS.items()}
+
+
+DEEP_MERGE_CASE = Case(
+    sizes=((1, 1), (13, 5), (16, 4), (65, 1)),
+    random=random_deep_pictures,
+    launch=launch_deep_merge,
+    twin=_twin_of_deep_merge,
+    frozen=_frozen_deep_pictures,
+    digested=("planes",),
+    by_shape=False,
+)
 
 
 def _holdout(bench: CaseBench) -> StageOutcome:
@@ -237,7 +287,6 @@ PICTURE_CASES: dict[str, Callable[[CaseBench], StageOutcome]] = {
     "features": _features,
     "channels": _channels,
     "deep": _deep,
-    "deep_merge": _deep_merge,
     "holdout": _holdout,
     "rays": _rays,
 }

@@ -4,49 +4,79 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.random import Generator
 
-from clsplat.device.buffers import DeviceArray, upload
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.context import Device
+from clsplat.gaussians import group_shapes
+from clsplat.layouts.columns import POSE_ROWS
 from clsplat.reference.pose import pose_gradient as reference
 from clsplat.reference.project import lens_grad
 from clsplat.reference.render import parameters, project_model
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted
+from clsplat.selftest.cases.steps import random_scene
 from clsplat.selftest.harness import Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
 from clsplat.selftest.synthetic_slots import MadeUpSlots
-from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians
+from clsplat.stages.device_camera import pack_camera
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
 from clsplat.stages.pose import LENS_NUMBERS, lens_rows, pose_rows, sum_of, sums_of
 from clsplat.stages.project import Screen, project_grad
 
 SYNTHETIC_GRADIENT_GROUPS = ("means", "quaternions", "sh_dc")
 
 
-def of_pose(bench: CaseBench) -> StageOutcome:
-    """Test synthetic gradients of the Gaussians that the scene's view shows."""
-    device, model, frozen = bench.device, bench.model, bench.frozen
-    arrays = {
-        group: evenly(51 + index, model[group].shape, -0.25, 0.5).astype(np.float32)
+def _random(rng: Generator, count: int) -> Inputs:
+    """Gradients of any size of Gaussians, of which some are not seen: their gradients are no numbers."""
+    scene, seen = random_scene(rng, count), np.arange(count) % 3 != 1
+    size, by = 10 ** rng.uniform(-6, 3), {}
+    for group in SYNTHETIC_GRADIENT_GROUPS:
+        shape = group_shapes(count, 4)[group]
+        values = rng.standard_normal(shape) * size
+        by[group] = np.where(seen.reshape(-1, *[1] * (len(shape) - 1)), values, np.nan).astype(np.float32)
+    return Inputs(gaussians=scene.gaussians, camera=scene.camera, by=by, seen=seen)
+
+
+def _frozen(bench: CaseBench) -> list[Inputs]:
+    by = {
+        group: evenly(51 + index, bench.model[group].shape, -0.25, 0.5).astype(np.float32)
         for index, group in enumerate(SYNTHETIC_GRADIENT_GROUPS)
     }
-    gradients = DeviceGaussians(
-        model.count, model.coefficients, {group: upload(device, values) for group, values in arrays.items()}
-    )
+    return [Inputs(gaussians=bench.frozen.gaussians, camera=bench.camera, by=by, seen=bench.visible)]
 
-    def launch() -> DeviceArray:
-        sums = sums_of(bench.work, model.count)
-        pose_rows(device, model, bench.camera_array, bench.projected.tile_counts, gradients, sums)
-        return sum_of(device, bench.work, sums)
 
-    def take(sums: DeviceArray) -> list[Array]:
-        return [sums.get()[0]]
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
+    model, seen = upload_gaussians(device, given.gaussians), upload(device, given.seen.astype(np.uint32))
+    by = {group: upload(device, values) for group, values in given.by.items()}
+    sums = sums_of(work, model.count)
+    sums.fill(np.nan)
+    camera_array = upload(device, pack_camera(given.camera))
+    pose_rows(device, model, camera_array, seen, DeviceGaussians(model.count, model.coefficients, by), sums)
+    total = sum_of(device, work, sums)
+    return lambda: {"sums": total.get()[0]}
 
-    _, outcome = bench.twice(launch, take)
-    seen = bench.visible
-    wide = {group: values[seen].astype(np.float64) for group, values in arrays.items()}
-    by = {"means": wide["means"], "quaternions": wide["quaternions"], "sh": wide["sh_dc"][:, None]}
-    given = {name: np.asarray(values, np.float64)[seen] for name, values in frozen.gaussians.arrays().items()}
-    degree = frozen.gaussians.sh_degree
-    wanted = reference(given["means"], given["quaternions"], given["sh"], bench.camera, degree, by)
-    (got,) = outcome.arrays
-    return outcome.compared({"turn": (got[:3], wanted[:3]), "shift": (got[3:], wanted[3:])})
+
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    seen, arrays = given.seen, given.gaussians.arrays()
+    means, quaternions, sh = (arrays[name][seen].astype(np.float64) for name in ("means", "quaternions", "sh"))
+    by = {group: values[seen].astype(np.float64) for group, values in given.by.items()}
+    by["sh"] = by.pop("sh_dc")[:, None]
+    degree = given.gaussians.sh_degree
+    wanted = reference(means, quaternions, sh, given.camera, degree, by)
+    got |= {"turn": got["sums"][:3], "shift": got["sums"][3:]}
+    # terms of either sign: the sum of 4000 is 60 times a term, and off by roundings of partial sums
+    return {"turn": Wanted(wanted[:3], 2e-6), "shift": Wanted(wanted[3:], 2e-6)}
+
+
+POSE_CASE = Case(
+    sizes=(1, POSE_ROWS, POSE_ROWS + 1, POSE_ROWS**2 + 1),
+    random=_random,
+    launch=_launch,
+    twin=_twin,
+    frozen=_frozen,
+    digested=("sums",),
+    by_shape=False,
+)
 
 
 def of_lens(bench: CaseBench) -> StageOutcome:

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stage beside its float64 twin: its inputs, its launch, the values that the twin wants and the bounds of errors.
+
+The self-test runs every case on the frozen scenes, `tests/stages/test_cases.py` at the seams of sizes on every driver,
+`tools/stress/run kernels` on random inputs by the thousand, and `tools/ci/check_memory.py` on small ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import EllipsisType, SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import ArrayLike, NDArray
+
+from clsplat.device.buffers import DeviceArray, Workspace, upload
+from clsplat.device.context import Device
+from clsplat.layouts.columns import READBACK
+from clsplat.selftest.harness import Array, CaseBench, StageOutcome, joined
+
+Arrays = dict[str, Array]
+Read = Callable[[], Arrays]
+"""Function that reads the results of a launch, by name."""
+Sure = NDArray[np.bool_] | EllipsisType
+"""Elements that are compared."""
+
+
+class Inputs(SimpleNamespace):
+    """Inputs of a case by name, arrays and numbers. Images are (H, W, ...)."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image."""
+        return self.image.shape[1], self.image.shape[0]
+
+    def wide(self, *names: str) -> list[NDArray[np.float64]]:
+        """These arrays in float64."""
+        return [getattr(self, name).astype(np.float64) for name in names]
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """The twin's values of a result.
+
+    bound: the largest error; its reason is beside it.
+    of: magnitude that an error is relative to. None: the error is that of all values together, in the 2-norm.
+    sure: the elements that are compared, where rounding decides the others.
+    exact: True for results without an error, such as integers.
+    """
+
+    values: Array
+    bound: float
+    of: ArrayLike | None = None
+    sure: Sure = ...
+    exact: bool = False
+
+    def error_of(self, got: Array) -> float:
+        """The largest error, relative to `of`; of exact results the number of wrong elements."""
+        if got.shape != self.values.shape:
+            return float("inf")
+        found, wanted = got[self.sure], self.values[self.sure]
+        if self.exact:
+            return float(np.count_nonzero(found != wanted))
+        if not np.isfinite(found).all():
+            return float("inf")
+        off = np.abs(found.astype(np.float64) - wanted)
+        if self.of is None:
+            error, scale = np.linalg.norm(off), np.linalg.norm(wanted)
+            return float(error / scale) if scale > 0 else float("inf") if error > 0 else 0.0
+        size = np.broadcast_to(np.asarray(self.of, np.float64), self.values.shape)[self.sure]
+        return float((off / np.maximum(size, 1e-30)).max(initial=0.0))
+
+
+def exactly(values: Array) -> Wanted:
+    """Values without an error."""
+    return Wanted(values, 0.0, exact=True)
+
+
+class Deviation(NamedTuple):
+    """An error, and the largest that there may be."""
+
+    error: float
+    bound: float
+
+
+def faults(found: Mapping[str, Deviation]) -> list[str]:
+    """Errors over their bounds, in words."""
+    return [f"{name} {error:.2g} over {bound:g}" for name, (error, bound) in found.items() if not error <= bound]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One stage.
+
+    sizes: sizes at the seams of its kernels, each a number of rows or (width, height).
+    random: inputs of a size.
+    launch: function that launches the kernels, and returns the function that reads the results.
+    twin: the wanted values by name, from the inputs and the results, as for a gradient of what the device projected.
+    frozen: inputs from a frozen scene, each of which the self-test launches; None if it has no such stage.
+    digested: names of the results in the self-test's digest, in order.
+    by_shape: True if the kernels or their launches depend on the kernel shape.
+    """
+
+    sizes: Sequence[Any]
+    random: Callable[[Generator, Any], Inputs]
+    launch: Callable[[Device, Workspace, Inputs], Read]
+    twin: Callable[[Inputs, Arrays], Mapping[str, Wanted]]
+    frozen: Callable[[CaseBench], Sequence[Inputs]] | None = None
+    digested: tuple[str, ...] = ()
+    by_shape: bool = True
+
+    def errors(self, device: Device, given: Inputs, work: Workspace | None = None) -> dict[str, Deviation]:
+        """Launch the kernels on the inputs; the errors by name."""
+        got = self.launch(device, work or Workspace(device), given)()
+        return {name: Deviation(of.error_of(got[name]), of.bound) for name, of in self.twin(given, got).items()}
+
+    def outcome(self, bench: CaseBench) -> StageOutcome:
+        """Outcome of the self-test's stage."""
+        assert self.frozen is not None
+        return joined([self._outcome(bench, given) for given in self.frozen(bench)])
+
+    def _outcome(self, bench: CaseBench, given: Inputs) -> StageOutcome:
+        work = Workspace(bench.device)  # later stages need the results of earlier ones
+        got: Arrays = {}
+
+        def take(read: Read) -> list[Array]:
+            got.update(read())
+            return [got[name] for name in self.digested]
+
+        _, outcome = bench.twice(lambda: self.launch(bench.device, work, given), take)
+        wanted = self.twin(given, got)
+        parts = {name: (got[name][of.sure], of.values[of.sure]) for name, of in wanted.items() if not of.exact}
+        wrong = {name: int(of.error_of(got[name])) for name, of in wanted.items() if of.exact}
+        return outcome.compared(parts, **wrong)
+
+
+def read_of(**arrays: DeviceArray) -> Read:
+    """Function that reads these arrays."""
+    return lambda: {name: array.get() for name, array in arrays.items()}
+
+
+def fresh_readback(device: Device) -> DeviceArray:
+    """The counts of a step in which nothing has stopped."""
+    return upload(device, np.zeros(len(READBACK), np.uint32))

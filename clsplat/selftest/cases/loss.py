@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loss of a photograph, and with masks, alpha and known depths."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.random import Generator
+
+from clsplat.arrays import Float32
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.reference.depth import depth_loss
+from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
+from clsplat.selftest.harness import CaseBench, cropped, planes_of
+from clsplat.selftest.scenes import evenly
+from clsplat.stages.blend import Blended
+from clsplat.stages.device_camera import padded_size
+from clsplat.stages.loss import Loss, loss
+from clsplat.stages.loss_terms import AlphaTerm, DepthTerm
+from clsplat.stages.target import target
+
+Size = tuple[int, int]
+
+ALPHA_LOSS_WEIGHT = 0.5
+"""Weight of the alpha loss."""
+MIN_LOSS_DIFFERENCE = 1e-6
+"""Difference of alphas or colours below which rounding decides the gradient's sign."""
+
+
+def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
+    """A render and a photograph (H, W, 3): noise, flat, dark, nearly the same."""
+    width, height = size
+    y = rng.random((height, width, 3)) ** rng.choice([0.2, 1.0, 8.0])
+    if rng.random() < 0.3:
+        y[:] = rng.random(3)
+    apart = 10 ** rng.uniform(-4, 0)
+    x = np.clip(y + rng.normal(0, apart, y.shape), 0, 1.5)
+    return x.astype(np.float32), np.clip(y, 0, 1).astype(np.float32)
+
+
+def _given(image: Float32, photograph: Float32, weight: float = 0.2) -> Inputs:
+    return Inputs(image=image, photograph=photograph, weight=weight)
+
+
+def _read(result: Loss, size: Size) -> Arrays:
+    planes = result.gradient.get()[:, : size[1]]  # the rows below are not written
+    value, squared = result.read()
+    return {
+        "planes": planes,
+        "gradient": cropped(planes, size)[:, :, :3],
+        "beside": planes[:, :, size[0] :],
+        "loss": np.array([value]),
+        "squared error": np.array([squared]),
+    }
+
+
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
+    image, photograph = (upload(device, planes_of(each)) for each in (given.image, given.photograph))
+    result = loss(device, work, image, photograph, *given.size, given.weight)
+    return lambda: _read(result, given.size)
+
+
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    x, y = given.wide("image", "photograph")
+    value, gradient = l1_dssim(x, y, given.weight)
+    squared = np.square(x - y).mean()
+    return {
+        # differences of pixels are exact to 1e-7 of the brightness, up to 1.5, or of a flat ripple
+        "gradient": Wanted(gradient, 1e-5),
+        "beside": exactly(np.zeros_like(got["beside"])),
+        "loss": Wanted(np.array([value]), 1e-6, max(1.0, value)),  # sums of partial sums
+        "squared error": Wanted(np.array([squared]), 1e-5, squared),
+    }
+
+
+LOSS_CASE = Case(
+    # below and over the window's 11, vectors of 16 columns, blocks of 32 columns or rows
+    sizes=((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65)),
+    random=lambda rng, size: _given(*random_pictures(rng, size), float(rng.choice([0.0, 0.2, 0.2]))),
+    launch=_launch,
+    twin=_twin,
+    frozen=lambda bench: [
+        _given(cropped(bench.blended.image.get(), bench.camera), cropped(bench.frozen.photograph, bench.camera))
+    ],
+    digested=("planes",),
+)
+
+
+def _blended(device: Device, size: Size, image: Float32, left: Float32, nearness: Float32 | None = None) -> Blended:
+    stops = np.full(padded_size(*size), -1, np.int32)
+    stops[: size[1], : size[0]] = 0
+    planes = (upload(device, planes_of(each[:, :, None])[0]) for each in (left, nearness) if each is not None)
+    return Blended(upload(device, planes_of(image)), next(planes), upload(device, stops), None, next(planes, None))
+
+
+def _random_masks(rng: Generator, size: Size) -> Inputs:
+    x, y = random_pictures(rng, size)
+    counts = (rng.random((*y.shape[:2], 1)) < rng.choice([0.0, 0.1, 0.5, 1.0])).astype(np.float32)
+    counts[0, 0] = 1
+    alpha = (rng.random(counts.shape) ** rng.choice([0.0, 1.0, 8.0])).astype(np.float32)
+    left = (rng.random(y.shape[:2]) ** rng.choice([0.0, 1.0, 8.0])).astype(np.float32)
+    photograph, background = np.concatenate([y, alpha, counts], axis=2), np.array([0.1, 0.5, 0.9], np.float32)
+    return Inputs(image=x, left=left, photograph=photograph, background=background)
+
+
+def _frozen_masks(bench: CaseBench) -> list[Inputs]:
+    width, height = bench.camera.width, bench.camera.height
+    photograph = evenly(35, (height, width, 5), 0.0, 1.0).astype(np.float32)
+    photograph[:, :, 4] = 1
+    photograph[: height // 2 + 3, : width // 2 + 5, 4] = 0
+    image, left = (cropped(planes.get(), bench.camera) for planes in (bench.blended.image, bench.blended.transmittance))
+    return [Inputs(image=image, left=left, photograph=photograph, background=bench.frozen.background)]
+
+
+def _launch_masks(device: Device, work: Workspace, given: Inputs) -> Read:
+    blended = _blended(device, given.size, given.image, given.left)
+    planes = target(device, work, given.photograph, upload(device, given.background), blended, alpha=True)
+    kept, terms = int(given.photograph[:, :, 4].sum()), (AlphaTerm(ALPHA_LOSS_WEIGHT),)
+    result = loss(device, work, blended.image, planes, *given.size, 0.2, kept=kept, blended=blended, terms=terms)
+
+    def read() -> Arrays:
+        by_left = cropped(result.gradient.get(), given.size)[:, :, 3]
+        masked = by_left[given.photograph[:, :, 4] == 0]
+        return {**_read(result, given.size), "gradient by transmittance": by_left, "masked pixels": masked}
+
+    return read
+
+
+def _twin_of_masks(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    seen, left, parts, background = given.wide("image", "left", "photograph", "background")
+    alpha, counts = parts[:, :, 3], parts[:, :, 4]
+    truth = parts[:, :, :3] * alpha[:, :, None] + (1 - alpha)[:, :, None] * background
+    value, gradient = masked_l1_dssim(seen, truth, counts)
+    of_alpha, by_left = alpha_loss(left, alpha, counts, ALPHA_LOSS_WEIGHT)
+    total, sure = value + of_alpha, (counts > 0) & (np.abs(seen - truth).min(axis=2) > MIN_LOSS_DIFFERENCE)
+    return {
+        # blending's gradient skips the pixels that do not count
+        "gradient": Wanted(gradient, 1e-5, sure=sure),
+        "gradient by transmittance": Wanted(by_left, 1e-6, sure=np.abs(1 - left - alpha) > MIN_LOSS_DIFFERENCE),
+        "masked pixels": exactly(np.zeros_like(got["masked pixels"])),
+        # windows under the mask cancel
+        "loss": Wanted(np.array([total]), 1e-6, max(1.0, total, counts.size / counts.sum())),
+    }
+
+
+MASKS_CASE = Case(
+    sizes=LOSS_CASE.sizes,
+    random=_random_masks,
+    launch=_launch_masks,
+    twin=_twin_of_masks,
+    frozen=_frozen_masks,
+    digested=("planes",),
+)
+
+
+def _random_depths(rng: Generator, size: Size) -> Inputs:
+    """Nearness of 1e-6 to 1e6 against known ones, of which some, all or none are known."""
+    image, _ = random_pictures(rng, size)
+    scale = 10 ** rng.uniform(-6, 6)
+    nearness, aims = (np.float32(scale) * rng.random(image.shape[:2]).astype(np.float32) for _ in range(2))
+    weights = rng.random(aims.shape) * (rng.random(aims.shape) < rng.choice([0.0, 0.1, 1.0]))
+    factor = float(10 ** rng.uniform(-3, 3) / scale)
+    return Inputs(image=image, nearness=nearness, aims=aims, weights=weights.astype(np.float32), factor=factor)
+
+
+def _launch_depth_loss(device: Device, work: Workspace, given: Inputs) -> Read:
+    size = given.size
+    blended = _blended(device, size, given.image, np.zeros_like(given.nearness), given.nearness)
+    known = DepthTerm(planes_of(np.stack([given.aims, given.weights], axis=2)), given.factor)
+    render = blended.image
+    result = loss(device, work, render, render, *size, 0.2, blended=blended, terms=(known,))
+    return lambda: {
+        "gradient": cropped(result.gradient.get(), size)[:, :, 3],
+        "loss": np.array([result.read()[0]]),
+    }
+
+
+def _twin_of_depth_loss(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+    nearness, aims, weights = given.wide("nearness", "aims", "weights")
+    value, gradient = depth_loss(nearness, aims, weights, given.factor)
+    return {
+        "gradient": Wanted(gradient, 3e-7, np.abs(gradient)),  # a product
+        "loss": Wanted(np.array([value]), 1e-6, max(1.0, value)),  # of equal pictures nothing else is lost
+    }
+
+
+DEPTH_LOSS_CASE = Case(
+    sizes=LOSS_CASE.sizes[:7],
+    random=_random_depths,
+    launch=_launch_depth_loss,
+    twin=_twin_of_depth_loss,
+)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every stage that stands by itself against its float64 twin: every driver and shape, at the seams of sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from _pytest.mark.structures import ParameterSet
+
+from clsplat.device.buffers import Workspace
+from clsplat.device.context import Device
+from clsplat.selftest.case import Wanted, faults
+from clsplat.selftest.cases.table import CASES
+
+DRAWS = 2
+"""Inputs of each size."""
+
+
+def cases(*, by_shape: bool) -> list[ParameterSet]:
+    """Names and sizes; beyond the first four sizes of a case only one in three is not slow."""
+    return [
+        pytest.param(name, size, id=f"{name}-{size}", marks=pytest.mark.slow if index > 3 and index % 3 else ())
+        for name, case in CASES.items()
+        for index, size in enumerate(case.sizes)
+        if case.by_shape == by_shape
+    ]
+
+
+def check(device: Device, name: str, size: object) -> None:
+    case, work = CASES[name], Workspace(device)
+    for draw in range(DRAWS):
+        rng = np.random.default_rng([draw, *np.atleast_1d(np.array(size)), *name.encode()])
+        assert faults(case.errors(device, case.random(rng, size), work)) == []
+
+
+@pytest.mark.parametrize(("name", "size"), cases(by_shape=True))
+def test_in_every_shape(shaped_device: Device, name: str, size: object) -> None:
+    check(shaped_device, name, size)
+
+
+@pytest.mark.parametrize(("name", "size"), cases(by_shape=False))
+def test_kernels_that_know_of_no_shape(device: Device, name: str, size: object) -> None:
+    check(device, name, size)
+
+
+def test_errors() -> None:
+    """Relative to a size or in norm; a missing value, or one of another shape, is no small error."""
+    values = np.array([1.0, 2.0, 0.0])
+    off = values + np.array([0.0, 1e-3, 1e-3])
+    assert Wanted(values, 0, 1.0).error_of(off) == pytest.approx(1e-3)
+    assert Wanted(values, 0, 1.0, sure=values == 1).error_of(off) == 0
+    assert Wanted(values, 0, np.abs(values) + 1e-3).error_of(off) == pytest.approx(1.0)
+    assert Wanted(values, 0).error_of(off) == pytest.approx(1e-3 * (2 / 5) ** 0.5)
+    assert Wanted(np.zeros(3), 0).error_of(off) == np.inf
+    assert Wanted(values, 0, 1.0).error_of(np.array([1.0, np.nan, 0.0])) == np.inf
+    assert Wanted(values, 0, 1.0).error_of(off[:2]) == np.inf
+    assert Wanted(values, 0, exact=True).error_of(off) == 2
