@@ -80,8 +80,8 @@ def test_what_is_said_is_the_fields_docstring_and_default(capsys: Capture, monke
     wide = " ".join(render_help(capsys, monkeypatch, 100).split())
     for part in (
         f"More are smoother, and take proportionally longer. (default: {SamplingConfig().samples})",
-        "--shutter-open FLOAT Opening of the shutter, in frames from the frame, such as -0.25",
-        "--eye both|left|right Render only one eye of --stereo, such as for a video. (default: both)",
+        "--shutter-open FLOAT Time at which the shutter opens, in frames relative to the frame, such as -0.25",
+        "--eye both|left|right Eyes of --stereo to render. One eye alone is useful for a video",
         "--rasterizer.transmittance-min FLOAT Leave out a Gaussian that would reduce",
         "-o, --output PATTERN File names of the images",
     ):

@@ -186,7 +186,7 @@ def test_a_checkpoint_that_is_damaged(
 
 def test_settings_that_make_no_sense(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     for config, text in (
-        (replace(CONFIG, batch=2), "--refine-poses: not supported with --batch 2, "),
+        (replace(CONFIG, batch=2), "--refine-poses: not supported with --batch 2 or several devices"),
         (replace(CONFIG, pose_reach=0.0), "--pose-reach 0.0: expected over 0"),
     ):
         with pytest.raises(InputError, match=text):
