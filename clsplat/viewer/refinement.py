@@ -18,7 +18,7 @@ REST_INTERVAL_RATIO = 3.0
 MOTION_PICTURE_SECONDS = 0.04
 """Time budget in seconds of a picture in motion, with encoding but without the browser's time."""
 MAX_UNPREPARED_EXACT_SECONDS = 0.6
-"""If an exact picture takes more seconds than this, intermediate pictures of growing size are shown first."""
+"""Maximum seconds of an exact picture that is not preceded by intermediate pictures of growing size."""
 MIN_MOTION_SCALE = 1 / 8
 """Smallest size of a picture relative to the page. A coarser picture would be unrecognisable."""
 PAGE_JPEG_QUALITIES = (60, 95)

@@ -131,7 +131,7 @@ class Viewing:
         return bool(job or turn)
 
     def _turn(self, version: int, share: Share | None) -> tuple[Viewer, Level] | None:
-        """Viewer that has waited longest among those for whom a picture is due, and the picture's level; else None."""
+        """Viewer that has waited longest among viewers with a picture due, and the picture's level; or None."""
         now = self.clock()
         if share is not None and not (share.ready(now, moving=True) or share.ready(now, moving=False)):
             return None
