@@ -114,7 +114,10 @@ def test_morton_order_interleaves_the_bits() -> None:
             lambda data: data.replace(b"element chunk 1\n", b"element chunk 0\n"),
             "has 0 chunks of 256 Gaussians, too few for 2",
         ),
-        (lambda data: data.replace(b"element chunk 1\n", b"element chunk 99999999999\n"), "bytes that its header promises"),
+        (
+            lambda data: data.replace(b"element chunk 1\n", b"element chunk 99999999999\n"),
+            "bytes that its header promises",
+        ),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 255"), "sh has 2 rows, expected 255"),
         (lambda data: data.replace(b"element vertex 2", b"element vertex 0"), "0 Gaussians"),
         (lambda data: data.replace(b"uint packed_scale", b"uint packed_other"), "vertex lacks packed_scale"),
