@@ -214,7 +214,7 @@ def test_resume_takes_the_runs_settings(folder: str, tmp_path: Path, pipeline: P
     assert config.warmup == (2, 4)
     capsys.readouterr()
     assert pipeline.main(["train", "--resume", "-o", run, "--seed", "4"]) == 2
-    assert "seed is 3 there" in error_line(capsys)
+    assert "seed is 3, a resumed run" in error_line(capsys)
 
 
 def test_ctrl_c_leaves_a_resumable_run(folder: str, tmp_path: Path, pipeline: Pipeline, capsys: Capture) -> None:

@@ -290,7 +290,7 @@ def test_a_model_is_changed_in_place_only_if_asked(model: Path, capsys: Capture)
     other = model.with_name("b.ply")
     random_gaussians(3).save(other)
     assert convert(model, other, "--merge", other) == 2
-    assert "b.ply: is read" in capsys.readouterr().err
+    assert "b.ply: is an input" in capsys.readouterr().err
     assert model.read_bytes() == before
     assert convert(model, model, "--prune-opacity", "0.5", "--overwrite") == 0
     assert 0 < len(Gaussians.load(model)) < 300
