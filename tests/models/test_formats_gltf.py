@@ -142,8 +142,7 @@ def test_nodes_that_no_gaussian_can_follow(tmp_path: Path, node: dict[str, Any])
     gltf.write(path, lopsided(5))
     changed(path, lambda asset: asset["nodes"][0].update(node))
     with pytest.raises(
-        InputError,
-        match=r"model\.gltf: .*(a transform that (is no|cannot be)|rotation of node 0 is 0)",
+        InputError, match=r"model\.gltf: .*(a transform that (is no|cannot be)|rotation of node 0 is 0)"
     ):
         gltf.read(path)
 

@@ -6,8 +6,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tracemalloc
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 
@@ -21,11 +23,29 @@ Capture = pytest.CaptureFixture[str]
 
 
 def warnings_of(work: Callable[[], object]) -> list[str]:
-    """The user's warnings of a piece of work."""
+    """The user's warnings of a piece of work, and NumPy's."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         work()
-    return [str(warning.message) for warning in caught if warning.category is UserWarning]
+    return [str(warning.message) for warning in caught if warning.category in {UserWarning, RuntimeWarning}]
+
+
+@contextmanager
+def no_warnings() -> Iterator[None]:
+    """Any warning is an error here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    """Bytes that Python and NumPy have at most during a piece of work."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
 
 
 def flags(config: object, prefix: str = "--") -> list[str]:
