@@ -18,7 +18,7 @@ import pytest
 import scenes
 from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
-from tiny import write_scene
+from tiny import run_steps, write_scene
 
 from clsplat.bench import plots
 from clsplat.bench import settings as tradeoff
@@ -287,8 +287,7 @@ def test_nothing_is_recorded_unless_asked(profiled: Device) -> None:
 def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
     subject = bench_subject.synthetic(200, 40, 30)
     trainer = bench_stages.trainer_of(subject, profiled, RasterizerConfig())
-    for _ in range(3):
-        trainer.train_step()
+    run_steps(3, trainer)
     after = trainer.gaussians()
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(after, name), getattr(subject.gaussians, name))

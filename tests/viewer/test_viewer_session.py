@@ -441,8 +441,7 @@ def test_keys_are_taken_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "numbers"),
-    [((0, 20), {}), ((1 << 20, 20), {}), ((32, 20), {"apart": math.nan}), ((32, 20), {"fps": 0.0})],
+    ("size", "numbers"), [((0, 20), {}), ((1 << 20, 20), {}), ((32, 20), {"apart": math.nan}), ((32, 20), {"fps": 0.0})]
 )
 def test_numbers_that_make_no_path(size: tuple[int, int], numbers: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected"):
