@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import json
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from calls import warnings_of
 from ring import FOCAL, HEIGHT, WIDTH, matrix_of, points, poses, write_cloud, write_colmap, write_transforms
 from scipy.spatial.transform import Rotation
 from tiny import write_scene
@@ -69,10 +69,7 @@ def test_those_of_a_colmap_model_too(tmp_path: Path) -> None:
 def test_intrinsics_that_no_lens_has_are_told(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
     folder = write_transforms(tmp_path, **keys)
     assert any(words in text for text in load_scene(folder).warnings)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        read_poses(folder / "transforms.json")
-    assert any(words in str(each.message) for each in caught)
+    assert any(words in text for text in warnings_of(lambda: read_poses(folder / "transforms.json")))
 
 
 @pytest.mark.parametrize(
