@@ -199,14 +199,7 @@ def test_ssim_is_that_of_scikit_image() -> None:
     y = rng.uniform(0, 1, (40, 33, 3))
     x = np.clip(y + rng.normal(0, 0.2, y.shape), 0, 1)
     _, wanted = structural_similarity(  # type: ignore[no-untyped-call]
-        x,
-        y,
-        data_range=1.0,
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
+        x, y, data_range=1.0, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
     )
     # inside, where scikit-image's reflected edge and our zeros are both out of reach
     inside = (slice(5, -5), slice(5, -5))
