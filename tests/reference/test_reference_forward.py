@@ -129,16 +129,9 @@ def test_stop_rule_excludes_the_gaussian_that_would_saturate() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("means", np.nan),
-        ("means", np.inf),
-        ("quaternions", 0.0),
-        ("quaternions", np.nan),
-        ("log_scales", np.inf),
-        ("log_scales", np.nan),
-        ("log_scales", 400.0),
-        ("opacity_logits", np.nan),
-        ("opacity_logits", -np.inf),
-        ("sh", np.nan),
+        *(("means", np.nan), ("means", np.inf), ("quaternions", 0.0), ("quaternions", np.nan)),
+        *(("log_scales", np.inf), ("log_scales", np.nan), ("log_scales", 400.0), ("opacity_logits", np.nan)),
+        *(("opacity_logits", -np.inf), ("sh", np.nan)),
     ],
 )
 def test_poison_culls_its_own_gaussian_only(field: str, value: float) -> None:

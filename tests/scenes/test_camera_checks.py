@@ -291,19 +291,9 @@ def test_the_verbs_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     write_transforms(tmp_path / "wrong", matrices=WRONG["inverted"][0], cx=0.0, cy=0.0)
     wrong = tmp_path / "wrong"
     for words in (
-        [
-            "train",
-            str(wrong),
-            "-o",
-            str(tmp_path / "other"),
-            "--iterations",
-            "1",
-            "--random-points",
-            "50",
-            "--no-report",
-        ],
-        ["eval", str(run / "model.ply"), "--scene", str(wrong)],
-        ["render", str(run / "model.ply"), "--cameras", str(wrong), "-o", str(tmp_path / "out" / "{name}.png")],
+        f"train {wrong} -o {tmp_path}/other --iterations 1 --random-points 50 --no-report".split(),
+        f"eval {run}/model.ply --scene {wrong}".split(),
+        f"render {run}/model.ply --cameras {wrong} -o {tmp_path}/out/{{name}}.png".split(),
     ):
         capsys.readouterr()
         assert main(words) == 0

@@ -249,14 +249,14 @@ def test_bad_folders(tmp_path, photos):
     shutil.copy(photos / "view_00.jpg", tmp_path / "few")
     with pytest.raises(InputError, match=r"few: only 1 photo\(s\) found, expected at least 3"):
         sfm.reconstruct(tmp_path / "few", tmp_path / "out")
-    with pytest.raises(InputError, match="is not empty and not a result of sfm"):
-        sfm.reconstruct(photos, tmp_path)
-    with pytest.raises(InputError, match="is a file"):
-        sfm.reconstruct(photos, tmp_path / "few/view_00.jpg")
-    with pytest.raises(InputError, match="expected auto, exhaustive or sequential"):
-        sfm.reconstruct(photos, tmp_path / "out", sfm.SfmSettings(matching="nearest"))
-    with pytest.raises(InputError, match="camera model 'LENS'"):
-        sfm.reconstruct(photos, tmp_path / "out", sfm.SfmSettings(camera_model="LENS"))
+    for output, settings, told in [
+        (tmp_path, {}, "is not empty and not a result of sfm"),
+        (tmp_path / "few/view_00.jpg", {}, "is a file"),
+        (tmp_path / "out", {"matching": "nearest"}, "expected auto, exhaustive or sequential"),
+        (tmp_path / "out", {"camera_model": "LENS"}, "camera model 'LENS'"),
+    ]:
+        with pytest.raises(InputError, match=told):
+            sfm.reconstruct(photos, output, sfm.SfmSettings(**settings))
     assert not (tmp_path / "out").exists()
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -66,10 +67,14 @@ def train(scene: Path, run: Path, config: TrainConfig, *more: str) -> int:
     return main(["train", str(scene), "-o", str(run), *flags(config), *more])
 
 
+def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A Python process that is given these words, once it has ended; options: of subprocess.run."""
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "clsplat", *arguments], capture_output=True, text=True, timeout=120, check=False
-    )
+    return python("-m", "clsplat", *arguments, timeout=120)
 
 
 def error_line(capsys: Capture) -> str:
