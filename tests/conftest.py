@@ -107,32 +107,38 @@ def shaped_device(request: pytest.FixtureRequest) -> Device:
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny scene on disk; not to be changed."""
     return write_scene(tmp_path_factory.mktemp("cli") / "scene")
 
 
 @pytest.fixture(scope="session")
-def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(scene_folder: Path) -> Path:
+    """That scene; where tests of training are, it is a scene that is read."""
+    return scene_folder
+
+
+@pytest.fixture(scope="session")
+def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of CONFIG by the command line; not to be changed."""
     run = tmp_path_factory.mktemp("trained") / "run"
-    assert train(scene, run, CONFIG) == 0
+    assert train(scene_folder, run, CONFIG) == 0
     return run
 
 
 @pytest.fixture(scope="session")
-def reported(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reported(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run with everything that a report shows; not to be changed."""
     run = tmp_path_factory.mktemp("reported") / "a run"
-    assert train(scene, run, short(stages_every=10, eval_at=(10, 30))) == 0
+    assert train(scene_folder, run, short(stages_every=10, eval_at=(10, 30))) == 0
     return run
 
 
 @pytest.fixture(scope="session")
-def begun(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def begun(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of FEW by the command line; not to be changed."""
     run = tmp_path_factory.mktemp("begun") / "run"
-    assert train(scene, run, FEW) == 0
+    assert train(scene_folder, run, FEW) == 0
     return run
 
 

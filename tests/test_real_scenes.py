@@ -25,10 +25,7 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 
 BACKGROUND = (0.1, 0.2, 0.3)
-CAMERAS = {
-    "far": scenes.straight_camera(240, 160, 220.0),
-    "oblique": scenes.tilted_camera(200, 150, 120.0),
-}
+CAMERAS = {"far": scenes.straight_camera(240, 160, 220.0), "oblique": scenes.tilted_camera(200, 150, 120.0)}
 """In the middle of the model's near side, looking into it; both have most of the Gaussians before them."""
 
 

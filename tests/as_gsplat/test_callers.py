@@ -88,10 +88,7 @@ def test_the_parts_take_numbers_in_other_guises() -> None:
 
 @pytest.mark.parametrize(
     ("channels", "mode"),
-    [
-        (768, "RGB+ED"),
-        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((513, "RGB"), (1024, "RGB"))),
-    ],
+    [(768, "RGB+ED"), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((513, "RGB"), (1024, "RGB")))],
 )
 def test_any_number_of_channels(channels: int, mode: str) -> None:
     """CLIP has 768, DINOv2 1024: what calls with a third of them give, bit for bit, by colours too; by backgrounds to

@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from calls import python
 from needs import require
 
 require("torch")
@@ -29,14 +28,7 @@ def run(code: str, *paths: Path, without: str = "") -> str:
     """Output of a program; `without` hides a package from it."""
     hide = f"import sys; sys.modules[{without!r}] = None\n" if without else ""
     path = os.pathsep.join([*map(str, paths), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, "-c", hide + RENDER + code],
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    done = python("-c", hide + RENDER + code, env={**os.environ, "PYTHONPATH": path}, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -168,12 +160,6 @@ except Exception as error:
 
 
 def test_without_torch_the_error_says_what_to_install() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", "import sys; sys.modules['torch'] = None; import clsplat.torch"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    code = "import sys; sys.modules['torch'] = None; import clsplat.torch"
+    done = python("-c", code, env={**os.environ, "PYTHONPATH": str(ROOT)}, timeout=300)
     assert "ModuleNotFoundError: clsplat.torch needs PyTorch: pip install 'clsplat[torch]'" in done.stderr

@@ -40,6 +40,11 @@ def model(count: int) -> tuple[torch.nn.ParameterDict, dict[str, torch.optim.Opt
     return params, optimisers, {"viewmats": floats["viewmats"], "Ks": floats["Ks"], "width": 37, "height": 29}
 
 
+def drawn(params: torch.nn.ParameterDict, **how: Any) -> Any:
+    values = {"scales": torch.exp(params["scales"]), "opacities": torch.sigmoid(params["opacities"])}
+    return rasterization(**{name: params[name] for name in ("means", "quats", "colors")}, **values, **how)
+
+
 def run(strategy: Any, packed: bool, steps: int, **extra: Any) -> tuple[list[int], list[float]]:
     """Numbers of Gaussians and losses of a short training, written as in gsplat's documentation."""
     torch.manual_seed(0)
@@ -49,16 +54,7 @@ def run(strategy: Any, packed: bool, steps: int, **extra: Any) -> tuple[list[int
     state = strategy.initialize_state()
     counts, losses = [], []
     for step in range(steps):
-        images, _, info = rasterization(
-            means=params["means"],
-            quats=params["quats"],
-            scales=torch.exp(params["scales"]),
-            opacities=torch.sigmoid(params["opacities"]),
-            colors=params["colors"],
-            packed=packed,
-            absgrad=getattr(strategy, "absgrad", False),
-            **cameras,
-        )
+        images, _, info = drawn(params, packed=packed, absgrad=getattr(strategy, "absgrad", False), **cameras)
         strategy.step_pre_backward(params, optimisers, state, step, info)
         loss = (images - target).abs().mean()
         loss.backward()
@@ -82,14 +78,8 @@ def run(strategy: Any, packed: bool, steps: int, **extra: Any) -> tuple[list[int
     ],
 )
 def test_the_default_strategy_clones_splits_and_prunes(packed: bool, absgrad: bool) -> None:
-    strategy = DefaultStrategy(
-        refine_start_iter=5,
-        refine_every=5,
-        reset_every=15,
-        grow_grad2d=1e-4,
-        absgrad=absgrad,
-        refine_scale2d_stop_iter=20,
-    )
+    steps = {"refine_start_iter": 5, "refine_every": 5, "reset_every": 15, "refine_scale2d_stop_iter": 20}
+    strategy = DefaultStrategy(grow_grad2d=1e-4, absgrad=absgrad, **steps)
     counts, losses = run(strategy, packed, 24)
     assert len(set(counts)) > 2
     assert max(counts) > 30
@@ -118,15 +108,7 @@ def test_gaussians_that_are_added_share_the_picture_of_those_that_they_join() ->
 
     def picture() -> torch.Tensor:
         with torch.no_grad():
-            return rasterization(
-                params["means"],
-                params["quats"],
-                torch.exp(params["scales"]),
-                torch.sigmoid(params["opacities"]),
-                params["colors"],
-                **cameras,
-                eps2d=0.0,
-            )[0]
+            return drawn(params, **cameras, eps2d=0.0)[0]
 
     before, strategy = picture(), MCMCStrategy(cap_max=45, min_opacity=0.0)
     operations = pytest.importorskip("gsplat.strategy.ops")

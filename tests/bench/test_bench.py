@@ -6,7 +6,6 @@ from __future__ import annotations
 import html
 import json
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
@@ -16,9 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from calls import python
 from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
-from tiny import write_scene
+from tiny import run_steps, write_scene
 
 from clsplat.bench import plots
 from clsplat.bench import settings as tradeoff
@@ -37,6 +37,7 @@ from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import count_pairs
 from clsplat.stages.peak import Limits, measure_limits
 
+LIMITS = Limits(1e9, 5e8, 1e10, 8, 1)
 SMALL = ["--gaussians", "400", "--size", "70x50", "--repeat", "1"]
 FRAME = {"project", "duplicate", "ranges", "blend"}
 STEP = {"target", "loss", "blend_grad", "project_grad", "statistics"}
@@ -58,14 +59,8 @@ def profiled(default_device: Device) -> Device:
 
 def counted(pipeline: Pipeline) -> tuple[int, int]:
     frame, rasterizer = pipeline.frame, pipeline.rasterizer
-    return count_pairs(
-        rasterizer.device,
-        rasterizer.work,
-        frame.listed.lists,
-        frame.projected.splats,
-        frame.background,
-        pipeline.camera,
-    )
+    lists, splats = frame.listed.lists, frame.projected.splats
+    return count_pairs(rasterizer.device, rasterizer.work, lists, splats, frame.background, pipeline.camera)
 
 
 def first_cell(low: float, size: float, count: int) -> int:
@@ -206,9 +201,7 @@ def test_limits_are_finite_in_every_shape(shaped_device: Device) -> None:
 @pytest.mark.parametrize("shape", [None, (1, 64)], ids=str)
 def test_stages(profiled: Device, shape: tuple[int, int] | None) -> None:
     device = profiled.with_shape(lanes=shape[0], items=shape[1]) if shape else profiled
-    result = bench_stages.bench(
-        bench_subject.synthetic(300, 50, 40), device, repeat=2, limits=Limits(1e9, 5e8, 1e10, 8, 1)
-    )
+    result = bench_stages.bench(bench_subject.synthetic(300, 50, 40), device, repeat=2, limits=LIMITS)
     assert set(result["stages"]) >= FRAME | STEP
     assert result["timer"] == "events"
     for name in FRAME | STEP:
@@ -233,20 +226,11 @@ MOST_LAUNCHES = 40
 """Kernels of a training step, in a GPU's shape and in a CPU's."""
 
 
-@pytest.mark.parametrize(
-    ("shape", "launches"),
-    [pytest.param((1, 64), MOST_LAUNCHES, marks=pytest.mark.slow), (None, MOST_LAUNCHES)],
-    ids=str,
-)
+@pytest.mark.parametrize("shape", [pytest.param((1, 64), marks=pytest.mark.slow), None], ids=str)
 @pytest.mark.parametrize("count", quick([300, 6000], 6000))
 @pytest.mark.parametrize("by_capacity", quick([False, True], False))
 def test_what_a_step_gives_the_queue(
-    device: Device,
-    monkeypatch: pytest.MonkeyPatch,
-    shape: tuple[int, int] | None,
-    launches: int,
-    count: int,
-    by_capacity: bool,
+    device: Device, monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int] | None, count: int, by_capacity: bool
 ) -> None:
     """A step waits for one number, by capacity for none, and for no copy to the device, whichever sort its size asks
     for."""
@@ -265,13 +249,11 @@ def test_what_a_step_gives_the_queue(
         calls = bench_stages.calls_of(device, work)
         assert calls.blocking_reads <= (0 if by_capacity and work == trainer.train_step else 1)
         assert calls.blocking_writes == 0
-        assert 0 < calls.launches <= launches
+        assert 0 < calls.launches <= MOST_LAUNCHES
 
 
 def test_wall_time_where_events_have_none(default_device: Device) -> None:
-    result = bench_stages.bench(
-        bench_subject.synthetic(200, 40, 30), default_device, repeat=1, limits=Limits(1e9, 5e8, 1e10, 8, 1)
-    )
+    result = bench_stages.bench(bench_subject.synthetic(200, 40, 30), default_device, repeat=1, limits=LIMITS)
     assert result["timer"] == "wall"
     assert all(result["stages"][name]["ms"] == result["stages"][name]["wall_ms"] for name in FRAME | STEP)
 
@@ -287,8 +269,7 @@ def test_nothing_is_recorded_unless_asked(profiled: Device) -> None:
 def test_measuring_leaves_the_model_as_it_is(profiled: Device) -> None:
     subject = bench_subject.synthetic(200, 40, 30)
     trainer = bench_stages.trainer_of(subject, profiled, RasterizerConfig())
-    for _ in range(3):
-        trainer.train_step()
+    run_steps(3, trainer)
     after = trainer.gaussians()
     for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
         np.testing.assert_array_equal(getattr(after, name), getattr(subject.gaussians, name))
@@ -420,11 +401,10 @@ def test_exact_switches_together(profiled: Device, monkeypatch: pytest.MonkeyPat
 @pytest.mark.usefixtures("_quick")
 def test_a_held_model_is_what_frames_are_measured_of(profiled: Device) -> None:
     subject = bench_subject.synthetic(300, 50, 40)
-    limits = Limits(1e9, 5e8, 1e10, 8, 1)
     sizes = []
     for storage in ("float", "half"):
         config = RasterizerConfig(sh_storage=storage)
-        result = bench_stages.bench(subject, profiled, config, repeat=1, limits=limits)
+        result = bench_stages.bench(subject, profiled, config, repeat=1, limits=LIMITS)
         sizes.append(result["stages"]["project"]["bytes"])
     assert sizes[0] - sizes[1] == 300 * 90
 
@@ -457,14 +437,8 @@ def test_what_approximates() -> None:
 def a_point(name: str, ms: float, psnr: float, error: float, *, approximate: bool = True) -> dict[str, object]:
     """As `compare` has them, with steps of twice the time."""
     against = {"psnr": psnr, "max_abs": error}
-    return {
-        "name": name,
-        "approximate": approximate,
-        "frame_ms": ms,
-        "iteration_ms": 2 * ms,
-        "against_exact": against,
-        **against,
-    }
+    settings = {"name": name, "approximate": approximate, "frame_ms": ms, "iteration_ms": 2 * ms}
+    return {**settings, "against_exact": against, **against}
 
 
 @pytest.fixture
@@ -664,15 +638,11 @@ def test_plot_of_training(tmp_path: Path) -> None:
     assert main(["train", str(scene), "-o", str(run), "--iterations", "4", "--eval-at", "2"]) == 0
     tool = Path(__file__).parents[2] / "tools" / "bench" / "plot_training.py"
     output = tmp_path / "training.svg"
-    done = subprocess.run(
-        [sys.executable, str(tool), str(run), "-o", str(output)], capture_output=True, text=True, check=False
-    )
+    done = python(tool, run, "-o", output)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("run  ")
     assert done.stdout.count(" dB") == 2
     assert "run" in output.read_text()
-    wrong = subprocess.run(
-        [sys.executable, str(tool), str(scene), "-o", str(output)], capture_output=True, text=True, check=False
-    )
+    wrong = python(tool, scene, "-o", output)
     assert wrong.returncode == 2
     assert wrong.stderr.count("\n") == 1

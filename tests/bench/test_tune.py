@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +11,7 @@ from typing import Any
 
 import pyopencl as cl
 import pytest
+from calls import no_warnings
 from pipeline import shaped
 
 from clsplat.bench import shapes as tune
@@ -182,8 +182,7 @@ def test_a_home_that_is_no_folder_or_cannot_be_read(
 ) -> None:
     device = default_device.cl_device
     (tmp_path / "file").touch()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
         assert shape_of(device)[0] == default_shape(device)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -144,19 +144,9 @@ def transforms(scene: Path, spoil: Callable[[dict[str, Any]], object]) -> str:
 
 
 BAD_SCENES = (
-    no_such_folder,
-    nothing_in_it,
-    no_pictures,
-    pictures_are_missing,
-    truncated_images,
-    corrupt_images,
-    unknown_camera_model,
-    unknown_camera_number,
-    a_picture_is_cut,
-    a_picture_is_text,
-    without_frames,
-    without_intrinsics,
-    without_a_pose,
+    *(no_such_folder, nothing_in_it, no_pictures, pictures_are_missing, truncated_images),
+    *(corrupt_images, unknown_camera_model, unknown_camera_number, a_picture_is_cut),
+    *(a_picture_is_text, without_frames, without_intrinsics, without_a_pose),
 )
 
 

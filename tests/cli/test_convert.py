@@ -35,6 +35,12 @@ def convert(*arguments: object) -> int:
     return main(["convert", *map(str, arguments)])
 
 
+def told(capsys: Capture, *arguments: object) -> Any:
+    """The answer of a call to --json."""
+    assert main([*map(str, arguments), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
 @pytest.mark.smoke
 def test_what_was_lost_is_said(model: Path, capsys: Capture) -> None:
     target = model.with_suffix(".splat")
@@ -44,8 +50,7 @@ def test_what_was_lost_is_said(model: Path, capsys: Capture) -> None:
     assert f"{target}: splat, 300 Gaussians of SH degree 0, 9,600 bytes" in said
     for name in ("position", "scale", "rotation", "opacity", "colour", "SH"):
         assert f"\n{name} " in said
-    assert convert(model, target, "--json", "--overwrite") == 0
-    found = json.loads(capsys.readouterr().out)
+    found = told(capsys, "convert", model, target, "--overwrite")
     whole, read = Gaussians.load(model), Gaussians.load(target)
     errors = found["errors"]
     assert errors["position"]["largest"] == 0
@@ -61,8 +66,7 @@ def test_what_was_lost_is_said(model: Path, capsys: Capture) -> None:
 
 def test_rows_in_another_order_are_compared_with_their_own(model: Path, capsys: Capture) -> None:
     target = model.with_suffix(".compressed.ply")
-    assert convert(model, target, "--json") == 0
-    errors = json.loads(capsys.readouterr().out)["errors"]
+    errors = told(capsys, "convert", model, target)["errors"]
     assert 0 < errors["position_relative"]["largest"] < 1e-3  # 10 bits of two chunks of the model
     assert 0 < errors["rotation"]["largest"] < 0.5  # 10 bits
 
@@ -117,8 +121,7 @@ def test_bands_that_are_zero_are_not_rounded(tmp_path: Path, capsys: Capture) ->
     source = tmp_path / "model.ply"
     model.save(source)
     for name, degree in (("a.compressed.ply", 1), ("a.spz", 1), ("a.sog", 1), ("a.glb", 3), ("b.ply", 3)):
-        assert convert(source, tmp_path / name, "--json") == 0
-        assert json.loads(capsys.readouterr().out)["target"]["sh_degree"] == degree
+        assert told(capsys, "convert", source, tmp_path / name)["target"]["sh_degree"] == degree
     model.sh[7, 15, 2] = 1e-3
     model.save(source)
     assert edit.without_empty_bands(model) is model
@@ -132,8 +135,7 @@ def test_bits_of_spz_are_chosen(tmp_path: Path, capsys: Capture) -> None:
     lopsided().save(model)
     for bits in ("8", "6", "6,6", "5,4", "2", "1,8"):
         target = model.with_name(f"{bits}.spz")
-        assert convert(model, target, "--sh-bits", bits, "--json") == 0
-        result = json.loads(capsys.readouterr().out)
+        result = told(capsys, "convert", model, target, "--sh-bits", bits)
         found[bits] = result["target"]["bytes"], result["errors"]["sh"]["largest"]
     assert found["6"] == found["6,6"]
     for more, fewer in (("8", "6"), ("6", "5,4"), ("5,4", "2")):
@@ -178,8 +180,7 @@ def test_pruning_by_contribution_leaves_what_the_cameras_see(scene: Path, tmp_pa
     both = edit.merge([seen, unseen])
     source, target = tmp_path / "both.ply", tmp_path / "pruned.ply"
     both.save(source)
-    assert convert(source, target, "--prune-contribution", 0.01, "--cameras", scene, "--scene", scene, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+    found = told(capsys, "convert", source, target, "--prune-contribution", 0.01, "--cameras", scene, "--scene", scene)
     kept = Gaussians.load(target)
     assert 30 <= len(kept) <= len(seen)
     assert np.abs(kept.means).max() < 50
@@ -205,8 +206,7 @@ def test_psnr_before_and_after_with_cameras_that_move_along(scene: Path, tmp_pat
     source, target = tmp_path / "model.ply", tmp_path / "moved.compressed.ply"
     hidden_model().save(source)
     moved = ["--transform=0,-1,0,4, 0,0,1,5, -1,0,0,6, 0,0,0,1", "--scale", 3]
-    assert convert(source, target, *moved, "--scene", scene, "--json") == 0
-    found = json.loads(capsys.readouterr().out)["scene"]
+    found = told(capsys, "convert", source, target, *moved, "--scene", scene)["scene"]
     assert len(found["views"]) == 2, "the held-out ones"
     assert found["before"] > 45, "the pictures are of this model, in 8 bits"
     assert found["between"] > 40
@@ -316,8 +316,7 @@ def test_info_of_a_model_of_nothing(model: Path, capsys: Capture) -> None:
     said = capsys.readouterr().out
     assert "\nGaussians     0\n" in said
     assert "\nSH degree     2, zero beyond 0\n" in said
-    assert main(["info", str(model), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["gaussians"] == 0
+    assert told(capsys, "info", model)["gaussians"] == 0
     assert convert(model, model.with_name("b.ply")) == 2
     assert "has 0 Gaussians" in capsys.readouterr().err
 
@@ -360,8 +359,7 @@ def test_info_of_every_format(suffix: str, model: Path, capsys: Capture) -> None
     target = model.with_name(f"other{suffix}")
     assert convert(model, target) == 0
     capsys.readouterr()
-    assert main(["info", str(target), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = told(capsys, "info", target)
     whole = Gaussians.load(target)
     assert found["format"] == formats.format_of(target).name
     assert found["gaussians"] == 300
@@ -440,8 +438,7 @@ def test_values_that_are_activated_already(model: Path, which: str, capsys: Capt
 
 @pytest.mark.smoke
 def test_a_run_is_its_model(trained: Path, tmp_path: Path, capsys: Capture) -> None:
-    assert main(["info", str(trained), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["path"] == str(trained / "model.ply")
+    assert told(capsys, "info", trained)["path"] == str(trained / "model.ply")
     assert convert(trained, tmp_path / "a.splat") == 0
     assert len(Gaussians.load(tmp_path / "a.splat")) == len(Gaussians.load(trained / "model.ply"))
 
@@ -461,8 +458,7 @@ def test_a_folder_of_pictures_is_a_model(trained: Path, scene: Path, tmp_path: P
     assert convert(trained, folder / "meta.json") == 0
     assert convert(folder, tmp_path / "a.ply") == 0
     capsys.readouterr()
-    assert main(["info", str(folder), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["path"] == str(folder / "meta.json")
+    assert told(capsys, "info", folder)["path"] == str(folder / "meta.json")
     for given in (folder, tmp_path / "a.ply"):
         assert main(["eval", str(given), "--scene", str(scene), "--json"]) == 0
     found = capsys.readouterr().out.split("\n}\n")
@@ -506,8 +502,7 @@ def test_a_near_plane_that_a_format_does_not_keep(model: Path, tmp_path: Path, c
     gaussians = Gaussians.load(model)
     gaussians.near = 0.2
     gaussians.save(model)
-    assert main(["info", str(model), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["near"] == 0.2
+    assert told(capsys, "info", model)["near"] == 0.2
     assert main(["info", str(model)]) == 0
     assert "\nnear plane    0.2\n" in capsys.readouterr().out
     assert convert(model, tmp_path / "a.ply") == 0
@@ -524,8 +519,7 @@ def test_what_mip_splatting_adds(model: Path, capsys: Capture) -> None:
     model.write_bytes(head + b"property float filter_3D\nend_header\n" + rows.tobytes())
     with pytest.warns(UserWarning, match=r"model\.ply: filter_3D, mip-splatting's filter, is ignored; fuse it first"):
         assert len(Gaussians.load(model)) == 300
-    assert main(["info", str(model), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["ignored"] == ["filter_3D"]
+    assert told(capsys, "info", model)["ignored"] == ["filter_3D"]
 
 
 def test_pictures_of_sh_that_are_no_more(tmp_path: Path) -> None:

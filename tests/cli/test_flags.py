@@ -156,18 +156,8 @@ def test_a_number_that_is_none_is_said_in_few_words(capsys: Capture) -> None:
 )
 def test_one_scale_is_one_number(steps: str, found: str, tmp_path: Path, capsys: Capture) -> None:
     random_gaussians(5).save(tmp_path / "model.ply")
-    call = [
-        "render",
-        str(tmp_path / "model.ply"),
-        "-o",
-        "x.png",
-        "--path",
-        "turntable",
-        "--dry-run",
-        "--transform",
-        steps,
-    ]
-    assert main(call) == 2
+    call = f"render {tmp_path}/model.ply -o x.png --path turntable --dry-run --transform"
+    assert main([*call.split(), steps]) == 2
     wanted = f"expected one number, the same scale in all directions, found '{found}'"
     assert error_line(capsys) == f"clsplat: error: --transform {steps}: {wanted}"
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, python
 from quick import quick
 from tiny import short, write_scene
 
@@ -148,7 +148,7 @@ def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
         "from clsplat.__main__ import main\n"
         "sys.exit(main())\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = python("-c", code, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
 
 
@@ -178,7 +178,7 @@ def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
         "train.run = work\n"
         "sys.exit(main())\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = python("-c", code, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
 
 

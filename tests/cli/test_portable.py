@@ -353,11 +353,7 @@ def run_clsplat(folder: Path, environment: dict[str, str], *arguments: str) -> s
 
 
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-LOCALES = {
-    "C": {"LC_ALL": "C"},
-    "C without Python's own help": ASCII,
-    "cp1252": {"PYTHONIOENCODING": "cp1252"},
-}
+LOCALES = {"C": {"LC_ALL": "C"}, "C without Python's own help": ASCII, "cp1252": {"PYTHONIOENCODING": "cp1252"}}
 
 
 @pytest.mark.slow

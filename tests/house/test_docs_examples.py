@@ -8,11 +8,10 @@ import doctest
 import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from calls import python
 from test_docs import PAGES, ROOT
 
 import clsplat
@@ -56,15 +55,8 @@ def test_the_block_of_the_readme_runs() -> None:
 @pytest.mark.parametrize("name", LIMITS)
 def test_an_example_does_what_it_says(name: str, tmp_path: Path) -> None:
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    done = subprocess.run(
-        [sys.executable, str(ROOT / f"docs/examples/{name}.py")],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = python(ROOT / f"docs/examples/{name}.py", cwd=tmp_path, env=environment, timeout=240)
     assert done.returncode == 0, done.stderr
     number = float(re.findall(r"[\d.]+", done.stdout)[0])
     assert number < LIMITS[name] if name in SMALLER else number > LIMITS[name], done.stdout

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import rooms
+from calls import python
 from needs import require
 
 from clsplat.device.source import kernel_root
@@ -66,9 +67,7 @@ def test_kernels_are_found_from_a_wheel(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path)
     # -I: neither the checkout in the working folder nor PYTHONPATH; site-packages still has what clsplat needs
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {FOUND}"
-    found = subprocess.run(
-        [sys.executable, "-I", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    found = python("-I", "-c", code, cwd=tmp_path)
     assert found.returncode == 0, found.stderr
     assert Path(found.stdout.strip()) == tmp_path / "clsplat/kernels"
 

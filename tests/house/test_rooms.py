@@ -7,10 +7,10 @@ import ast
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from calls import python
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLIC = {"clsplat/__init__.py", "clsplat/__main__.py", "clsplat/gaussians.py"}
@@ -21,17 +21,8 @@ def lint(root: Path) -> subprocess.CompletedProcess[str]:
     """The contracts, held against the package in `root`."""
     code = "import sys; from importlinter.cli import lint_imports_command; sys.exit(lint_imports_command())"
     path = os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-c", code, "--config", str(root / "pyproject.toml"), "--no-cache"]
-    return subprocess.run(
-        command,
-        cwd=root,
-        env={**os.environ, "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        timeout=120,
-        check=False,
-    )
+    words, environment = ("--config", root / "pyproject.toml", "--no-cache"), {**os.environ, "PYTHONPATH": path}
+    return python("-c", code, *words, cwd=root, env=environment, encoding="utf-8", timeout=120)
 
 
 @pytest.fixture(scope="module")

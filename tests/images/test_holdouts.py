@@ -77,10 +77,7 @@ def test_what_is_wrong(tmp_path: Path) -> None:
     cases = [
         (tmp_path / "none.exr", "none.exr: no such holdout, expected a depth or deep EXR for each frame"),
         (write_flat(tmp_path / "s.exr", {"Z": np.ones((4, 4))}), "s.exr: holds a frame of 4x4, expected 3x2"),
-        (
-            write_flat(tmp_path / "c.exr", {"Y": DEPTH}),
-            "c.exr: has the channels Y, expected Z; name its depths with",
-        ),
+        (write_flat(tmp_path / "c.exr", {"Y": DEPTH}), "c.exr: has the channels Y, expected Z; name its depths with"),
         (write_samples(tmp_path / "a.exr", SIZE, [[[1.0]]] * 6, ("Z",)), "a.exr: is a deep EXR without A, expected"),
         (write_flat(tmp_path / "z.tif", {"Z": DEPTH}), "z.tif: is no EXR, expected a depth or deep EXR"),
     ]

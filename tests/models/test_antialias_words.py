@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from calls import no_warnings
 from models import random_gaussians
 
 from clsplat.gaussians import Gaussians
@@ -89,8 +90,7 @@ def test_comments_of_plys(tmp_path: Path, name: str) -> None:
         (["Not trained antialiased by X", "AntiAliased 0"], False),
     ):
         formats.save(path, model, comments=lines)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with no_warnings():
             assert model_info(path)["antialiased"] == wanted, lines
             read = Gaussians.load(path)
         assert read.antialiased == wanted

@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import json
 import struct
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture
+from calls import Capture, no_warnings, warnings_of
 from models import random_gaussians
 from splats import lopsided
 
@@ -24,13 +23,6 @@ from clsplat.models.info import model_info
 
 RNG = np.random.default_rng(7)
 LOGS = RNG.normal(-3, 1, (3000, 3)).astype(np.float32)
-
-
-def texts_of(path: Path) -> list[str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        formats.load(path)
-    return [str(each.message) for each in caught]
 
 
 def trained(highest: float) -> np.ndarray:
@@ -73,7 +65,7 @@ def test_levels_of_any_white(tmp_path: Path, white: int, dark: bool) -> None:
     levels = np.rint(RNG.uniform(0, (0.66 if dark else 1) * white, 400))
     model.opacity_logits = levels.astype(np.float32)
     model.save(path)
-    (text,) = texts_of(path)
+    (text,) = warnings_of(lambda: formats.load(path))
     assert ("as percentages do" if white == 100 else "as levels do") in text
     right = formats.load(path, activated="opacities")
     np.testing.assert_allclose(values.opacities(right.opacity_logits), levels / white, atol=1e-6)  # float32's
@@ -128,7 +120,7 @@ def test_numbers_are_those_of_the_file(tmp_path: Path) -> None:
     """Though Gaussians before are left out; one that is left out has no rotation either, and does not count."""
     path = tmp_path / "model.ply"
     with_bad_rows(path)
-    out, turned = texts_of(path)
+    out, turned = warnings_of(lambda: formats.load(path))
     assert "2 of 20 Gaussians have a value that is not finite, the first is Gaussian 2 with a position" in out
     assert "1 of 20 Gaussians has a quaternion of 0, the first is Gaussian 3; it is drawn unrotated" in turned
     for which, said in (
@@ -158,8 +150,7 @@ def test_info_of_scales_that_no_float_holds(tmp_path: Path, huge: float) -> None
     path, model = tmp_path / "model.ply", random_gaussians(200, 0)
     model.log_scales[:8, 1] = huge
     model.save(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         scale = model_info(path)["scale"]
     assert all(np.isfinite(value) for value in scale.values())
     assert scale["p100"] > 1e300

@@ -142,8 +142,7 @@ def test_nodes_that_no_gaussian_can_follow(tmp_path: Path, node: dict[str, Any])
     gltf.write(path, lopsided(5))
     changed(path, lambda asset: asset["nodes"][0].update(node))
     with pytest.raises(
-        InputError,
-        match=r"model\.gltf: .*(a transform that (is no|cannot be)|rotation of node 0 is 0)",
+        InputError, match=r"model\.gltf: .*(a transform that (is no|cannot be)|rotation of node 0 is 0)"
     ):
         gltf.read(path)
 
@@ -167,12 +166,9 @@ def test_several_primitives_are_one_model(tmp_path: Path) -> None:
     def double(asset: dict[str, Any]) -> None:
         asset["nodes"] = [{"mesh": 0}, {"mesh": 1, "translation": [1, 0, 0]}]
         asset["scenes"] = [{"nodes": [0, 1]}]
-        flat = {
-            name: index
-            for name, index in asset["meshes"][0]["primitives"][0]["attributes"].items()
-            if "_2_" not in name
-        }
-        asset["meshes"] += [{"primitives": [asset["meshes"][0]["primitives"][0] | {"attributes": flat}]}]
+        (primitive,) = asset["meshes"][0]["primitives"]
+        flat = {name: index for name, index in primitive["attributes"].items() if "_2_" not in name}
+        asset["meshes"] += [{"primitives": [primitive | {"attributes": flat}]}]
 
     changed(path, double)
     both = gltf.read(path)

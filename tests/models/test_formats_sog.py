@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import re
 import tracemalloc
-import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import no_warnings
 from models import assert_equal, real_file
 from node import splat_transform
 from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, opacity, read_plainly, with_origin
@@ -83,9 +83,8 @@ def test_sorted_it_is_the_same_model_and_smaller(tmp_path: Path) -> None:
     order = packing.morton_order(model.means)
     np.testing.assert_array_equal(ordered.means, plain.means[order])
     np.testing.assert_array_equal(ordered.quaternions, plain.quaternions[order])
-    assert (tmp_path / "True.sog").stat().st_size < (
-        tmp_path / "False.sog"
-    ).stat().st_size * 0.97  # only positions are smooth here
+    sizes = [(tmp_path / f"{sort}.sog").stat().st_size for sort in (False, True)]
+    assert sizes[1] < sizes[0] * 0.97  # only positions are smooth here
 
 
 @pytest.mark.parametrize("name", ["5_0", "6_0"])
@@ -210,6 +209,12 @@ def change(folder: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     (folder / "meta.json").write_text(json.dumps(meta))
 
 
+def meta_of(folder: Path, count: int, degree: int) -> Path:
+    """The meta.json of such a model, in this folder."""
+    sog.write(folder / "meta.json", lopsided(count, degree=degree))
+    return folder / "meta.json"
+
+
 LIES: dict[str, Callable[[dict[str, Any]], object]] = {
     "version": lambda meta: meta.update(version=3),
     "count": lambda meta: meta.update(count=1 << 30),
@@ -244,8 +249,7 @@ def test_lies(tmp_path: Path, lie: str) -> None:
 
 
 def test_a_count_that_is_too_large_is_named_with_what_fits(tmp_path: Path) -> None:
-    path = tmp_path / "meta.json"
-    sog.write(path, lopsided(20, degree=1))
+    path = meta_of(tmp_path, 20, degree=1)
     for count, shown in ((10**12, "1000000000000"), (1 << 32, "4294967296"), (0, "0"), (-3, "-3")):
         change(tmp_path, lambda meta, count=count: meta.update(count=count))
         with pytest.raises(InputError, match=rf"meta\.json: has {shown} Gaussians, expected 1 to 4294967295$"):
@@ -355,8 +359,7 @@ def test_no_numbers(tmp_path: Path, name: str) -> None:
 
 @links
 def test_a_picture_that_is_a_link_to_itself(tmp_path: Path) -> None:
-    path = tmp_path / "meta.json"
-    sog.write(path, lopsided(20, degree=0))
+    path = meta_of(tmp_path, 20, degree=0)
     (tmp_path / "quats.webp").unlink()
     (tmp_path / "quats.webp").symlink_to("quats.webp")
     with pytest.raises(InputError, match=r"its picture quats\.webp is missing"):
@@ -384,8 +387,7 @@ def test_null_at_the_head_of_a_codebook_is_a_scale_of_0(tmp_path: Path) -> None:
     """As splat-transform, which sorts it, writes flat Gaussians: no word. Among the numbers it is told."""
     sog.write(tmp_path / "meta.json", lopsided(300, degree=0))
     change(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(slice(0, 2), [None, None]))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         formats.load(tmp_path / "meta.json")
     change(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(-1, None))
     with pytest.warns(UserWarning, match="has null in place of 3 of 256 numbers, which"):
@@ -403,8 +405,7 @@ def test_null_at_the_head_of_a_codebook_is_a_scale_of_0(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_wrong_is_told_as_it_is(tmp_path: Path, keys: dict[str, Any], message: str) -> None:
-    path = tmp_path / "meta.json"
-    sog.write(path, lopsided(20, degree=0))
+    path = meta_of(tmp_path, 20, degree=0)
     change(tmp_path, lambda meta: meta.update(keys))
     with pytest.raises(InputError, match=message):
         sog.read(path)
@@ -414,8 +415,7 @@ def test_what_is_wrong_is_told_as_it_is(tmp_path: Path, keys: dict[str, Any], me
 
 
 def test_null_in_place_of_the_coefficients_is_none(tmp_path: Path) -> None:
-    path = tmp_path / "meta.json"
-    sog.write(path, lopsided(20, degree=0))
+    path = meta_of(tmp_path, 20, degree=0)
     wanted = sog.read(path)
     change(tmp_path, lambda meta: meta.update(shN=None))
     assert_equal(sog.read(path), wanted)
@@ -424,8 +424,7 @@ def test_null_in_place_of_the_coefficients_is_none(tmp_path: Path) -> None:
 @pytest.mark.brings("Windows, macOS", "SOG whose pictures' names are of another case", "found")
 @pytest.mark.parametrize("archived", [False, True])
 def test_names_of_another_case(tmp_path: Path, archived: bool) -> None:
-    path = tmp_path / "meta.json"
-    sog.write(path, lopsided(20, degree=1))
+    path = meta_of(tmp_path, 20, degree=1)
     wanted = sog.read(path)
     change(tmp_path, lambda meta: meta["means"].update(files=["MEANS_L.webp", "Means_U.WEBP"]))
     if archived:

@@ -3,12 +3,11 @@
 
 import errno
 import time
-import tracemalloc
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import no_warnings, peak_of
 from models import assert_equal, random_gaussians, real_file
 
 from clsplat.errors import InputError
@@ -118,8 +117,7 @@ def test_formats_orders_and_other_properties(tmp_path: Path, form: str, kind: st
     else:
         code = (">" if "big" in form else "<") + ("f8" if kind == "double" else "f4")
         path.write_bytes(text.encode() + b"\x01\x02" + table.astype(code).tobytes() + b"\x03" + bytes(12))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         assert_equal(gaussians, Gaussians.load(path))
 
 
@@ -288,14 +286,8 @@ def test_reading_makes_no_second_copy_of_the_file(tmp_path: Path) -> None:
     model.save(path)
     own = sum(array.nbytes for array in (model.means, model.quaternions, model.log_scales, model.opacity_logits))
     own += model.sh.nbytes
-    tracemalloc.start()
-    try:
-        Gaussians.load(path)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
     # three blocks of rows, of 8 MB each: the last, the next, and what reading it has joined. The file has 50 MB.
-    assert peak < own + 3 * ply.IO_BLOCK_ROWS * 248 + (2 << 20)
+    assert peak_of(lambda: Gaussians.load(path)) < own + 3 * ply.IO_BLOCK_ROWS * 248 + (2 << 20)
 
 
 @pytest.mark.slow

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import json
 import struct
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from calls import no_warnings, warnings_of
 from models import assert_equal, random_gaussians
 from needs import require
 from splats import lopsided, with_origin
@@ -39,12 +39,19 @@ def written(path: Path, model: Gaussians) -> Path:
 
 def told(path: Path) -> tuple[Gaussians, list[str]]:
     """The model, and the warnings without the path that each has."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        read = formats.load(path)
-    texts = [str(each.message) for each in caught]
+    read: list[Gaussians] = []
+    texts = warnings_of(lambda: read.append(formats.load(path)))
     assert all(text.startswith(f"{path}: ") for text in texts), texts
-    return read, [text.removeprefix(f"{path}: ") for text in texts]
+    return read[0], [text.removeprefix(f"{path}: ") for text in texts]
+
+
+def right(path: Path, meant: str) -> Gaussians:
+    """The model as it is meant, without a warning; `meant` is what it is told that all of them are."""
+    _, (text,) = told(path)
+    assert text.startswith(f"all {meant} lie in ")
+    assert text.endswith(f"`clsplat convert --activated {meant}` writes a correct model")
+    with no_warnings():
+        return formats.load(path, activated=meant)
 
 
 @pytest.mark.brings("any", "rows of NaN", "left out and counted")
@@ -247,19 +254,12 @@ SCALES = {
 @pytest.mark.brings("pixelSplat, mesh2splat", "opacities in place of logits", "named; `convert --activated`")
 @pytest.mark.parametrize("name", OPACITIES)
 def test_opacities_in_place_of_logits(tmp_path: Path, name: str) -> None:
-    logits = OPACITIES[name]
     path = tmp_path / "model.ply"
-    formats.save(path, shifted(400, opacity_logits=logits))
-    _, texts = told(path)
-    assert len(texts) == 1
-    assert texts[0].startswith("all opacities lie in ")
-    assert texts[0].endswith("`clsplat convert --activated opacities` writes a correct model")
-    white = 255 if name == "levels" else 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        right = formats.load(path, activated="opacities")
-    wanted = np.clip(logits / white, 0, 1)
-    np.testing.assert_allclose(values.opacities(right.opacity_logits), wanted, atol=1e-6)  # float32's
+    formats.save(path, shifted(400, opacity_logits=OPACITIES[name]))
+    wanted = np.clip(OPACITIES[name] / (255 if name == "levels" else 1), 0, 1)
+    np.testing.assert_allclose(
+        values.opacities(right(path, "opacities").opacity_logits), wanted, atol=1e-6
+    )  # float32's
 
 
 @pytest.mark.brings("GPS-Gaussian", "scales in place of logs", "named; `convert --activated`")
@@ -267,14 +267,7 @@ def test_opacities_in_place_of_logits(tmp_path: Path, name: str) -> None:
 def test_scales_in_place_of_logs(tmp_path: Path, name: str) -> None:
     path = tmp_path / "model.ply"
     formats.save(path, shifted(400, log_scales=SCALES[name]))
-    _, texts = told(path)
-    assert len(texts) == 1
-    assert texts[0].startswith("all scales lie in ")
-    assert texts[0].endswith("`clsplat convert --activated scales` writes a correct model")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        right = formats.load(path, activated="scales")
-    np.testing.assert_allclose(np.exp(right.log_scales), SCALES[name], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(np.exp(right(path, "scales").log_scales), SCALES[name], rtol=1e-5, atol=1e-9)
 
 
 def test_logits_and_logs_give_no_doubt(tmp_path: Path) -> None:
@@ -360,7 +353,6 @@ def test_a_kernel_that_is_not_known_is_drawn_as_an_ellipse(tmp_path: Path, kerne
 def test_ordinary_models_keep_their_bits() -> None:
     model = random_gaussians(1000, 3)
     before = edit.take(model, np.arange(1000))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         assert soundness.sound(model, "model") is model
     assert_equal(model, before)

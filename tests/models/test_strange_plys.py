@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import tracemalloc
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import no_warnings
 from models import assert_equal, random_gaussians
 
 from clsplat.errors import InputError
@@ -53,8 +53,7 @@ def test_two_scales_are_those_of_a_flat_gaussian(tmp_path: Path, order: str) -> 
     table = columns(model)
     del table["scale_2"]
     path = write(tmp_path / "model.ply", table, {}, order)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         read = Gaussians.load(path)
         assert model_info(path)["scale"]["p0"] == pytest.approx(values.MIN_SCALE)
     model.log_scales[:, 2] = np.log(values.MIN_SCALE)
@@ -147,20 +146,14 @@ def test_a_long_comment(tmp_path: Path, name: str, length: int) -> None:
 @pytest.mark.brings("Visual C++ of before 2015", "ascii PLY with `1.#QNAN`, `-nan(ind)`", "NaN and infinite")
 @pytest.mark.parametrize("word", ["-nan(ind)", "1.#QNAN", "-1.#IND", "1.#SNAN0", "nan(snan)", "-1.#IND00"])
 def test_words_for_no_number(tmp_path: Path, word: str) -> None:
-    path, lines = ascii_file(tmp_path)
-    at = lines.index("end_header") + 1
-    lines[at + 2] = lines[at + 2].rsplit(" ", 1)[0] + f" {word}"
-    path.write_text("\n".join(lines))
+    path = with_word(tmp_path, 2, word)
     with pytest.warns(UserWarning, match="1 of 6 Gaussians has a value .* Gaussian 2 with a rotation; it is left out"):
         assert len(Gaussians.load(path)) == 5
 
 
 @pytest.mark.parametrize(("word", "sign"), [("-1.#INF", -1), ("1.#INF", 1), ("1.#INF00", 1), ("-inf", -1)])
 def test_words_for_infinite(tmp_path: Path, word: str, sign: int) -> None:
-    path, lines = ascii_file(tmp_path, last="opacity")
-    at = lines.index("end_header") + 1
-    lines[at + 4] = lines[at + 4].rsplit(" ", 1)[0] + f" {word}"
-    path.write_text("\n".join(lines))
+    path = with_word(tmp_path, 4, word, "opacity")
     assert Gaussians.load(path).opacity_logits[4] == values.logits(np.array([(1 + sign) / 2]))[0]
 
 
@@ -169,21 +162,22 @@ def test_a_word_that_is_no_number_is_told_with_its_row(
     tmp_path: Path, word: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ply_file, "IO_BLOCK_ROWS", 2)
-    path, lines = ascii_file(tmp_path)
-    at = lines.index("end_header") + 1
-    lines[at + 5] = lines[at + 5].rsplit(" ", 1)[0] + f" {word}"
-    path.write_text("\n".join(lines))
+    path = with_word(tmp_path, 5, word)
     shown = word if word.isascii() else "\ufffd\ufffd"
     with pytest.raises(InputError, match=rf"model\.ply: Gaussian 5 has {shown!r}, expected a number$"):
         Gaussians.load(path)
 
 
-def ascii_file(tmp_path: Path, last: str = "rot_3") -> tuple[Path, list[str]]:
-    """One of 6 Gaussians, and its lines, each of whose last word is that property."""
+def with_word(tmp_path: Path, row: int, word: str, last: str = "rot_3") -> Path:
+    """A text of 6 Gaussians, in one of which that property, the last of its line, is the word."""
     table = columns(random_gaussians(6, 0))
     table[last] = table.pop(last)
     path = write(tmp_path / "model.ply", table, {}, "ascii")
-    return path, path.read_text().splitlines()
+    lines = path.read_text().splitlines()
+    at = lines.index("end_header") + 1 + row
+    lines[at] = lines[at].rsplit(" ", 1)[0] + f" {word}"
+    path.write_text("\n".join(lines))
+    return path
 
 
 def test_whole_colours_in_text_that_are_no_number(tmp_path: Path) -> None:

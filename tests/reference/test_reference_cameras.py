@@ -12,12 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera, Projection, focal_length
-from clsplat.reference.cameras import (
-    cam_from_pixel,
-    pixel_from_cam,
-    pixel_from_world,
-    pixel_grid,
-)
+from clsplat.reference.cameras import cam_from_pixel, pixel_from_cam, pixel_from_world, pixel_grid
 
 ROTATION = Rotation.from_euler("xyz", [0.3, -1.1, 2.0]).as_matrix()
 TRANSLATION = np.array([0.4, -2.0, 1.5])

@@ -129,16 +129,9 @@ def test_stop_rule_excludes_the_gaussian_that_would_saturate() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("means", np.nan),
-        ("means", np.inf),
-        ("quaternions", 0.0),
-        ("quaternions", np.nan),
-        ("log_scales", np.inf),
-        ("log_scales", np.nan),
-        ("log_scales", 400.0),
-        ("opacity_logits", np.nan),
-        ("opacity_logits", -np.inf),
-        ("sh", np.nan),
+        *(("means", np.nan), ("means", np.inf), ("quaternions", 0.0), ("quaternions", np.nan)),
+        *(("log_scales", np.inf), ("log_scales", np.nan), ("log_scales", 400.0), ("opacity_logits", np.nan)),
+        *(("opacity_logits", -np.inf), ("sh", np.nan)),
     ],
 )
 def test_poison_culls_its_own_gaussian_only(field: str, value: float) -> None:
@@ -199,14 +192,7 @@ def test_ssim_is_that_of_scikit_image() -> None:
     y = rng.uniform(0, 1, (40, 33, 3))
     x = np.clip(y + rng.normal(0, 0.2, y.shape), 0, 1)
     _, wanted = structural_similarity(  # type: ignore[no-untyped-call]
-        x,
-        y,
-        data_range=1.0,
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
+        x, y, data_range=1.0, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True
     )
     # inside, where scikit-image's reflected edge and our zeros are both out of reach
     inside = (slice(5, -5), slice(5, -5))

@@ -141,11 +141,7 @@ def test_frames_do_not_depend_on_those_before(default_device: Device) -> None:
 
 
 @pytest.mark.parametrize("share", [1.5, 0.9, 0.55])
-@pytest.mark.parametrize(
-    "settings",
-    [{"sh_storage": "half"}, {"sh_tolerance": 0.8}, {"frustum_cull": False}],
-    ids=str,
-)
+@pytest.mark.parametrize("settings", [{"sh_storage": "half"}, {"sh_tolerance": 0.8}, {"frustum_cull": False}], ids=str)
 def test_a_frame_in_less_memory(default_device: Device, settings: dict[str, object], share: float) -> None:
     gaussians, camera = cloud(6000)
     free = default_device.with_memory_limit(None)

@@ -13,7 +13,7 @@ from compare import assert_same_bits
 from quick import quick
 from same_bytes import opened_again
 from scenes import random_cloud
-from tiny import CONFIG, short, write_scene
+from tiny import CONFIG, run_steps, short, trained_to, write_scene
 
 import clsplat
 from clsplat.api import train
@@ -138,8 +138,7 @@ def test_what_is_streamed_and_banded_and_resumed(
     device = with_limit(default_device, int(0.26 * peak))
     trainer = Trainer(scene, MANY, device)
     assert not trainer.plan.streamed, "it grows into it"
-    for _ in range(32):
-        trainer.train_step()
+    run_steps(32, trainer)
     assert trainer.plan.streamed
     assert isinstance(trainer.parameters, HostGaussians)
     assert trainer.parameters.count > 2 * trainer.parameters.rows
@@ -154,9 +153,7 @@ def test_what_is_streamed_and_banded_and_resumed(
 def test_resumed_under_a_limit(
     scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path
 ) -> None:
-    trainer = Trainer(scene, MANY, default_device)
-    for _ in range(17):
-        trainer.train_step()
+    trainer = trained_to(17, scene, MANY, default_device)
     run = Run.create(tmp_path / "run", MANY)
     arrays, state = trainer.checkpoint()
     run.save_checkpoint(trainer.step, arrays, {**state, "seconds": 1.0})

@@ -69,10 +69,7 @@ def test_backward_motion_is_forward_motion_of_the_frame_before(projection: Proje
     renderer = Renderer(open_device())
     there, back = (
         renderer.render_channels(gaussians, view, (name,), **{way: other})[1]
-        for view, name, way, other in (
-            (first, "motion", "after", second),
-            (second, "backward", "before", first),
-        )
+        for view, name, way, other in ((first, "motion", "after", second), (second, "backward", "before", first))
     )
     forward = there["motion"][there["count"] > 0][0]
     backward = back["backward"][back["count"] > 0][0]

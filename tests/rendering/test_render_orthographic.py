@@ -34,10 +34,7 @@ POSITION = np.array([3.0, -4.0, 2.5])
 ROTATION, TRANSLATION = look_at(POSITION, np.zeros(3), np.array([0.0, 0.0, 1.0]))
 RIGHT = ROTATION[0]
 CAMERA = Camera(
-    *(WIDTH, HEIGHT, 1 / PIXEL, 1 / PIXEL, WIDTH / 2, HEIGHT / 2),
-    ROTATION,
-    TRANSLATION,
-    projection="orthographic",
+    *(WIDTH, HEIGHT, 1 / PIXEL, 1 / PIXEL, WIDTH / 2, HEIGHT / 2), ROTATION, TRANSLATION, projection="orthographic"
 )
 
 

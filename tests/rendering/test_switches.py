@@ -243,12 +243,8 @@ def test_gradient_of_bands_left_out_is_zero(default_device: Device) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"sh_degree_limit": 4},
-        {"sh_tolerance": -0.1},
-        {"sh_tolerance": float("nan")},
-        {"alpha_min": 0.0},
-        {"alpha_min": float("nan")},
-        {"transmittance_min": 1.0},
+        *({"sh_degree_limit": 4}, {"sh_tolerance": -0.1}, {"sh_tolerance": float("nan")}),
+        *({"alpha_min": 0.0}, {"alpha_min": float("nan")}, {"transmittance_min": 1.0}),
     ],
 )
 def test_values_that_make_no_sense(change: dict[str, float]) -> None:

@@ -15,7 +15,7 @@ import pytest
 from calls import Capture, error_line, train
 from pages import charts_of, figures_of, outside_of, parse, rows_of
 from systems import links
-from tiny import CONFIG, short
+from tiny import CONFIG, run_steps, short
 
 from clsplat.cli.main import main
 from clsplat.device.context import Device
@@ -381,8 +381,7 @@ def test_a_report_that_fails_does_not_fail_the_training(
 
 def test_contributions_are_the_references(scene: Path, device: Device) -> None:
     trainer = Trainer(load_scene(scene), short(stages_every=0), device)
-    for _ in range(12):
-        trainer.train_step()
+    run_steps(12, trainer)
     found, looked = telemetry.largest_contributions(trainer, 1e9)
     assert looked == len(trainer.views) == 8
     model = trainer.gaussians()

@@ -3,13 +3,13 @@
 
 import json
 import os
-import warnings
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tomli_w
+from calls import no_warnings
 from models import random_gaussians
 
 import clsplat
@@ -108,8 +108,7 @@ def test_switches_that_only_the_bench_has_are_passed_over(tmp_path: Path) -> Non
     gone = dict.fromkeys(("vector_skip", "last_contributor", "gradient_skip", "opacity_cull"), True)
     text = tomli_w.dumps({"clsplat": "1", "train": {"rasterizer": asdict(BenchSwitches()) | gone}})
     path.write_text(text)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         assert read_config(path) == (TrainConfig(), None), "as every earlier version wrote them"
     path.write_text(
         text.replace("row_skip = true", "row_skip = false")
@@ -132,8 +131,7 @@ def test_settings_of_training_that_are_gone_are_passed_over(tmp_path: Path) -> N
     nothing = {"edge_views": 0, "prune_at": [], "prune_fraction": 0.0, "views_agree": 1}
     path.write_text(tomli_w.dumps({"train": {"frequency_steps": 0, "density": nothing | {"every": 50}}}))
     config = TrainConfig(density=DensityConfig(every=50))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         assert read_config(path) == (config, None), "as every earlier version wrote them"
     once = {"edge_views": 5, "prune_at": [600, 3000], "prune_fraction": 0.25, "views_agree": 2}
     path.write_text(tomli_w.dumps({"train": {"frequency_steps": 500, "density": once | {"every": 50}}}))

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import json
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from calls import warnings_of
 from ring import FOCAL, HEIGHT, WIDTH, matrix_of, points, poses, write_cloud, write_colmap, write_transforms
 from scipy.spatial.transform import Rotation
 from tiny import write_scene
@@ -69,10 +69,7 @@ def test_those_of_a_colmap_model_too(tmp_path: Path) -> None:
 def test_intrinsics_that_no_lens_has_are_told(keys: dict[str, Any], words: str, tmp_path: Path) -> None:
     folder = write_transforms(tmp_path, **keys)
     assert any(words in text for text in load_scene(folder).warnings)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        read_poses(folder / "transforms.json")
-    assert any(words in str(each.message) for each in caught)
+    assert any(words in text for text in warnings_of(lambda: read_poses(folder / "transforms.json")))
 
 
 @pytest.mark.parametrize(
@@ -295,19 +292,9 @@ def test_the_verbs_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     write_transforms(tmp_path / "wrong", matrices=WRONG["inverted"][0], cx=0.0, cy=0.0)
     wrong = tmp_path / "wrong"
     for words in (
-        [
-            "train",
-            str(wrong),
-            "-o",
-            str(tmp_path / "other"),
-            "--iterations",
-            "1",
-            "--random-points",
-            "50",
-            "--no-report",
-        ],
-        ["eval", str(run / "model.ply"), "--scene", str(wrong)],
-        ["render", str(run / "model.ply"), "--cameras", str(wrong), "-o", str(tmp_path / "out" / "{name}.png")],
+        f"train {wrong} -o {tmp_path}/other --iterations 1 --random-points 50 --no-report".split(),
+        f"eval {run}/model.ply --scene {wrong}".split(),
+        f"render {run}/model.ply --cameras {wrong} -o {tmp_path}/out/{{name}}.png".split(),
     ):
         capsys.readouterr()
         assert main(words) == 0

@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -15,6 +16,8 @@ from needs import SCENES
 from clsplat.errors import InputError
 from clsplat.rotations import rotation_from_quaternion
 from clsplat.scenes.readers.colmap import find_model, read_cameras, read_model
+
+TRACK = "9 1 2 3 255 255 255 0.5 1 2"
 
 
 def make_model(folder: Path, names: list[str] | None = None, model: str = "PINHOLE") -> pycolmap.Reconstruction:
@@ -113,15 +116,6 @@ def test_text_that_is_cut_at_the_end_of_a_line_is_told(tmp_path: Path, stem: str
             read_cameras(tmp_path / "txt")
 
 
-def test_a_track_that_is_cut_is_refused_with_the_line(tmp_path: Path) -> None:
-    make_model(tmp_path)
-    path = tmp_path / "txt" / "points3D.txt"
-    line = "9 1 2 3 255 255 255 0.5 1 2"
-    path.write_text(f"{line}\n{line} 3")
-    with pytest.raises(InputError, match=r"points3D\.txt: line 2 does not read as POINT3D_ID"):
-        read_model(tmp_path / "txt")
-
-
 def test_text_that_was_edited_beside_a_binary_file_is_told(tmp_path: Path) -> None:
     make_model(tmp_path)
     folder = tmp_path / "bin"
@@ -172,12 +166,19 @@ def test_flipped_bytes_are_read_or_refused_but_never_crash(tmp_path: Path, stem:
     assert len(refused) > 40
 
 
-def test_truncated_text_is_refused_with_the_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("stem", "cut", "told"),
+    [
+        ("images", lambda lines: [*lines[:-2], lines[-2][:30]], r"line \d+ does not read as IMAGE_ID QW"),
+        ("points3D", lambda _: [TRACK, f"{TRACK} 3"], "line 2 does not read as POINT3D_ID"),
+    ],
+    ids=["an image", "a track"],
+)
+def test_truncated_text_is_refused_with_the_line(tmp_path: Path, stem: str, cut: Any, told: str) -> None:
     make_model(tmp_path)
-    path = tmp_path / "txt" / "images.txt"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([*lines[:-2], lines[-2][:30]]))
-    with pytest.raises(InputError, match=r"images\.txt: line \d+ does not read as IMAGE_ID QW"):
+    path = tmp_path / "txt" / f"{stem}.txt"
+    path.write_text("\n".join(cut(path.read_text().splitlines())))
+    with pytest.raises(InputError, match=rf"{stem}\.txt: {told}"):
         read_model(tmp_path / "txt")
 
 
@@ -189,19 +190,15 @@ def test_unknown_camera_models_are_refused_by_name(tmp_path: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"cameras\.bin: camera 1 has the unknown camera model id 77"):
         read_model(tmp_path / "bin")
-    text = tmp_path / "txt" / "cameras.txt"
-    text.write_text("1 KALEIDOSCOPE 48 32 1 2 3\n")
-    with pytest.raises(InputError, match=r"cameras\.txt: camera 1: unknown camera model KALEIDOSCOPE, expected one of"):
-        read_model(tmp_path / "txt")
-    text.write_text("1 EQUIRECTANGULAR 48 32 48 30\n")
-    with pytest.raises(InputError, match=r"parameters are \[48.0, 30.0\], expected the size of a full panorama, 48 32"):
-        read_model(tmp_path / "txt")
-    text.write_text("1 PINHOLE 48 32 1 2 3\n")
-    with pytest.raises(InputError, match="PINHOLE has 3 parameters, expected 4"):
-        read_model(tmp_path / "txt")
-    text.write_text("1 PINHOLE 48 32 -1 2 3 4\n")
-    with pytest.raises(InputError, match="focal lengths above 0"):
-        read_model(tmp_path / "txt")
+    for line, told in [
+        ("KALEIDOSCOPE 48 32 1 2 3", r"cameras\.txt: camera 1: unknown camera model KALEIDOSCOPE, expected one of"),
+        ("EQUIRECTANGULAR 48 32 48 30", r"parameters are \[48.0, 30.0\], expected the size of a full panorama, 48 32"),
+        ("PINHOLE 48 32 1 2 3", "PINHOLE has 3 parameters, expected 4"),
+        ("PINHOLE 48 32 -1 2 3 4", "focal lengths above 0"),
+    ]:
+        (tmp_path / "txt" / "cameras.txt").write_text(f"1 {line}\n")
+        with pytest.raises(InputError, match=told):
+            read_model(tmp_path / "txt")
 
 
 @pytest.mark.parametrize(

@@ -191,13 +191,8 @@ def test_a_scene_of_nerfstudio_names_its_maps(tmp_path: Path) -> None:
         (folder / "depths" / f"{index:02d}.png").rename(folder / "depths" / f"of_{index}.png")  # no photograph's name
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0]), camera.position
-        frames.append(
-            {
-                "file_path": f"images/{index:02d}.png",
-                "depth_file_path": f"depths/of_{index}.png",
-                "transform_matrix": pose.tolist(),
-            }
-        )
+        paths = {"file_path": f"images/{index:02d}.png", "depth_file_path": f"depths/of_{index}.png"}
+        frames.append({**paths, "transform_matrix": pose.tolist()})
     lens = {"w": WIDTH, "h": HEIGHT, "fl_x": 50.0, "fl_y": 50.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
     path = folder / "transforms.json"
     path.write_text(json.dumps({**lens, "camera_model": "PINHOLE", "frames": frames}))

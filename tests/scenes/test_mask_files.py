@@ -31,6 +31,19 @@ def mask_of(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     return mask
 
 
+def frame(scene: Path, index: int, file_path: str, mask_path: str | None = None) -> dict[str, object]:
+    """One of a transforms.json, 30 x 20, and its picture; `index` is where it stands."""
+    (scene / file_path).parent.mkdir(parents=True, exist_ok=True)
+    write_image(scene / file_path, np.full((20, 30, 3), 0.5, np.float32))
+    pose = [[1.0, 0, 0, index], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    paths = {"file_path": file_path, **({"mask_path": mask_path} if mask_path else {})}
+    return {**paths, "transform_matrix": pose}
+
+
+def write_frames(scene: Path, frames: list[dict[str, object]]) -> None:
+    (scene / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 30, "h": 20, "frames": frames}))
+
+
 @pytest.mark.parametrize("form", ["{0}.png.png", "{0}.png", "{0}_mask.png", "mask_{0}.png", "{0}.mask.png"])
 @pytest.mark.parametrize("folder", ["masks", "mask", "images/masks"])
 def test_names_of_masks(tmp_path: Path, form: str, folder: str) -> None:
@@ -49,23 +62,21 @@ def test_names_of_masks(tmp_path: Path, form: str, folder: str) -> None:
     assert cut[:, :, 3].mean() == 0.5
 
 
-def test_a_mask_of_no_photograph(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "size", "told"),
+    [
+        ("elsewhere.png", (48, 40), r"masks: 1 mask\(s\) fit no photograph \(elsewhere\.png\): expected names"),
+        ("03.png", (24, 20), r"03\.png: the mask has 24x20 pixels, expected the size of its photograph, 48x40"),
+    ],
+    ids=["of no photograph", "of another size"],
+)
+def test_a_mask_that_does_not_fit(name: str, size: tuple[int, int], told: str, tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene")
     (scene / "masks").mkdir()
-    write_image(scene / "masks" / "elsewhere.png", mask_of())
-    with pytest.raises(InputError, match=r"masks: 1 mask\(s\) fit no photograph \(elsewhere\.png\): expected names"):
+    write_image(scene / "masks" / name, mask_of(*size))
+    with pytest.raises(InputError, match=told):
         load_scene(scene, masks=IGNORE)
     assert load_scene(scene).views[0].mask is None
-
-
-def test_a_mask_of_another_size(tmp_path: Path) -> None:
-    scene = write_scene(tmp_path / "scene")
-    (scene / "masks").mkdir()
-    write_image(scene / "masks" / "03.png", mask_of(24, 20))
-    with pytest.raises(
-        InputError, match=r"03\.png: the mask has 24x20 pixels, expected the size of its photograph, 48x40"
-    ):
-        load_scene(scene, masks=IGNORE)
 
 
 def test_no_masks_at_all_and_some_missing(tmp_path: Path) -> None:
@@ -96,17 +107,8 @@ def test_an_alpha_channel_to_ignore(tmp_path: Path) -> None:
 
 
 def test_mask_path_of_a_frame(tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
-    (tmp_path / "shapes").mkdir()
-    frames = []
-    for index in range(3):
-        write_image(tmp_path / "images" / f"{index}.png", np.full((20, 30, 3), 0.5, np.float32))
-        write_image(tmp_path / "shapes" / f"m{index}.png", mask_of(30, 20))
-        pose = np.eye(4)
-        pose[0, 3] = index
-        paths = {"file_path": f"images/{index}.png", "mask_path": f"shapes/m{index}.png"}
-        frames.append({**paths, "transform_matrix": pose.tolist()})
-    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 30, "h": 20, "frames": frames}))
+    write_frames(tmp_path, [frame(tmp_path, i, f"images/{i}.png", f"shapes/m{i}.png") for i in range(3)])
+    masks_at(tmp_path, *(f"shapes/m{index}.png" for index in range(3)))
     read = load_scene(tmp_path, masks=IGNORE)
     assert read.views[1].load_masked()[:, :, 4].mean() == 0.5
     assert not any("ignored" in text for text in read.warnings)
@@ -117,19 +119,10 @@ def test_mask_path_of_a_frame(tmp_path: Path) -> None:
 
 def test_one_mask_for_all_frames(tmp_path: Path) -> None:
     """As nerfstudio writes it, in a folder where names would be of photographs; one more has its own there."""
-    for folder in ("images", "masks"):
-        (tmp_path / folder).mkdir()
-    frames = []
-    for index in range(3):
-        write_image(tmp_path / "images" / f"{index}.png", np.full((20, 30, 3), 0.5, np.float32))
-        pose = np.eye(4)
-        pose[0, 3] = index
-        paths = {"file_path": f"images/{index}.png", "mask_path": "masks/mask.png"}
-        frames.append({**paths, "transform_matrix": pose.tolist()})
-    write_image(tmp_path / "masks" / "mask.png", mask_of(30, 20))
-    del frames[2]["mask_path"]
+    listed = ("masks/mask.png", "masks/mask.png", None)
+    write_frames(tmp_path, [frame(tmp_path, i, f"images/{i}.png", mask) for i, mask in enumerate(listed)])
+    masks_at(tmp_path, "masks/mask.png")
     write_image(tmp_path / "masks" / "2.png", np.ones((20, 30, 3), np.float32))
-    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 30, "h": 20, "frames": frames}))
     read = load_scene(tmp_path, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5, 0.5, 1.0]
 
@@ -137,17 +130,8 @@ def test_one_mask_for_all_frames(tmp_path: Path) -> None:
 def test_masks_of_something_else_beside_the_scene(tmp_path: Path) -> None:
     """Photographs beside transforms.json have theirs in the same folder; what is outside it is not asked then."""
     scene = tmp_path / "scene"
-    (scene / "masks").mkdir(parents=True)
-    (tmp_path / "masks").mkdir()
-    write_image(tmp_path / "masks" / "of-another.png", mask_of(30, 20))
-    frames = []
-    for index in range(3):
-        write_image(scene / f"{index}.png", np.full((20, 30, 3), 0.5, np.float32))
-        write_image(scene / "masks" / f"{index}.png", mask_of(30, 20))
-        pose = np.eye(4)
-        pose[0, 3] = index
-        frames.append({"file_path": f"{index}.png", "transform_matrix": pose.tolist()})
-    (scene / "transforms.json").write_text(json.dumps({"fl_x": 30, "w": 30, "h": 20, "frames": frames}))
+    write_frames(scene, [frame(scene, index, f"{index}.png") for index in range(3)])
+    masks_at(tmp_path, "masks/of-another.png", *(f"scene/masks/{index}.png" for index in range(3)))
     read = load_scene(scene, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * 3
 

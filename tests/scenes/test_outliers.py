@@ -153,10 +153,7 @@ def test_stray_points_are_left_out(count: int, distance: float, tmp_path: Path) 
     plain = load_scene(write_colmap(tmp_path / "plain", cloud=(xyz[count:], rgb[count:])))
     xyz = xyz.copy()
     xyz[:count] *= distance / np.linalg.norm(xyz[:count], axis=1, keepdims=True)
-    for scene in (
-        load_scene(write_colmap(tmp_path, cloud=(xyz, rgb))),
-        load_ply(tmp_path / "nerfstudio", xyz, rgb),
-    ):
+    for scene in (load_scene(write_colmap(tmp_path, cloud=(xyz, rgb))), load_ply(tmp_path / "nerfstudio", xyz, rgb)):
         np.testing.assert_allclose(scene.points, plain.points, rtol=1e-6)
         np.testing.assert_array_equal(scene.point_colors, plain.point_colors)
         (warning,) = scene.warnings

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import warnings_of
 from models import assert_equal
 from numpy.typing import NDArray
 from test_scene import make_colmap
@@ -29,10 +30,7 @@ from clsplat.spherical_harmonics import SH_C0
 
 
 def told(scene: Scene, device: Device, **changes: object) -> list[str]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        train(scene, short(warmup=(), **changes), device=device)
-    return [str(warning.message) for warning in caught]
+    return warnings_of(lambda: train(scene, short(warmup=(), **changes), device=device))
 
 
 def with_cameras(scene: Scene, **changes: object) -> Scene:

@@ -77,8 +77,6 @@ def test_resolution(tmp_path: Path) -> None:
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (24, 16, 20, 20.5, 12, 8)
     assert load_scene(tmp_path, resolution=5000).views[0].camera.width == WIDTH  # never enlarged
     assert load_scene(tmp_path, resolution=24).views[0].load().shape == (16, 24, 3)
-    with pytest.raises(InputError, match="resolution -1"):
-        load_scene(tmp_path, resolution=-1)
 
 
 def test_large_pictures_are_worked_on_at_1600(tmp_path: Path) -> None:
@@ -283,12 +281,10 @@ def test_a_mark_of_the_byte_order_is_passed_over(kind: str, tmp_path: Path) -> N
 def test_undecodable_pictures_are_found_before_training(tmp_path: Path) -> None:
     make_colmap(tmp_path)
     path = tmp_path / "images" / "5.png"
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InputError, match=r"5\.png: does not decode"):
-        load_scene(tmp_path)
-    path.write_text("no picture")
-    with pytest.raises(InputError, match=r"5\.png: does not decode"):
-        load_scene(tmp_path)
+    for data in (path.read_bytes()[:-20], b"no picture"):
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=r"5\.png: does not decode"):
+            load_scene(tmp_path)
 
 
 def test_a_distorted_camera_becomes_a_pinhole(tmp_path: Path) -> None:
@@ -427,12 +423,8 @@ def test_real_scenes(name: str, views: int, held_out: int, points: int) -> None:
     scene = load_scene(SCENES / name)
     assert (len(scene.views), len(scene.test_views), len(scene.points)) == (views, held_out, points)
     assert scene.warnings == []
-    image = scene.views[0].load()
-    assert image.shape == (
-        scene.views[0].camera.height,
-        scene.views[0].camera.width,
-        4 if name.startswith("lego") else 3,
-    )
+    image, camera = scene.views[0].load(), scene.views[0].camera
+    assert image.shape == (camera.height, camera.width, 4 if name.startswith("lego") else 3)
     assert 0 <= image.min() < image.max() <= 1
     low, high = scene.bounds
     inside = ((scene.points > low) & (scene.points < high)).all(axis=1)

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import sys
-import warnings
 
 import numpy as np
 import OpenImageIO as oiio
@@ -127,13 +126,7 @@ def test_every_pose_is_recovered(scene, pictures):
     assert record["photos"] == len(record["registered"]) == COUNT
     assert record["mean_reprojection_error"] < 0.5
     stages = list(dict.fromkeys(text for text, _ in heard))
-    assert stages == [
-        "reading photos",
-        "finding features",
-        "matching photos",
-        "placing cameras",
-        "undistorting photos",
-    ]
+    assert stages == ["reading photos", "finding features", "matching photos", "placing cameras", "undistorting photos"]
     placed = [fraction.text for text, fraction in heard if text == "placing cameras"]
     assert (placed[0], placed[-1]) == (f"0 of {COUNT} cameras stand", f"{COUNT} of {COUNT} cameras stand")
     assert len(placed) > 3  # they are counted as they come
@@ -152,8 +145,7 @@ def test_finished_result_is_used_again_and_never_replaced_unasked(scene, photos,
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["gone", "cut"])
 def test_a_result_that_has_changed_since_is_not_used_again(scene, photos, tmp_path, change):
-    copy = tmp_path / "scene"
-    shutil.copytree(scene[0], copy)
+    copy = shutil.copytree(scene[0], tmp_path / "scene")
     assert sfm.reconstruct(photos, copy, PINHOLE) == copy
     picture = copy / "images/view_03.jpg"
     if change == "gone":
@@ -184,10 +176,8 @@ def test_exif_orientation_subfolders_and_a_photo_of_something_else(pictures, tmp
     (folder / "phone.heic").write_bytes(b"not read")
     (folder / "notes.txt").write_text("not a photo")
     # the output may lie among the photos: it must not be taken for some
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        output = sfm.reconstruct(folder, folder / "scene")
-    messages = [str(warning.message) for warning in caught if warning.category is UserWarning]
+    output = folder / "scene"
+    messages = warnings_of(lambda: sfm.reconstruct(folder, output))
     assert any("phone.heic" in message for message in messages)
     assert any("stray.jpg" in message and "could not be placed" in message for message in messages)
     assert json.loads((output / sfm.SFM_RECORD_FILE).read_text())["unregistered"] == ["stray.jpg"]
@@ -225,8 +215,7 @@ def test_photos_that_lose_their_alpha_are_named(pictures, tmp_path):
     ("name", "form", "begin"), [("view_03.jpg", "GIF", b"\xff\xd8\xff"), ("view_03.png", "GIF", b"\x89PNG")]
 )
 def test_a_gif_under_another_name_is_written_anew(name, form, begin, photos, tmp_path, monkeypatch):
-    folder = tmp_path / "photos"
-    shutil.copytree(photos, folder)
+    folder = shutil.copytree(photos, tmp_path / "photos")
     picture = read_image(folder / "view_03.jpg")
     (folder / "view_03.jpg").unlink()
     Pillow.fromarray(picture).save(folder / name, form)
@@ -262,21 +251,20 @@ def test_bad_folders(tmp_path, photos):
     shutil.copy(photos / "view_00.jpg", tmp_path / "few")
     with pytest.raises(InputError, match=r"few: only 1 photo\(s\) found, expected at least 3"):
         sfm.reconstruct(tmp_path / "few", tmp_path / "out")
-    with pytest.raises(InputError, match="is neither empty nor a result of sfm"):
-        sfm.reconstruct(photos, tmp_path)
-    with pytest.raises(InputError, match="is a file"):
-        sfm.reconstruct(photos, tmp_path / "few/view_00.jpg")
-    with pytest.raises(InputError, match="expected auto, exhaustive or sequential"):
-        sfm.reconstruct(photos, tmp_path / "out", sfm.SfmSettings(matching="nearest"))
-    with pytest.raises(InputError, match="camera model 'LENS'"):
-        sfm.reconstruct(photos, tmp_path / "out", sfm.SfmSettings(camera_model="LENS"))
+    for output, settings, told in [
+        (tmp_path, {}, "is neither empty nor a result of sfm"),
+        (tmp_path / "few/view_00.jpg", {}, "is a file"),
+        (tmp_path / "out", {"matching": "nearest"}, "expected auto, exhaustive or sequential"),
+        (tmp_path / "out", {"camera_model": "LENS"}, "camera model 'LENS'"),
+    ]:
+        with pytest.raises(InputError, match=told):
+            sfm.reconstruct(photos, output, sfm.SfmSettings(**settings))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("damage", ["garbage", "truncated", "empty"])
 def test_photo_that_does_not_decode_is_named(photos, tmp_path, damage):
-    folder = tmp_path / "photos"
-    shutil.copytree(photos, folder)
+    folder = shutil.copytree(photos, tmp_path / "photos")
     whole = (folder / "view_05.jpg").read_bytes()
     broken = {"garbage": b"hello" * 100, "truncated": whole[: len(whole) // 2], "empty": b""}[damage]
     (folder / "view_05.jpg").write_bytes(broken)
@@ -309,8 +297,7 @@ def task_of(monkeypatch):
 
 
 def test_what_is_no_photo_is_left_out_with_a_line(photos, tmp_path, monkeypatch):
-    folder = tmp_path / "photos"
-    shutil.copytree(photos, folder)
+    folder = shutil.copytree(photos, tmp_path / "photos")
     (folder / "masks").mkdir()
     for index in range(COUNT):
         write_png(folder / "masks" / f"view_{index:02d}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
@@ -345,8 +332,7 @@ def test_a_folder_of_photos_that_cannot_be_read_is_named(photos, tmp_path, monke
 
 def test_a_photo_of_another_kind_than_its_name_says_is_written_anew(photos, tmp_path, monkeypatch):
     """pycolmap reads no WebP."""
-    folder = tmp_path / "photos"
-    shutil.copytree(photos, folder)
+    folder = shutil.copytree(photos, tmp_path / "photos")
     picture = read_image(folder / "view_03.jpg")
     Pillow.fromarray(picture).save(folder / "view_03.jpg", "WEBP", quality=95)
     tasks = task_of(monkeypatch)

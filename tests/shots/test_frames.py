@@ -104,17 +104,8 @@ def test_more_digits_than_the_pattern_has_and_negative_ones() -> None:
 @pytest.mark.parametrize(
     "pattern",
     [
-        "{nmae}.png",
-        "{}.png",
-        "{name:04}.png",
-        "{frames}.png",
-        "a.%x.png",
-        "a.%4d.png",
-        "{frame:4d}.png",
-        "{a b}.png",
-        "a.$FF.png",
-        "a.<f4>.png",
-        "a.<UDIM>.png",
+        *("{nmae}.png", "{}.png", "{name:04}.png", "{frames}.png", "a.%x.png", "a.%4d.png"),
+        *("{frame:4d}.png", "{a b}.png", "a.$FF.png", "a.<f4>.png", "a.<UDIM>.png"),
     ],
 )
 def test_fields_that_are_not_known(pattern: str) -> None:

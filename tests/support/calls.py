@@ -6,10 +6,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tracemalloc
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,11 +24,29 @@ Capture = pytest.CaptureFixture[str]
 
 
 def warnings_of(work: Callable[[], object]) -> list[str]:
-    """The user's warnings of a piece of work."""
+    """The user's warnings of a piece of work, and NumPy's."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         work()
-    return [str(warning.message) for warning in caught if warning.category is UserWarning]
+    return [str(warning.message) for warning in caught if warning.category in {UserWarning, RuntimeWarning}]
+
+
+@contextmanager
+def no_warnings() -> Iterator[None]:
+    """Any warning is an error here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    """Bytes that Python and NumPy have at most during a piece of work."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
 
 
 def flags(config: object, prefix: str = "--") -> list[str]:
@@ -46,10 +67,14 @@ def train(scene: Path, run: Path, config: TrainConfig, *more: str) -> int:
     return main(["train", str(scene), "-o", str(run), *flags(config), *more])
 
 
+def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A Python process that is given these words, once it has ended; options: of subprocess.run."""
+    command = [sys.executable, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "clsplat", *arguments], capture_output=True, text=True, timeout=120, check=False
-    )
+    return python("-m", "clsplat", *arguments, timeout=120)
 
 
 def error_line(capsys: Capture) -> str:

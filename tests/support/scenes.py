@@ -12,6 +12,7 @@ from clsplat.camera import Camera
 from clsplat.gaussians import Gaussians
 
 Scene = tuple[Gaussians, Camera]
+Limits = tuple[float, float]
 
 
 def make_gaussians(
@@ -94,30 +95,32 @@ def overlap(count: int = 40, width: int = 40, height: int = 30, seed: int = 4) -
     return make_gaussians(world_from_pixels(camera, pixels, depths), quaternions, log_scales, opacities, sh), camera
 
 
+def _placed(
+    rng: np.random.Generator, camera: Camera, pixels: Float64, depths: Float64, axes: Float64, opacities: Limits
+) -> Scene:
+    """Gaussians at pixels (N, 2) and depths (N,), with axes (N, 3) in pixels and opacities from a range."""
+    log_scales = np.log(depths[:, None] / camera.fx * axes)
+    sh = random_sh(rng, len(depths))
+    opaque = rng.uniform(*opacities, len(depths))
+    means, quaternions = world_from_pixels(camera, pixels, depths), rng.normal(size=(len(depths), 4))
+    return make_gaussians(means, quaternions, log_scales, opaque, sh), camera
+
+
 def many_per_tile(count: int = 500, width: int = 48, height: int = 32) -> Scene:
     """All means within the 16x16 tile at (16, 0), faint enough that most of them are blended."""
     rng = np.random.default_rng(5)
-    camera = straight_camera(width, height)
     pixels = np.array([16.0, 0.0]) + rng.uniform(1.0, 15.0, (count, 2))
     depths = rng.uniform(1.0, 9.0, count)
-    log_scales = np.log(depths[:, None] / camera.fx * rng.uniform(0.5, 3.0, (count, 3)))
-    sh = random_sh(rng, count)
-    opacities = rng.uniform(0.006, 0.12, count)
-    means = world_from_pixels(camera, pixels, depths)
-    return make_gaussians(means, rng.normal(size=(count, 4)), log_scales, opacities, sh), camera
+    axes = rng.uniform(0.5, 3.0, (count, 3))
+    return _placed(rng, straight_camera(width, height), pixels, depths, axes, (0.006, 0.12))
 
 
 def saturating(count: int = 60, width: int = 40, height: int = 36) -> Scene:
     """Nearly opaque layers: alpha is clamped at 0.99 and pixels end after a few Gaussians, neighbours later."""
     rng = np.random.default_rng(6)
-    camera = straight_camera(width, height)
     pixels = rng.uniform(0.1, 0.9, (count, 2)) * np.array([width, height])
-    depths = np.linspace(1.5, 5.0, count)
-    log_scales = np.log(depths[:, None] / camera.fx * rng.uniform(3.0, 9.0, (count, 3)))
-    sh = random_sh(rng, count)
-    opacities = rng.uniform(0.9, 0.9999, count)
-    means = world_from_pixels(camera, pixels, depths)
-    return make_gaussians(means, rng.normal(size=(count, 4)), log_scales, opacities, sh), camera
+    axes = rng.uniform(3.0, 9.0, (count, 3))
+    return _placed(rng, straight_camera(width, height), pixels, np.linspace(1.5, 5.0, count), axes, (0.9, 0.9999))
 
 
 def off_frustum(count: int = 64, width: int = 40, height: int = 30) -> Scene:
@@ -143,28 +146,18 @@ def off_frustum(count: int = 64, width: int = 40, height: int = 30) -> Scene:
 def needles(count: int = 48, width: int = 64, height: int = 48) -> Scene:
     """Axis ratios up to 10,000: the 2D covariance is all but singular, the low-pass alone keeps it invertible."""
     rng = np.random.default_rng(8)
-    camera = tilted_camera(width, height)
     pixels = rng.uniform(0.0, 1.0, (count, 2)) * np.array([width, height])
     depths = rng.uniform(2.0, 6.0, count)
     axes = np.array([100.0, 0.01, 0.01]) * rng.uniform(0.2, 2.0, (count, 3))
-    log_scales = np.log(depths[:, None] / camera.fx * axes)
-    sh = random_sh(rng, count)
-    opacities = rng.uniform(0.1, 0.9, count)
-    means = world_from_pixels(camera, pixels, depths)
-    return make_gaussians(means, rng.normal(size=(count, 4)), log_scales, opacities, sh), camera
+    return _placed(rng, tilted_camera(width, height), pixels, depths, axes, (0.1, 0.9))
 
 
 def equal_depth(count: int = 40, width: int = 40, height: int = 32) -> Scene:
     """All at exactly the same float32 depth, overlapping: only the index orders them."""
     rng = np.random.default_rng(9)
-    camera = straight_camera(width, height)
     pixels = rng.uniform(0.2, 0.8, (count, 2)) * np.array([width, height])
-    depths = np.full(count, 3.0)
-    log_scales = np.log(depths[:, None] / camera.fx * rng.uniform(1.0, 5.0, (count, 3)))
-    sh = random_sh(rng, count)
-    opacities = rng.uniform(0.2, 0.9, count)
-    means = world_from_pixels(camera, pixels, depths)
-    return make_gaussians(means, rng.normal(size=(count, 4)), log_scales, opacities, sh), camera
+    axes = rng.uniform(1.0, 5.0, (count, 3))
+    return _placed(rng, straight_camera(width, height), pixels, np.full(count, 3.0), axes, (0.2, 0.9))
 
 
 def random_cloud(count: int, seed: int, width: int, height: int, degree: int = 3) -> Scene:

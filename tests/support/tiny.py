@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,9 +71,7 @@ def cameras() -> list[Camera]:
         right = np.cross([0.0, 1.0, 0.0], forward)
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
-        made.append(
-            Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, rotation, -rotation @ position),
-        )
+        made.append(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, rotation, -rotation @ position))
     return made
 
 
@@ -127,6 +126,18 @@ def short(**changes: object) -> TrainConfig:
 
 FEW = short(iterations=3, sh_degree_every=1, report=False, density={"every": 0})
 """A training of three steps, without density control."""
+
+
+def run_steps(count: int, trainer: Trainer) -> None:
+    for _ in range(count):
+        trainer.train_step()
+
+
+def trained_to(step: int, scene: Scene, config: TrainConfig, device: Device, **options: Any) -> Trainer:
+    """A training after so many steps; options: of the trainer."""
+    trainer = Trainer(scene, config, device, **options)
+    run_steps(step, trainer)
+    return trainer
 
 
 def loss_curve(scene: Scene, device: Device) -> list[float]:

@@ -5,14 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from compare import (
-    assert_close,
-    assert_close_gradient,
-    assert_close_images,
-    assert_same_bits,
-    cosine,
-    relative_error,
-)
+from compare import assert_close, assert_close_gradient, assert_close_images, assert_same_bits, cosine, relative_error
 
 
 def test_close_passes_within_and_fails_beyond() -> None:

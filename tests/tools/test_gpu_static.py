@@ -410,12 +410,10 @@ def test_without_clang(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
 
 def test_another_clang(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu_compilers.shutil, "which", lambda name: "/bin/clang" if name == "clang" else None)
-    monkeypatch.setattr(
-        gpu_compilers, "_run", lambda _: subprocess.CompletedProcess([], 0, "clang version 15.0.6\n", "")
-    )
-    with pytest.raises(
-        NoCompilerError, match=r"no clang 19 found; /bin/clang is another version: apt install clang-19"
-    ):
+    done = subprocess.CompletedProcess([], 0, "clang version 15.0.6\n", "")
+    monkeypatch.setattr(gpu_compilers, "_run", lambda _: done)
+    told = "no clang 19 found; /bin/clang is another version: apt install clang-19"
+    with pytest.raises(NoCompilerError, match=told):
         gpu_compilers.clang()
 
 
@@ -423,9 +421,8 @@ def test_without_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     gpu_compilers.nvidia.cache_clear()
     monkeypatch.setattr(gpu_compilers, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(gpu_compilers, "_run", lambda _: subprocess.CompletedProcess([], 1, "", "ERROR: no index\n"))
-    with pytest.raises(
-        NoCompilerError, match=r"no ptxas found: .*pip download nvidia-cuda-nvcc==\S+ failed: ERROR: no i"
-    ):
+    told = r"no ptxas found: .*pip download nvidia-cuda-nvcc==\S+ failed: ERROR: no i"
+    with pytest.raises(NoCompilerError, match=told):
         gpu_compilers.nvidia("ptxas")
 
 
@@ -452,15 +449,8 @@ def test_a_rehearsed_step_is_the_packages() -> None:
 def test_a_prediction(monkeypatch: pytest.MonkeyPatch) -> None:
     source = Source("ranges", ("-DITEMS=64",))
     kernel = built(parse_sass(SASS)["walk"], kernel="ranges")
-    launch = {
-        "kernel": "ranges",
-        "stem": source.stem,
-        "options": list(source.options),
-        "size": [3200],
-        "scalars": [3200.0],
-        "bytes": 5e6,
-        "stage": "ranges",
-    }
+    launch = {"kernel": "ranges", "stem": source.stem, "options": list(source.options), "stage": "ranges"}
+    launch |= {"size": [3200], "scalars": [3200.0], "bytes": 5e6}
     frame = {"listed": 4, "visible": 2, "width": 64, "height": 64, "sh_degree": 3, "walked": 4}
     gpu = Gpu("some", "sm_89", units=2, issue=4, ghz=1.0, gb=1000)
     copied = {"kernel": "write", "bytes": 1e9, "stage": "target"}

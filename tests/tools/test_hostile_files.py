@@ -9,7 +9,6 @@ import json
 import os
 import random
 import struct
-import tracemalloc
 import warnings
 import zipfile
 import zlib
@@ -17,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import calls
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -60,12 +60,7 @@ def refusal(read: Callable[[], object]) -> str:
 
 def peak_of(read: Callable[[], object]) -> int:
     """Bytes that Python and NumPy had at most while `read` was refused."""
-    tracemalloc.start()
-    try:
-        refusal(read)
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    return calls.peak_of(lambda: refusal(read))
 
 
 # The sample
@@ -187,11 +182,8 @@ def huge(path: Path) -> None:
 
 
 PLACES = (
-    pytest.param(pipe, marks=posix),
-    pytest.param(loop, marks=links),
-    folder,
-    pytest.param(zeros, marks=posix),
-    huge,
+    *(pytest.param(pipe, marks=posix), pytest.param(loop, marks=links)),
+    *(folder, pytest.param(zeros, marks=posix), huge),
 )
 
 
@@ -338,13 +330,8 @@ def change(tmp_path: Path, **values: object) -> Path:
 
 
 OUTSIDE = (
-    "../../etc/passwd",
-    "/etc/passwd",
-    "../images/a.png",
-    "images/../../x.png",
-    "..\\x.png",
-    "images\\..\\..\\x.png",
-    "..",
+    *("../../etc/passwd", "/etc/passwd", "../images/a.png", "images/../../x.png"),
+    *("..\\x.png", "images\\..\\..\\x.png", ".."),
 )
 
 
@@ -617,12 +604,8 @@ def test_a_checkpoint_may_be_made_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "array",
     [
-        np.float32(3),
-        np.zeros((0, 3)),
-        np.ones(4, bool),
-        np.asfortranarray(np.ones((4, 3))),
-        np.arange(3, dtype=">u2"),
-        np.zeros(2, complex),
+        *(np.float32(3), np.zeros((0, 3)), np.ones(4, bool), np.asfortranarray(np.ones((4, 3)))),
+        *(np.arange(3, dtype=">u2"), np.zeros(2, complex)),
     ],
 )
 def test_every_array_of_numbers_comes_back(array: Any, tmp_path: Path) -> None:
@@ -641,11 +624,8 @@ def test_a_checkpoints_directory_claims_at_most_what_it_has(tmp_path: Path) -> N
     end = data.rindex(b"PK\5\6")
     data[end + 12 : end + 16] = struct.pack("<I", 0xFFFFFFF0)
     path.write_bytes(data)
-    tracemalloc.start()
     with pytest.warns(UserWarning, match="is a damaged checkpoint"):
-        runs.Run.open(tmp_path / "run").load_latest_checkpoint()
-    assert tracemalloc.get_traced_memory()[1] < 1e7
-    tracemalloc.stop()
+        assert calls.peak_of(runs.Run.open(tmp_path / "run").load_latest_checkpoint) < 1e7
 
 
 # Results of structure from motion

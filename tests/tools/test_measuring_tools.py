@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import bench_growth
 import bench_library
@@ -59,19 +60,6 @@ def test_library(capsys: Capture) -> None:
     assert (result["gaussians"], result["width"], result["height"]) == (300, 40, 30)
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        ("--gaussians 0", "--gaussians 0: expected at least 1"),
-        ("--size 0x30", "--size 0x30: expected at least 1x1"),
-        ("--repeat 0", "--repeat 0: expected at least 1"),
-    ],
-)
-def test_wrong_calls_of_bench_library(flags: str, message: str, capsys: Capture) -> None:
-    assert bench_library.main(flags.split()) == 2
-    assert message in one_error(capsys, "bench_library")
-
-
 def test_deviation_from_linear_growth() -> None:
     rows = [{"n": n, "ns_per_key": ns} for n, ns in ((10_000, 90.0), (100_000, 12.0), (300_000, 10.0), (10**6, 15.0))]
     assert bench_sort.deviation(rows) == 1.5
@@ -93,20 +81,6 @@ def test_an_order_that_is_not_numpys(monkeypatch: pytest.MonkeyPatch, capsys: Ca
     assert "keys: the order of 10000 differs" in one_error(capsys, "bench_sort")
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        ("--max 9999", "--max 9999: expected at least 10000"),
-        ("--repeat 0", "--repeat 0: expected at least 1"),
-        ("--plot sort.pdf", "sort.pdf"),
-        ("--device abacus", "--device abacus: no such device"),
-    ],
-)
-def test_wrong_calls_of_bench_sort(flags: str, message: str, capsys: Capture) -> None:
-    assert bench_sort.main(flags.split()) == 2
-    assert message in one_error(capsys, "bench_sort")
-
-
 @pytest.mark.needs("matplotlib")
 def test_growth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     for name, value in {"GAUSSIANS": 500, "WIDTH": 80, "HEIGHT": 60, "FEWEST": 100}.items():
@@ -117,16 +91,8 @@ def test_growth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
     assert bench_growth.main([*flags, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     gaussians, pixels = result["gaussians"], result["pixels"]
-    assert [(row["gaussians"], row["width"], row["height"]) for row in gaussians["rows"]] == [
-        (100, 80, 60),
-        (300, 80, 60),
-        (1000, 80, 60),
-    ]
-    assert [(row["gaussians"], row["width"], row["height"]) for row in pixels["rows"]] == [
-        (500, 63, 47),
-        (500, 89, 67),
-        (500, 126, 94),
-    ]
+    drawn = [[(row["gaussians"], row["width"], row["height"]) for row in part["rows"]] for part in (gaussians, pixels)]
+    assert drawn == [[(100, 80, 60), (300, 80, 60), (1000, 80, 60)], [(500, 63, 47), (500, 89, 67), (500, 126, 94)]]
     for part in (gaussians, pixels):
         for row in part["rows"]:
             assert row["pairs"] > 0
@@ -149,17 +115,25 @@ def test_line_of_relative_residuals() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flags", "message"),
+    ("tool", "flags", "message"),
     [
-        ("--max-gaussians 5e4", "--max-gaussians 50000: expected at least 100000"),
-        ("--max-megapixels 0.4", "--max-megapixels 0.4: expected at least 0.5"),
-        ("--repeat 0", "--repeat 0: expected at least 1"),
-        ("--plot nowhere/growth.svg", "nowhere"),
+        (bench_library, "--gaussians 0", "--gaussians 0: expected at least 1"),
+        (bench_library, "--size 0x30", "--size 0x30: expected at least 1x1"),
+        (bench_library, "--repeat 0", "--repeat 0: expected at least 1"),
+        (bench_sort, "--max 9999", "--max 9999: expected at least 10000"),
+        (bench_sort, "--repeat 0", "--repeat 0: expected at least 1"),
+        (bench_sort, "--plot sort.pdf", "sort.pdf"),
+        (bench_sort, "--device abacus", "--device abacus: no such device"),
+        (bench_growth, "--max-gaussians 5e4", "--max-gaussians 50000: expected at least 100000"),
+        (bench_growth, "--max-megapixels 0.4", "--max-megapixels 0.4: expected at least 0.5"),
+        (bench_growth, "--repeat 0", "--repeat 0: expected at least 1"),
+        (bench_growth, "--plot nowhere/growth.svg", "nowhere"),
     ],
+    ids=lambda value: getattr(value, "__name__", None),
 )
-def test_wrong_calls_of_bench_growth(flags: str, message: str, capsys: Capture) -> None:
-    assert bench_growth.main(flags.split()) == 2
-    assert message in one_error(capsys, "bench_growth")
+def test_wrong_calls(tool: ModuleType, flags: str, message: str, capsys: Capture) -> None:
+    assert tool.main(flags.split()) == 2
+    assert message in one_error(capsys, tool.__name__)
 
 
 @pytest.fixture

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import stress_kernels
+from calls import python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stress_cases import GRADIENT_NORM, GRADIENT_TAIL, PROJECTION, STRESSORS
@@ -128,16 +127,8 @@ def test_a_wrong_loss_is_found(default_device: Device, monkeypatch: pytest.Monke
 @pytest.mark.slow
 def test_command(tmp_path: Path) -> None:
     plot = tmp_path / "errors.svg"
-    command = [
-        sys.executable,
-        ROOT / "tools" / "stress" / "run",
-        "kernels",
-        "--cases",
-        "600",
-        "--only",
-        "scales,counts,wild",
-    ]
-    done = subprocess.run([*command, "--json", "--plot", plot], capture_output=True, text=True, check=False)
+    flags = "--cases 600 --only scales,counts,wild --json --plot"
+    done = python(ROOT / "tools" / "stress" / "run", "kernels", *flags.split(), plot)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
     assert result["cases"] >= 600
@@ -155,8 +146,6 @@ def test_command(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_calls(arguments: list[str]) -> None:
-    done = subprocess.run(
-        [sys.executable, ROOT / "tools" / "stress" / "run", *arguments], capture_output=True, text=True, check=False
-    )
+    done = python(ROOT / "tools" / "stress" / "run", *arguments)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1

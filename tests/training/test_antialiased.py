@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture
-from tiny import CONFIG, short, write_scene
+from tiny import CONFIG, run_steps, short, write_scene
 
 from clsplat.api import train
 from clsplat.cli.main import main
@@ -64,8 +64,7 @@ def test_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path, mo
 def test_no_scale_is_less_than_the_pictures_show(scene: Scene, default_device: Device) -> None:
     trainer = Trainer(scene, replace(SMOOTH, density=replace(SMOOTH.density, every=0)), default_device)
     start = trainer.gaussians().means.astype(np.float64)
-    for _ in range(30):
-        trainer.train_step()
+    run_steps(30, trainer)
     model = trainer.gaussians()
     cameras = [trainer.local(view.camera) for view in trainer.views]
     limits = sampling_limits(start, cameras)  # they were worked out once, before the first step

@@ -8,23 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from tiny import CONFIG, write_scene
+from tiny import CONFIG, run_steps
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_devices
 from clsplat.errors import DeviceError
 from clsplat.runs.checkpoints import Checkpoint
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.trainer import Trainer
 
 LEARNT = {"exposure": "appearance/logs", "ppisp": "appearance/lenses_logs", "grid": "appearance/first"}
 """An array of each kind's checkpoint that is 0 before anything is learnt."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 @pytest.fixture(params=LEARNT)
@@ -34,8 +28,7 @@ def config(request: pytest.FixtureRequest) -> TrainConfig:
 
 def state(trainer: Trainer, steps: int = 24) -> dict[str, np.ndarray]:
     """All that a training has after so many steps."""
-    for _ in range(steps):
-        trainer.train_step()
+    run_steps(steps, trainer)
     arrays = trainer.checkpoint()[0]
     assert arrays[LEARNT[trainer.config.appearance]].any()
     trainer.close()
@@ -50,8 +43,7 @@ def assert_same_state(got: dict[str, np.ndarray], wanted: dict[str, np.ndarray])
 
 def test_a_resumed_training_has_the_same_bytes(default_device: Device, scene: Scene, config: TrainConfig) -> None:
     first, second = (Trainer(scene, config, default_device) for _ in range(2))
-    for _ in range(9):
-        first.train_step()
+    run_steps(9, first)
     second.restore(Checkpoint(9, *first.checkpoint()))
     assert_same_state(state(second, 11), state(Trainer(scene, config, default_device), 20))
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import assert_close, assert_same_bits
-from tiny import CONFIG, short, write_scene
+from tiny import CONFIG, short
 
 from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
@@ -25,7 +25,6 @@ from clsplat.optimisation.step_noise import Exploration
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
 from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.adam import AdamStep
 from clsplat.stages.device_gaussians import allocate_gaussians
@@ -36,11 +35,6 @@ from clsplat.training.step.inputs import StepRows
 from clsplat.training.trainer import Trainer
 
 TWO = short(batch=2, iterations=40)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 @cache

@@ -9,24 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import CONFIG, write_scene
+from tiny import CONFIG
 
 from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
 from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.grid import GRID_SHAPE
 from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 WITH_GRIDS = replace(CONFIG, appearance="grid")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 def test_only_grids_of_trained_views_move(default_device: Device, scene: Scene) -> None:

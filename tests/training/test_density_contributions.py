@@ -13,14 +13,7 @@ from test_density import state
 
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.training.density import RowPlan, StatisticsNeeds
-from clsplat.training.density.adaptive import (
-    Adaptive,
-    budget,
-    is_due,
-    is_pruning_due,
-    plan,
-    plan_pruning,
-)
+from clsplat.training.density.adaptive import Adaptive, budget, is_due, is_pruning_due, plan, plan_pruning
 
 CONFIG = DensityConfig()
 GROWING = replace(CONFIG, growth="budget", max_gaussians=9000, start=500, stop=2500)
@@ -36,11 +29,7 @@ def contributions(totals: ArrayLike, largest: ArrayLike | None = None) -> dict[s
 
 
 def make_plan(
-    gradients: ArrayLike,
-    config: DensityConfig = CONFIG,
-    step: int = 600,
-    *,
-    known: dict[str, np.ndarray] | None = None,
+    gradients: ArrayLike, config: DensityConfig = CONFIG, step: int = 600, *, known: dict[str, np.ndarray] | None = None
 ) -> RowPlan:
     """All small, so that who is densified is cloned, and seen in four views."""
     sums = 4 * np.asarray(gradients, np.float32)

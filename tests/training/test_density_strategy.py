@@ -8,16 +8,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 from compare import assert_same_bits
 from numpy.typing import NDArray
-from tiny import write_scene
+from tiny import run_steps, trained_to
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.runs.checkpoints import Checkpoint
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
@@ -73,15 +71,8 @@ class Juggler(Strategy):
         self.ages = arrays["ages"]
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
 def trained(scene: Scene, device: Device, steps: int) -> tuple[Trainer, Juggler]:
-    trainer = Trainer(scene, CONFIG, device, strategy=Juggler)
-    for _ in range(steps):
-        trainer.train_step()
+    trainer = trained_to(steps, scene, CONFIG, device, strategy=Juggler)
     assert isinstance(trainer.strategy, Juggler)
     return trainer, trainer.strategy
 
@@ -129,8 +120,7 @@ def test_its_state_is_in_the_checkpoint(scene: Scene, default_device: Device) ->
     assert "strategy/ages" in arrays
     again = Trainer(scene, CONFIG, default_device, strategy=Juggler)
     again.restore(Checkpoint(6, arrays, state))
-    for _ in range(2):
-        again.train_step()
+    run_steps(2, again)
     assert isinstance(again.strategy, Juggler)
     assert_same_bits(again.strategy.ages, juggler.ages)
     for group in PARAMETER_GROUPS:

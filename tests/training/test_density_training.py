@@ -4,19 +4,19 @@ wherever training was stopped, and in pieces."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from calls import warnings_of
 from compare import assert_close, assert_same_bits
 from quick import quick
 from same_bytes import model_bytes, stopped_at
 from scenes import random_cloud
 from test_trainer import host
-from tiny import short, write_scene
+from tiny import run_steps, short, trained_to, write_scene
 
 from clsplat.api import train
 from clsplat.config.training import TrainConfig
@@ -34,15 +34,9 @@ from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(
-    iterations=48,
-    density={"min_contribution": 2.0, "prune_every": 6, "growth": "budget", "max_gaussians": 120},
+    iterations=48, density={"min_contribution": 2.0, "prune_every": 6, "growth": "budget", "max_gaussians": 120}
 )
 """All that goes beyond the paper, and steps of nothing but pruning before and after `stop`."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 @pytest.mark.parametrize(("growth", "most"), [("paper", 60), ("paper", 10_000), ("paper", 40), ("budget", 60)])
@@ -52,10 +46,8 @@ def test_a_limit_that_held_the_growth_is_told_of(scene: Scene, default_device: D
     config = short(
         iterations=120, density={"growth": growth, "max_gaussians": most, "gradient_threshold": 1e-6} | keeps
     )
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        train(scene, config, device=default_device)
-    held = [str(one.message) for one in told if "has limited the growth" in str(one.message)]
+    told = warnings_of(lambda: train(scene, config, device=default_device))
+    held = [text for text in told if "has limited the growth" in text]
     assert len(held) == (growth == "paper" and most == 60)
     assert all(text.startswith("--density.max-gaussians 60 has limited the growth: --density.growth") for text in held)
 
@@ -80,9 +72,7 @@ def test_everything_happens(scene: Scene, default_device: Device, monkeypatch: p
 
     monkeypatch.setattr(adaptive, "plan", noted("plan"))
     monkeypatch.setattr(adaptive, "plan_pruning", noted("plan_pruning"))
-    trainer = Trainer(scene, CONFIG, default_device)
-    for _ in range(CONFIG.iterations):
-        trainer.train_step()
+    trained_to(CONFIG.iterations, scene, CONFIG, default_device)
     assert [step for name, step in made if name == "plan"] == [15, 20, 25, 30, 35]
     assert [step for name, step in made if name == "plan_pruning"] == [12, 18, 24, 36, 42]
     pruned = {step: count - len(rows) for (name, step), (count, rows) in made.items() if name == "plan_pruning"}
@@ -96,9 +86,7 @@ def test_a_pruning_alone_keeps_what_is_not_of_epochs(scene: Scene, default_devic
     config = short(
         density={"prune_every": 26, "min_contribution": 20.0, "every": 99, "start": 5, "opacity_reset_every": 0}
     )
-    trainer = Trainer(scene, config, default_device)
-    for _ in range(26):
-        trainer.train_step()
+    trainer = trained_to(26, scene, config, default_device)
     before = {name: array.get() for name, array in trainer.statistics.named().items()}
     models = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
     gone = np.maximum(before["current_largest"], before["whole_largest"]) < 20.0
@@ -121,8 +109,7 @@ def test_contributions_are_those_of_an_epoch(scene: Scene, default_device: Devic
     config = replace(base, optimiser=optimiser, warmup=())
     trainer = Trainer(scene, config, default_device)
     model, views = trainer.gaussians(), scene.train_views
-    for _ in range(len(views) + 1):
-        trainer.train_step()
+    run_steps(len(views) + 1, trainer)
     nothing = np.zeros((views[0].camera.height, views[0].camera.width, 3))
     each = np.array([render_grad(model, view.camera, nothing).contributions for view in views])
     assert trainer.statistics.whole_totals is not None
@@ -130,8 +117,7 @@ def test_contributions_are_those_of_an_epoch(scene: Scene, default_device: Devic
     assert_close(trainer.statistics.whole_totals.get(), each.sum(axis=0), relative=1e-4, absolute=len(views) * 4 / 255)
     assert_close(trainer.statistics.whole_largest.get(), each.max(axis=0), relative=1e-4, absolute=4 / 255)
     coarse = Trainer(scene, replace(config, warmup=(99,)), default_device)
-    for _ in range(len(views) + 1):
-        coarse.train_step()
+    run_steps(len(views) + 1, coarse)
     assert coarse.statistics.whole_totals is not None
     # half the pixels a side: the low-pass of 0.3 square pixels weighs four times as much, which makes small ones larger
     ratio = coarse.statistics.whole_totals.get().sum() / each.sum()
@@ -139,9 +125,7 @@ def test_contributions_are_those_of_an_epoch(scene: Scene, default_device: Devic
 
 
 def test_a_reset_forgets_contributions(scene: Scene, default_device: Device) -> None:
-    trainer = Trainer(scene, CONFIG, default_device)
-    for _ in range(20):
-        trainer.train_step()
+    trainer = trained_to(20, scene, CONFIG, default_device)
     assert trainer.statistics.whole_totals is not None
     assert np.isfinite(trainer.statistics.whole_totals.get()).any()
     trainer._control_density()
@@ -209,11 +193,7 @@ def test_settings_that_come_with_resume(scene: Scene, default_device: Device, tm
     assert run.model_path.exists()
 
 
-MANY = replace(
-    CONFIG,
-    density=replace(CONFIG.density, max_gaussians=2500, min_contribution=0.02),
-    random_points=400,
-)
+MANY = replace(CONFIG, density=replace(CONFIG.density, max_gaussians=2500, min_contribution=0.02), random_points=400)
 
 
 @pytest.mark.slow
@@ -245,7 +225,6 @@ def test_every_driver_prunes_alike(device: Device, default_device: Device, scene
     config: TrainConfig = replace(CONFIG, iterations=16)
     trainers = [Trainer(scene, config, opened) for opened in (device, default_device)]
     for trainer in trainers:
-        for _ in range(config.iterations):
-            trainer.train_step()
+        run_steps(config.iterations, trainer)
         assert not isinstance(trainer.parameters, HostGaussians)
     assert trainers[0].parameters.count == trainers[1].parameters.count

@@ -10,14 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from depths import add_maps, add_tracks
-from same_bytes import (  # noqa: F401  # undisturbed is a fixture
-    check_in_less_memory,
-    check_on_two_devices,
-    interrupted,
-    model_bytes,
-    undisturbed,
-)
-from tiny import HEIGHT, WIDTH, short, write_scene
+from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
+from tiny import HEIGHT, WIDTH, short, trained_to, write_scene
 
 from clsplat.camera import DEFAULT_NEAR_PLANE
 from clsplat.config.training import TrainConfig
@@ -72,9 +66,7 @@ def test_the_render_comes_nearer_to_what_is_known(scene: Scene, default_device: 
     found = {}
     for weight in (0.0, 20.0):
         config = short(iterations=40, depth=source, depth_weight=weight, warmup=())
-        trainer = Trainer(with_depths(scene, config.depth_use), config, default_device)
-        for _ in range(40):
-            trainer.train_step()
+        trainer = trained_to(40, with_depths(scene, config.depth_use), config, default_device)
         trainer.settle()
         found[weight] = wrong(trainer)
     assert found[20.0] < 0.85 * found[0.0]  # the points are wrong by a twentieth themselves
@@ -171,20 +163,13 @@ def test_without_weight_the_model_is_that_of_today(scene: Scene, default_device:
 
 
 def test_an_interruption_gives_the_same_bytes(
-    scene: Scene,
-    default_device: Device,
-    tmp_path: Path,
-    undisturbed: bytes,  # noqa: F811
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
 ) -> None:
     assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
 
 
 def test_by_capacity_the_same_bytes(
-    scene: Scene,
-    default_device: Device,
-    tmp_path: Path,
-    undisturbed: bytes,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
+    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     assert model_bytes(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
@@ -203,9 +188,7 @@ def test_several_devices_and_one_give_the_same_bytes(scene: Scene, default_devic
 @pytest.mark.slow
 def test_a_bundle_has_the_depths(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     config = short(iterations=20, depth="maps")
-    trainer = Trainer(with_depths(scene, config.depth_use), config, default_device)
-    for _ in range(12):
-        trainer.train_step()
+    trainer = trained_to(12, with_depths(scene, config.depth_use), config, default_device)
     trainer.settle()
     incident = Incident(12, 0, trainer.views[0].name, "loss", 1, "nothing", np.zeros(3, np.float32))
     bundle = read_bundle(write_bundle(tmp_path, trainer, incident))

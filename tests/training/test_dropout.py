@@ -35,11 +35,6 @@ GROUP_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 THINNING = Thinning(0.3, (0x12345678, 0x9ABCDEF0))
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
 def cloud() -> tuple[Gaussians, Camera]:
     """Gaussians that stay under 1 when the rest are left out, for which the twin has a logit."""
     model, camera = random_cloud(300, 3, 64, 48)

@@ -11,7 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from compare import assert_same_bits
-from tiny import CONFIG, write_scene
+from tiny import CONFIG, trained_to
 
 from clsplat.api import train
 from clsplat.cli.main import main
@@ -25,7 +25,6 @@ from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.analysis.visible_points import VisiblePoints
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.appearance import exposure as gains
 from clsplat.training.appearance.exposure import GainsOfAll
@@ -33,11 +32,6 @@ from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 EXPOSED = replace(CONFIG, appearance="exposure")
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 def test_a_batch_learns_from_all_of_its_views(default_device: Device, scene: Scene) -> None:
@@ -78,9 +72,7 @@ def test_gains_that_points_tell_are_held_there(
     for pulls in ((0.0, 0.0), (1e3, 0.0), (0.0, 1e3)):
         for name, pull in zip(("VIEW_PULL_WEIGHT", "NEIGHBOUR_PULL_WEIGHT"), pulls, strict=True):
             monkeypatch.setattr(gains, name, pull)
-        trainer = Trainer(scene, EXPOSED, default_device)
-        for _ in range(30):
-            trainer.train_step()
+        trainer = trained_to(30, scene, EXPOSED, default_device)
         arrays = trainer.checkpoint()[0]
         moved[pulls] = np.abs(arrays["appearance/logs"] - arrays["appearance/start"]).max()
     assert moved[1e3, 0.0] < 0.3 * moved[0.0, 0.0], moved

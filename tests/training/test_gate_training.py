@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import warnings_of
 from held_out import psnr_of
 from same_bytes import gone_on, model_bytes
 from tiny import short, write_scene
@@ -41,11 +42,6 @@ CONFIG = short(
 """Nothing but the cameras makes a model of this worse on its way, and it follows them quickly."""
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
 @pytest.fixture
 def sabotaged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps uphill, of 6 degrees and as much of a world unit along each motion, after the second measurement."""
@@ -70,10 +66,8 @@ def test_bad_poses_are_gone_back_from(
 ) -> None:
     """To the poses of the best measurement, and the run says so."""
     run = Run.create(tmp_path / "run", CONFIG)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        train(scene, CONFIG, device=default_device, run=run)
-    told = [str(each.message) for each in caught if "held-out views had" in str(each.message)]
+    told = warnings_of(lambda: train(scene, CONFIG, device=default_device, run=run))
+    told = [text for text in told if "held-out views had" in text]
     gate = run.read_metrics()[-1]["gate"]
     ended, steps = gate["ended"], [each["step"] for each in gate["measured"]]
     figures = {each["step"]: each["psnr"] for each in gate["measured"]}

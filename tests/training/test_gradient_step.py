@@ -6,13 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from tiny import write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.stages.loss import Loss
@@ -51,11 +49,6 @@ class Witness(StepProbe):
     def after_rows(self, rows: StepRows) -> None:
         self.stages.append("after_rows")
         self.screen = rows.screen.gradients.get()
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 @pytest.mark.parametrize("looks", [False, True])

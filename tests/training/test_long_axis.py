@@ -11,21 +11,15 @@ import pytest
 from quick import quick
 from same_bytes import check_in_less_memory, model_bytes, stopped_at
 from scipy.spatial.transform import Rotation
-from tiny import short, write_scene
+from tiny import run_steps, short, trained_to, write_scene
 
 from clsplat.device.context import Device
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.density.adaptive import long_halves
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
-from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=48, density={"growth": "budget", "max_gaussians": 120, "long_axis": True})
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 def test_halves_lie_on_the_longest_axis() -> None:
@@ -76,10 +70,7 @@ def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -
 
 
 def test_it_grows_by_splits_alone(scene: Scene, default_device: Device) -> None:
-    trainer = Trainer(scene, CONFIG, default_device)
-    for _ in range(16):
-        trainer.train_step()
+    trainer = trained_to(16, scene, CONFIG, default_device)
     before = trainer.parameters.count
-    for _ in range(20):
-        trainer.train_step()
+    run_steps(20, trainer)
     assert trainer.parameters.count > before

@@ -7,20 +7,13 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 from compare import assert_close
-from tiny import loss_curve, write_scene
+from tiny import loss_curve
 
 from clsplat.device.context import Device
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "loss_curve.json"
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("curve") / "scene"))
 
 
 def test_losses_are_the_golden_ones(device: Device, scene: Scene) -> None:

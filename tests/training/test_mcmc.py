@@ -13,7 +13,7 @@ import pytest
 from compare import assert_same_bits
 from quick import quick
 from same_bytes import check_on_two_devices, model_bytes, stopped_at
-from tiny import short, write_scene
+from tiny import run_steps, short, trained_to, write_scene
 
 from clsplat.api import train
 from clsplat.arrays import Float32
@@ -33,15 +33,9 @@ from clsplat.training.trainer import Trainer
 
 GROWN = 150
 CONFIG = short(
-    iterations=48,
-    density={"growth": "mcmc", "max_gaussians": GROWN, "min_opacity": 0.03, "max_screen_radius": 30.0},
+    iterations=48, density={"growth": "mcmc", "max_gaussians": GROWN, "min_opacity": 0.03, "max_screen_radius": 30.0}
 )
 """Gaussians move and are added after steps 15, 20, ... 35, and there is noise in all steps."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 # The policy
@@ -88,9 +82,7 @@ def test_the_strongest_are_those_with_the_largest_scores() -> None:
 
 def begun(scene: Scene, device: Device, config: TrainConfig) -> Trainer:
     """A training of 15 steps, in which five Gaussians died: four transparent, and one too large on the screen."""
-    trainer = Trainer(scene, config, device)
-    for _ in range(15):
-        trainer.train_step()
+    trainer = trained_to(15, scene, config, device)
     logits = trainer.parameters["opacity_logits"].get()
     logits[:4], logits[4:] = -6.0, np.maximum(logits[4:], -2.0)
     trainer.parameters["opacity_logits"].set(logits)
@@ -270,8 +262,7 @@ def test_by_capacity_the_same_bytes(scene: Scene, default_device: Device, monkey
                 (room := real(*size)) and (8 if trainer.step in (12, 31) else room)
             ),
         )
-        for _ in range(CONFIG.iterations):
-            trainer.train_step()
+        run_steps(CONFIG.iterations, trainer)
         ends.append(trainer.checkpoint()[0])
         assert (trainer.pending.redone > 0) == capacity
     for name, values in ends[0].items():
@@ -289,8 +280,7 @@ def test_every_driver_trains_alike(device: Device, default_device: Device, scene
     ends = []
     for opened in (device, default_device):
         trainer = Trainer(scene, replace(CONFIG, iterations=24), opened.with_shape(lanes=1, items=1))
-        for _ in range(24):
-            trainer.train_step()
+        run_steps(24, trainer)
         ends.append(trainer.gaussians().arrays())
     for name, values in ends[0].items():
         assert_same_bits(ends[1][name], values, name)

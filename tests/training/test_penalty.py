@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from compare import assert_same_bits
 from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
-from tiny import short, write_scene
+from tiny import short, trained_to, write_scene
 
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.device.context import Device
@@ -21,15 +21,9 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.density import StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
-from clsplat.training.trainer import Trainer
 
 CONFIG = replace(short(iterations=40), penalty=0.5)
 """With a penalty so large that a short training shows it."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 def test_weights_are_shares_of_the_means() -> None:
@@ -75,9 +69,7 @@ def test_a_strategy_of_your_own_keeps_the_penalty(scene: Scene, default_device: 
     still = replace(CONFIG, density=DensityConfig(every=0))
     models = []
     for penalty, strategy in ((0.5, strategy_of), (0.5, Still), (0.0, Still)):
-        trainer = Trainer(scene, replace(still, penalty=penalty), default_device, strategy=strategy)
-        for _ in range(12):
-            trainer.train_step()
+        trainer = trained_to(12, scene, replace(still, penalty=penalty), default_device, strategy=strategy)
         models.append(trainer.gaussians().arrays())
     wanted, own, without = models
     for name, values in wanted.items():

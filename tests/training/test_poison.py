@@ -14,7 +14,7 @@ from depths import add_maps
 from golden_frames import checksums
 from pipeline import shaped
 from quick import quick
-from tiny import HEIGHT, WIDTH, short, write_scene
+from tiny import HEIGHT, WIDTH, short, trained_to, write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
@@ -39,11 +39,6 @@ BROKEN = (np.nan, np.inf, -np.inf)
 GARBAGE = (3e38, -1e30, 1e-42)
 ROW = 5
 """The Gaussian that is poisoned."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 @pytest.fixture(scope="module")
@@ -171,9 +166,7 @@ def test_training_in_poisoned_memory(
     for value in ("", WORDS[word]):
         monkeypatch.setenv("CLSPLAT_POISON", value)
         memory = little_memory(many_points, default_device) if pieces else device
-        trainer = Trainer(many_points if pieces else scene, config, memory)
-        for _ in range(config.iterations):
-            trainer.train_step()
+        trainer = trained_to(config.iterations, many_points if pieces else scene, config, memory)
         assert trainer.monitor.latest is None
         assert trainer.plan.streamed == pieces
         found.append(trainer.checkpoint()[0])
@@ -185,9 +178,7 @@ def test_training_in_poisoned_memory(
 def little_memory(scene: Scene, device: Device) -> Device:
     """So much that MANY is streamed at its end."""
     free = device.with_memory_limit(None)
-    trainer = Trainer(scene, MANY, free)
-    for _ in range(MANY.iterations):
-        trainer.train_step()
+    trained_to(MANY.iterations, scene, MANY, free)
     return device.with_memory_limit(int(0.3 * free.memory.peak))
 
 
@@ -202,10 +193,7 @@ def quiet(**changes: object) -> TrainConfig:
 
 def started(scene: Scene, device: Device, config: TrainConfig | None = None) -> Trainer:
     """After three steps, so that there are moments."""
-    trainer = Trainer(scene, config or quiet(), device)
-    for _ in range(3):
-        trainer.train_step()
-    return trainer
+    return trained_to(3, scene, config or quiet(), device)
 
 
 def put(array: DeviceArray, value: float, row: int = ROW) -> None:
@@ -468,9 +456,7 @@ def test_a_colour_that_is_not_finite_is_the_only_one_lost(scene: Scene, default_
 
 @pytest.mark.slow
 def test_rows_that_are_streamed_are_looked_after_too(many_points: Scene, default_device: Device) -> None:
-    trainer = Trainer(many_points, MANY, little_memory(many_points, default_device))
-    for _ in range(MANY.iterations):
-        trainer.train_step()
+    trainer = trained_to(MANY.iterations, many_points, MANY, little_memory(many_points, default_device))
     assert trainer.plan.streamed
     count = trainer.parameters.count
     values = trainer.parameters["sh_dc"].get()

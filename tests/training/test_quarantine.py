@@ -18,7 +18,7 @@ from calls import Capture
 from calls import train as command_train
 from compare import assert_same_bits
 from quick import quick
-from tiny import CONFIG, short, write_scene
+from tiny import CONFIG, run_steps, short, trained_to
 
 from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
@@ -28,7 +28,6 @@ from clsplat.errors import ClsplatError, InputError
 from clsplat.gaussians import MAX_SH_COEFFICIENT, PARAMETER_GROUPS, group_shapes
 from clsplat.runs.checkpoints import read_checkpoint, write_checkpoint
 from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.training import repro_bundle
@@ -45,11 +44,6 @@ from clsplat.training.stability.health import (
 from clsplat.training.trainer import Trainer
 
 CHECKED = short(checkpoint_every=5)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 Due = Callable[[Trainer], bool]
@@ -295,9 +289,7 @@ def test_a_bundle_of_a_sound_step_says_so(
     scene: Scene, default_device: Device, tmp_path: Path, capsys: Capture
 ) -> None:
     """Where the trouble was the machine's nothing shows it again: then all Gaussians are kept."""
-    trainer = Trainer(scene, CONFIG, default_device)
-    for _ in range(7):
-        trainer.train_step()
+    trainer = trained_to(7, scene, CONFIG, default_device)
     trainer.monitor.loss_failed()
     trainer.mend()
     assert trainer.monitor.latest is not None
@@ -356,8 +348,7 @@ def test_kernels_without_checks_have_the_same_bits_and_no_checks(scene: Scene, d
     """What `tools/bench/bench_guards.py` compares with."""
     trainers = [Trainer(scene, CONFIG, each) for each in (default_device, unguarded(default_device))]
     for trainer in trainers:
-        for _ in range(20):
-            trainer.train_step()
+        run_steps(20, trainer)
     arrays = [trainer.checkpoint()[0] for trainer in trainers]
     for name, array in arrays[0].items():
         assert_same_bits(arrays[1][name], array, name)

@@ -19,11 +19,6 @@ from clsplat.scenes.scene import Scene
 REFINED = {"poses": ("refine_poses",), "lenses": ("refine_lenses",), "both": ("refine_poses", "refine_lenses")}
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
-
-
 @pytest.fixture(scope="module", params=quick(REFINED, "both"))
 def config(request: pytest.FixtureRequest) -> TrainConfig:
     return short(iterations=40, **dict.fromkeys(REFINED[request.param], True))

@@ -148,17 +148,8 @@ def test_a_damaged_checkpoint_is_told(scene: Scene) -> None:
 
 def test_eval_takes_the_refined_lens(folder: Path, default_device: Device, tmp_path: Path) -> None:
     """clsplat eval RUN gives the figures that training wrote."""
-    command = [
-        "train",
-        str(folder),
-        "-o",
-        str(tmp_path / "run"),
-        "--iterations",
-        "40",
-        "--refine-lenses",
-        "--no-report",
-    ]
-    assert clsplat([*command, "--warmup", ""]) == 0
+    command = f"train {folder} -o {tmp_path}/run --iterations 40 --refine-lenses --no-report --warmup"
+    assert clsplat([*command.split(), ""]) == 0
     path = tmp_path / "run" / "eval.json"
     before = json.loads(path.read_text())["mean"]
     assert clsplat(["eval", str(tmp_path / "run")]) == 0

@@ -8,25 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import CONFIG, short, write_scene
+from tiny import CONFIG, run_steps, short
 
 from clsplat.api import train
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.start.initialise import from_points
 from clsplat.stages.device_gaussians import download_gaussians
 from clsplat.training.trainer import Trainer
 
 ALL = replace(CONFIG, optimiser=replace(CONFIG.optimiser, sparse=True, sh_rest_every=3))
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("scene")))
 
 
 def with_one_behind(scene: Scene) -> Gaussians:
@@ -48,8 +42,7 @@ def test_sparse_steps_leave_the_hidden(scene: Scene, default_device: Device, spa
     moment = trainer.first["means"].get()
     moment[-1] = 0.5
     trainer.first["means"].set(moment)
-    for _ in range(3):
-        trainer.train_step()
+    run_steps(3, trainer)
     after = download_gaussians(trainer.parameters)
     assert np.all(np.any(after.means[:-1] != model.means[:-1], axis=1)), "those in view move"
     assert np.array_equal(after.means[-1], model.means[-1]) == sparse

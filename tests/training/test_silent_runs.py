@@ -7,7 +7,6 @@ import json
 import shutil
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, no_warnings, warnings_of
 from tiny import FEW, short, write_scene
 
 import clsplat
@@ -103,11 +102,11 @@ def test_a_checkpoint_of_another_form_is_named(
     assert message in line
 
 
-def test_a_checkpoint_of_more_coefficients_is_named(scene: Path, run: Path, default_device: Device) -> None:
+def test_a_checkpoint_of_more_coefficients_is_named(scene_folder: Path, run: Path, default_device: Device) -> None:
     text = (run / "config.toml").read_text()
     (run / "config.toml").write_text(text.replace("sh_degree = 2", "sh_degree = 1"))
     with pytest.raises(InputError, match="has 9 SH coefficients, more than the 4 of --sh-degree 1"):
-        train(load_scene(scene), device=default_device, run=Run.open(run), resume=True)
+        train(load_scene(scene_folder), device=default_device, run=Run.open(run), resume=True)
 
 
 def test_a_checkpoint_under_another_name_is_passed_over(run: Path) -> None:
@@ -139,39 +138,37 @@ def test_photographs_of_one_colour_are_told(tmp_path: Path) -> None:
     assert any("has a single colour or is transparent" in text for text in found)
 
 
-def test_settings_that_come_to_nothing_are_told(scene: Path, default_device: Device) -> None:
-    loaded = load_scene(scene, test_every=0)
+def test_settings_that_come_to_nothing_are_told(scene_folder: Path, default_device: Device) -> None:
+    loaded = load_scene(scene_folder, test_every=0)
     config = replace(FEW, iterations=2, eval_at=(1,), density=replace(FEW.density, every=5, max_gaussians=3))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        train(loaded, config, device=default_device)
-    told = [str(each.message) for each in caught]
+    told = warnings_of(lambda: train(loaded, config, device=default_device))
     assert any("--eval-at 1: no view is held out" in text for text in told)
     assert any("training begins with 40 Gaussians, more than --density.max-gaussians 3" in text for text in told)
 
 
 def test_a_run_that_ends_below_an_earlier_evaluation_is_told(
-    scene: Path, tmp_path: Path, default_device: Device
+    scene_folder: Path, tmp_path: Path, default_device: Device
 ) -> None:
     """A rate of the means that grows from step 2 on throws a model off that was right."""
-    loaded = load_scene(scene)
+    loaded = load_scene(scene_folder)
     rates = replace(FEW.optimiser, means_rate=1e-6, means_rate_end=10.0, means_rate_steps=12)
     config = replace(FEW, iterations=12, eval_at=(2,), optimiser=rates)
-    run = Run.create(tmp_path / "run", config, scene=scene)
+    run = Run.create(tmp_path / "run", config, scene=scene_folder)
     with pytest.warns(UserWarning, match=r"had \d+\.\d\d dB after step 2 and have .* Train with --iterations 2"):
         train(loaded, config, device=default_device, run=run)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with no_warnings():
         doubt_length(run.read_metrics(), run.read_metrics()[0]["eval"]["mean"]["psnr"] - OVERFITTING_DB)
         doubt_length([], 20.0)
 
 
-def test_an_evaluation_of_what_was_trained_on_says_so(scene: Path, run: Path, tmp_path: Path, capfd: Capture) -> None:
+def test_an_evaluation_of_what_was_trained_on_says_so(
+    scene_folder: Path, run: Path, tmp_path: Path, capfd: Capture
+) -> None:
     assert main(["eval", str(run)]) == 0
     assert "warning" not in capfd.readouterr().err
     assert main(["eval", str(run), "--test-every", "3"]) == 0
     assert "warning: 3 of 4 views were trained on (03.png, 06.png, 09.png): they score" in capfd.readouterr().err
-    own = Path(shutil.copytree(scene, tmp_path / "own"))
+    own = Path(shutil.copytree(scene_folder, tmp_path / "own"))
     shutil.copy(own / "images" / "05.png", own / "images" / "00.png")
     assert main(["eval", str(run), "--scene", str(own)]) == 0
     assert "1 view with another photograph than in training (00.png)" in capfd.readouterr().err
@@ -211,13 +208,11 @@ LATE = {
 
 
 @pytest.mark.parametrize("name", LATE)
-def test_what_comes_after_the_last_step_is_told(name: str, scene: Path, default_device: Device) -> None:
+def test_what_comes_after_the_last_step_is_told(name: str, scene_folder: Path, default_device: Device) -> None:
     settings, text = LATE[name]
     config = short(**{"iterations": 3, "report": False, "warmup": (), "density": {"every": 0}, **settings})
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        train(load_scene(scene), config, device=default_device)
-    assert [str(each.message) for each in caught if "--iterations" in str(each.message)] == [text]
+    told = warnings_of(lambda: train(load_scene(scene_folder), config, device=default_device))
+    assert [each for each in told if "--iterations" in each] == [text]
 
 
 def test_defaults_are_silent_for_every_number_of_iterations() -> None:

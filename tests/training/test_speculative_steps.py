@@ -11,7 +11,7 @@ import pytest
 from compare import assert_same_bits
 from numpy.typing import NDArray
 from quick import quick
-from tiny import short, write_scene
+from tiny import run_steps, short, trained_to
 
 from clsplat.bench import stages as bench_stages
 from clsplat.bench import workload as bench_subject
@@ -19,7 +19,6 @@ from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.program import Kernel
 from clsplat.errors import InputError
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.training.density import ModelState, RowPlan
@@ -29,11 +28,6 @@ from clsplat.training.trainer import Trainer
 
 CONFIG = short(density={"min_contribution": 0.01})
 """Densifies and prunes after steps 15, 20, 25, ...; resets opacities after 20; contributions make an epoch matter."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 Result = tuple[dict[str, NDArray[Any]], list[tuple[float, float]], Trainer]
@@ -121,8 +115,7 @@ def test_a_step_by_capacity_waits_for_no_number(
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     device = device.with_shape(lanes=shape[0], items=shape[1])
     trainer = bench_stages.trainer_of(bench_subject.synthetic(6000, 320, 200), device, RasterizerConfig())
-    for _ in range(3):
-        trainer.train_step()
+    run_steps(3, trainer)
     for _ in range(4):
         calls = bench_stages.calls_of(device, trainer.train_step)
         assert (calls.blocking_reads, calls.blocking_writes, calls.reads) == (0, 0, 1)
@@ -156,12 +149,9 @@ def test_what_is_looked_at_or_tight_is_exact(
         Trainer(scene, pairs, default_device),
     ]
     for trainer in trainers:
-        for _ in range(3):
-            trainer.train_step()
+        run_steps(3, trainer)
     assert asked == [0] * 9
-    plain = Trainer(scene, CONFIG, default_device)
-    for _ in range(3):
-        plain.train_step()
+    trained_to(3, scene, CONFIG, default_device)
     assert asked[9] == 0 < asked[10], "the first step says how many pairs there are"
 
 

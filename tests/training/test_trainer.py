@@ -15,7 +15,7 @@ from compare import assert_close, assert_same_bits
 from marking import on_host
 from same_bytes import model_bytes
 from test_density import split_of
-from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, short, write_scene
+from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, run_steps, short, trained_to, write_scene
 
 from clsplat.api import train
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
@@ -30,11 +30,6 @@ from clsplat.stages.loss import Loss
 from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.loop import StepReport
 from clsplat.training.trainer import Trainer
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
 
 
 @pytest.fixture(scope="module")
@@ -314,8 +309,7 @@ def test_the_warm_up_doubles_the_resolution(
         return real(gaussians, camera, background, **how)
 
     monkeypatch.setattr(trainer.rasterizer, "forward", forward)
-    for _ in range(12):
-        trainer.train_step()
+    run_steps(12, trainer)
     quarter, half, full = ((WIDTH // factor, HEIGHT // factor) for factor in (4, 2, 1))
     assert sizes == [quarter] * 4 + [half] * 5 + [full] * 3
 
@@ -353,16 +347,9 @@ def test_every_rate_falls_in_the_cooldown(scene: Scene, default_device: Device) 
         np.testing.assert_allclose([got[group] / full[group] for group in PARAMETER_GROUPS], wanted)
 
 
-def trained_to(scene: Scene, device: Device, step: int, config: TrainConfig = CONFIG) -> Trainer:
-    trainer = Trainer(scene, config, device)
-    while trainer.step < step:
-        trainer.train_step()
-    return trainer
-
-
 def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """After step 25 some are cloned, some split, some kept: what a row was is what it is, what is fresh has none."""
-    trainer = trained_to(scene, default_device, 25)
+    trainer = trained_to(25, scene, CONFIG, default_device)
     plans, real = [], adaptive.plan
 
     def noted(config: DensityConfig, model: ModelState) -> RowPlan:
@@ -402,7 +389,7 @@ def test_moments_move_with_their_rows(scene: Scene, default_device: Device, monk
 
 def test_an_opacity_reset_forgets_the_moments_of_opacity_alone(scene: Scene, default_device: Device) -> None:
     config = short(density={"start": 100})  # no cloning: rows stay
-    trainer = trained_to(scene, default_device, 20, config)
+    trainer = trained_to(20, scene, config, default_device)
     before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
     trainer._control_density()
     after = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
@@ -423,7 +410,7 @@ def test_an_opacity_reset_forgets_the_moments_of_opacity_alone(scene: Scene, def
 
 
 def test_a_new_degree_keeps_what_there_is(scene: Scene, default_device: Device) -> None:
-    trainer = trained_to(scene, default_device, 23, short(density={"every": 0}))
+    trainer = trained_to(23, scene, short(density={"every": 0}), default_device)
     before = {kind: host(getattr(trainer, kind)) for kind in ("parameters", "first", "second")}
     trainer.step = 24
     trainer._raise_sh_degree()

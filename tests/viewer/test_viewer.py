@@ -64,11 +64,6 @@ def test_the_page_has_the_models_colour_space(tmp_path: Path, monkeypatch: pytes
     assert f"shown in ('{LINEAR}',)" in error_line(capsys)
 
 
-def test_a_scene_that_is_missing(model: Path, tmp_path: Path, capsys: Capture) -> None:
-    assert main(["view", str(model), "--port", "0", "--scene", str(tmp_path / "none")]) == 2
-    assert "none" in error_line(capsys)
-
-
 def test_viser_is_missing(model: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(model)]) == 2
@@ -91,6 +86,7 @@ def test_a_port_that_is_taken(verb: str, model: Path, scene: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
+        (["--port", "0", "--scene", "/nowhere/none"], "none"),
         (["--port", "70000"], "expected 0 to 65535"),
         (["--host", "203.0.113.7"], "cannot listen there"),
         (["--host", "no such host"], "cannot listen there"),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import CONFIG, cameras, hidden_model, write_scene
+from tiny import CONFIG, cameras, hidden_model, trained_to, write_scene
 
 from clsplat.api import train
 from clsplat.config.rasterizer import RasterizerConfig
@@ -179,9 +179,7 @@ def test_a_training_in_little_memory_shows_what_it_can(default_device: Device, p
 
 
 def test_a_picture_of_a_training_is_the_models(default_device: Device, photographs: Scene, tmp_path: Path) -> None:
-    trainer = Trainer(photographs, CONFIG, default_device)
-    for _ in range(3):
-        trainer.train_step()
+    trainer = trained_to(3, photographs, CONFIG, default_device)
     live = LiveModel(trainer, BLACK)
     assert live.version == 3
     held = HeldModel(trainer.gaussians(), default_device, CONFIG.rasterizer, BLACK)

@@ -84,19 +84,9 @@ def test_another_size_keeps_the_vertical_angle() -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"wxyz": (math.nan, 0, 0, 1)},
-        {"wxyz": (0, 0, 0, 0)},
-        {"wxyz": (1, 0, 0)},
-        {"wxyz": "1000"},
-        {"position": (math.inf, 0, 0)},
-        {"position": (1e300, 0, 0)},
-        {"position": None},
-        {"fov": 0.0},
-        {"fov": math.pi},
-        {"fov": math.nan},
-        {"fov": "wide"},
-        {"size": (0, 10)},
-        {"size": (1 << 20, 10)},
+        *({"wxyz": (math.nan, 0, 0, 1)}, {"wxyz": (0, 0, 0, 0)}, {"wxyz": (1, 0, 0)}, {"wxyz": "1000"}),
+        *({"position": (math.inf, 0, 0)}, {"position": (1e300, 0, 0)}, {"position": None}, {"fov": 0.0}),
+        *({"fov": math.pi}, {"fov": math.nan}, {"fov": "wide"}, {"size": (0, 10)}, {"size": (1 << 20, 10)}),
         {"size": (math.inf, 10)},
     ],
 )
@@ -153,13 +143,8 @@ def test_an_upright_page_shows_all_of_a_model_without_cameras() -> None:
 def test_a_picture_of_an_upright_page_is_no_wider_than_the_page() -> None:
     """The angle across the page is that across a square, and that down a wider picture."""
     upright = replace(pose(size=(300, 600)), fov=2 * math.atan(1.2))
-    for (width, height), down in (
-        ((300, 600), 1.2),
-        ((600, 600), 0.6),
-        ((1280, 720), 0.6),
-        ((400, 600), 0.9),
-        ((9, 90), 1.2),
-    ):
+    sizes = {(300, 600): 1.2, (600, 600): 0.6, (1280, 720): 0.6, (400, 600): 0.9, (9, 90): 1.2}
+    for (width, height), down in sizes.items():
         camera = upright.camera(width, height)
         assert 0.5 * height / camera.fy == pytest.approx(down)
         document = json.loads(path_document([upright], (width, height)))
@@ -441,8 +426,7 @@ def test_keys_are_taken_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "numbers"),
-    [((0, 20), {}), ((1 << 20, 20), {}), ((32, 20), {"apart": math.nan}), ((32, 20), {"fps": 0.0})],
+    ("size", "numbers"), [((0, 20), {}), ((1 << 20, 20), {}), ((32, 20), {"apart": math.nan}), ((32, 20), {"fps": 0.0})]
 )
 def test_numbers_that_make_no_path(size: tuple[int, int], numbers: dict[str, float]) -> None:
     with pytest.raises(InputError, match="expected"):
