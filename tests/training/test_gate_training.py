@@ -13,7 +13,7 @@ import pytest
 from calls import warnings_of
 from held_out import psnr_of
 from same_bytes import gone_on, model_bytes
-from tiny import short, write_scene
+from tiny import short, trained_to, write_scene
 
 from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
@@ -30,15 +30,8 @@ from clsplat.training.loop import StepReport
 from clsplat.training.trainer import Trainer
 
 FAST = OptimiserConfig(means_rate=5e-3, sh_dc_rate=0.02, scales_rate=0.02, opacities_rate=0.1)
-CONFIG = short(
-    iterations=60,
-    refine_poses=True,
-    pose_reach=0.5,
-    refine_gate=0.5,
-    report=False,
-    density={"every": 0},
-    optimiser=FAST,
-)
+REFINED = {"refine_poses": True, "pose_reach": 0.5, "refine_gate": 0.5}
+CONFIG = short(iterations=60, report=False, density={"every": 0}, optimiser=FAST, **REFINED)
 """Nothing but the cameras makes a model of this worse on its way, and it follows them quickly."""
 
 
@@ -109,9 +102,7 @@ def test_good_poses_are_let_be(scene: Scene, default_device: Device, tmp_path: P
     train(scene, config, device=default_device, run=run)
     assert run.model_path.read_bytes() == undisturbed
     assert not any("gate" in record for record in run.read_metrics())
-    trainer = Trainer(scene, CONFIG, default_device)
-    while trainer.step < trainer.config.iterations:
-        trainer.train_step()
+    trainer = trained_to(CONFIG.iterations, scene, CONFIG, default_device)
     assert trainer.cameras.gate.ended is None
     assert len(trainer.cameras.gate.measured) == 9  # the last is the loop's
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from calls import Capture, no_warnings
 from same_bytes import model_bytes
-from tiny import short, write_scene
+from tiny import run_steps, short, trained_to, write_scene
 
 from clsplat.api import train
 from clsplat.camera import Camera
@@ -79,8 +79,7 @@ def test_poses_come_back(scene: Scene, default_device: Device) -> None:
         return float(np.mean([pixels_off(camera, view.camera, scene.points) for camera, view in pairs]))
 
     before = away()
-    while trainer.step < trainer.config.iterations:
-        trainer.train_step()
+    run_steps(600, trainer)
     assert before > 1.5
     assert away() < 0.3 * before
     assert len(held) == 2
@@ -92,9 +91,7 @@ def test_poses_come_back(scene: Scene, default_device: Device) -> None:
 
 def test_a_held_out_view_is_aligned(scene: Scene, default_device: Device) -> None:
     """From two pixels off to under a third of one, with the model as it was."""
-    trainer = Trainer(scene, replace(CONFIG, iterations=300, refine_poses=False), default_device)
-    while trainer.step < trainer.config.iterations:
-        trainer.train_step()
+    trainer = trained_to(300, scene, replace(CONFIG, iterations=300, refine_poses=False), default_device)
     before = trainer.gaussians().arrays()
     view = scene.test_views[0]
     away = replace(view, camera=view.camera.moved(np.array([0.02, 0.02, 0.02, 0, 0, 0])))
