@@ -84,6 +84,8 @@ BROKEN = {
     "project_rays: l22 * t.e2[0]": ("l11 * t.e2[0]", "rays"),
     "project_rays: latitude - cap": ("latitude + cap", "rays"),
     "project_rays: -(s * around) / fx": ("(s * around) / fx", "rays"),
+    "project_grad: opacity_weight * opacity": ("opacity_weight + opacity", "penalties"),
+    "noise: * s * s * by": ("* s * by", "noise"),
     "adam: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "project_grad: (1.0f - s.beta2) * (g * g)": ("(1.0f - s.beta2) * g", "adam"),
     "density: fma1(gx, gx, gy * gy)": ("fma1(gx, gx, gx * gy)", "statistics"),

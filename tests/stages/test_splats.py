@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compare import assert_close, assert_close_gradient, assert_same_bits
-from flat import Flat, cloud, conics_of
+from flat import Flat, cloud
 from numpy.typing import NDArray
 
 from clsplat.device.buffers import Workspace, from_host, hosted, upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import SPLAT, TILE, SlotFields
 from clsplat.reference import splats as twin
+from clsplat.selftest.cases.library import conics_of
 from clsplat.stages.project import Projected, Slots
 from clsplat.stages.splats import ScreenGaussians, ScreenGradients, add_values, splats, splats_grad
 

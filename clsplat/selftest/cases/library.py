@@ -11,6 +11,7 @@ from dataclasses import asdict, replace
 import numpy as np
 from numpy.random import Generator
 
+from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import DeviceArray, Workspace, from_host, upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import SPLAT
@@ -98,20 +99,28 @@ def of_ewa(bench: CaseBench) -> StageOutcome:
     return outcome.compared({**parts, "by lens": (by_lens, back["intrinsics"])}, radii=wrong)
 
 
-def _random_splats(rng: Generator, count: int) -> Given:
-    """Ellipses of a few pixels all over an image and a little beyond, a tenth culled by a radius, some at the cap."""
-    sides, angles = np.exp(rng.normal(0.9, 0.5, (count, 2))), rng.uniform(0, np.pi, count)
+def conics_of(sides: Float64, angles: Float64) -> Float32:
+    """Conics (n, 3) of ellipses with these standard deviations (n, 2) in pixels, turned by the angles (n,)."""
     axes = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1).reshape(-1, 2, 2)
     inverse = (axes / sides[:, None, :] ** 2) @ axes.transpose(0, 2, 1)
-    arrays = {
-        "means2d": rng.uniform(-0.1, 1.1, (count, 2)) * [70, 50],
-        "conics": inverse.reshape(-1, 4)[:, [0, 1, 3]],
-        "opacities": np.where(rng.random(count) < 0.1, 1.0, rng.uniform(0.02, 0.95, count)),
-        "depths": rng.uniform(1, 9, count),
-        "values": rng.random((count, 3)),
-    }
+    return np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=1).astype(np.float32)
+
+
+def random_splats(
+    rng: Generator, count: int, *, width: int = 70, height: int = 50, depth: int = 3, opaque: float = 0.1
+) -> Given:
+    """Gaussians of a few pixels all over an image and a little beyond, a tenth culled by a radius, and a part as opaque
+    as the cap; two of the same depth. They have `depth` values each."""
+    sides = np.exp(rng.normal(0.9, 0.5, (count, 2)))
+    opacities = np.where(rng.random(count) < opaque, 1.0, rng.uniform(0.02, 0.95, count))
+    depths = rng.uniform(1, 9, count)
+    depths[: count // 2 * 2 : 2] = depths[1 : count // 2 * 2 : 2]
     radii = np.where(rng.random((count, 2)) < 0.05, 0, 9).astype(np.int32)
-    return Given(radii=radii, width=70, height=50, **{name: each.astype(np.float32) for name, each in arrays.items()})
+    means2d = (rng.uniform(-0.1, 1.1, (count, 2)) * [width, height]).astype(np.float32)
+    conics, values = conics_of(sides, rng.uniform(0, np.pi, count)), rng.uniform(0, 1, (count, depth))
+    single = {"opacities": opacities, "depths": depths, "values": values}
+    floats = {name: each.astype(np.float32) for name, each in single.items()}
+    return Given(radii=radii, means2d=means2d, conics=conics, **floats, width=width, height=height)
 
 
 def _frozen_splats(bench: CaseBench) -> list[Given]:
@@ -168,7 +177,7 @@ def _twin_of_splats(given: Given, got: Arrays) -> dict[str, Wanted]:
 
 SPLATS_CASE = Case(
     sizes=(1, 63, 64, 65, 0, 200),
-    random=_random_splats,
+    random=random_splats,
     launch=_launch_splats,
     twin=_twin_of_splats,
     frozen=_frozen_splats,
