@@ -28,7 +28,7 @@ Sure = NDArray[np.bool_] | EllipsisType
 """Elements that are compared."""
 
 
-class Given(SimpleNamespace):
+class Inputs(SimpleNamespace):
     """Inputs of a case by name, arrays and numbers. Images are (H, W, ...)."""
 
     @property
@@ -105,14 +105,14 @@ class Case:
     """
 
     sizes: Sequence[Any]
-    random: Callable[[Generator, Any], Given]
-    launch: Callable[[Device, Workspace, Given], Read]
-    twin: Callable[[Given, Arrays], Mapping[str, Wanted]]
-    frozen: Callable[[CaseBench], Sequence[Given]] | None = None
+    random: Callable[[Generator, Any], Inputs]
+    launch: Callable[[Device, Workspace, Inputs], Read]
+    twin: Callable[[Inputs, Arrays], Mapping[str, Wanted]]
+    frozen: Callable[[CaseBench], Sequence[Inputs]] | None = None
     digested: tuple[str, ...] = ()
     by_shape: bool = True
 
-    def errors(self, device: Device, given: Given, work: Workspace | None = None) -> dict[str, Deviation]:
+    def errors(self, device: Device, given: Inputs, work: Workspace | None = None) -> dict[str, Deviation]:
         """Launch the kernels on the inputs; the errors by name."""
         got = self.launch(device, work or Workspace(device), given)()
         return {name: Deviation(of.error_of(got[name]), of.bound) for name, of in self.twin(given, got).items()}
@@ -122,7 +122,7 @@ class Case:
         assert self.frozen is not None
         return joined([self._outcome(bench, given) for given in self.frozen(bench)])
 
-    def _outcome(self, bench: CaseBench, given: Given) -> StageOutcome:
+    def _outcome(self, bench: CaseBench, given: Inputs) -> StageOutcome:
         work = Workspace(bench.device)  # later stages need the results of earlier ones
         got: Arrays = {}
 

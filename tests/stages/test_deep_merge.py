@@ -12,7 +12,7 @@ from clsplat.arrays import Float32
 from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
 from clsplat.layouts.columns import DEEP_PICTURES
-from clsplat.selftest.case import Given, faults
+from clsplat.selftest.case import Inputs, faults
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, launch_deep_merge, random_deep_pictures
 
 
@@ -23,7 +23,7 @@ def random_pictures(count: int, bins: int, height: int, width: int) -> tuple[Flo
 
 def merged(device: Device, pictures: Float32, weights: Float32) -> Float32:
     """(bins, H, W, 5) by the kernel."""
-    return launch_deep_merge(device, Workspace(device), Given(pictures=pictures, weights=weights))()["slices"]
+    return launch_deep_merge(device, Workspace(device), Inputs(pictures=pictures, weights=weights))()["slices"]
 
 
 @pytest.mark.parametrize(("count", "bins"), [(1, 1), (1, 5), (2, 1), (3, 7), (DEEP_PICTURES, 4), (2, 40)])

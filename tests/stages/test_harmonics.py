@@ -11,17 +11,17 @@ from quick import quick
 from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.selftest.case import Arrays, Given, faults
-from clsplat.selftest.cases.harmonics import HARMONICS_CASE, harmonics_inputs, launch_harmonics, random_harmonics
+from clsplat.selftest.case import Arrays, Inputs, faults
+from clsplat.selftest.cases.library import HARMONICS_CASE, harmonics_inputs, launch_harmonics, random_harmonics
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.stages.harmonics import MAX_SH_BASIS_DEGREE
 
 
-def subject(count: int, degree: int = 3, *, camera: bool = True) -> Given:
+def subject(count: int, degree: int = 3, *, camera: bool = True) -> Inputs:
     return random_harmonics(np.random.default_rng(count + degree), count, degree, camera=camera)
 
 
-def run(device: Device, given: Given, *, add: bool = False, start: float = -7.0) -> Arrays:
+def run(device: Device, given: Inputs, *, add: bool = False, start: float = -7.0) -> Arrays:
     return launch_harmonics(device, Workspace(device), given, add=add, start=start)()
 
 

@@ -14,7 +14,7 @@ from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.images.reading import read_image
 from clsplat.reference.loss import l1_dssim
-from clsplat.selftest.case import Given
+from clsplat.selftest.case import Inputs
 from clsplat.selftest.cases.loss import LOSS_CASE
 from clsplat.selftest.harness import planes_of
 from clsplat.stages.loss import loss, scratch_bytes
@@ -25,7 +25,7 @@ def test_dssim_alone(shaped_device: Device) -> None:
     rng = np.random.default_rng(17)
     x = rng.random((33, 17, 3)).astype(np.float32)
     y = np.clip(x + rng.normal(0, 0.2, x.shape), 0, 1).astype(np.float32)
-    errors = LOSS_CASE.errors(shaped_device, Given(image=x, photograph=y, weight=1.0))
+    errors = LOSS_CASE.errors(shaped_device, Inputs(image=x, photograph=y, weight=1.0))
     # variances are differences of windowed moments in float32: 1e-7 against C2 = 9e-4
     assert errors["gradient"].error < 1e-4 and errors["loss"].error < 1e-5
 

@@ -11,7 +11,7 @@ from quick import quick
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.selftest.case import faults
-from clsplat.selftest.cases.sort import SCAN_CASE
+from clsplat.selftest.cases.primitives import SCAN_CASE
 from clsplat.stages.scan import CHUNK_ELEMENTS_PER_ITEM, MAX_SCAN_GROUPS, scan
 
 

@@ -42,7 +42,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.supervision.depth_samples import KnownDepth
-from clsplat.selftest.case import Case, Given, faults
+from clsplat.selftest.case import Case, Inputs, faults
 from clsplat.selftest.cases.table import CASES
 from clsplat.stages import scan as stages_scan
 from clsplat.stages.adam import add_view
@@ -162,7 +162,7 @@ def cases(device: Device) -> None:
     sums["means"].get()
 
 
-def check(name: str, case: Case, device: Device, given: Given) -> None:
+def check(name: str, case: Case, device: Device, given: Inputs) -> None:
     """Raise SystemExit where a case is over its bounds."""
     if wrong := faults(case.errors(device, given)):
         raise SystemExit(f"{name}: {', '.join(wrong)}")
@@ -302,8 +302,8 @@ def sorts(device: Device) -> None:
     for alone, n, bits in ((few, 700, 20), (0, 2500, 13), (0, 77, 5), (few, 1, 1)):
         stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = alone
         keys = rng.integers(0, 1 << bits, n).astype(np.uint32)
-        check(f"sort of {n} keys", CASES["sort"], device, Given(keys=keys, bits=bits, base=0))
-    check("scan", CASES["scan"], device, Given(values=np.ones(2100, np.uint32), in_place=True))  # more than one chunk
+        check(f"sort of {n} keys", CASES["sort"], device, Inputs(keys=keys, bits=bits, base=0))
+    check("scan", CASES["scan"], device, Inputs(values=np.ones(2100, np.uint32), in_place=True))  # more than one chunk
     stages_scan.MAX_SINGLE_CHUNK_ELEMENTS = few
 
 
@@ -417,7 +417,8 @@ PARTS = {
     "training": (training,),
     "methods": (methods,),
     "library": (library,),
-    "passes": (cases, sorts, limits, frames, subgroups, rendering, pictures, density),
+    "cases": (cases, sorts),
+    "passes": (limits, frames, subgroups, rendering, pictures, density),
 }
 """The workload in parts that take a child each, by name."""
 

@@ -13,7 +13,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import appearance as reference
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly, fresh_readback, read_of
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
@@ -33,21 +33,21 @@ def random_moments(rng: Generator, shape: tuple[int, ...], size: float) -> Float
     return (moments * (rng.random() > 1 / 3)).astype(np.float32)
 
 
-def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) -> Given:
+def frozen_pictures(bench: CaseBench, photograph_seed: int, gradient_seed: int) -> Inputs:
     """The scene's blended image as the render, a photograph, and the loss's gradient by the render."""
     image = bench.blended.image.get()
     photograph = evenly(photograph_seed, image.shape, 0.0, 1.0).astype(np.float32)
     by_image = evenly(gradient_seed, image.shape, -0.25, 1.0).astype(np.float32)
     planes = {"image": image, "photograph": photograph, "by_image": by_image}
-    return Given(**{name: cropped(each, bench.camera) for name, each in planes.items()})
+    return Inputs(**{name: cropped(each, bench.camera) for name, each in planes.items()})
 
 
-def _random(rng: Generator, size: tuple[int, int]) -> Given:
+def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
     """Gains of 1/256 to 256, and gradients of any size."""
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
     pull = rng.choice([0.0, 1e-3, 1.0]) * rng.uniform(0, 0.5, (3, 3)) * np.abs(by_image).sum()
-    return Given(
+    return Inputs(
         image=image,
         photograph=photograph,
         by_image=by_image,
@@ -60,23 +60,23 @@ def _random(rng: Generator, size: tuple[int, int]) -> Given:
     )
 
 
-def _frozen(bench: CaseBench) -> list[Given]:
+def _frozen(bench: CaseBench) -> list[Inputs]:
     """One of three photographs."""
     ends = {41: (-1.0, 1.0), 43: (-1.0, 1.0), 44: (0.0, 0.5)}
     logs, start, pull = (evenly(seed, (3, 3), *ends[seed]).astype(np.float32) for seed in ends)
     pull[2] = pull[:, 2] = 0  # a photograph without pull
-    learnt = Given(logs=logs, start=start, pull=pull, moments=np.zeros((2, 3, 3), np.float32), number=5, rate=0.03125)
-    return [Given(**vars(frozen_pictures(bench, 45, 42)), **vars(learnt))]
+    learnt = Inputs(logs=logs, start=start, pull=pull, moments=np.zeros((2, 3, 3), np.float32), number=5, rate=0.03125)
+    return [Inputs(**vars(frozen_pictures(bench, 45, 42)), **vars(learnt))]
 
 
-def uploaded(device: Device, given: Given) -> list[DeviceArray]:
+def uploaded(device: Device, given: Inputs) -> list[DeviceArray]:
     """The photograph with a plane of alpha, the render, and the gradient by it, unwritten below like the loss's."""
     planes, below = planes_of(given.photograph), planes_of(given.by_image)
     below[:, given.size[1] :] = np.nan
     return [upload(device, each) for each in (np.concatenate([planes, planes[:1]]), planes_of(given.image), below)]
 
 
-def _launch(device: Device, work: Workspace, given: Given) -> Read:
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     start, first, second = (upload(device, array) for array in (given.start, *given.moments))
     gains = replace(Gains.on(device, given.logs, csr_array(given.pull)), start=start, first=first, second=second)
     target, image, gradient = uploaded(device, given)
@@ -87,7 +87,7 @@ def _launch(device: Device, work: Workspace, given: Given) -> Read:
     return lambda: {**read(), **pictures_read(given, target, gradient)}
 
 
-def pictures_read(given: Given, target: DeviceArray, gradient: DeviceArray) -> Arrays:
+def pictures_read(given: Inputs, target: DeviceArray, gradient: DeviceArray) -> Arrays:
     """The changed photograph, and the planes that do not change."""
     planes = target.get()
     return {
@@ -97,7 +97,7 @@ def pictures_read(given: Given, target: DeviceArray, gradient: DeviceArray) -> A
     }
 
 
-def unchanged(given: Given) -> dict[str, Wanted]:
+def unchanged(given: Inputs) -> dict[str, Wanted]:
     """The planes that do not change."""
     return {"alpha": exactly(planes_of(given.photograph)[0]), "gradient": exactly(given.by_image)}
 
@@ -112,7 +112,7 @@ def stepped(values: Float64, rate: float | Float64) -> Wanted:
     return Wanted(values, 1e-4, rate + 1e-2 * np.abs(values))
 
 
-def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     image, by_image, photograph, logs, start, pull, moments = given.wide(
         *("image", "by_image", "photograph", "logs", "start", "pull", "moments")
     )

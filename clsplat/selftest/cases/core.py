@@ -23,8 +23,8 @@ from clsplat.reference import blend as reference_blend
 from clsplat.reference import project as reference_project
 from clsplat.reference.render import parameters, project_model
 from clsplat.reference.tiles import touched_tiles
-from clsplat.selftest.case import Given, fresh_readback
-from clsplat.selftest.cases.adam import ADAM_CASE, uploaded_groups
+from clsplat.selftest.case import Inputs, fresh_readback
+from clsplat.selftest.cases.steps import ADAM_CASE, uploaded_groups
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome, cropped
 from clsplat.selftest.scenes import evenly, padded
 from clsplat.selftest.synthetic_slots import SLOT_COLOURS, MadeUpSlots, slot_sums
@@ -242,7 +242,7 @@ def _adam(bench: CaseBench) -> StageOutcome:
     return replace(outcome, trouble=outcome.trouble or (f"{wrong} with projection wrong" if wrong else ""))
 
 
-def _steps_off(bench: CaseBench, given: Given) -> int:
+def _steps_off(bench: CaseBench, given: Inputs) -> int:
     """Count the elements that `project_step` moves differently from float64 Adam with the gradients of
     `project_grad`."""
     device, (n, coefficients) = bench.device, (bench.model.count, bench.model.coefficients)

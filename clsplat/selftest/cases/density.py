@@ -16,7 +16,7 @@ from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import SPLAT
 from clsplat.optimisation.density_rules import MarkRules
 from clsplat.reference import density as reference
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly, faults
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, faults
 from clsplat.selftest.harness import WHITENING_FACTOR, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.density import CONTRIBUTION_STATISTICS, DeviceMarker, add_statistics, new_statistics
@@ -28,7 +28,7 @@ MIN_RADIUS_MARGIN = 1e-4
 """Distance of a radius from a whole pixel, relative to it, below which rounding decides the pixel."""
 
 
-def _random(rng: Generator, count: int) -> Given:
+def _random(rng: Generator, count: int) -> Inputs:
     """Three views of ellipses of any size; a third of the Gaussians is not in view."""
     columns = {name: index for index, name in enumerate(SPLAT)}
     views = []
@@ -39,16 +39,16 @@ def _random(rng: Generator, count: int) -> Given:
         splats[:, columns["L12"]] = rng.uniform(-0.5, 0.5, count) * splats[:, columns["L11"]]
         screen = rng.normal(size=(count, 2)).astype(np.float32)
         views.append((splats, rng.integers(0, 3, count).astype(np.uint32), screen))
-    return Given(views=views, camera=Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3)))
+    return Inputs(views=views, camera=Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3)))
 
 
-def _frozen(bench: CaseBench) -> list[Given]:
+def _frozen(bench: CaseBench) -> list[Inputs]:
     screen = evenly(34, (bench.model.count, 2), -0.0625, 0.0625).astype(np.float32)
     view = (bench.projected.splats.get(), bench.projected.tile_counts.get(), screen)
-    return [Given(views=[view, view], camera=bench.camera)]
+    return [Inputs(views=[view, view], camera=bench.camera)]
 
 
-def _launch(device: Device, _: Workspace, given: Given) -> Read:
+def _launch(device: Device, _: Workspace, given: Inputs) -> Read:
     statistics = new_statistics(device, len(given.views[0][1]))
     for view in given.views:
         splats, tiles, screen = (upload(device, array) for array in view)
@@ -56,7 +56,7 @@ def _launch(device: Device, _: Workspace, given: Given) -> Read:
     return lambda: {name: array.get() for name, array in statistics.named().items()}
 
 
-def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     sums, seen, radii, doubtful = (np.zeros(len(got["seen"]), kind) for kind in (float, float, float, bool))
     to_ndc = 0.5 * np.array([given.camera.width, given.camera.height])
     for splats, tiles, screen in given.views:
@@ -85,7 +85,7 @@ STATISTICS_CASE = Case(
 )
 
 
-def _random_marks(rng: Generator, count: int) -> Given:
+def _random_marks(rng: Generator, count: int) -> Inputs:
     """Every statistic, scale and opacity is at an edge, next to it, or not a number, for some Gaussian."""
 
     def values(*around: float, size: tuple[int, ...] = (count,)) -> Float32:
@@ -103,10 +103,10 @@ def _random_marks(rng: Generator, count: int) -> Given:
     zeros = np.zeros((count, 4), np.float32)
     gaussians = Gaussians(*(zeros[:, :3], zeros, values(0.5, 1.5, 2, size=(count, 3)), values(-1), zeros[:, None, :3]))
     rules = (MarkRules(), MARK_RULES, further, replace(further, gradient=0.0, cut_off=(-np.inf, 0)))
-    return Given(statistics=statistics, gaussians=gaussians, rules=rules, streamed=bool(rng.random() < 0.5))
+    return Inputs(statistics=statistics, gaussians=gaussians, rules=rules, streamed=bool(rng.random() < 0.5))
 
 
-def _launch_marks(device: Device, work: Workspace, given: Given) -> Read:
+def _launch_marks(device: Device, work: Workspace, given: Inputs) -> Read:
     model = upload_gaussians(device, given.gaussians)
     statistics = new_statistics(device, model.count, contributions="whole_largest" in given.statistics)
     statistics.load(given.statistics)
@@ -118,7 +118,7 @@ def _launch_marks(device: Device, work: Workspace, given: Given) -> Read:
     return lambda: found
 
 
-def _twin_of_marks(given: Given, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_marks(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     known, gaussians, wanted = given.statistics, given.gaussians, {}
     for index, rules in enumerate(given.rules):
         rows, halves = reference.rows(rules, known, gaussians.log_scales, gaussians.opacity_logits)
@@ -143,6 +143,6 @@ def of_statistics(bench: CaseBench) -> StageOutcome:
     middle, limit = 0.500001 * np.median(known["gradient_sums"]), float(np.median(gaussians.log_scales.max(axis=1)))
     transparent = float(np.median(gaussians.opacity_logits)) - 1
     rules = MarkRules(gradient=float(middle), large=limit, transparent=transparent, oversized=limit + 2)
-    given = Given(statistics=known, gaussians=gaussians, rules=[rules], streamed=False)
+    given = Inputs(statistics=known, gaussians=gaussians, rules=[rules], streamed=False)
     wrong = faults(MARKS_CASE.errors(bench.device, given))
     return replace(outcome, trouble=outcome.trouble or ", ".join(wrong))

@@ -11,7 +11,7 @@ from numpy.random import Generator
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import grid as reference
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly, fresh_readback, read_of
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback, read_of
 from clsplat.selftest.cases.appearance import moment, random_gradient, random_moments, stepped
 from clsplat.selftest.cases.loss import random_pictures
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
@@ -23,13 +23,13 @@ MIN_LEVEL_DISTANCE = 1e-4
 """Distance from a luminance level below which rounding decides the slope."""
 
 
-def _random(rng: Generator, size: tuple[int, int]) -> Given:
+def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
     """Grids from next to none to wild ones; colours under 0 and over 1 among those between."""
     image, _ = random_pictures(rng, size)
     image = (image * rng.uniform(1.0, 1.5) - rng.choice([0.0, 0.2])).astype(np.float32)
     noise = rng.standard_normal((2, *GRID_SHAPE)) * 10 ** rng.uniform(-4, 0.5)
     by_seen = random_gradient(rng, image)
-    return Given(
+    return Inputs(
         image=image,
         by_seen=by_seen,
         grids=(reference.identity(GRID_SHAPE[:3]) + noise).astype(np.float32),
@@ -40,16 +40,16 @@ def _random(rng: Generator, size: tuple[int, int]) -> Given:
     )
 
 
-def _frozen(bench: CaseBench) -> list[Given]:
+def _frozen(bench: CaseBench) -> list[Inputs]:
     """One of two photographs, with the scene's blended image as the render."""
     grids = (reference.identity(GRID_SHAPE[:3]) + evenly(43, (2, *GRID_SHAPE), -0.25, 0.25)).astype(np.float32)
     by_seen = evenly(44, tuple(bench.blended.image.shape), -0.25, 1.0).astype(np.float32)
     image, by_seen = (cropped(each, bench.camera) for each in (bench.blended.image.get(), by_seen))
     step = {"moments": np.zeros((2, *grids.shape), np.float32), "weight": 10.0, "visit": 5, "rate": 0.03125}
-    return [Given(image=image, by_seen=by_seen, grids=grids, **step)]
+    return [Inputs(image=image, by_seen=by_seen, grids=grids, **step)]
 
 
-def _launch(device: Device, work: Workspace, given: Given) -> Read:
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     first, second = (upload(device, moment) for moment in given.moments)
     grids, readback = replace(Grids.on(device, given.grids), first=first, second=second), fresh_readback(device)
     image, gradient = (upload(device, planes_of(each, np.nan)) for each in (given.image, given.by_seen))
@@ -63,7 +63,7 @@ def _launch(device: Device, work: Workspace, given: Given) -> Read:
     return lambda: {**read(), **{name: cropped(array.get(), given.size) for name, array in planes.items()}}
 
 
-def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     image, held, by_seen, moments = given.wide("image", "grids", "by_seen", "moments")
     at, (first, second) = GRID_PHOTOGRAPH, moments
     own = held[at].copy()

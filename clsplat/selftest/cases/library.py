@@ -12,15 +12,17 @@ import numpy as np
 from numpy.random import Generator
 
 from clsplat.arrays import Float32, Float64
-from clsplat.device.buffers import DeviceArray, Workspace, from_host, upload
+from clsplat.device.buffers import DeviceArray, Workspace, allocate, from_host, upload
 from clsplat.device.context import Device
 from clsplat.layouts.columns import SPLAT
 from clsplat.reference import ewa as reference_ewa
 from clsplat.reference import splats as reference_splats
 from clsplat.reference import values as reference_values
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly
+from clsplat.reference.sh import sh_basis_grad
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
 from clsplat.selftest.harness import WHITENING_FACTOR, Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
+from clsplat.spherical_harmonics import sh_basis
 from clsplat.stages.ewa import (
     Ewa,
     EwaCamera,
@@ -31,6 +33,14 @@ from clsplat.stages.ewa import (
     camera_gradients,
     ewa,
     ewa_grad,
+)
+from clsplat.stages.harmonics import (
+    MAX_SH_BASIS_DEGREE,
+    Harmonics,
+    HarmonicsGradients,
+    centre_array,
+    harmonics,
+    harmonics_grad,
 )
 from clsplat.stages.splats import ScreenGaussians, ScreenGradients, splats
 from clsplat.stages.values import ValuePass, values, values_grad
@@ -108,7 +118,7 @@ def conics_of(sides: Float64, angles: Float64) -> Float32:
 
 def random_splats(
     rng: Generator, count: int, *, width: int = 70, height: int = 50, depth: int = 3, opaque: float = 0.1
-) -> Given:
+) -> Inputs:
     """Gaussians of a few pixels all over an image and a little beyond, a tenth culled by a radius, and a part as opaque
     as the cap; two of the same depth. They have `depth` values each."""
     sides = np.exp(rng.normal(0.9, 0.5, (count, 2)))
@@ -120,10 +130,10 @@ def random_splats(
     conics, values = conics_of(sides, rng.uniform(0, np.pi, count)), rng.uniform(0, 1, (count, depth))
     single = {"opacities": opacities, "depths": depths, "values": values}
     floats = {name: each.astype(np.float32) for name, each in single.items()}
-    return Given(radii=radii, means2d=means2d, conics=conics, **floats, width=width, height=height)
+    return Inputs(radii=radii, means2d=means2d, conics=conics, **floats, width=width, height=height)
 
 
-def _frozen_splats(bench: CaseBench) -> list[Given]:
+def _frozen_splats(bench: CaseBench) -> list[Inputs]:
     """The scene's projected Gaussians, given as arrays."""
     camera, seen, rows = bench.camera, bench.visible, bench.splats()
     arrays = {
@@ -135,10 +145,10 @@ def _frozen_splats(bench: CaseBench) -> list[Given]:
     }
     radii = np.repeat(np.where(seen, 9, 0)[:, None], 2, axis=1).astype(np.int32)
     single = {name: np.ascontiguousarray(each, np.float32) for name, each in arrays.items()}
-    return [Given(radii=radii, width=camera.width, height=camera.height, **single)]
+    return [Inputs(radii=radii, width=camera.width, height=camera.height, **single)]
 
 
-def _launch_splats(device: Device, work: Workspace, given: Given) -> Read:
+def _launch_splats(device: Device, work: Workspace, given: Inputs) -> Read:
     names = ("radii", "means2d", "conics", "opacities", "depths", "values")
     inputs = ScreenGaussians(*(from_host(device, getattr(given, name)) for name in names))
     found = splats(device, work, inputs, given.width, given.height)
@@ -151,7 +161,7 @@ def _launch_splats(device: Device, work: Workspace, given: Given) -> Read:
     return read
 
 
-def _twin_of_splats(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin_of_splats(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     conics, opacities = given.wide("conics", "opacities")
     wanted = reference_splats.splats(conics, opacities, given.radii)
     seen = wanted.drawn & (got["tiles"] > 0)
@@ -225,3 +235,83 @@ def of_values(bench: CaseBench) -> StageOutcome:
     parts = {"pixels": (pixels[sure], wanted.image[sure])}
     parts |= {f"by {name}": (got[seen], back[name][seen]) for name, got in zip(widths, gradients, strict=True)}
     return outcome.compared(parts)
+
+
+SH_CENTRE = np.array([0.1, 0.2, 3.3])
+"""Of a camera; not one of float32's numbers."""
+
+
+def random_harmonics(rng: Generator, count: int, degree: int | None = None, *, camera: bool | None = None) -> Inputs:
+    """Colours of a degree, seen from a camera or not, each random unless it is given."""
+    degree = int(rng.integers(MAX_SH_BASIS_DEGREE + 1)) if degree is None else degree
+    shapes = ((count, 3), (count, 25 if degree == MAX_SH_BASIS_DEGREE else 16, 3), (count, 3))
+    directions, sh, by = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
+    mask = np.repeat((rng.random((count, 1)) < 0.8).astype(np.int32), 2, axis=1)
+    centre = SH_CENTRE if (rng.random() < 0.5 if camera is None else camera) else None
+    return Inputs(directions=directions, sh=sh, by=by, mask=mask, degree=degree, centre=centre)
+
+
+def _frozen_harmonics(bench: CaseBench) -> list[Inputs]:
+    """Colours of the highest degree in synthetic directions."""
+    n = bench.model.count
+    shapes = ((n, 3), (n, (MAX_SH_BASIS_DEGREE + 1) ** 2, 3), (n, 3))
+    away, sh, by = (evenly(71 + index, shape, -1.0, 1.0).astype(np.float32) for index, shape in enumerate(shapes))
+    away[:, 2] += 1.5
+    return [Inputs(directions=away, sh=sh, by=by, mask=None, degree=MAX_SH_BASIS_DEGREE, centre=None)]
+
+
+def harmonics_inputs(device: Device, given: Inputs) -> Harmonics:
+    """The inputs on the device."""
+    mask, centre = None, None
+    if given.centre is not None:
+        mask, centre = upload(device, given.mask), centre_array(device, given.centre)
+    return Harmonics(upload(device, given.directions), upload(device, given.sh), given.degree, mask, centre)
+
+
+def launch_harmonics(device: Device, work: Workspace, given: Inputs, *, add: bool = False, start: float = -7.0) -> Read:
+    """Launch both kernels, with gradients in arrays that are full of `start`."""
+    inputs = harmonics_inputs(device, given)
+    shapes = ((inputs.count, 3), given.sh.shape, (inputs.count, 3))
+    colours, d_sh, d_directions = (allocate(device, shape, np.float32) for shape in shapes)
+    for array in (colours, d_sh, d_directions):
+        array.fill(start)
+    harmonics(device, inputs, colours)
+    by = (colours, upload(device, given.by), HarmonicsGradients(d_sh, d_directions))
+    from_centre = given.centre is not None
+    by_centre = harmonics_grad(device, work, inputs, *by, add=add, add_directions=add, by_centre=from_centre)
+    made = {"colours": colours, "sh": d_sh, "directions": d_directions}
+    made |= {} if by_centre is None else {"centre": by_centre}
+    return lambda: {name: array.get() for name, array in made.items()}
+
+
+def _twin_of_harmonics(given: Inputs, _: Arrays) -> dict[str, Wanted]:
+    directions, sh, d_colours = given.wide("directions", "sh", "by")
+    away, used = directions - (0.0 if given.centre is None else given.centre), (given.degree + 1) ** 2
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    unit, sh = away / length, sh[:, :used]
+    basis, slopes = sh_basis(unit, given.degree), sh_basis_grad(unit, given.degree)
+    colours = np.einsum("nk,nkc->nc", basis, sh)
+    if given.centre is not None:
+        shown = given.mask[:, :1] > 0
+        colours = np.where(shown, np.maximum(colours + 0.5, 0.0), 0.0)
+        d_colours = np.where(colours > 0, d_colours, 0.0)
+    d_sh = np.zeros(given.sh.shape)
+    d_sh[:, :used] = basis[:, :, None] * d_colours[:, None]
+    by_unit = np.einsum("nkd,nkc,nc->nd", slopes, sh, d_colours)
+    d_directions = (by_unit - unit * (unit * by_unit).sum(axis=1, keepdims=True)) / length
+    # sums of up to 25 products of size 1, each off by 1e-7
+    wanted = {"colours": Wanted(colours, 4e-6, 1.0), "sh": Wanted(d_sh, 2e-6)}
+    wanted["directions"] = Wanted(d_directions, 2e-6) if given.degree else exactly(np.zeros_like(d_directions))
+    if given.centre is not None:
+        wanted["centre"] = Wanted(-d_directions.sum(axis=0), 2e-6, (np.abs(by_unit) / length).sum(axis=0))
+    return wanted
+
+
+HARMONICS_CASE = Case(
+    sizes=(1, 64, 65, 300, 63, 0, 513),
+    random=random_harmonics,
+    launch=launch_harmonics,
+    twin=_twin_of_harmonics,
+    frozen=_frozen_harmonics,
+    digested=("colours", "sh", "directions"),
+)

@@ -11,7 +11,7 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference.depth import depth_loss
 from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, exactly
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
 from clsplat.selftest.harness import CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.blend import Blended
@@ -39,8 +39,8 @@ def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
     return x.astype(np.float32), np.clip(y, 0, 1).astype(np.float32)
 
 
-def _given(image: Float32, photograph: Float32, weight: float = 0.2) -> Given:
-    return Given(image=image, photograph=photograph, weight=weight)
+def _given(image: Float32, photograph: Float32, weight: float = 0.2) -> Inputs:
+    return Inputs(image=image, photograph=photograph, weight=weight)
 
 
 def _read(result: Loss, size: Size) -> Arrays:
@@ -55,13 +55,13 @@ def _read(result: Loss, size: Size) -> Arrays:
     }
 
 
-def _launch(device: Device, work: Workspace, given: Given) -> Read:
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     image, photograph = (upload(device, planes_of(each)) for each in (given.image, given.photograph))
     result = loss(device, work, image, photograph, *given.size, given.weight)
     return lambda: _read(result, given.size)
 
 
-def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     x, y = given.wide("image", "photograph")
     value, gradient = l1_dssim(x, y, given.weight)
     squared = np.square(x - y).mean()
@@ -94,26 +94,26 @@ def _blended(device: Device, size: Size, image: Float32, left: Float32, nearness
     return Blended(upload(device, planes_of(image)), next(planes), upload(device, stops), None, next(planes, None))
 
 
-def _random_masks(rng: Generator, size: Size) -> Given:
+def _random_masks(rng: Generator, size: Size) -> Inputs:
     x, y = random_pictures(rng, size)
     counts = (rng.random((*y.shape[:2], 1)) < rng.choice([0.0, 0.1, 0.5, 1.0])).astype(np.float32)
     counts[0, 0] = 1
     alpha = (rng.random(counts.shape) ** rng.choice([0.0, 1.0, 8.0])).astype(np.float32)
     left = (rng.random(y.shape[:2]) ** rng.choice([0.0, 1.0, 8.0])).astype(np.float32)
     photograph, background = np.concatenate([y, alpha, counts], axis=2), np.array([0.1, 0.5, 0.9], np.float32)
-    return Given(image=x, left=left, photograph=photograph, background=background)
+    return Inputs(image=x, left=left, photograph=photograph, background=background)
 
 
-def _frozen_masks(bench: CaseBench) -> list[Given]:
+def _frozen_masks(bench: CaseBench) -> list[Inputs]:
     width, height = bench.camera.width, bench.camera.height
     photograph = evenly(35, (height, width, 5), 0.0, 1.0).astype(np.float32)
     photograph[:, :, 4] = 1
     photograph[: height // 2 + 3, : width // 2 + 5, 4] = 0
     image, left = (cropped(planes.get(), bench.camera) for planes in (bench.blended.image, bench.blended.transmittance))
-    return [Given(image=image, left=left, photograph=photograph, background=bench.frozen.background)]
+    return [Inputs(image=image, left=left, photograph=photograph, background=bench.frozen.background)]
 
 
-def _launch_masks(device: Device, work: Workspace, given: Given) -> Read:
+def _launch_masks(device: Device, work: Workspace, given: Inputs) -> Read:
     blended = _blended(device, given.size, given.image, given.left)
     planes = target(device, work, given.photograph, upload(device, given.background), blended, alpha=True)
     kept, terms = int(given.photograph[:, :, 4].sum()), (AlphaTerm(ALPHA_LOSS_WEIGHT),)
@@ -127,7 +127,7 @@ def _launch_masks(device: Device, work: Workspace, given: Given) -> Read:
     return read
 
 
-def _twin_of_masks(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin_of_masks(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     seen, left, parts, background = given.wide("image", "left", "photograph", "background")
     alpha, counts = parts[:, :, 3], parts[:, :, 4]
     truth = parts[:, :, :3] * alpha[:, :, None] + (1 - alpha)[:, :, None] * background
@@ -154,17 +154,17 @@ MASKS_CASE = Case(
 )
 
 
-def _random_depths(rng: Generator, size: Size) -> Given:
+def _random_depths(rng: Generator, size: Size) -> Inputs:
     """Nearness of 1e-6 to 1e6 against known ones, of which some, all or none are known."""
     image, _ = random_pictures(rng, size)
     scale = 10 ** rng.uniform(-6, 6)
     nearness, aims = (np.float32(scale) * rng.random(image.shape[:2]).astype(np.float32) for _ in range(2))
     weights = rng.random(aims.shape) * (rng.random(aims.shape) < rng.choice([0.0, 0.1, 1.0]))
     factor = float(10 ** rng.uniform(-3, 3) / scale)
-    return Given(image=image, nearness=nearness, aims=aims, weights=weights.astype(np.float32), factor=factor)
+    return Inputs(image=image, nearness=nearness, aims=aims, weights=weights.astype(np.float32), factor=factor)
 
 
-def _launch_depth_loss(device: Device, work: Workspace, given: Given) -> Read:
+def _launch_depth_loss(device: Device, work: Workspace, given: Inputs) -> Read:
     size = given.size
     blended = _blended(device, size, given.image, np.zeros_like(given.nearness), given.nearness)
     known = DepthTerm(planes_of(np.stack([given.aims, given.weights], axis=2)), given.factor)
@@ -176,7 +176,7 @@ def _launch_depth_loss(device: Device, work: Workspace, given: Given) -> Read:
     }
 
 
-def _twin_of_depth_loss(given: Given, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_depth_loss(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     nearness, aims, weights = given.wide("nearness", "aims", "weights")
     value, gradient = depth_loss(nearness, aims, weights, given.factor)
     return {

@@ -26,7 +26,7 @@ from clsplat.reference import every_pixel
 from clsplat.reference import holdout as reference_holdout
 from clsplat.reference import rays as reference_rays
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted
 from clsplat.selftest.harness import (
     MIN_DECISION_MARGIN,
     WHITENING_FACTOR,
@@ -127,7 +127,7 @@ def _deep(bench: CaseBench) -> StageOutcome:
 
 def random_deep_pictures(
     rng: Generator, size: tuple[int, int], count: int | None = None, bins: int | None = None
-) -> Given:
+) -> Inputs:
     """Pictures (P, bins, H, W, 5) whose pixels have 0 to `bins` slices, and weights (P, H, W) of the sum 1."""
     count, bins = count or int(rng.choice([1, 2, 3, DEEP_PICTURES])), bins or int(rng.choice([1, 4, 7, 40]))
     shape = (count, bins, size[1], size[0])
@@ -139,17 +139,17 @@ def random_deep_pictures(
     slices = rng.integers(0, bins + 1, (count, *shape[2:]))
     pictures[np.arange(bins)[None, :, None, None] >= slices[:, None]] = 0
     weights = rng.uniform(0.1, 1, (count, *shape[2:]))
-    return Given(pictures=pictures, weights=(weights / weights.sum(axis=0)).astype(np.float32))
+    return Inputs(pictures=pictures, weights=(weights / weights.sum(axis=0)).astype(np.float32))
 
 
-def _frozen_deep_pictures(bench: CaseBench) -> list[Given]:
+def _frozen_deep_pictures(bench: CaseBench) -> list[Inputs]:
     """The sliced picture with itself, shifted and upside down: depths are equal, and there are too many slices."""
     planes = bench.slices.get()
     pictures = np.stack([planes, np.roll(planes, 3, axis=3), planes[:, :, ::-1], planes]).transpose(0, 1, 3, 4, 2)
-    return [Given(pictures=pictures, weights=np.full((4, *planes.shape[2:]), 0.25, np.float32))]
+    return [Inputs(pictures=pictures, weights=np.full((4, *planes.shape[2:]), 0.25, np.float32))]
 
 
-def launch_deep_merge(device: Device, work: Workspace, given: Given) -> Read:
+def launch_deep_merge(device: Device, work: Workspace, given: Inputs) -> Read:
     """Launch deep_merge.cl."""
     count, bins, height, width, floats = given.pictures.shape
     planes = np.ascontiguousarray(given.pictures.transpose(0, 1, 4, 2, 3)).reshape(count, bins, floats, -1)
@@ -164,7 +164,7 @@ def launch_deep_merge(device: Device, work: Workspace, given: Given) -> Read:
     return read
 
 
-def _twin_of_deep_merge(given: Given, _: Arrays) -> dict[str, Wanted]:
+def _twin_of_deep_merge(given: Inputs, _: Arrays) -> dict[str, Wanted]:
     pictures, weights = given.wide("pictures", "weights")
     twin = reference_deep_merge.deep_merge(pictures, weights)
     sure = np.broadcast_to(twin.margin > MIN_MERGED_MARGIN, twin.slices.shape[:3])

@@ -13,8 +13,8 @@ from clsplat.layouts.columns import POSE_ROWS
 from clsplat.reference.pose import pose_gradient as reference
 from clsplat.reference.project import lens_grad
 from clsplat.reference.render import parameters, project_model
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted
-from clsplat.selftest.cases.noise import random_scene
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted
+from clsplat.selftest.cases.steps import random_scene
 from clsplat.selftest.harness import Array, CaseBench, StageOutcome
 from clsplat.selftest.scenes import evenly
 from clsplat.selftest.synthetic_slots import MadeUpSlots
@@ -26,7 +26,7 @@ from clsplat.stages.project import Screen, project_grad
 SYNTHETIC_GRADIENT_GROUPS = ("means", "quaternions", "sh_dc")
 
 
-def _random(rng: Generator, count: int) -> Given:
+def _random(rng: Generator, count: int) -> Inputs:
     """Gradients of any size of Gaussians, of which some are not seen: their gradients are no numbers."""
     scene, seen = random_scene(rng, count), np.arange(count) % 3 != 1
     size, by = 10 ** rng.uniform(-6, 3), {}
@@ -34,18 +34,18 @@ def _random(rng: Generator, count: int) -> Given:
         shape = group_shapes(count, 4)[group]
         values = rng.standard_normal(shape) * size
         by[group] = np.where(seen.reshape(-1, *[1] * (len(shape) - 1)), values, np.nan).astype(np.float32)
-    return Given(gaussians=scene.gaussians, camera=scene.camera, by=by, seen=seen)
+    return Inputs(gaussians=scene.gaussians, camera=scene.camera, by=by, seen=seen)
 
 
-def _frozen(bench: CaseBench) -> list[Given]:
+def _frozen(bench: CaseBench) -> list[Inputs]:
     by = {
         group: evenly(51 + index, bench.model[group].shape, -0.25, 0.5).astype(np.float32)
         for index, group in enumerate(SYNTHETIC_GRADIENT_GROUPS)
     }
-    return [Given(gaussians=bench.frozen.gaussians, camera=bench.camera, by=by, seen=bench.visible)]
+    return [Inputs(gaussians=bench.frozen.gaussians, camera=bench.camera, by=by, seen=bench.visible)]
 
 
-def _launch(device: Device, work: Workspace, given: Given) -> Read:
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     model, seen = upload_gaussians(device, given.gaussians), upload(device, given.seen.astype(np.uint32))
     by = {group: upload(device, values) for group, values in given.by.items()}
     sums = sums_of(work, model.count)
@@ -56,7 +56,7 @@ def _launch(device: Device, work: Workspace, given: Given) -> Read:
     return lambda: {"sums": total.get()[0]}
 
 
-def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     seen, arrays = given.seen, given.gaussians.arrays()
     means, quaternions, sh = (arrays[name][seen].astype(np.float64) for name in ("means", "quaternions", "sh"))
     by = {group: values[seen].astype(np.float64) for group, values in given.by.items()}

@@ -12,7 +12,7 @@ from clsplat.arrays import Float32, Float64
 from clsplat.device.buffers import Workspace, upload
 from clsplat.device.context import Device
 from clsplat.reference import appearance, ppisp
-from clsplat.selftest.case import Arrays, Case, Given, Read, Wanted, fresh_readback, read_of
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, fresh_readback, read_of
 from clsplat.selftest.cases.appearance import (
     frozen_pictures,
     moment,
@@ -44,13 +44,13 @@ PPISP_PARTS = {"by gains": slice(3), "by mixes": slice(3, COLOUR_ENTRIES), "by l
 """Parts of the gradient by a photograph's entries and a lens's vignette."""
 
 
-def _random(rng: Generator, size: tuple[int, int]) -> Given:
+def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
     """Gains of 1/256 to 256, any mixes, vignettes to where they are held, principal points beside the picture."""
     image, photograph = random_pictures(rng, size)
     by_image = random_gradient(rng, image)
     entries = np.concatenate([rng.uniform(-8, 8, (3, 3)), rng.uniform(-MAX_MIX, MAX_MIX, (3, 6))], axis=1)
     scale = float(np.abs(by_image).sum())
-    return Given(
+    return Inputs(
         image=image,
         photograph=photograph,
         by_image=by_image,
@@ -64,9 +64,9 @@ def _random(rng: Generator, size: tuple[int, int]) -> Given:
     )
 
 
-def _frozen(bench: CaseBench) -> list[Given]:
+def _frozen(bench: CaseBench) -> list[Inputs]:
     """One of three photographs, through the second of two lenses."""
-    learnt = Given(
+    learnt = Inputs(
         taken=PhotoLens(photograph=1, lens=1, centre=(0.4375, 0.5625)),
         entries=evenly(46, (3, COLOUR_ENTRIES), -0.125, 0.125).astype(np.float32),
         lenses=evenly(47, (2, VIGNETTE_ENTRIES), -0.5, 0.25).astype(np.float32),
@@ -75,10 +75,10 @@ def _frozen(bench: CaseBench) -> list[Given]:
         number=5,
         rate=0.03125,
     )
-    return [Given(**vars(frozen_pictures(bench, 48, 49)), **vars(learnt))]
+    return [Inputs(**vars(frozen_pictures(bench, 48, 49)), **vars(learnt))]
 
 
-def _launch(device: Device, work: Workspace, given: Given) -> Read:
+def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
     first, second, *others = (upload(device, moment) for moment in (*given.of_entries, *given.of_lenses))
     colours = replace(Gains.on(device, given.entries), first=first, second=second)
     vignettes = replace(Gains.on(device, given.lenses), first=others[0], second=others[1])
@@ -101,7 +101,7 @@ def _sums(columns: Float32) -> Float64:
     return sums
 
 
-def _twin(given: Given, got: Arrays) -> dict[str, Wanted]:
+def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     image, by_image, photograph, entries, lenses, of_entries, of_lenses = given.wide(
         *("image", "by_image", "photograph", "entries", "lenses", "of_entries", "of_lenses")
     )

@@ -6,21 +6,18 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from clsplat.selftest.case import Case
-from clsplat.selftest.cases.adam import ADAM_CASE
 from clsplat.selftest.cases.appearance import APPEARANCE_CASE
 from clsplat.selftest.cases.core import CORE_STAGES
 from clsplat.selftest.cases.density import MARKS_CASE, STATISTICS_CASE, of_statistics
 from clsplat.selftest.cases.depth import of_depth
-from clsplat.selftest.cases.elementary import ELEMENTARY_CASE
 from clsplat.selftest.cases.grid import GRID_CASE
-from clsplat.selftest.cases.harmonics import HARMONICS_CASE
-from clsplat.selftest.cases.library import SPLATS_CASE, of_ewa, of_values
+from clsplat.selftest.cases.library import HARMONICS_CASE, SPLATS_CASE, of_ewa, of_values
 from clsplat.selftest.cases.loss import DEPTH_LOSS_CASE, LOSS_CASE, MASKS_CASE
-from clsplat.selftest.cases.noise import NOISE_CASE, PENALTIES_CASE
 from clsplat.selftest.cases.pictures import DEEP_MERGE_CASE, PICTURE_CASES
 from clsplat.selftest.cases.poses import POSE_CASE, of_lens
 from clsplat.selftest.cases.ppisp import PPISP_CASE
-from clsplat.selftest.cases.sort import BITONIC_CASE, SCAN_CASE, SORT_CASE
+from clsplat.selftest.cases.primitives import BITONIC_CASE, ELEMENTARY_CASE, SCAN_CASE, SORT_CASE
+from clsplat.selftest.cases.steps import ADAM_CASE, NOISE_CASE, PENALTIES_CASE
 from clsplat.selftest.harness import CaseBench, StageOutcome
 
 CASES: dict[str, Case] = {

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a training step: Adam, the noise of MCMC on means, and penalties on opacity and scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.random import Generator
+from scipy.spatial.transform import Rotation
+
+from clsplat.camera import Camera
+from clsplat.config.training import OptimiserConfig
+from clsplat.device.buffers import Workspace, upload
+from clsplat.device.context import Device
+from clsplat.gaussians import PARAMETER_GROUPS, Gaussians, group_shapes
+from clsplat.layouts.columns import SLOT_PLAIN
+from clsplat.optimisation.step_noise import Exploration, step_key
+from clsplat.reference.adam import adam as reference
+from clsplat.reference.noise import displacements, penalty_grad
+from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly, fresh_readback
+from clsplat.selftest.harness import Array, CaseBench
+from clsplat.selftest.scenes import evenly
+from clsplat.stages.adam import AdamStep, adam
+from clsplat.stages.device_camera import pack_camera
+from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, upload_gaussians
+from clsplat.stages.noise import highest_logit, noise
+from clsplat.stages.project import Screen, Slots, project, project_grad
+
+ADAM_ENDS = {"parameters": (-1.0, 1.0), "gradients": (-0.5, 0.5), "first": (-0.25, 0.25), "second": (0.0625, 0.5)}
+"""Arrays of a step, and where their values in the self-test end."""
+ADAM_RATES = {name: 2.0**-power for power, name in enumerate(PARAMETER_GROUPS, 3)}
+
+
+def _random_step(rng: Generator, count: int) -> Inputs:
+    """Gradients of 1e-15 to 1e6, from moments of any size or none, all in view or some."""
+    step = int(rng.choice([1, 2, 10, 1000, 30_000, 10_000_000]))
+    later, sparse = step > 1, bool(rng.random() < 0.5)
+    visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # whole vectors among them
+    visible[: count // 3] = False
+    made: dict[str, Arrays] = {name: {} for name in ADAM_ENDS}
+    for group, shape in group_shapes(count, 4).items():
+        size = 10 ** rng.uniform(-15, 6, shape)
+        values = {
+            "parameters": rng.standard_normal(shape) * rng.choice([0.0, 1e-2, 1.0]),
+            "gradients": rng.standard_normal(shape) * size,
+            "first": rng.standard_normal(shape) * size * later,
+            "second": rng.random(shape) * size**2 * later,
+        }
+        if sparse:
+            values["gradients"][~visible] = 0.0
+        for name, array in values.items():
+            made[name][group] = array.astype(np.float32)
+    return Inputs(arrays=made, sparse=sparse, step=step, visible=visible, rates=dict.fromkeys(PARAMETER_GROUPS, 1e-2))
+
+
+def _frozen_steps(bench: CaseBench) -> list[Inputs]:
+    shapes = group_shapes(bench.model.count, bench.model.coefficients)
+    found = []
+    for sparse in (False, True):
+        made = {
+            name: {
+                group: evenly(60 + 8 * i + j, shapes[group], *ADAM_ENDS[name]).astype(np.float32)
+                for j, group in enumerate(PARAMETER_GROUPS)
+            }
+            for i, name in enumerate(ADAM_ENDS)
+        }
+        if sparse:
+            for values in made["gradients"].values():
+                values[~bench.visible] = 0.0  # as project_grad leaves them
+        found.append(Inputs(arrays=made, sparse=sparse, step=7, visible=bench.visible, rates=ADAM_RATES))
+    return found
+
+
+def uploaded_groups(device: Device, arrays: Mapping[str, Arrays]) -> list[DeviceGaussians]:
+    """Arrays by group as on the device."""
+    found = []
+    for groups in arrays.values():
+        count, rest, _ = groups["sh_rest"].shape
+        held = {group: upload(device, values) for group, values in groups.items()}
+        found.append(DeviceGaussians(count, rest + 1, held))
+    return found
+
+
+def _launch_adam(device: Device, _: Workspace, given: Inputs) -> Read:
+    models = uploaded_groups(device, given.arrays)
+    config, moving = OptimiserConfig(sparse=given.sparse), upload(device, 3 * given.visible.astype(np.uint32))
+    parameters, gradients, first, second = models
+    adam(device, AdamStep(config, given.step, given.rates), parameters, gradients, first, second, moving)
+    by_name = dict(zip(given.arrays, models, strict=True))
+    return lambda: {
+        name: np.concatenate([model[group].get().ravel() for group in PARAMETER_GROUPS])
+        for name, model in by_name.items()
+    }
+
+
+def _twin_of_adam(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    moved = given.visible if given.sparse else np.ones_like(given.visible)
+    made: dict[str, list[Array]] = {name: [] for name in ("parameters", "first", "second", "steps", "terms", "rows")}
+    for group, rate in given.rates.items():
+        p, g, m, v = (arrays[group].astype(np.float64) for arrays in given.arrays.values())
+        after = reference(p, g, m, v, given.step, rate)
+        rows = np.broadcast_to(moved.reshape(-1, *[1] * (p.ndim - 1)), p.shape)
+        steps, terms = np.maximum(np.abs(after[0] - p), rate), np.abs(m) + np.abs(g)
+        kept = (np.where(rows, new, old) for new, old in zip(after, (p, m, v), strict=True))
+        for values, found in zip((*kept, steps, terms, rows), made.values(), strict=True):
+            found.append(values.ravel())
+    parameters, first, second, steps, terms, rows = (np.concatenate(found) for found in made.values())
+    wanted = {
+        # of a step: beta2 in float32 is 1e-8 off in 1 - beta2 = 1e-3, 1e-5 of a step
+        "parameters": Wanted(parameters, 1e-4, steps + 1e-2 * np.abs(parameters), rows),
+        "first": Wanted(first, 1e-6, terms, rows),  # a few roundings
+        "second": Wanted(second, 3e-5, second, rows),
+        "gradients": exactly(np.zeros_like(got["gradients"])),
+    }
+    for name in ("parameters", "first", "second"):
+        got[f"{name} out of view"] = got[name][~rows]
+        wanted[f"{name} out of view"] = exactly(wanted[name].values[~rows])
+    return wanted
+
+
+ADAM_CASE = Case(
+    sizes=(1, 7, 8, 9, 2, 63, 64, 65, 100),
+    random=_random_step,
+    launch=_launch_adam,
+    twin=_twin_of_adam,
+    frozen=_frozen_steps,
+    digested=tuple(ADAM_ENDS),
+)
+
+
+GEOMETRY_ARRAYS = ("quaternions", "log_scales", "opacity_logits")
+
+
+def _random_noise(rng: Generator, count: int) -> Inputs:
+    """Gaussians of nearly any opacity, needles and discs among them."""
+    explore = Exploration(amount=10 ** rng.uniform(-3, 3), key=step_key(0, int(rng.integers(1 << 30))))
+    logits = rng.uniform(-9, 0, count).astype(np.float32)
+    logits[0] = -7.0  # one moves
+    return Inputs(
+        explore=explore,
+        quaternions=(rng.standard_normal((count, 4)) * 10 ** rng.uniform(-3, 3, (count, 1))).astype(np.float32),
+        log_scales=rng.uniform(-9, 2, (count, 3)).astype(np.float32),
+        opacity_logits=logits,
+    )
+
+
+def _frozen_noise(bench: CaseBench) -> list[Inputs]:
+    gaussians, logits = bench.frozen.gaussians, evenly(39, (bench.model.count,), -9.0, 0.0).astype(np.float32)
+    explore = Exploration(amount=40.0, key=(0x9E3779B9, 0x85EBCA6B))
+    return [
+        Inputs(
+            explore=explore,
+            quaternions=gaussians.quaternions,
+            log_scales=gaussians.log_scales,
+            opacity_logits=logits,
+        )
+    ]
+
+
+def _launch_noise(device: Device, _: Workspace, given: Inputs) -> Read:
+    count = len(given.opacity_logits)
+    means, sh = np.zeros((count, 3), np.float32), np.zeros((count, 1, 3), np.float32)  # so that no digit is lost
+    arrays = {name: getattr(given, name) for name in GEOMETRY_ARRAYS}
+    held = upload_gaussians(device, Gaussians(means=means, sh=sh, **arrays))
+    noise(device, given.explore, held, 0, fresh_readback(device))
+    return lambda: {name: held[name].get() for name in ("means", *GEOMETRY_ARRAYS)}
+
+
+def _twin_of_noise(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    quaternions, log_scales, logits = given.wide(*GEOMETRY_ARRAYS)
+    wanted = displacements(given.explore, quaternions, log_scales, logits)
+    stays = given.opacity_logits >= highest_logit(given.explore.dead)
+    got |= {"moves": got["means"][~stays], "means of the opaque": got["means"][stays]}
+    size = np.abs(wanted) + 0.1 * np.abs(wanted).max(initial=0)
+    return {
+        "means": Wanted(wanted, 5e-6),  # of 100 (o - dead), up to 16, a digit of o is 1e-6 of the weight
+        "moves": Wanted(wanted[~stays], 1e-4, size[~stays]),
+        "means of the opaque": exactly(np.zeros_like(got["means of the opaque"])),
+        **{name: exactly(getattr(given, name)) for name in GEOMETRY_ARRAYS},
+    }
+
+
+NOISE_CASE = Case(
+    sizes=(1, 63, 64, 65, 203),
+    random=_random_noise,
+    launch=_launch_noise,
+    twin=_twin_of_noise,
+    frozen=_frozen_noise,
+    digested=("means",),
+    by_shape=False,
+)
+
+
+def random_scene(rng: Generator, count: int) -> Inputs:
+    """Gaussians with SH of degree 1 before a camera, and some behind it."""
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    camera = Camera(70, 50, 60.0, 65.0, 30.0, 27.0, rotation, rng.normal(size=3))
+    depths = rng.uniform(1.0, 6.0, count) * np.where(np.arange(count) % 5 == 3, -1, 1)
+    local = np.concatenate([rng.uniform(-0.4, 0.4, (count, 2)) * depths[:, None], depths[:, None]], axis=1)
+    arrays = (
+        *((local - camera.translation) @ rotation, rng.normal(size=(count, 4)), rng.uniform(-5, -1, (count, 3))),
+        *(rng.uniform(-6, 6, count), rng.normal(0, 0.3, (count, 4, 3))),
+    )
+    means, quaternions, log_scales, logits, sh = (np.ascontiguousarray(each, np.float32) for each in arrays)
+    gaussians = Gaussians(means, quaternions, log_scales, logits, sh)
+    return Inputs(gaussians=gaussians, camera=camera, explore=Exploration(*10 ** rng.uniform(-3, 1, 2)))
+
+
+def _launch_penalties(device: Device, work: Workspace, given: Inputs) -> Read:
+    """The gradient of a loss that is 0."""
+    model, camera_array = upload_gaussians(device, given.gaussians), upload(device, pack_camera(given.camera))
+    projected = project(device, work, model, given.camera, camera_array)
+    gradients = allocate_gaussians(device, model.count, model.coefficients, zero=True)
+    slots = Slots(upload(device, np.zeros((model.count, SLOT_PLAIN), np.float32)))
+    screen = Screen(upload(device, np.zeros((model.count, 2), np.float32)))
+    project_grad(device, model, camera_array, projected, slots, gradients, screen, explore=given.explore)
+    return lambda: {
+        **{group: gradients[group].get() for group in PARAMETER_GROUPS},
+        "shown": projected.tile_counts.get() > 0,
+    }
+
+
+def _twin_of_penalties(given: Inputs, got: Arrays) -> dict[str, Wanted]:
+    gaussians, shown = given.gaussians, got.pop("shown")
+    parts = penalty_grad(given.explore, *(getattr(gaussians, name).astype(np.float64) for name in GEOMETRY_ARRAYS[1:]))
+    wanted: dict[str, Wanted] = {}
+    for name, values in zip(GEOMETRY_ARRAYS[1:], parts, strict=True):
+        got[f"{name} out of view"] = got[name][~shown]
+        wanted |= {
+            name: Wanted(values, 1e-6, sure=shown),
+            f"{name} out of view": exactly(np.zeros_like(values[~shown])),
+        }
+    others = [group for group in PARAMETER_GROUPS if group not in GEOMETRY_ARRAYS[1:]]
+    return wanted | {group: exactly(np.zeros_like(got[group])) for group in others}
+
+
+PENALTIES_CASE = Case(
+    sizes=(1, 7, 8, 9, 63, 64, 65, 203),
+    random=random_scene,
+    launch=_launch_penalties,
+    twin=_twin_of_penalties,
+    frozen=lambda bench: [
+        Inputs(gaussians=bench.frozen.gaussians, camera=bench.camera, explore=Exploration(opacity=0.3125, scale=0.6875))
+    ],
+    digested=tuple(PARAMETER_GROUPS),
+)
