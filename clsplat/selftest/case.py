@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A stage beside its float64 twin: its inputs, its launch, the values that the twin wants and the bounds of errors.
 
-The self-test runs every case on the frozen scenes, `tests/stages/test_cases.py` at the seams of sizes on every driver,
-`tools/stress/run kernels` on random inputs by the thousand, and `tools/ci/check_memory.py` on small ones.
+The self-test runs cases on the frozen scenes, and `tests/stages/test_cases.py` at the seams of sizes on every driver.
+`tools/stress/run kernels` runs them on random inputs by the thousand, and `tools/ci/check_memory.py` on small ones.
 """
 
 from __future__ import annotations

@@ -141,5 +141,4 @@ APPEARANCE_CASE = Case(
     twin=_twin,
     frozen=_frozen,
     digested=("logs", "first", "second", "gains", "columns", "target"),
-    by_shape=False,
 )

@@ -94,5 +94,4 @@ GRID_CASE = Case(
     twin=_twin,
     frozen=_frozen,
     digested=("grids", "first", "second", "by grid", "seen", "gradient"),
-    by_shape=False,
 )

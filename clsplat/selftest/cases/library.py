@@ -119,8 +119,10 @@ def conics_of(sides: Float64, angles: Float64) -> Float32:
 def random_splats(
     rng: Generator, count: int, *, width: int = 70, height: int = 50, depth: int = 3, opaque: float = 0.1
 ) -> Inputs:
-    """Gaussians of a few pixels all over an image and a little beyond, a tenth culled by a radius, and a part as opaque
-    as the cap; two of the same depth. They have `depth` values each."""
+    """Gaussians of a few pixels all over an image and a little beyond, a tenth culled by a radius.
+
+    A part is as opaque as the cap, and two each have the same depth. They have `depth` values each.
+    """
     sides = np.exp(rng.normal(0.9, 0.5, (count, 2)))
     opacities = np.where(rng.random(count) < opaque, 1.0, rng.uniform(0.02, 0.95, count))
     depths = rng.uniform(1, 9, count)

@@ -75,7 +75,6 @@ POSE_CASE = Case(
     twin=_twin,
     frozen=_frozen,
     digested=("sums",),
-    by_shape=False,
 )
 
 

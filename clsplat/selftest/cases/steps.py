@@ -188,7 +188,6 @@ NOISE_CASE = Case(
     twin=_twin_of_noise,
     frozen=_frozen_noise,
     digested=("means",),
-    by_shape=False,
 )
 
 
