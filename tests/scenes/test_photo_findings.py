@@ -336,7 +336,7 @@ def test_few_views_are_trained_for_fewer_steps() -> None:
     mcmc = TrainConfig(density=DensityConfig(growth="mcmc", max_gaussians=1000))
     assert answered(few, mcmc)[1] == replace(mcmc, thinning=0.2), "which has penalties of its own"
     (answer,), config = answered(few, TrainConfig(), {"thinning"})
-    assert (answer.words, config) == ("a (--thinning is given)", TrainConfig())
+    assert (answer.words, config) == ("a (you set --thinning)", TrainConfig())
 
 
 def test_few_steps_are_trained_with_high_rates() -> None:
