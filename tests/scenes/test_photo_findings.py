@@ -350,9 +350,9 @@ def test_few_steps_are_trained_with_high_rates() -> None:
     stopped = replace(mcmc, density=replace(mcmc.density, stop=4000))
     late = replace(mcmc, density=replace(mcmc.density, start=6000, stop=7000))
     for mine, given, words in (
-        (TrainConfig(), {"schedule"}, "--schedule is given"), (stopped, {"density.stop"}, "--density.stop is given"),
-        (late, {"density.start"}, "--density.start is given"),
-        (TrainConfig(), {"sh_degree_every", "sh_degree"}, "--sh-degree-every is given"),
+        (TrainConfig(), {"schedule"}, "you set --schedule"), (stopped, {"density.stop"}, "you set --density.stop"),
+        (late, {"density.start"}, "you set --density.start"),
+        (TrainConfig(), {"sh_degree_every", "sh_degree"}, "you set --sh-degree-every"),
         (bundled("fast", None, 7000), {"preset"}, "--schedule high-rates is incompatible with the other settings"),
     ):  # fmt: skip
         (answer,), config = answered(few, mine, given)
