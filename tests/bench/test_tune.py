@@ -223,7 +223,7 @@ def test_the_verb(default_device: Device, monkeypatch: pytest.MonkeyPatch, capsy
     assert (result["best"]["lanes"], result["best"]["items"]) == (chosen.lanes, chosen.items)
     assert shape_of(device)[0] == chosen
     assert main(["tune", "--device", name]) == 0
-    assert "5.00 ms  <- kept" in capsys.readouterr().out
+    assert "5.00 ms  <- saved" in capsys.readouterr().out
     assert main(["tune", "--device", name, "--forget"]) == 0
     assert shape_of(device)[0] == default_shape(device)
 

@@ -172,7 +172,7 @@ def test_no_gaussians_and_no_cameras(default_device: Device) -> None:
         ({"width": 0}, "width is 0, expected a positive whole number"),
         ({"eps2d": -1.0}, r"eps2d is -1.0, expected a number from 0 to 3.4\d*e\+38"),
         ({"radius_clip": float("nan")}, "radius_clip is nan, expected a number from 0 to 3.4"),
-        ({"near_plane": 5.0, "far_plane": 2.0}, "near_plane is 5.0 and far_plane 2.0"),
+        ({"near_plane": 5.0, "far_plane": 2.0}, "near_plane is 5.0 and far_plane is 2.0"),
         ({"camera_model": "ftheta"}, "camera_model is 'ftheta', expected one of pinhole, ortho, fisheye"),
         ({"opacities": np.zeros(3)}, r"opacities: got shape \(3,\), expected \(400,\)"),
     ],

@@ -181,7 +181,7 @@ def test_what_makes_no_sense_is_named(default_device: Device, changed: dict[str,
 
 
 def test_ids_that_make_no_sense() -> None:
-    with pytest.raises(InputError, match="beyond 1 of 3 x 3"):
+    with pytest.raises(InputError, match="beyond the 1 images of 3 x 3"):
         isect_offset_encode(np.array([1 << 36]), 1, 3, 3)
     with pytest.raises(InputError, match="image_ids"):
         isect_tiles(

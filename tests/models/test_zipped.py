@@ -90,7 +90,7 @@ def test_what_is_wrong_with_the_model_names_the_archive(tmp_path: Path) -> None:
         assert_equal(formats.load(archive), model)
     assert len(caught) == 1
     packed(archive, {"x/model.ply": data[:-1]})
-    with pytest.raises(InputError, match=rf"{archive}: x/model\.ply: truncated: 3 Gaussians need") as trouble:
+    with pytest.raises(InputError, match=rf"{archive}: x/model\.ply: truncated: has 2 of 3 Gaussians") as trouble:
         formats.load(archive)
     assert "clsplat-" not in str(trouble.value)  # the folder that it was unpacked to
 

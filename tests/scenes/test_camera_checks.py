@@ -299,6 +299,6 @@ def test_the_verbs_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         capsys.readouterr()
         assert main(words) == 0
         told = capsys.readouterr().err
-        assert "lies at 0 0" in told, words[0]
+        assert "is 0 0 in a picture" in told, words[0]
         assert "the poses have inverted" in told, words[0]
     assert json.loads((wrong / "transforms.json").read_text())["cx"] == 0

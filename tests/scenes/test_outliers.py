@@ -158,7 +158,7 @@ def test_stray_points_are_left_out(count: int, distance: float, tmp_path: Path) 
         np.testing.assert_array_equal(scene.point_colors, plain.point_colors)
         (warning,) = scene.warnings
         assert f"{count} of 400 points lie over 5 times as far off as the others, such as " in warning
-        assert warning.endswith(", and are left out")
+        assert warning.endswith("; they are left out")
     assert plain.warnings == []
 
 

@@ -114,7 +114,7 @@ def test_pictures_of_another_scale_than_the_camera(tmp_path: Path) -> None:
 def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
     make_colmap(tmp_path)
     write_image(tmp_path / "images" / "3.png", np.zeros((30, 70, 3), np.float32))
-    with pytest.raises(InputError, match=r"3\.png: is 70 x 30 pixels, expected its camera's 48 x 32"):
+    with pytest.raises(InputError, match=r"3\.png: has 70x30 pixels, expected its camera's size, 48x32"):
         load_scene(tmp_path)
 
 

@@ -193,7 +193,7 @@ def test_settings_that_make_no_sense(scene: Scene, default_device: Device, tmp_p
         Trainer(few, CONFIG, default_device)
     run = Run.create(tmp_path / "run", replace(CONFIG, iterations=3))
     train(scene, run.config, device=default_device, run=run)
-    with pytest.raises(InputError, match="refine_poses is True there"):
+    with pytest.raises(InputError, match="refine_poses is True, a resumed run"):
         train(scene, replace(CONFIG, refine_poses=False), device=default_device, run=run, resume=True)
 
 

@@ -134,7 +134,7 @@ def test_refusals(scene: Scene, default_device: Device, tmp_path: Path) -> None:
         TrainConfig(lens_reach=0.0).check()
     run = Run.create(tmp_path / "run", CONFIG)
     train(scene, replace(CONFIG, iterations=4), device=default_device, run=run)
-    with pytest.raises(InputError, match="refine_lenses is True there"):
+    with pytest.raises(InputError, match="refine_lenses is True, a resumed run"):
         train(scene, replace(CONFIG, refine_lenses=False), device=default_device, run=run, resume=True)
 
 

@@ -363,7 +363,7 @@ def test_pictures() -> None:
     counts, text = count_picture(np.array([[0, 5, 10]], np.int32))
     assert counts[0, 0].tolist() == VIRIDIS_RGB[0].tolist()
     assert counts[0, 2].tolist() == VIRIDIS_RGB[-1].tolist()
-    assert text.endswith("10 at most")
+    assert text.endswith("maximum 10")
     assert count_picture(np.zeros((2, 2), np.int32))[0].shape == (2, 2, 3)
 
 
