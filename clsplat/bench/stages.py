@@ -156,7 +156,7 @@ def _measure(device: Device, work: Callable[[], object], repeat: int) -> _Cost:
     """Measure the cost of `work`, in `repeat` rounds.
 
     In each round, `work` runs three times: without recording, with events, and with waits between stages. Wall time and
-    processor time are those of the first.
+    processor time are measured in the run without recording.
     """
     for _ in range(2):
         work()

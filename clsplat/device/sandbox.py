@@ -118,7 +118,7 @@ class KernelTrials:
     def known(self) -> dict[str, str]:
         """Names of working builds and launches, with the salt of `Variant.anew` that each text needs.
 
-        In a worker process, those that were begun.
+        In a worker process: names of the builds and launches that it has begun.
         """
         return {} if regardless() else dict(driver_records.entry(self._device, self._shape).kernels)
 

@@ -44,7 +44,7 @@ _AVERAGED_SCORES: tuple[_AveragedScore, ...] = ("psnr", "psnr_corrected", "psnr_
 class Evaluation(TypedDict):
     """Content of eval.json.
 
-    step, gaussians, seconds: those of the model (`EvaluatedModel`).
+    step, gaussians, seconds: of the evaluated model (`EvaluatedModel`).
     mean: mean over the views for each score's name; empty without views.
     lpips_missing: the reason why LPIPS is missing, if it is.
     """

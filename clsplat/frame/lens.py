@@ -107,7 +107,7 @@ class Warp:
 
     @property
     def shown(self) -> Camera:
-        """A camera of the warped frame's size. Use only its size and window: its rays are not those of the pixels."""
+        """A camera of the warped frame's size. Only its size and window are valid, not its rays."""
         width, height = self.source.size(self.frame)
         return replace(self.frame, width=width, height=height)
 

@@ -33,7 +33,7 @@ _EXTENSIONS_BY_FLAG = {
 class Request:
     """Call of `clsplat render` whose flags are valid, and agree with each other.
 
-    pictures: settings before those of a USD stage.
+    pictures: settings of the flags; a USD stage may still change them.
     holdout: settings for reading holdouts; None without any.
     devices: selector of each device; None for the default device.
     resize: function that resizes a camera by --width, --height and --scale.
