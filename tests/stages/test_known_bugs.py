@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What has gone wrong in other programs of this kind, a test each that the suite would not have by another name.
 
-docs/numerics.md lists them all, with the tests elsewhere.
+docs/numerics.md lists those that are tested elsewhere.
 """
 
 from __future__ import annotations
