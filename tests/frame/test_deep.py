@@ -38,6 +38,7 @@ SCENES = {
     "saturating": scenes.NAMED["saturating"],
     "equal_depth": scenes.NAMED["equal_depth"],
     "cloud": lambda: scenes.random_cloud(600, 8, 70, 50),
+    "orthographic cloud": lambda: scenes.orthographic(scenes.random_cloud(600, 8, 70, 50)),
 }
 
 
@@ -65,7 +66,7 @@ def over(pixels: list[NDArray[np.float64]], spec: Any) -> NDArray[np.float64]:
 
 
 @pytest.mark.slow_in_groups
-@pytest.mark.parametrize("name", quick(SCENES, "overlap"))
+@pytest.mark.parametrize("name", quick(SCENES, "overlap", "orthographic cloud"))
 def test_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = SCENES[name]()
     got = render_deep(Renderer(shaped_device), gaussians, camera, 5)

@@ -202,15 +202,6 @@ def test_order_in_memory_does_not_matter(device: Device) -> None:
     assert_same_bits(Pipeline.run(device, (permuted, camera)).image, first)
 
 
-def test_nothing_visible(shaped_device: Device) -> None:
-    gaussians, camera = scenes.one()
-    gaussians.means[:, 2] = -5
-    run = Pipeline.run(shaped_device, (gaussians, camera))
-    assert_close(run.image, np.broadcast_to(np.float32(BACKGROUND), run.image.shape))
-    got, _ = run.backward(np.ones((camera.height, camera.width, 3)))
-    assert not got.means.any()
-
-
 def test_saturated_pixels_stop_where_the_contract_says(shaped_device: Device) -> None:
     scene = scenes.saturating()
     run, wanted = Pipeline.run(shaped_device, scene), reference.forward(*scene).blended

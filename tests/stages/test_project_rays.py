@@ -58,11 +58,6 @@ def pinhole(width: int, height: int, angle: float) -> Camera:
     return replace(fisheye(width, height, 90), fx=focal, fy=1.1 * focal, projection="perspective", by_rays=True)
 
 
-def model_for(camera: Camera, count: int, seed: int) -> Gaussians:
-    """Gaussians all around, drawn as the camera does."""
-    return replace(all_around(count, seed), by_rays=camera.by_rays)
-
-
 CAMERAS = {
     "panorama": panorama(96, 48),
     "panorama of a width that is no multiple of a tile": panorama(70, 35),
@@ -74,9 +69,19 @@ CAMERAS = {
     "a whole sphere in a circle": fisheye(64, 64, 360),
     "perspective": pinhole(60, 50, 100),
     "perspective of 150 degrees": pinhole(60, 50, 150),
+    "antialiased half a turn": panorama(64, 40, np.pi),
+    "antialiased fisheye": fisheye(60, 50, 120),
 }
+"""By name; what begins with antialiased is."""
 
 
+def model_for(name: str, count: int, seed: int) -> Gaussians:
+    """Gaussians all around, drawn as the camera of this name does."""
+    antialiased = name.startswith("antialiased")
+    return replace(all_around(count, seed), by_rays=CAMERAS[name].by_rays, antialiased=antialiased)
+
+
+QUICK = ("panorama", "fisheye of 300 degrees", "perspective of 150 degrees", *list(CAMERAS)[-2:])
 FEATURES = ("normal", "position", "motion")
 
 
@@ -92,13 +97,13 @@ def moved(camera: Camera) -> Camera:
 
 @cache
 def expected(name: str) -> every_pixel.Picture:
-    return every_pixel.render(model_for(CAMERAS[name], 300, 5), CAMERAS[name], BACKGROUND, moved(CAMERAS[name]))
+    return every_pixel.render(model_for(name, 300, 5), CAMERAS[name], BACKGROUND, moved(CAMERAS[name]))
 
 
-@pytest.mark.parametrize("name", quick(CAMERAS, "panorama", "fisheye of 300 degrees", "perspective of 150 degrees"))
+@pytest.mark.parametrize("name", quick(CAMERAS, *QUICK))
 def test_against_the_twin(device: Device, name: str) -> None:
     camera, wanted = CAMERAS[name], expected(name)
-    gaussians = model_for(camera, 300, 5)
+    gaussians = model_for(name, 300, 5)
     after = moved(camera)
     image, found = Renderer(device).render_channels(gaussians, camera, FEATURES, after=after, background=BACKGROUND)
     # As of a frame; a direction of float32 is good to 1e-7, that of a pixel is 0.1.
@@ -122,7 +127,7 @@ def assert_close_channels(found: ChannelResult, wanted: every_pixel.Picture) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"])
 def test_the_same_bits_in_every_shape(device: Device, name: str) -> None:
-    camera, gaussians = CAMERAS[name], model_for(CAMERAS[name], 2000, 6)
+    camera, gaussians = CAMERAS[name], model_for(name, 2000, 6)
     first, *others = (
         Renderer(shaped(device, *shape)).render_channels(gaussians, camera, FEATURES, after=moved(camera))
         for shape in shapes_of(device)
@@ -136,7 +141,7 @@ def test_the_same_bits_in_every_shape(device: Device, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective", "perspective of 150 degrees"])
 def test_gaussians_that_move_are_a_camera_that_moves(device: Device, name: str) -> None:
-    camera, gaussians = CAMERAS[name], model_for(CAMERAS[name], 300, 5)
+    camera, gaussians = CAMERAS[name], model_for(name, 300, 5)
     there = moved(camera)
     # R' x + t' is R (R^T (R' x + t' - t)) + t
     means = (gaussians.means @ there.rotation.T + there.translation - camera.translation) @ camera.rotation
@@ -317,7 +322,7 @@ def test_what_is_too_near_or_transparent_is_left_out(device: Device) -> None:
 )
 def test_what_is_not_finite_is_left_out_alone(default_device: Device, name: str, value: float, group: str) -> None:
     renderer, camera = Renderer(default_device), CAMERAS[name]
-    clean, broken = model_for(camera, 60, 9), model_for(camera, 60, 9)
+    clean, broken = model_for(name, 60, 9), model_for(name, 60, 9)
     clean.opacity_logits[7] = -20.0
     getattr(broken, group)[7] = value
     wanted, got = (renderer.render_channels(gaussians, camera, ("normal", "position")) for gaussians in (clean, broken))

@@ -10,18 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture
-from tiny import CONFIG, run_steps, short, write_scene
+from tiny import CONFIG, run_steps
 
-from clsplat.api import train
 from clsplat.cli.main import main
-from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.models.formats import load
 from clsplat.reference.sampling import sampling_limits
 from clsplat.rendering.renderer import Renderer
-from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training import mip_filter
@@ -29,36 +25,6 @@ from clsplat.training.mip_filter import MipFilter
 from clsplat.training.trainer import Trainer
 
 SMOOTH = replace(CONFIG, antialiased=True)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-
-
-@pytest.fixture(scope="module")
-def scene(folder: Path) -> Scene:
-    return load_scene(folder)
-
-
-def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: bool) -> bytes:
-    run = Run.create(folder, config, **options)
-    train(scene, config, device=device, run=run, **options)
-    return run.model_path.read_bytes()
-
-
-@pytest.mark.slow
-def test_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Resumed, and by capacity; without the setting they are others."""
-    whole = model_bytes(scene, SMOOTH, default_device, tmp_path / "whole")
-    for step in (7, 15, 23):
-        config = replace(short(iterations=step), antialiased=True)
-        model_bytes(scene, config, default_device, tmp_path / "cut", **({"resume": True} if step > 7 else {}))
-    assert model_bytes(scene, SMOOTH, default_device, tmp_path / "cut", resume=True) == whole
-    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "1")
-    assert model_bytes(scene, SMOOTH, default_device, tmp_path / "capacity") == whole
-    monkeypatch.delenv("CLSPLAT_BY_CAPACITY")
-    assert model_bytes(scene, CONFIG, default_device, tmp_path / "off") != whole
 
 
 def test_no_scale_is_less_than_the_pictures_show(scene: Scene, default_device: Device) -> None:

@@ -10,32 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture
-from compare import assert_same_bits
-from same_bytes import interrupted, model_bytes
 from test_intrinsics import write_lens_scene
-from tiny import CONFIG, hidden_model, short, write_scene
+from tiny import CONFIG, hidden_model
 
-from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
-from clsplat.gaussians import Gaussians
 from clsplat.models.formats import load
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.trainer import Trainer
-
-ALONG_RAYS = replace(CONFIG, perspective="rays")
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-
-
-@pytest.fixture(scope="module")
-def scene(folder: Path) -> Scene:
-    return load_scene(folder)
 
 
 @pytest.mark.slow
@@ -55,29 +39,6 @@ def test_it_is_so_where_the_scene_has_other_lenses(scene: Scene, default_device:
             assert kinds <= {by_rays}
             trainer.train_step()
             assert trainer.gaussians().by_rays == by_rays
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("further", [{}, {"antialiased": True}, {"refine_poses": True}, {"batch": 2}])
-def test_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path, further: dict[str, bool]) -> None:
-    config = replace(short(report=False), perspective="rays", **further)
-    whole = model_bytes(scene, config, default_device, tmp_path / "whole")
-    assert interrupted(scene, config, default_device, tmp_path / "stopped") == whole
-
-
-@pytest.mark.slow
-def test_by_capacity_and_with_less_memory(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def model(device: Device) -> Gaussians:
-        return train(scene, replace(ALONG_RAYS, report=False), device=device)
-
-    whole = model(default_device)
-    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "1")
-    assert_same_bits(model(default_device).means, whole.means)
-    monkeypatch.delenv("CLSPLAT_BY_CAPACITY")
-    monkeypatch.setenv("CLSPLAT_POISON", "1")
-    assert_same_bits(model(default_device).means, whole.means)
 
 
 @pytest.mark.slow

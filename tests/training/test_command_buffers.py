@@ -4,17 +4,14 @@ step."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from compare import assert_same_bits
-from depths import add_maps
-from numpy.typing import NDArray
-from tiny import short, write_scene
+from compare import assert_same_arrays
+from quick import quick
+from same_bytes import PLAIN, SETTINGS, State, make_too_small, scene_for, write_known_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import Workspace, upload
@@ -22,9 +19,6 @@ from clsplat.device.command_buffer import CHECK_TAPES, CommandBuffer
 from clsplat.device.command_buffer import TAPES_VARIABLE as TAPES
 from clsplat.device.context import Device
 from clsplat.errors import InputError
-from clsplat.images.reading import read_image
-from clsplat.images.writing import write_image
-from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages import project
@@ -32,46 +26,17 @@ from clsplat.stages.scan import scan
 from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
-PLAIN = short(iterations=60, density={"min_contribution": 0.01})
-MCMC = {"growth": "mcmc", "max_gaussians": 150, "min_opacity": 0.03, "max_screen_radius": 30.0}
-CONFIGS = {
-    "plain": PLAIN,
-    "background": short(iterations=60, background="random"),
-    "thinning": replace(PLAIN, thinning=0.5),
-    "exposure": replace(PLAIN, appearance="exposure"),
-    "ppisp": replace(PLAIN, appearance="ppisp"),
-    "grid": replace(PLAIN, appearance="grid"),
-    "MCMC": short(iterations=60, density=MCMC),
-    "long axis": short(density={"growth": "budget", "max_gaussians": 120, "long_axis": True}),
-    "antialiased": replace(PLAIN, antialiased=True),
-    "ignored": replace(PLAIN, masks="ignore"),
-    "transparent": replace(PLAIN, masks="transparent"),
-    "sparse": replace(PLAIN, optimiser=replace(PLAIN.optimiser, sparse=True)),
-    "all": replace(
-        short(iterations=60, density=MCMC), thinning=0.3, appearance="exposure", antialiased=True, masks="ignore"
-    ),
-    "depth": replace(PLAIN, depth="maps", thinning=0.2, penalty=0.01),
-    "batch": replace(PLAIN, batch=2, thinning=0.3),
-}
-"""Each with density control, rising SH degrees and sizes of photographs."""
+WITHOUT = {"poses", "lenses", "cameras", "rays, refined", "points"}
 TOO_SMALL = (7, 12, 13, 25)
-"""Steps whose room is for 8 pairs, so that they are made again."""
+"""Steps that are made again."""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny scene with a mask of each picture, of as many pixels as no other's, and its depths."""
-    scene = write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-    (scene / "masks").mkdir()
-    for index, path in enumerate(sorted((scene / "images").iterdir())):
-        mask = np.ones_like(read_image(path)[:, :, :3])
-        mask[5:23, 2 * index : 3 * index + 9] = 0
-        write_image(scene / "masks" / f"{path.name}.png", mask)
-    add_maps(scene)
-    return scene
+    return write_known_scene(tmp_path_factory.mktemp("tiny") / "scene")
 
 
-Result = tuple[Mapping[str, NDArray[Any]], list[tuple[float, float]], int]
+Result = tuple[State, list[tuple[float, float]], int]
 
 
 def trained(scene: Scene, config: TrainConfig, device: Device, monkeypatch: pytest.MonkeyPatch, **how: str) -> Result:
@@ -79,10 +44,7 @@ def trained(scene: Scene, config: TrainConfig, device: Device, monkeypatch: pyte
     for name, value in ((BY_CAPACITY_VARIABLE, how.get("capacity", "1")), (TAPES, how["command_buffers"])):
         monkeypatch.setenv(name, value)
     trainer, losses = Trainer(scene, config, device), []
-    real = trainer.pending.room
-    monkeypatch.setattr(
-        trainer.pending, "room", lambda *size: (room := real(*size)) and (8 if trainer.step in TOO_SMALL else room)
-    )
+    make_too_small(monkeypatch, trainer, TOO_SMALL)
     while trainer.step < config.iterations:
         losses.append(trainer.train_step(reads_loss=trainer.step % 10 == 9))
         if trainer.step % 10 == 0:
@@ -92,26 +54,14 @@ def trained(scene: Scene, config: TrainConfig, device: Device, monkeypatch: pyte
     return trainer.checkpoint()[0], losses, trainer.pending.redone
 
 
-def assert_alike(one: Result, other: Result) -> None:
-    assert one[0].keys() == other[0].keys()
-    for name, values in one[0].items():
-        assert_same_bits(values, other[0][name], name)
-    assert one[1] == other[1]
-
-
-FAST = ("plain",)
-
-
-@pytest.mark.parametrize(
-    "setting", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in CONFIGS]
-)
+@pytest.mark.parametrize("setting", quick([name for name in SETTINGS if name not in WITHOUT], "plain"))
 def test_every_setting_has_its_bytes(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch, setting: str
 ) -> None:
     """Without command buffers, with them, and with each launch compared with the recorded one; in a group's shape
     too."""
-    config, replayed, checked = CONFIGS[setting], [], []
-    scene = with_depths(load_scene(folder, masks=config.mask_use), config.depth_use)
+    config, replayed, checked = SETTINGS[setting], [], []
+    scene = scene_for(folder, config)
     group = default_device.with_shape(lanes=1, items=64)
     for name, calls in (("set", replayed), ("check", checked)):
         real = getattr(CommandBuffer, name)
@@ -121,7 +71,8 @@ def test_every_setting_has_its_bytes(
         for use in uses:
             replayed.clear(), checked.clear()
             other = trained(scene, config, device, monkeypatch, command_buffers=use)
-            assert_alike(exact, other)
+            assert_same_arrays(other[0], exact[0])
+            assert other[1] == exact[1]
             assert (other[2] > 0) == (config.batch == 1)
             assert (len(replayed) > 20) == (use == "1" and config.batch == 1)
             assert (len(checked) > 20) == (use == CHECK_TAPES and config.batch == 1)

@@ -189,3 +189,15 @@ def test_the_same_seed_gives_the_same_halves() -> None:
     first, again = (split_halves(CONFIG, **values, rng=np.random.default_rng(5))[0] for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(first, axis=0)) == 3, "two halves are drawn apart"
+
+
+def test_splitting_a_zero_quaternion_gives_finite_halves() -> None:
+    means, log_scales = split_halves(
+        CONFIG,
+        means=np.ones((4, 3), np.float32),
+        quaternions=np.array([[0, 0, 0, 0], [1e-42, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1e-20]], np.float32),
+        log_scales=np.zeros((4, 3), np.float32),
+        rng=np.random.default_rng(0),
+    )
+    assert np.isfinite(means).all()
+    assert np.isfinite(log_scales).all()

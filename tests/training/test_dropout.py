@@ -4,15 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from quick import quick
-from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
 from scenes import random_cloud
-from tiny import short, write_scene
+from tiny import short
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
@@ -25,8 +23,6 @@ from clsplat.optimisation.dropout import Thinning, thinning_of
 from clsplat.reference.dropout import factors, logit_grad, thinned_logits
 from clsplat.reference.render import forward, render_grad
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.scenes.loading import load_scene
-from clsplat.scenes.scene import Scene
 from clsplat.stages.device_camera import padded_size
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
 
@@ -111,28 +107,6 @@ def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device
         assert values.any()
         difference = np.linalg.norm(getattr(got, name).astype(np.float64) - values)
         assert difference <= 1e-4 * np.linalg.norm(values), name
-
-
-def test_stopping_and_going_on_gives_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-def test_it_changes_the_model(scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes) -> None:
-    assert model_bytes(scene, replace(CONFIG, thinning=0.0), default_device, tmp_path / "whole") != undisturbed
-
-
-@pytest.mark.slow
-def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
-    """Rows that come in parts are thinned by their place in the model."""
-    scene = load_scene(write_scene(tmp_path / "scene", points=False))
-    many = replace(CONFIG, random_points=1500, thinning=0.5)
-    check_in_less_memory(scene, many, default_device, tmp_path)
-
-
-def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
-    check_on_two_devices(scene, CONFIG, default_device, 12)
 
 
 @pytest.mark.parametrize("rate", [-0.1, 0.95])

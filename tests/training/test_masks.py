@@ -13,9 +13,9 @@ import scenes
 from compare import assert_close, assert_close_gradient
 from pipeline import BACKGROUND, Pipeline
 from quick import quick
+from same_bytes import model_bytes
 from tiny import CONFIG, write_scene
 
-from clsplat.api import train
 from clsplat.config.masks import MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
@@ -26,7 +26,6 @@ from clsplat.reference.blend import blend
 from clsplat.reference.loss import alpha_loss, masked_l1_dssim
 from clsplat.reference.project import project
 from clsplat.reference.render import forward, parameters, render_grad
-from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians
 from clsplat.stages.loss import loss
@@ -119,14 +118,8 @@ def with_masks(folder: Path, seed: int) -> Path:
     return scene
 
 
-def model(folder: Path, scene: Path, config: TrainConfig, device: Device, stop: int = 0) -> bytes:
-    read = load_scene(scene, masks=config.mask_use)
-    run = Run.create(folder, config)
-    if stop:
-        train(read, replace(config, iterations=stop), device=device, run=run)
-        run = Run.create(folder, config, resume=True)
-    train(read, config, device=device, run=run, resume=stop > 0)
-    return run.model_path.read_bytes()
+def model(folder: Path, scene: Path, config: TrainConfig, device: Device) -> bytes:
+    return model_bytes(load_scene(scene, masks=config.mask_use), config, device, folder)
 
 
 @pytest.mark.parametrize("batch", quick([1, 2], 1))
@@ -137,13 +130,6 @@ def test_ignored_pixels_change_no_bit(default_device: Device, tmp_path: Path, ba
     assert models[0] == models[1]
     plain = model(tmp_path / "plain", tmp_path / "1", replace(CONFIG, report=False, batch=batch), default_device)
     assert plain != models[0]
-
-
-@pytest.mark.parametrize("meaning", quick(["ignore", "transparent"], "ignore"))
-def test_going_on_gives_the_same_bytes(default_device: Device, tmp_path: Path, meaning: Any) -> None:
-    scene, config = with_masks(tmp_path / "scene", 1), replace(CONFIG, masks=meaning, report=False)
-    whole = model(tmp_path / "whole", scene, config, default_device)
-    assert model(tmp_path / "parts", scene, config, default_device, stop=17) == whole
 
 
 def test_the_mean_is_of_the_part_that_counts(tmp_path: Path) -> None:
