@@ -177,6 +177,11 @@ def random_cloud(count: int, seed: int, width: int, height: int, degree: int = 3
     return make_gaussians(world_from_pixels(camera, pixels, depths), quaternions, log_scales, opacities, sh), camera
 
 
+def in_float64(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians in float64, so that a step of a difference is not rounded away."""
+    return replace(gaussians, **{name: np.asarray(values, np.float64) for name, values in gaussians.arrays().items()})
+
+
 def antialiased(scene: Scene) -> Scene:
     """The scene with the antialiased model's low-pass."""
     return replace(scene[0], antialiased=True), scene[1]
