@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from compare import assert_same_arrays
 from depths import add_maps, add_tracks
 from numpy.typing import NDArray
 from tiny import short, write_scene
@@ -24,6 +25,7 @@ from clsplat.runs.run import Run
 from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
+from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
 PLAIN = short(iterations=48, report=False, density={"min_contribution": 0.01})
@@ -137,6 +139,39 @@ def make_too_small(monkeypatch: pytest.MonkeyPatch, trainer: Trainer, steps: Col
     monkeypatch.setattr(
         trainer.pending, "room", lambda *size: (room := real(*size)) and (8 if trainer.step in steps else room)
     )
+
+
+Stepped = tuple[State, list[tuple[float, float]], Trainer]
+
+
+def stepped(
+    scene: Scene,
+    config: TrainConfig,
+    device: Device,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    capacity: bool,
+    too_small: Collection[int] = (),
+    before: Callable[[Trainer], object] = lambda _: None,
+) -> Stepped:
+    """The arrays of a checkpoint after a training by capacity or with exact counts, the losses that were read, and the
+    trainer. before: called before each step."""
+    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "01"[capacity])
+    trainer, losses = Trainer(scene, config, device), []
+    make_too_small(monkeypatch, trainer, too_small)
+    while trainer.step < config.iterations:
+        before(trainer)
+        result = trainer.train_step(reads_loss=trainer.step % 10 == 9)
+        if trainer.step % 10 == 0 or trainer.step == 17:
+            losses.append(result.read())
+    return trainer.checkpoint()[0], losses, trainer
+
+
+def assert_alike(one: Stepped, other: Stepped) -> None:
+    """Arrays, losses and incidents."""
+    assert_same_arrays(one[0], other[0])
+    assert one[1] == other[1]
+    assert list(map(str, one[2].monitor.incidents)) == list(map(str, other[2].monitor.incidents))
 
 
 def opened_again(device: Device) -> Device:

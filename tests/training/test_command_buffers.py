@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compare import assert_same_arrays
 from quick import quick
-from same_bytes import PLAIN, SETTINGS, State, make_too_small, scene_for, write_known_scene
+from same_bytes import PLAIN, SETTINGS, Stepped, assert_alike, scene_for, stepped, write_known_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import Workspace, upload
@@ -23,7 +22,6 @@ from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages import project
 from clsplat.stages.scan import scan
-from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
 WITHOUT = {"poses", "lenses", "cameras", "rays, refined", "points"}
@@ -36,22 +34,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_known_scene(tmp_path_factory.mktemp("tiny") / "scene")
 
 
-Result = tuple[State, list[tuple[float, float]], int]
-
-
-def trained(scene: Scene, config: TrainConfig, device: Device, monkeypatch: pytest.MonkeyPatch, **how: str) -> Result:
-    """The arrays of a checkpoint after a training, its losses, and how many steps were made again."""
-    for name, value in ((BY_CAPACITY_VARIABLE, how.get("capacity", "1")), (TAPES, how["command_buffers"])):
-        monkeypatch.setenv(name, value)
-    trainer, losses = Trainer(scene, config, device), []
-    make_too_small(monkeypatch, trainer, TOO_SMALL)
-    while trainer.step < config.iterations:
-        losses.append(trainer.train_step(reads_loss=trainer.step % 10 == 9))
-        if trainer.step % 10 == 0:
-            losses[-1] = losses[-1].read()
-        else:
-            losses.pop()
-    return trainer.checkpoint()[0], losses, trainer.pending.redone
+def trained(
+    device: Device, scene: Scene, config: TrainConfig, patch: pytest.MonkeyPatch, use: str, *, capacity: bool = True
+) -> Stepped:
+    patch.setenv(TAPES, use)
+    return stepped(scene, config, device, patch, too_small=TOO_SMALL, capacity=capacity)
 
 
 @pytest.mark.parametrize("setting", quick([name for name in SETTINGS if name not in WITHOUT], "plain"))
@@ -67,13 +54,12 @@ def test_every_setting_has_its_bytes(
         real = getattr(CommandBuffer, name)
         monkeypatch.setattr(CommandBuffer, name, lambda *given, real=real, calls=calls: (calls.append(1), real(*given)))
     for device, uses in ((default_device, ("0", "1", CHECK_TAPES)), (group, ("1",))):
-        exact = trained(scene, config, device, monkeypatch, capacity="0", command_buffers="0")
+        exact = trained(device, scene, config, monkeypatch, "0", capacity=False)
         for use in uses:
             replayed.clear(), checked.clear()
-            other = trained(scene, config, device, monkeypatch, command_buffers=use)
-            assert_same_arrays(other[0], exact[0])
-            assert other[1] == exact[1]
-            assert (other[2] > 0) == (config.batch == 1)
+            other = trained(device, scene, config, monkeypatch, use)
+            assert_alike(other, exact)
+            assert (other[2].pending.redone > 0) == (config.batch == 1)
             assert (len(replayed) > 20) == (use == "1" and config.batch == 1)
             assert (len(checked) > 20) == (use == CHECK_TAPES and config.batch == 1)
 
@@ -86,7 +72,7 @@ def test_a_step_with_exact_counts_makes_no_command_buffer(
     made: list[int] = []
     monkeypatch.setattr(CommandBuffer, "add_launch", lambda *_: made.append(1))
     config = replace(PLAIN, batch=batch, iterations=6)
-    trained(load_scene(folder), config, default_device, monkeypatch, capacity="0", command_buffers="1")
+    trained(default_device, load_scene(folder), config, monkeypatch, "1", capacity=False)
     assert not made
 
 
@@ -97,7 +83,7 @@ def test_a_number_that_is_not_declared_is_found(
     monkeypatch.setattr(project, "step_numbers", real := project.step_numbers)
     monkeypatch.setattr("clsplat.training.step.gradient_step.step_numbers", lambda *given: real(*given)[:0])
     with pytest.raises(AssertionError, match="project_step in a command buffer has other arguments than now"):
-        trained(load_scene(folder), PLAIN, default_device, monkeypatch, command_buffers=CHECK_TAPES)
+        trained(default_device, load_scene(folder), PLAIN, monkeypatch, CHECK_TAPES)
 
 
 def test_a_number_that_is_not_given_is_found(
@@ -106,7 +92,7 @@ def test_a_number_that_is_not_given_is_found(
     real = project.step_numbers
     monkeypatch.setattr("clsplat.training.step.gradient_step.step_numbers", lambda *given: (*real(*given)[:-1], 0.5))
     with pytest.raises(AssertionError, match="numbers given to a command buffer are"):
-        trained(load_scene(folder), PLAIN, default_device, monkeypatch, command_buffers=CHECK_TAPES)
+        trained(default_device, load_scene(folder), PLAIN, monkeypatch, CHECK_TAPES)
 
 
 def test_another_word_than_those_is_refused(
