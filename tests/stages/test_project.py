@@ -11,6 +11,7 @@ from pipeline import Pipeline, assert_gradients
 from quick import quick
 
 from clsplat.device.context import Device
+from clsplat.layouts.columns import SlotFields
 from clsplat.reference import render as reference
 
 WHITEN = np.sqrt(np.log2(np.e) / 2)
@@ -44,19 +45,25 @@ def test_projection(device: Device, name: str) -> None:
     assert_close(run.splat("L11", "L12", "L22")[shown] / WHITEN / scale, whitening / scale, absolute=1e-5)
 
 
+WAYS = (SlotFields(), SlotFields(absolute=True), SlotFields(absolute=True, contributions=True))
+"""Fields of slots: the plain ones, and those that density control may want."""
+
+
 @pytest.mark.smoke
 @pytest.mark.parametrize("name", EVERY)
 def test_gradients(device: Device, name: str) -> None:
-    scene = EVERY[name]()
-    assert_gradients(Pipeline.run(device, scene), scene)
+    run = Pipeline.run(device, scene := EVERY[name]())
+    for fields in WAYS:
+        assert_gradients(run, scene, fields)
 
 
 @pytest.mark.parametrize(
     "name", quick([name for name in EVERY if name.split()[-1] in scenes.SHAPE_MATTERS], *scenes.SHAPE_MATTERS)
 )
 def test_gradients_in_every_shape(shaped_device: Device, name: str) -> None:
-    scene = EVERY[name]()
-    assert_gradients(Pipeline.run(shaped_device, scene), scene)
+    run = Pipeline.run(shaped_device, scene := EVERY[name]())
+    for fields in WAYS:
+        assert_gradients(run, scene, fields)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -68,20 +75,6 @@ def test_every_sh_degree(device: Device, degree: int) -> None:
     d_image = np.ones((30, 40, 3))
     got, _ = run.backward(d_image)
     assert_close_gradient(got.sh, reference.render_grad(*scene, d_image, (0.1, 0.2, 0.3)).parameters["sh"], 1e-4)
-
-
-@pytest.mark.slow_in_groups
-def test_absolute_screen_gradients(shaped_device: Device) -> None:
-    scene = scenes.overlap()
-    run = Pipeline.run(shaped_device, scene)
-    d_image = np.random.default_rng(2).standard_normal((run.camera.height, run.camera.width, 3))
-    plain, screen = run.backward(d_image)
-    absolute, absolute_screen = run.backward(d_image, absolute=True)
-    wanted = reference.render_grad(*scene, d_image, (0.1, 0.2, 0.3))
-    shown = run.visible
-    assert_close_gradient(absolute_screen[shown], wanted.abs_means2d[shown], 1e-4)
-    assert np.all(absolute_screen[shown] >= np.abs(screen[shown]) * (1 - 1e-4) - 1e-6)
-    assert_close_gradient(plain.means, absolute.means, 1e-5)
 
 
 def test_culled_gaussians_get_no_gradient(device: Device) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
-from pipeline import BACKGROUND, shaped, shapes_of
+from pipeline import BACKGROUND
 from quick import quick
 
 from clsplat.camera import Camera, Projection, focal_length
@@ -122,21 +122,6 @@ def assert_close_channels(found: ChannelResult, wanted: every_pixel.Picture) -> 
         of, got = (values.reshape(*solid.shape, -1)[solid] for values in (getattr(wanted, name), plane))
         size = np.abs(of).max(axis=1, keepdims=True)
         assert_close(got / size, of / size, absolute=1e-4, name=name)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"])
-def test_the_same_bits_in_every_shape(device: Device, name: str) -> None:
-    camera, gaussians = CAMERAS[name], model_for(name, 2000, 6)
-    first, *others = (
-        Renderer(shaped(device, *shape)).render_channels(gaussians, camera, FEATURES, after=moved(camera))
-        for shape in shapes_of(device)
-    )
-    for image, found in others:
-        assert_same_bits(image.image, first[0].image)
-        assert_same_bits(image.alpha, first[0].alpha)
-        for feature in FEATURES:
-            assert_same_bits(found[feature], first[1][feature])
 
 
 @pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective", "perspective of 150 degrees"])

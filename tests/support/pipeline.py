@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from compare import assert_close_gradient, assert_close_gradients
+from compare import assert_close, assert_close_gradient, assert_close_gradients
 from drivers import why_not
 from numpy.typing import NDArray
 from quick import quick
@@ -146,10 +146,16 @@ def steady(scene: Scene, seed: int = 1) -> NDArray[np.float64]:
     return d_image
 
 
-def assert_gradients(run: Pipeline, scene: Scene) -> None:
-    """The gradients of a frame beside those of the twin, for `steady`."""
-    d_image = steady(scene)
-    got, screen = run.backward(d_image)
+def assert_gradients(run: Pipeline, scene: Scene, fields: SlotFields = PLAIN_SLOTS) -> None:
+    """The gradients of a frame, and its contributions, beside those of the twin, for `steady`."""
+    d_image, shown = steady(scene), run.visible
+    got, screen = run.screened(d_image, fields)
     wanted = render_grad(*scene, d_image, BACKGROUND)
     assert_close_gradients(got.arrays(), wanted.parameters, 1e-4)
-    assert_close_gradient(screen[run.visible], wanted.means2d[run.visible], 1e-4)
+    on_image = wanted.abs_means2d if fields.absolute else wanted.means2d
+    assert_close_gradient(screen.gradients.get()[shown], on_image[shown], 1e-4)
+    if screen.contributions is not None:
+        # Weights are as good as frames are, 2e-5 a pixel at most; 1e-4 of a Gaussian's own sum, and a few pixels at the
+        # edge of an ellipse, of a weight of 1/255, that are decided the other way.
+        contributions = screen.contributions.get()[shown]
+        assert_close(contributions, wanted.contributions[shown], relative=1e-4, absolute=4 / 255)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -42,8 +44,9 @@ def make_plan(
     seen: ArrayLike = 4,
     radii: ArrayLike = 5,
     opacities: ArrayLike = 0.5,
+    known: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> RowPlan:
-    """sizes: the largest axis of each; the others are a tenth of it."""
+    """sizes: the largest axis of each; the others are a tenth of it. known: further statistics."""
     largest = np.asarray(sizes, np.float32)
     n = len(largest)
     views = np.broadcast_to(np.asarray(seen, np.float32), n)
@@ -52,6 +55,7 @@ def make_plan(
         "gradient_sums": (np.asarray(gradients) * views).astype(np.float32),
         "seen": views,
         "radii": np.broadcast_to(np.asarray(radii, np.float32), n),
+        **known,
     }
     parameters = {"log_scales": log_scales, "opacity_logits": np.broadcast_to(logit(opacities), n)}
     parameters |= {"means": np.zeros((n, 3), np.float32), "quaternions": np.ones((n, 4), np.float32)}
