@@ -18,7 +18,6 @@ from test_trainer import host
 from tiny import run_steps, short, trained_to
 
 from clsplat.api import train
-from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS
@@ -27,7 +26,6 @@ from clsplat.reference.render import render_grad
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.stages.density import CONTRIBUTION_STATISTICS, DeviceRowList
-from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.trainer import Trainer
 
@@ -189,12 +187,3 @@ def test_the_budget_is_reached(scene: Scene, default_device: Device) -> None:
     train(scene, config, device=default_device, on_step=lambda report: counts.append(report.gaussians))
     assert counts[-1] == 150, "nothing is pruned, and the last densification reaches it"
     assert len(scene.points) < counts[1] < 150
-
-
-def test_every_driver_prunes_alike(device: Device, default_device: Device, scene: Scene) -> None:
-    config: TrainConfig = replace(CONFIG, iterations=16)
-    trainers = [Trainer(scene, config, opened) for opened in (device, default_device)]
-    for trainer in trainers:
-        run_steps(config.iterations, trainer)
-        assert not isinstance(trainer.parameters, HostGaussians)
-    assert trainers[0].parameters.count == trainers[1].parameters.count

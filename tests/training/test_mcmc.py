@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from tiny import run_steps, short, trained_to
+from tiny import short, trained_to
 
 from clsplat.api import train
 from clsplat.arrays import Float32
@@ -221,15 +221,3 @@ def test_it_grows_learns_and_leaves_nothing_undrawn(scene: Scene, default_device
     kept = trainer.gaussians().opacity_logits
     assert 0 < len(kept) < len(scene.points)
     assert kept.min() > -5.54
-
-
-@pytest.mark.slow
-def test_every_driver_trains_alike(device: Device, default_device: Device, scene: Scene) -> None:
-    """In one shape of the kernels, to the bit."""
-    ends = []
-    for opened in (device, default_device):
-        trainer = Trainer(scene, replace(CONFIG, iterations=24), opened.with_shape(lanes=1, items=1))
-        run_steps(24, trainer)
-        ends.append(trainer.gaussians().arrays())
-    for name, values in ends[0].items():
-        assert_same_bits(ends[1][name], values, name)

@@ -153,17 +153,6 @@ def test_broken_parameters_are_not_drawn_and_removed(
         assert_well(poisoned)
 
 
-@pytest.mark.parametrize("group", PARAMETER_GROUPS)
-def test_garbage_in_parameters_spoils_nothing_else(scene: Scene, default_device: Device, group: str) -> None:
-    for value in GARBAGE:
-        trainer = started(scene, default_device)
-        put(trainer.parameters[group], value)
-        for _ in range(3):
-            assert np.isfinite(trainer.train_step().read()).all(), value
-        assert trainer.parameters.count >= 39
-        assert_well(trainer)
-
-
 def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: str, value: float) -> None:
     """In the next step alone, after the backward pass, with gradients in memory."""
     model = trainer.parameters
@@ -233,16 +222,18 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
 
 
 @pytest.mark.parametrize("group", PARAMETER_GROUPS)
-@pytest.mark.parametrize("which", ["first", "second"])
-def test_garbage_in_moments_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
+@pytest.mark.parametrize("which", ["parameters", "first", "second"])
+def test_garbage_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
     for value in GARBAGE:
         poisoned, plain = started(scene, default_device), started(scene, default_device)
         put(getattr(poisoned, which)[group], value)
-        poisoned.train_step()
+        assert np.isfinite(poisoned.train_step().read()).all(), value
         plain.train_step()
-        assert_others_alike(poisoned, plain)
+        if which != "parameters":  # garbage there is drawn, and has its place in the others' gradients
+            assert_others_alike(poisoned, plain)
         for _ in range(3):
             assert np.isfinite(poisoned.train_step().read()).all(), value
+        assert poisoned.parameters.count >= 39
         assert_well(poisoned)
 
 

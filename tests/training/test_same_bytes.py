@@ -45,7 +45,10 @@ STOPS = {
 """Steps to stop after: at the seams of epochs (8 views), of resets, of passes and of what is gathered."""
 QUICK_STOPS = [
     *(("contributions", 8), ("contributions", 20), ("MCMC", 16), ("MCMC", 40), ("long axis", 16), ("long axis", 40)),
-    *((name, 17) for name in ("exposure", "ppisp", "grid", "ignored", "points", "thinning", "penalty", "cameras")),
+    *(
+        (name, 17)
+        for name in ("background", "exposure", "ppisp", "grid", "ignored", "points", "thinning", "penalty", "cameras")
+    ),
 ]
 
 
@@ -177,3 +180,14 @@ def test_two_devices_have_the_bytes_of_one(name: str, folder: Path, default_devi
         found.append(trainer.checkpoint()[0])
         trainer.close()
     assert_same_arrays(found[1], found[0])
+
+
+@pytest.mark.parametrize("name", quick(["contributions", "MCMC", "all"], "contributions"))
+def test_every_driver_trains_alike(name: str, folder: Path, device: Device, default_device: Device) -> None:
+    """In one shape of the kernels."""
+    config, found = SETTINGS[name], []
+    for opened in (device, default_device):
+        trainer = Trainer(scene_for(folder, config), config, opened.with_shape(lanes=1, items=1))
+        run_steps(24, trainer)
+        found.append(trainer.checkpoint()[0])
+    assert_same_arrays(*found)
