@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from clsplat.arrays import Float32
 from clsplat.camera import Camera
@@ -15,7 +17,7 @@ from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 
-def change_photographs(monkeypatch: pytest.MonkeyPatch, change: Callable[[int, Float32], object]) -> None:
+def change_photographs(monkeypatch: pytest.MonkeyPatch, change: Callable[[int, NDArray[Any]], object]) -> None:
     """Let photographs be float, and what `change` makes of each, by its index."""
     plain = ImageCache.load
 

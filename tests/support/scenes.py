@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -179,7 +180,8 @@ def random_cloud(count: int, seed: int, width: int, height: int, degree: int = 3
 
 def in_float64(gaussians: Gaussians) -> Gaussians:
     """The same Gaussians in float64, so that a step of a difference is not rounded away."""
-    return replace(gaussians, **{name: np.asarray(values, np.float64) for name, values in gaussians.arrays().items()})
+    arrays: dict[str, Any] = {name: np.asarray(values, np.float64) for name, values in gaussians.arrays().items()}
+    return replace(gaussians, **arrays)
 
 
 def antialiased(scene: Scene) -> Scene:

@@ -119,7 +119,8 @@ def without_points(scene: Scene) -> Scene:
 
 
 LITTLE = [
-    *((name, 0.45) for name in ("thinning", "penalty", "maps", "poses", "lenses", "cameras", "long axis")),
+    *((name, 0.45) for name in ("poses", "lenses", "cameras", "long axis")),
+    *((name, 0.6) for name in ("thinning", "penalty", "maps")),
     *(("MCMC", 0.6), ("MCMC", 0.5), ("contributions", 0.6), ("contributions", 0.3), ("absolute", 0.85)),
 ]
 """Settings, and the part of the memory that they take."""
