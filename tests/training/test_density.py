@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from marking import TwinMarker, on_host
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from clsplat.config.training import DensityConfig
 from clsplat.stages.device_gaussians import HostArray
@@ -168,14 +169,7 @@ def test_halves_are_smaller_by_the_factor_and_drawn_from_their_gaussian() -> Non
     )
     assert means.dtype == log_scales.dtype == np.float32
     np.testing.assert_allclose(np.exp(log_scales[7]), scales / 1.6, rtol=1e-6)
-    w, x, y, z = q / np.linalg.norm(q)
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix()
     along = (means - centre) @ rotation  # in the Gaussian's own axes
     # 4 standard errors: sigma / sqrt(n) of a mean, 1 / sqrt(2 n) relative of a deviation
     assert np.all(np.abs(along.mean(axis=0)) < 4 * scales / np.sqrt(count))
