@@ -93,17 +93,8 @@ def test_numbers_that_are_given_anew(made: Work) -> None:
             first, second = (made.work.array(name, (3,), np.uint32) for name in ("first", "second"))
             for out, value in zip((first, second), values, strict=True):
                 out.fill(1)
-                launch_groups(
-                    made.device,
-                    made.kernel,
-                    1,
-                    1,
-                    1,
-                    -7,
-                    command_buffer.LaunchParameter(value),
-                    out,
-                    cl.LocalMemory(4),
-                )
+                arguments = (1, -7, command_buffer.LaunchParameter(value), out, cl.LocalMemory(4))
+                launch_groups(made.device, made.kernel, 1, 1, *arguments)
             one, other = first.begin_get(), second.begin_get()
             return lambda: np.stack([one(), other()])
 

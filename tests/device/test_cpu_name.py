@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import ctypes
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from calls import python
 
 from clsplat.device.context import all_devices
 from clsplat.device.drivers import cpu_name
@@ -70,11 +69,8 @@ def test_a_processor_that_llvm_does_not_know(mended: bool, tmp_path: Path) -> No
     """In a child with a cache of its own: PoCL would take what it built under another name."""
     if not pocl_3():
         pytest.skip("PoCL 3.0 is not there")
-    cache = {"POCL_CACHE_DIR": str(tmp_path)}
-    child = subprocess.run(
-        [sys.executable, "-c", CHILD, str(pocl_3()[0]), "generic", "mended" if mended else "left"],
-        env={**os.environ, **cache}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = (pocl_3()[0], "generic", "mended" if mended else "left")
+    child = python("-c", CHILD, *words, env={**os.environ, "POCL_CACHE_DIR": str(tmp_path)})
     assert (child.returncode == 0) == mended, child.stderr
     if not mended:
         assert KernelBuildError.__name__ in child.stderr

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from calls import python
 from scenes import one
 
 from clsplat.device import forks
@@ -80,15 +81,8 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 @pytest.mark.parametrize(("parent", "printed"), [("used", "DeviceError\n"), ("fresh", "")])
 def test_a_fork_by_hand(parent: str, printed: str) -> None:
     """One that OpenCL was not used in before may use it."""
-    paths = os.pathsep.join(sys.path)
-    done = subprocess.run(
-        [sys.executable, "-c", FORK, os.path.dirname(__file__), parent],  # noqa: PTH120
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        env={**os.environ, "PYTHONPATH": paths},
-        check=False,
-    )
+    paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = python("-c", FORK, Path(__file__).parent, parent, timeout=PATIENCE, env={**os.environ, **paths})
     assert (done.returncode, done.stdout) == (7, printed), done.stderr
 
 

@@ -7,11 +7,11 @@ glibc fills what is freed where MALLOC_PERTURB_ says so: what was luck without i
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from calls import python
 
 from clsplat.device.context import Device
 
@@ -26,13 +26,7 @@ for stem, defines in (("duplicate", {}), ("duplicate", {"RAYS": 1}), ("scan", {}
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc's variable")
 def test_builds_with_freed_memory_filled(device: Device, tmp_path: Path) -> None:
-    here = {"MALLOC_PERTURB_": "165", "XDG_CACHE_HOME": str(tmp_path), "CLSPLAT_BINARIES": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, "-c", BUILD, str(device.index), "1x32"],
-        env={**os.environ, **here, "POCL_CACHE_DIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    here = dict.fromkeys(("XDG_CACHE_HOME", "CLSPLAT_BINARIES", "POCL_CACHE_DIR"), str(tmp_path))
+    environment = {**os.environ, **here, "MALLOC_PERTURB_": "165"}
+    done = python("-c", BUILD, device.index, "1x32", env=environment, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]

@@ -6,12 +6,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 
 import pyopencl as cl
 import pytest
+from calls import python
 from drivers import KEPT
 
 from clsplat.device import program
@@ -112,9 +111,7 @@ for task in os.listdir("/proc/self/task"):
 def test_a_drivers_threads_have_no_signals(index: int, ignored: str, aside: bool) -> None:
     """Their linkers inherit that: a Ctrl-C would else end one in the middle, and PoCL aborts then."""
     code = MASKS.format(index=str(index), before=ignored, aside=aside)
-    done = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ}, capture_output=True, text=True, timeout=120, check=False
-    )
+    done = python("-c", code, timeout=120)
     assert done.returncode == 0, done.stderr
     first, *threads = done.stdout.splitlines()
     assert first == "0"  # the main thread has all signals

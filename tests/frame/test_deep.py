@@ -13,7 +13,6 @@ import pytest
 import scenes
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
-from pipeline import EVERY_SHAPE, shaped, shapes_of
 from quick import quick
 from slices import flattened, in_front
 
@@ -38,6 +37,7 @@ SCENES = {
     "saturating": scenes.NAMED["saturating"],
     "equal_depth": scenes.NAMED["equal_depth"],
     "cloud": lambda: scenes.random_cloud(600, 8, 70, 50),
+    "orthographic cloud": lambda: scenes.orthographic(scenes.random_cloud(600, 8, 70, 50)),
 }
 
 
@@ -65,7 +65,7 @@ def over(pixels: list[NDArray[np.float64]], spec: Any) -> NDArray[np.float64]:
 
 
 @pytest.mark.slow_in_groups
-@pytest.mark.parametrize("name", quick(SCENES, "overlap"))
+@pytest.mark.parametrize("name", quick(SCENES, "overlap", "orthographic cloud"))
 def test_against_the_twin(shaped_device: Device, name: str) -> None:
     gaussians, camera = SCENES[name]()
     got = render_deep(Renderer(shaped_device), gaussians, camera, 5)
@@ -85,15 +85,6 @@ def test_gaussians_of_one_depth_are_one_slice(default_device: Device) -> None:
     slices = render_deep(Renderer(default_device), gaussians, camera, 16)
     assert not slices[1:].any() and slices[0, :, :, 3].max() > 0.5
     assert set(np.unique(slices[0, :, :, 4])) == {0.0, 3.0}
-
-
-@EVERY_SHAPE
-def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
-    gaussians, camera = scenes.random_cloud(2000, 8, 150, 100)
-    renderers = (Renderer(shaped(device, *shape)) for shape in shapes_of(device, (4, 1), every=every))
-    first, *others = (render_deep(renderer, gaussians, camera, 7) for renderer in renderers)
-    for other in others:
-        assert_same_bits(other, first)
 
 
 def test_a_holdout_at_any_depth(default_device: Device) -> None:

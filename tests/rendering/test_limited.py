@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 from compare import assert_same_bits
 from quick import quick
-from same_bytes import opened_again
+from same_bytes import model_bytes, opened_again
 from scenes import random_cloud
 from tiny import CONFIG, run_steps, short, trained_to, write_scene
 
 import clsplat
-from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
-from clsplat.config.training import OptimiserConfig, TrainConfig
+from clsplat.config.training import OptimiserConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
@@ -43,40 +42,31 @@ from clsplat.training.trainer import Trainer
 KIB = 1024
 
 
-def with_limit(device: Device, limit: int | None) -> Device:
-    """The device with an account of its own; without a limit it is as large as it gets."""
-    return device.with_memory_limit(limit)
-
-
 # Frames
 
 
-@pytest.mark.parametrize("share", [0.9, 0.5, 0.4])
-def test_a_frame_in_less_memory(default_device: Device, share: float) -> None:
+@pytest.mark.parametrize(
+    ("config", "share"),
+    [
+        *((RasterizerConfig(), share) for share in (0.9, 0.5, 0.4)),
+        (BenchSwitches(tile_test="square", depth_sort="pairs"), 0.5),
+    ],
+    ids=["nine tenths", "half", "two fifths", "half, all pairs sorted"],
+)
+def test_a_frame_in_less_memory(default_device: Device, config: RasterizerConfig, share: float) -> None:
     scene, camera = random_cloud(6000, 11, 100, 80)
-    free = with_limit(default_device, None)
-    wanted = Renderer(free).render(scene, camera, (0.1, 0.2, 0.3))
+    free = default_device.with_memory_limit(None)
+    wanted = Renderer(free, config=config).render(scene, camera, (0.1, 0.2, 0.3))
     limit = int(share * free.memory.peak)
-    device = with_limit(default_device, limit)
-    renderer = Renderer(device)
-    got = renderer.render(scene, camera, (0.1, 0.2, 0.3))
+    device = default_device.with_memory_limit(limit)
+    got = Renderer(device, config=config).render(scene, camera, (0.1, 0.2, 0.3))
     assert device.memory.peak <= limit
     assert_same_bits(got.image, wanted.image)
     assert_same_bits(got.alpha, wanted.alpha)
 
 
-def test_a_frame_that_sorts_all_pairs_in_less_memory(default_device: Device) -> None:
-    config = BenchSwitches(tile_test="square", depth_sort="pairs")
-    scene, camera = random_cloud(6000, 11, 100, 80)
-    free = with_limit(default_device, None)
-    wanted = Renderer(free, config=config).render(scene, camera)
-    device = with_limit(default_device, free.memory.peak // 2)
-    assert_same_bits(Renderer(device, config=config).render(scene, camera).image, wanted.image)
-    assert device.memory.peak <= free.memory.peak // 2
-
-
 def test_frames_of_many_sizes_and_models(default_device: Device) -> None:
-    device = with_limit(default_device, 2000 * KIB)
+    device = default_device.with_memory_limit(2000 * KIB)
     renderer, plain = Renderer(device), Renderer(default_device)
     for count, width, height in ((500, 60, 40), (3000, 200, 150), (5000, 320, 200), (500, 40, 40)):
         gaussians, camera = random_cloud(count, 3, width, height)
@@ -87,7 +77,7 @@ def test_frames_of_many_sizes_and_models(default_device: Device) -> None:
 def test_too_little_says_how_much_is_needed(default_device: Device) -> None:
     gaussians, camera = random_cloud(4000, 11, 200, 150)
     with pytest.raises(CapacityError, match=r"4,000 Gaussians .* at least about [\d,]+ KiB of device memory"):
-        Renderer(with_limit(default_device, 300 * KIB)).render(gaussians, camera)
+        Renderer(default_device.with_memory_limit(300 * KIB)).render(gaussians, camera)
 
 
 # Training
@@ -106,17 +96,11 @@ MANY = short(
 """CONFIG with Gaussians that become so many that memory is a matter of them and not of the planes."""
 
 
-def trained(scene: Scene, device: Device, folder: Path, config: TrainConfig = MANY, **options: bool) -> bytes:
-    run = Run.create(folder, config, resume=options.get("resume", False))
-    train(scene, config, device=device, run=run, **options)
-    return run.model_path.read_bytes()
-
-
 @pytest.fixture(scope="module")
 def unlimited(scene: Scene, default_device: Device, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, int]:
     """model.ply of MANY, and the most memory that its training had."""
-    device = with_limit(default_device, None)
-    return trained(scene, device, tmp_path_factory.mktemp("unlimited")), device.memory.peak
+    device = default_device.with_memory_limit(None)
+    return model_bytes(scene, MANY, device, tmp_path_factory.mktemp("unlimited")), device.memory.peak
 
 
 @pytest.mark.parametrize("share", quick([0.95, 0.6, 0.4, 0.26], 0.26))
@@ -125,8 +109,8 @@ def test_training_in_less_memory_gives_the_same_bytes(
 ) -> None:
     wanted, peak = unlimited
     limit = int(share * peak)
-    device = with_limit(default_device, limit)
-    assert trained(scene, device, tmp_path / "run") == wanted
+    device = default_device.with_memory_limit(limit)
+    assert model_bytes(scene, MANY, device, tmp_path / "run") == wanted
     assert device.memory.peak <= limit
 
 
@@ -135,7 +119,7 @@ def test_what_is_streamed_and_banded_and_resumed(
 ) -> None:
     """Stopped under a limit, resumed without one: the same bytes again."""
     wanted, peak = unlimited
-    device = with_limit(default_device, int(0.26 * peak))
+    device = default_device.with_memory_limit(int(0.26 * peak))
     trainer = Trainer(scene, MANY, device)
     assert not trainer.plan.streamed, "it grows into it"
     run_steps(32, trainer)
@@ -147,7 +131,7 @@ def test_what_is_streamed_and_banded_and_resumed(
     run = Run.create(tmp_path / "run", MANY)
     arrays, state = trainer.checkpoint()
     run.save_checkpoint(trainer.step, arrays, {**state, "seconds": 1.0})
-    assert trained(scene, default_device, tmp_path / "run", resume=True) == wanted
+    assert model_bytes(scene, MANY, default_device, tmp_path / "run", resume=True) == wanted
 
 
 def test_resumed_under_a_limit(
@@ -157,21 +141,9 @@ def test_resumed_under_a_limit(
     run = Run.create(tmp_path / "run", MANY)
     arrays, state = trainer.checkpoint()
     run.save_checkpoint(trainer.step, arrays, {**state, "seconds": 1.0})
-    device = with_limit(default_device, int(0.4 * unlimited[1]))
-    assert trained(scene, device, tmp_path / "run", resume=True) == unlimited[0]
+    device = default_device.with_memory_limit(int(0.4 * unlimited[1]))
+    assert model_bytes(scene, MANY, device, tmp_path / "run", resume=True) == unlimited[0]
     assert device.memory.peak <= 0.4 * unlimited[1]
-
-
-@pytest.mark.slow
-def test_absolute_gradients_in_less_memory(scene: Scene, default_device: Device) -> None:
-    config = short(random_points=1500, iterations=8, density={"absolute_gradients": True})
-    free = with_limit(default_device, None)
-    wanted = train(scene, config, device=free)
-    device = with_limit(default_device, int(0.85 * free.memory.peak))  # one tile has 1024 of the pairs
-    got = train(scene, config, device=device)
-    for field in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-        assert_same_bits(getattr(got, field), getattr(wanted, field))
-    assert device.memory.peak <= device.memory.limit
 
 
 def test_a_small_training_that_fits_is_not_cut(scene: Scene, default_device: Device) -> None:
@@ -183,9 +155,9 @@ def test_a_small_training_that_fits_is_not_cut(scene: Scene, default_device: Dev
 def test_no_buffer_is_over_the_devices_limit_of_one(
     scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path
 ) -> None:
-    device = with_limit(default_device, None)
+    device = default_device.with_memory_limit(None)
     device.max_allocation = 180 * KIB
-    assert trained(scene, device, tmp_path / "run") == unlimited[0]
+    assert model_bytes(scene, MANY, device, tmp_path / "run") == unlimited[0]
 
 
 # The needs
@@ -196,7 +168,7 @@ def test_no_buffer_is_over_the_devices_limit_of_one(
 def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int | None) -> None:
     """Memory of a step, at once and in bands, against what the stages say. They may say more: of the photograph, and
     of Gaussians that are not visible."""
-    device = with_limit(default_device, 2**40)  # a limit, so that no array has room to spare
+    device = default_device.with_memory_limit(2**40)  # a limit, so that no array has room to spare
     gaussians, camera = random_cloud(6000, 11, 100, 80)
     fields = SlotFields(absolute=True, contributions=True)
     config = RasterizerConfig()
@@ -223,7 +195,7 @@ def test_the_needs_are_those_of_the_arrays(default_device: Device, capacity: int
 
 def test_the_needs_of_a_batch_are_those_of_its_arrays(scene: Scene, default_device: Device) -> None:
     """On the device that has the model, and on another."""
-    devices = [with_limit(each, 2**40) for each in (default_device, opened_again(default_device))]
+    devices = [each.with_memory_limit(2**40) for each in (default_device, opened_again(default_device))]
     config = short(batch=2, iterations=2, random_points=6000, sh_degree_every=0, warmup=())
     trainer = Trainer(scene, config, devices[0], further=devices[1:])
     trainer.train_step()
@@ -240,7 +212,7 @@ def test_the_needs_of_a_batch_are_those_of_its_arrays(scene: Scene, default_devi
 
 
 def test_the_needs_of_a_frame_are_those_of_its_arrays(default_device: Device) -> None:
-    device = with_limit(default_device, 2**40)
+    device = default_device.with_memory_limit(2**40)
     gaussians, camera = random_cloud(6000, 11, 100, 80)
     need = plan_frame(device, 6000, 59, camera, RasterizerConfig()).need
     rasterizer = Rasterizer(device)
@@ -322,8 +294,8 @@ def test_from_python(scene: Scene) -> None:
 def test_a_device_with_little_memory_needs_no_flag(
     scene: Scene, default_device: Device, unlimited: tuple[bytes, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    device = with_limit(default_device, None)
+    device = default_device.with_memory_limit(None)
     budget = int(0.4 * unlimited[1])
     monkeypatch.setattr(Device, "budget", budget)
-    assert trained(scene, device, tmp_path / "run") == unlimited[0]
+    assert model_bytes(scene, MANY, device, tmp_path / "run") == unlimited[0]
     assert device.memory.peak <= budget

@@ -19,14 +19,6 @@ def directions(count: int, seed: int = 0) -> Float64:
     return unit
 
 
-def turned(start: Float64, angle: float, seed: int = 1) -> tuple[Float64, Float64]:
-    """Directions at this angle, and the unit tangents that lead there."""
-    tangents = directions(len(start), seed)
-    tangents -= (tangents * start).sum(axis=1, keepdims=True) * start
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    return np.cos(angle) * start + np.sin(angle) * tangents, tangents
-
-
 def coefficients(count: int = 50, degree: int = 3) -> NDArray[np.float32]:
     return np.random.default_rng(2).normal(size=(count, (degree + 1) ** 2, 3)).astype(np.float32)
 

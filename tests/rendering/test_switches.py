@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from compare import assert_same_bits
-from golden_frames import checksums
+from compare import assert_same_arrays, assert_same_bits
+from golden_frames import FOCALS, checksums, pictures_of
 from numpy.typing import NDArray
-from pipeline import BACKGROUND, Pipeline, shaped
+from pipeline import EVERY_SHAPE, Pipeline, shaped, shapes_of
 from quick import quick
 
 from clsplat.cli.bench import BenchVerb
@@ -22,14 +22,11 @@ from clsplat.cli.main import parse
 from clsplat.cli.train import TrainVerb
 from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
-from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import InputError
 from clsplat.rendering.build_flags import kernel_defines
-from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.sequence.task import digest_of
-from clsplat.stages.device_gaussians import upload_gaussians
 
 EXACT_OFF = {
     "constant extent": BenchSwitches(extent="constant"),
@@ -94,25 +91,28 @@ def scene(name: str) -> scenes.Scene:
 
 
 def run(device: Device, name: str, config: RasterizerConfig) -> Pipeline:
-    gaussians, camera = scene(name)
-    rasterizer = Rasterizer(device, config)
-    on_device = upload_gaussians(device, gaussians)
-    frame = rasterizer.forward(on_device, camera, upload(device, np.array(BACKGROUND, np.float32)))
-    return Pipeline(rasterizer, on_device, camera, frame)
+    return Pipeline.run(device, scene(name), config=config)
 
 
 def gradients(pipeline: Pipeline) -> dict[str, NDArray[np.float32]]:
     camera = pipeline.camera
     d_image = np.random.default_rng(2).random((camera.height, camera.width, 3)) - 0.5
     found, screen = pipeline.backward(d_image)
-    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    arrays = {name: getattr(found, name) for name in names}
-    return {**arrays, "screen": np.where(pipeline.visible[:, None], screen, np.float32(0))}
+    return {**found.arrays(), "screen": np.where(pipeline.visible[:, None], screen, np.float32(0))}
 
 
 def test_default_bits_are_the_stored_ones(device: Device) -> None:
     wanted = json.loads((Path(__file__).parents[1] / "golden" / "frames.json").read_text())["checksums"]
     assert checksums(device) == wanted, "see tools/ci/make_golden.py if the change is meant to change bits"
+
+
+@EVERY_SHAPE
+@pytest.mark.parametrize("kind", quick(FOCALS, "perspective", "orthographic"))
+def test_the_same_pictures_in_every_shape(device: Device, default_device: Device, kind: str, every: bool) -> None:
+    """Every channel and deep slices, on every driver."""
+    wanted = pictures_of(default_device, (kind,))
+    for shape in shapes_of(device, (1, 256), (4, 1), every=every):
+        assert pictures_of(shaped(device, *shape), (kind,)) == wanted
 
 
 def test_every_define_is_looked_at_by_a_kernel() -> None:
@@ -135,30 +135,21 @@ def test_exact_switches_change_no_bit(default_device: Device, switch: str, name:
     wanted, got = run(device, name, RasterizerConfig()), run(device, name, EXACT_OFF[switch])
     for array in ("image", "transmittance"):
         assert_same_bits(getattr(got.frame.blended, array).get(), getattr(wanted.frame.blended, array).get(), array)
-    wanted_gradients, got_gradients = gradients(wanted), gradients(got)
-    for array, values in wanted_gradients.items():
-        # a sum that is zero may be so with either sign
-        assert_same_bits(got_gradients[array] + np.float32(0), values + np.float32(0), array)
+    # a sum that is zero may be so with either sign
+    assert_same_arrays(*({name: a + np.float32(0) for name, a in gradients(each).items()} for each in (got, wanted)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["off_frustum", "sheaf", "cloud"])
-def test_culling_that_is_off_lists_more_gaussians(default_device: Device, name: str) -> None:
-    check_culling(default_device, name, RasterizerConfig())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("extent", ["constant", "3sigma"])
-def test_culling_that_is_off_with_other_extents(default_device: Device, extent: Any) -> None:
-    check_culling(default_device, "sheaf", BenchSwitches(extent=extent))
-
-
-def test_culling_that_is_off_on_every_device(device: Device) -> None:
-    check_culling(device, "sheaf", RasterizerConfig())
-
-
-def check_culling(device: Device, name: str, config: RasterizerConfig) -> None:
-    default, got = (run(device, name, replace(config.switches(), frustum_cull=on)) for on in (True, False))
+@pytest.mark.parametrize(
+    ("name", "extent"),
+    [
+        ("sheaf", "opacity"),
+        *(pytest.param(name, "opacity", marks=pytest.mark.slow) for name in ("off_frustum", "cloud")),
+        *(pytest.param("sheaf", extent, marks=pytest.mark.slow) for extent in ("constant", "3sigma")),
+    ],
+)
+def test_culling_that_is_off_lists_more_gaussians(device: Device, name: str, extent: Any) -> None:
+    config = BenchSwitches(extent=extent)
+    default, got = (run(device, name, replace(config, frustum_cull=on)) for on in (True, False))
     assert_same_bits(got.frame.blended.image.get(), default.frame.blended.image.get())
     projected, counted = got.frame.projected, got.frame.listed.counted
     np.testing.assert_array_equal(projected.tile_counts.get(), default.frame.projected.tile_counts.get())
@@ -175,13 +166,9 @@ def check_culling(device: Device, name: str, config: RasterizerConfig) -> None:
 
 
 def test_culling_that_is_off_in_bands(default_device: Device) -> None:
-    gaussians, camera = scene("sheaf")
     frames = []
     for config in (RasterizerConfig(), BenchSwitches(frustum_cull=False)):
-        rasterizer = Rasterizer(default_device, config)
-        rasterizer.capacity = 20_000
-        background = upload(default_device, np.array(BACKGROUND, np.float32))
-        frames.append(rasterizer.forward(upload_gaussians(default_device, gaussians), camera, background))
+        frames.append(Pipeline.run(default_device, scene("sheaf"), config=config, capacity=20_000).frame)
         assert len(frames[-1].bands) > 1
     assert_same_bits(frames[1].blended.image.get(), frames[0].blended.image.get())
 

@@ -25,21 +25,12 @@ from clsplat.device.drivers.worker_process import CHILD_MESSAGE_PREFIX, DRIVER_T
 from clsplat.device.program import BREAK_KERNEL_VARIABLE
 from clsplat.errors import DeviceError, InputError
 from clsplat.selftest import driver_check
+from clsplat.selftest import result as stage_groups
 from clsplat.selftest.driver_check import DriverReport, examine
 from clsplat.selftest.harness import error_of
 from clsplat.selftest.result import (
-    APPEARANCE_STAGES,
-    BACKWARD_STAGES,
     CHANNEL_STAGES,
-    DEEP_STAGES,
-    DEPTH_STAGES,
     FORWARD_STAGES,
-    HOLDOUT_STAGES,
-    LENS_STAGES,
-    LIBRARY_STAGES,
-    MASK_STAGES,
-    POSE_STAGES,
-    RAY_STAGES,
     SELFTEST_STAGES,
     STAGE_BOUNDS_ULP,
     TRAINING_STAGES,
@@ -114,23 +105,14 @@ BROKEN = {
 """What is miscompiled: kernel and words, the words that stand there then, and the stage that is to notice."""
 
 
+UNIONS = {"TRAINING_STAGES", "SELFTEST_STAGES", "INDEX_STAGES"}
+"""Groups of stages that share some with the others."""
+
+
 def condemned(device: Device, monkeypatch: pytest.MonkeyPatch, change: str, last: str) -> list[Result]:
     """What the last stage comes to, and those that it stands on, on the device with this change."""
     monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
-    groups = (
-        FORWARD_STAGES,
-        CHANNEL_STAGES,
-        DEEP_STAGES,
-        HOLDOUT_STAGES,
-        RAY_STAGES,
-        MASK_STAGES,
-        BACKWARD_STAGES,
-        APPEARANCE_STAGES,
-        DEPTH_STAGES,
-        POSE_STAGES,
-        LENS_STAGES,
-        LIBRARY_STAGES,
-    )
+    groups = [stages for name, stages in vars(stage_groups).items() if name.endswith("_STAGES") and name not in UNIONS]
     group = next(stages for stages in groups if last in stages)
     before = () if group is FORWARD_STAGES else FORWARD_STAGES
     return list(run(device.with_shape(), quick=True, stages=(*before, *group[: group.index(last) + 1])))
@@ -212,24 +194,23 @@ def test_rounding_otherwise_is_told_and_forgiven(
     assert told in report.verdict
 
 
-@pytest.mark.parametrize("change", ["blend", "blend: a", ": a => b"])
-def test_a_change_that_makes_no_sense(change: str, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        *((change, "expected STEM: WORDS => WORDS") for change in ("blend", "blend: a", ": a => b")),
+        ("blend: abacus => slide rule", r"blend\.cl has no such words"),
+        (
+            "blender: alpha => beta",
+            r"blender is not a kernel, expected one of adam, alpha_loss, appearance and \d+ more$",
+        ),
+    ],
+)
+def test_a_change_that_makes_no_sense(
+    change: str, message: str, default_device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
-    with pytest.raises(InputError, match="expected STEM: WORDS => WORDS"):
+    with pytest.raises(InputError, match=message):
         default_device.with_shape().kernels("blend")
-
-
-def test_a_change_of_words_that_are_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blend: abacus => slide rule")
-    with pytest.raises(InputError, match=r"blend\.cl has no such words"):
-        default_device.with_shape().kernels("blend")
-
-
-def test_a_change_of_a_kernel_that_is_not_there(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(BREAK_KERNEL_VARIABLE, "blender: alpha => beta")
-    known = r"blender is not a kernel, expected one of adam, alpha_loss, appearance and \d+ more$"
-    with pytest.raises(InputError, match=known):
-        default_device.with_shape().kernels("scan")
 
 
 def test_errors_in_ulp() -> None:
@@ -325,26 +306,22 @@ def test_no_such_device(capsys: Capture) -> None:
 # Drivers that die
 
 
-def child(monkeypatch: pytest.MonkeyPatch, code: str) -> DriverReport:
+BEGINS = f'import os, sys, time; print({CHILD_MESSAGE_PREFIX!r} + \'{{"begins": "blend"}}\', flush=True); '
+
+
+@pytest.mark.parametrize(
+    ("code", "failure"),
+    [
+        (f"{BEGINS}os.abort()", "the process was ended by signal 6 in blend"),
+        (f"{BEGINS}time.sleep(60)", "the driver did not come back within 2 s from blend"),
+        ("import sys; print('noise'); sys.exit('no good')", "the process ended with status 1 in starting (no good)"),
+    ],
+    ids=["aborts", "hangs", "ends early"],
+)
+def test_a_driver_that_dies(code: str, failure: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(driver_check, "python_module", lambda *_, **__: [sys.executable, "-c", code])
     monkeypatch.setenv(DRIVER_TIMEOUT_VARIABLE, "2")
-    return examine(0, shape_of(all_devices()[0])[0])
-
-
-def test_a_driver_that_aborts(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = f'import os; print({CHILD_MESSAGE_PREFIX!r} + \'{{"begins": "building blend.cl"}}\', flush=True); os.abort()'
-    assert child(monkeypatch, code).failure == "the process was ended by signal 6 in building blend.cl"
-
-
-def test_a_driver_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = f'import time; print({CHILD_MESSAGE_PREFIX!r} + \'{{"begins": "blend"}}\', flush=True); time.sleep(60)'
-    report = child(monkeypatch, code)
-    assert report.failure == "the driver did not come back within 2 s from blend"
-
-
-def test_a_child_that_ends_early(monkeypatch: pytest.MonkeyPatch) -> None:
-    report = child(monkeypatch, "import sys; print('noise'); sys.exit('no good')")
-    assert report.failure == "the process ended with status 1 in starting (no good)"
+    assert examine(0, shape_of(all_devices()[0])[0]).failure == failure
 
 
 # At the first use

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""adam.cl against the float64 twin over several steps."""
+"""adam.cl: sums of views, steps that are left out, and elements that are refused."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from clsplat.gaussians import PARAMETER_GROUPS, group_shapes
 from clsplat.layouts.columns import READBACK, REFUSED
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
+from clsplat.selftest.case import fresh_readback
+from clsplat.selftest.cases.steps import ADAM_CASE, uploaded_groups
 from clsplat.stages.adam import AdamStep, adam, add_view
 from clsplat.stages.device_gaussians import allocate_gaussians
 
@@ -46,45 +48,11 @@ def test_views_are_added_in_order(shaped_device: Device, count: int) -> None:
 
 @pytest.mark.smoke
 def test_no_gradient_no_step(device: Device) -> None:
-    p, g, m, v = (allocate_gaussians(device, 20, 1, zero=True) for _ in range(4))
-    p["means"].fill(0.5)
-    adam(
-        device,
-        AdamStep(OptimiserConfig(), 1, dict.fromkeys(PARAMETER_GROUPS, 0.1)),
-        p,
-        g,
-        m,
-        v,
-        upload(device, np.ones(20, np.uint32)),
-    )
-    assert np.all(p["means"].get() == 0.5)
-
-
-@pytest.mark.parametrize("count", quick([1, 7, 8, 9, 100], 1, 9))
-def test_sparse_steps_are_those_of_the_visible(shaped_device: Device, count: int) -> None:
-    """Rows that the view shows get the bits of the dense step, the others keep all of theirs."""
-    rng = np.random.default_rng(count)
-    visible = rng.random(count) < 0.4
-    visible[: count // 3] = False  # whole vectors of hidden ones, and of visible ones
-    visible[2 * count // 3 :] = True
-    counts = upload(shaped_device, visible.astype(np.uint32) * 3)
-    dense, sparse = ([allocate_gaussians(shaped_device, count, 16, zero=True) for _ in range(4)] for _ in range(2))
-    before = {}
-    for group, shape in group_shapes(count, 16).items():
-        for index in range(4):
-            values = rng.random(shape).astype(np.float32)
-            if index == 1:
-                values[~visible] = 0.0
-            before[group, index] = values
-            dense[index][group].set(values)
-            sparse[index][group].set(values)
-    rates = dict.fromkeys(PARAMETER_GROUPS, 0.1)
-    adam(shaped_device, AdamStep(OptimiserConfig(), 3, rates), *dense, counts)
-    adam(shaped_device, AdamStep(OptimiserConfig(sparse=True), 3, rates), *sparse, counts)
-    for (group, index), values in before.items():
-        got = sparse[index][group].get()
-        np.testing.assert_array_equal(got[visible], dense[index][group].get()[visible], err_msg=group)
-        np.testing.assert_array_equal(got[~visible], values[~visible], err_msg=group)
+    models = [allocate_gaussians(device, 20, 1, zero=True) for _ in range(4)]
+    models[0]["means"].fill(0.5)
+    step = AdamStep(OptimiserConfig(), 1, dict.fromkeys(PARAMETER_GROUPS, 0.1))
+    adam(device, step, *models, upload(device, np.ones(20, np.uint32)))
+    assert np.all(models[0]["means"].get() == 0.5)
 
 
 @pytest.mark.smoke
@@ -102,7 +70,7 @@ def test_sh_rest_waits_for_its_step(device: Device) -> None:
             np.testing.assert_array_equal(p["sh_rest"].get(), before)
         else:
             wanted = reference(wanted[0], np.full((5, 3, 3), 0.5 * step), *wanted[1:], step // 3, 0.1)
-    assert_close(p["sh_rest"].get(), wanted[0], relative=1e-6, absolute=1e-5)  # as in test_steps
+    assert_close(p["sh_rest"].get(), wanted[0], relative=1e-6, absolute=1e-5)  # as of a step in the case
 
 
 @pytest.mark.parametrize("sparse", [False, True])
@@ -110,44 +78,37 @@ def test_sh_rest_waits_for_its_step(device: Device) -> None:
 def test_what_is_not_finite_is_refused_and_marked(shaped_device: Device, count: int, sparse: bool) -> None:
     """Element by element, whatever shares its vector; counted by what was wrong."""
     device, rng = shaped_device, np.random.default_rng(count)
-    rates = dict.fromkeys(PARAMETER_GROUPS, 0.01)
+    step = AdamStep(OptimiserConfig(sparse=sparse), 5, dict.fromkeys(PARAMETER_GROUPS, 0.01))
     spoils = {  # array, value, what is then in the first and second moment, place in the counts
-        "parameter": (0, np.nan, (0, np.inf), 0),
-        "coefficient": (0, -2e7, (0, np.inf), 0),
-        "gradient": (1, -np.inf, (0, np.inf), 1),
-        "large gradient": (1, 1e30, (0, np.inf), 3),
-        "first moment": (2, np.nan, (0, 0), 2),
-        "second moment": (3, -1.0, (0, 0), 2),
+        "parameter": ("parameters", np.nan, (0, np.inf), 0),
+        "coefficient": ("parameters", -2e7, (0, np.inf), 0),
+        "gradient": ("gradients", -np.inf, (0, np.inf), 1),
+        "large gradient": ("gradients", 1e30, (0, np.inf), 3),
+        "first moment": ("first", np.nan, (0, 0), 2),
+        "second moment": ("second", -1.0, (0, 0), 2),
     }
     for name, (which, value, marks, place) in spoils.items():
         group = "sh_dc" if name == "coefficient" else "means"
-        row, column = rng.integers(count), rng.integers(3)
-        start = {
-            g: rng.uniform(0.5, 1.0, (4, *shape)).astype(np.float32) for g, shape in group_shapes(count, 4).items()
-        }
-        found = upload(device, np.zeros(len(READBACK), np.uint32))
-        models = []
-        for spoilt in (True, False):
-            arrays = [allocate_gaussians(device, count, 4) for _ in range(4)]
-            for g in PARAMETER_GROUPS:
-                for index, array in enumerate(arrays):
-                    values = start[g][index].copy()
-                    if spoilt and (g, index) == (group, which):
-                        values[row, column] = value
-                    array[g].set(values)
-            shown = upload(device, np.ones(count, np.uint32))
-            counts = found if spoilt else upload(device, np.zeros(len(READBACK), np.uint32))
-            adam(device, AdamStep(OptimiserConfig(sparse=sparse), 5, rates), *arrays, shown, counts)
-            models.append([{g: array[g].get() for g in PARAMETER_GROUPS} for array in arrays])
+        at = rng.integers(count), rng.integers(3)
+        plain, spoilt = (ADAM_CASE.random(np.random.default_rng(count), count).arrays for _ in range(2))
+        for kind, values in plain.items():
+            for each in values:
+                values[each][...] = spoilt[kind][each][...] = rng.uniform(0.5, 1.0, values[each].shape)
+        spoilt[which][group][at] = value
+        found, results = fresh_readback(device), []
+        for arrays, readback in ((spoilt, found), (plain, fresh_readback(device))):
+            models = uploaded_groups(device, arrays)
+            adam(device, step, *models, upload(device, np.ones(count, np.uint32)), readback)
+            names = zip(arrays, models, strict=True)
+            results.append({kind: {each: model[each].get() for each in PARAMETER_GROUPS} for kind, model in names})
         before_them = len(READBACK) - len(REFUSED)
         assert found.get().tolist() == [0] * before_them + [int(index == place) for index in range(len(REFUSED))], name
-        got, wanted = models
-        before = np.float32(value) if which == 0 else start[group][0][row, column]
-        np.testing.assert_equal(got[0][group][row, column], before)
-        assert (got[2][group][row, column], got[3][group][row, column]) == marks, name
-        assert not any(got[1][g].any() for g in PARAMETER_GROUPS), "the gradient is to be left zero"
-        for index in (0, 2, 3):
-            got[index][group][row, column] = wanted[index][group][row, column]
-            for g in PARAMETER_GROUPS:
+        got, wanted = results
+        np.testing.assert_equal(got["parameters"][group][at], spoilt["parameters"][group][at])
+        assert (got["first"][group][at], got["second"][group][at]) == marks, name
+        assert not any(values.any() for values in got.pop("gradients").values()), "the gradient is to be left zero"
+        for kind, values in got.items():
+            values[group][at] = wanted[kind][group][at]
+            for each in PARAMETER_GROUPS:
                 # A neighbour in the vector is worked out as a scalar, whose root a driver may round otherwise.
-                assert_close(got[index][g], wanted[index][g], relative=1e-6)
+                assert_close(values[each], wanted[kind][each], relative=1e-6)

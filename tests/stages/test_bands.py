@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from compare import assert_same_bits
-from pipeline import BACKGROUND, Pipeline
+from compare import assert_same_arrays, assert_same_bits
+from pipeline import Pipeline
 from quick import quick
 from scenes import NAMED, SHAPE_MATTERS, overlap, random_cloud
 
@@ -14,10 +14,7 @@ from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import CapacityError
-from clsplat.gaussians import PARAMETER_GROUPS
-from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.blend import count_pairs
-from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.duplicate import Band
 
 
@@ -27,12 +24,7 @@ def most_in_a_tile(run: Pipeline) -> int:
 
 
 def in_bands(device: Device, name: str, capacity: int, config: RasterizerConfig | None = None) -> Pipeline:
-    gaussians, camera = NAMED[name]()
-    rasterizer = Rasterizer(device, config)
-    rasterizer.capacity = capacity
-    on_device = upload_gaussians(device, gaussians)
-    frame = rasterizer.forward(on_device, camera, upload(device, np.array(BACKGROUND, np.float32)))
-    return Pipeline(rasterizer, on_device, camera, frame)
+    return Pipeline.run(device, NAMED[name](), config=config, capacity=capacity)
 
 
 def check(
@@ -55,8 +47,7 @@ def check(
     got, screen = banded.backward(d_image, absolute=absolute)
     visible = whole.visible
     assert_same_bits(screen[visible], wanted_screen[visible])
-    for field in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-        assert_same_bits(getattr(got, field), getattr(wanted, field))
+    assert_same_arrays(got.arrays(), wanted.arrays())
 
 
 @pytest.mark.slow
@@ -124,14 +115,10 @@ def test_counted_pairs_are_those_of_one_band(default_device: Device) -> None:
 
 def test_without_a_pair(default_device: Device) -> None:
     gaussians, camera = overlap()
-    rasterizer = Rasterizer(default_device)
     gaussians.opacity_logits[:] = -20
-    rasterizer.capacity = 0
-    on_device = upload_gaussians(default_device, gaussians)
-    frame = rasterizer.forward(on_device, camera, upload(default_device, np.array(BACKGROUND, np.float32)))
-    gradients = allocate_gaussians(default_device, on_device.count, on_device.coefficients, zero=True)
-    rasterizer.backward(on_device, frame, frame.blended.image, gradients)
-    assert not any(gradients[group].get().any() for group in PARAMETER_GROUPS)
+    run = Pipeline.run(default_device, (gaussians, camera), capacity=0)
+    gradients, _ = run.backward(np.ones((camera.height, camera.width, 3)))
+    assert not any(values.any() for values in gradients.arrays().values())
 
 
 @pytest.mark.parametrize("name", ["random_cloud", "overlap", "many_per_tile"])

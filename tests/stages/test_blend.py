@@ -8,24 +8,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-from compare import assert_close, assert_close_images, assert_same_bits
-from pipeline import BACKGROUND, EVERY_SHAPE, Pipeline, shaped, shapes_of
+from compare import assert_close, assert_close_gradients, assert_close_images, assert_same_arrays, assert_same_bits
+from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 
 from clsplat.camera import Camera
-from clsplat.config.rasterizer import BenchSwitches
+from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.device.drivers.quirks import subgroup_ways
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import SLOT_PLAIN, SlotFields
+from clsplat.models.edit import take
 from clsplat.reference import render as reference
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.stages.blend import blend_grad
 from clsplat.stages.device_gaussians import upload_gaussians
 
-PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 SIZES = ((1, 1), (15, 16), (16, 16), (17, 15), (33, 1), (1, 40), (64, 48))
 
 
@@ -59,18 +58,6 @@ def test_sizes_at_the_seams(shaped_device: Device, size: tuple[int, int]) -> Non
     assert not padded[:, size[1] :].any(), "below the image is not black"
 
 
-@EVERY_SHAPE
-def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
-    scene = scenes.random_cloud(2000, 8, 150, 100)
-    frames = [
-        Pipeline.run(shaped(device, *shape), scene).frame.blended
-        for shape in shapes_of(device, (1, 256), (4, 1), every=every)
-    ]
-    for other in frames[1:]:
-        assert_same_bits(other.image.get(), frames[0].image.get())
-        assert_same_bits(other.transmittance.get(), frames[0].transmittance.get())
-
-
 HARD = {
     "needles": scenes.needles,
     "saturating": scenes.saturating,
@@ -96,17 +83,20 @@ def test_the_gradient_of_a_group_of_any_size(default_device: Device, items: int)
     scene = scenes.many_per_tile()
     d_image = np.random.default_rng(2).standard_normal((scene[1].height, scene[1].width, 3))
     alone, group = (Pipeline.run(shaped(default_device, 1, size), scene).backward(d_image)[0] for size in (1, items))
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-        wanted, got = getattr(alone, name), getattr(group, name)
-        # two orders of adding up 256 numbers, sqrt(256) half ulp where nothing cancels, and three Newton steps for a
-        # division, an ulp more
-        assert np.linalg.norm(got - wanted) <= 2e-6 * np.linalg.norm(wanted), name
+    # two orders of adding up 256 numbers, sqrt(256) half ulp where nothing cancels, and three Newton steps for a
+    # division, an ulp more
+    assert_close_gradients(group.arrays(), alone.arrays(), 2e-6)
+
+
+def noise(run: Pipeline) -> np.ndarray:
+    """Gradients by the planes of an image."""
+    return np.random.default_rng(0).standard_normal(run.frame.blended.image.shape).astype(np.float32)
 
 
 def stacked(count: int) -> tuple[Gaussians, Camera]:
     """A tile, and so many thin Gaussians before each other in it."""
     gaussians, camera = scenes.one(16, 16)
-    arrays = {name: np.repeat(getattr(gaussians, name), count, axis=0) for name in PARAMETERS}
+    arrays = {name: np.repeat(values, count, axis=0) for name, values in gaussians.arrays().items()}
     shift = np.random.default_rng(count).uniform(-0.1, 0.1, (count, 3))
     arrays["means"] = (arrays["means"] + shift).astype(np.float32)
     arrays["opacity_logits"][:] = -3
@@ -121,15 +111,15 @@ def test_the_gradient_by_gaussian(device: Device, count: int) -> None:
     d_image = np.random.default_rng(2).standard_normal((16, 16, 3))
     fields = SlotFields(absolute=True, contributions=True)
     runs = [Pipeline.run(shaped(device, *shape), scene) for shape in ((1, 1), (1, 32, True), (1, 64, True))]
-    (wanted, wanted_screen), *others = (run.screened(d_image, fields) for run in runs)
     assert runs[0].frame.listed.lists.gaussian_from_sorted.shape == (count,)
-    for got, screen in others:
-        pairs = [(getattr(got, name), getattr(wanted, name)) for name in PARAMETERS]
-        pairs.append((screen.gradients.get(), wanted_screen.gradients.get()))
-        assert screen.contributions is not None and wanted_screen.contributions is not None
-        pairs.append((screen.contributions.get(), wanted_screen.contributions.get()))
-        for a, b in pairs:
-            assert np.linalg.norm(a - b) <= 2e-6 * np.linalg.norm(b)  # as of groups above
+    found = []
+    for run in runs:
+        gradients, screen = run.screened(d_image, fields)
+        assert screen.contributions is not None
+        on_image = {"screen": screen.gradients.get(), "contributions": screen.contributions.get()}
+        found.append({**gradients.arrays(), **on_image})
+    for other in found[1:]:
+        assert_close_gradients(other, found[0], 2e-6)  # as of groups above
 
 
 @pytest.mark.parametrize("items", quick([32, 64, 128, 256], 64))
@@ -145,11 +135,8 @@ def test_sums_by_sub_groups_have_the_bits_of_rows(device: Device, items: int, fi
     sizes = (4, 8, 16, 32)
     asked = [{"SUBGROUP": size, name: True, "SUBGROUP_IS_ASKED": True} for name in sorted(shuffles) for size in sizes]
     for switches in ({}, *asked):
-        opened = rows.with_switches(switches)
-        frame = (run := Pipeline.run(opened, scene)).frame
-        values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
-        of = (opened, run.rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
-        slots[str(switches)] = blend_grad(*of, upload(opened, values), fields=fields).get()
+        run = Pipeline.run(rows.with_switches(switches), scene)
+        slots[str(switches)] = run.slots(noise(run), fields)
     wanted, *others = slots.values()
     assert wanted.any() and len(others) >= 4
     for got in others:
@@ -163,11 +150,8 @@ def test_the_gradient_by_gaussian_has_its_bits_with_every_switch(device: Device,
     slots = []
     scene, by_gaussian = scenes.random_cloud(900, 8, 75, 50), shaped(device, 1, 32, True)
     for config in (BenchSwitches(), BenchSwitches(**{switch: False})):  # type: ignore[arg-type]
-        opened = by_gaussian.with_switches(kernel_defines(config))
-        frame = (run := Pipeline.run(opened, scene)).frame
-        values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
-        of = (opened, run.rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
-        slots.append(blend_grad(*of, upload(opened, values)).get() + np.float32(0))
+        run = Pipeline.run(by_gaussian.with_switches(kernel_defines(config)), scene)
+        slots.append(run.slots(noise(run)) + np.float32(0))
     assert_same_bits(slots[0], slots[1])
     assert slots[0].any()
 
@@ -196,19 +180,8 @@ def test_a_lone_gaussian_is_its_formula(shaped_device: Device) -> None:
 def test_order_in_memory_does_not_matter(device: Device) -> None:
     gaussians, camera = scenes.random_cloud(500, 4, 60, 40)
     order = np.random.default_rng(0).permutation(len(gaussians))
-    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    permuted = replace(gaussians, **{n: np.ascontiguousarray(getattr(gaussians, n)[order]) for n in names})
     first = Pipeline.run(device, (gaussians, camera)).image
-    assert_same_bits(Pipeline.run(device, (permuted, camera)).image, first)
-
-
-def test_nothing_visible(shaped_device: Device) -> None:
-    gaussians, camera = scenes.one()
-    gaussians.means[:, 2] = -5
-    run = Pipeline.run(shaped_device, (gaussians, camera))
-    assert_close(run.image, np.broadcast_to(np.float32(BACKGROUND), run.image.shape))
-    got, _ = run.backward(np.ones((camera.height, camera.width, 3)))
-    assert not got.means.any()
+    assert_same_bits(Pipeline.run(device, (take(gaussians, order), camera)).image, first)
 
 
 def test_saturated_pixels_stop_where_the_contract_says(shaped_device: Device) -> None:
@@ -223,8 +196,7 @@ def test_saturated_pixels_stop_where_the_contract_says(shaped_device: Device) ->
 def test_stacked_opaque_gaussians(shaped_device: Device) -> None:
     """Two layers at the cap leave (1 - 0.99)^2, a hair under the limit in float32: both sides decide alike."""
     gaussians, camera = scenes.one(96, 64)
-    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-    arrays = {name: np.repeat(getattr(gaussians, name), 3, axis=0) for name in names}
+    arrays = {name: np.repeat(values, 3, axis=0) for name, values in gaussians.arrays().items()}
     arrays["means"][:, 2] += np.float32([0, 0.5, 1])
     arrays["opacity_logits"][:] = 12
     arrays["sh"][1] = 0.8
@@ -234,55 +206,31 @@ def test_stacked_opaque_gaussians(shaped_device: Device) -> None:
     assert np.abs(wanted - wanted[0, 0]).max() > 0.1, "the Gaussians are to be seen"
 
 
-@pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
-def test_recorded_cells_are_those_that_contribute(device: Device, name: str) -> None:
-    check_record(shaped(device, 8, 1), name)
+LANES = [*((8, name) for name in scenes.SHAPE_MATTERS), pytest.param(16, "overlap", marks=pytest.mark.slow)]
 
 
-@pytest.mark.slow
-def test_recorded_cells_with_16_lanes(default_device: Device) -> None:
-    check_record(shaped(default_device, 16, 1), "overlap")
-
-
-def check_record(device: Device, name: str) -> None:
+@pytest.mark.parametrize(("lanes", "name"), LANES)
+def test_recorded_cells_are_those_that_contribute(device: Device, lanes: int, name: str) -> None:
     """The gradient has the same bits as without the record, and a pair without cells has none."""
-    run = Pipeline.run(device, scenes.NAMED[name]())
-    frame, rasterizer = run.frame, run.rasterizer
-    blended = frame.blended
+    run = Pipeline.run(shaped(device, lanes, 1), scenes.NAMED[name]())
+    blended = run.frame.blended
     assert blended.cells_from_sorted is not None
-    values = np.random.default_rng(0).standard_normal(blended.image.shape).astype(np.float32)
-    gradient = upload(rasterizer.device, values)
-    of = (rasterizer.device, rasterizer.work, frame.listed.lists, frame.inputs)
-    recorded = blend_grad(*of, blended, gradient).get()
-    assert_same_bits(recorded, blend_grad(*of, replace(blended, cells_from_sorted=None), gradient).get())
+    recorded = run.slots(noise(run))
+    assert_same_bits(recorded, run.slots(noise(run), blended=replace(blended, cells_from_sorted=None)))
     empty = blended.cells_from_sorted.get() == 0
-    assert not recorded[frame.listed.lists.slot_from_sorted.get()[empty]].any()
+    assert not recorded[run.frame.listed.lists.slot_from_sorted.get()[empty]].any()
     assert recorded.any()
 
 
-@pytest.mark.parametrize("name", scenes.SHAPE_MATTERS)
-def test_cells_without_a_gradient_are_left_out(device: Device, name: str) -> None:
-    check_skip(shaped(device, 8, 1), name)
-
-
-@pytest.mark.slow
-def test_cells_without_a_gradient_with_16_lanes(default_device: Device) -> None:
-    check_skip(shaped(default_device, 16, 1), "overlap")
-
-
-def check_skip(device: Device, name: str) -> None:
+@pytest.mark.parametrize(("lanes", "name"), LANES)
+def test_cells_without_a_gradient_are_left_out(device: Device, lanes: int, name: str) -> None:
     """As good as visiting them, which contributions want, but for the sign of zeros; some pairs lie in such cells
     alone."""
-    frame = (run := Pipeline.run(device, scenes.NAMED[name]())).frame
-    values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
+    values = noise(run := Pipeline.run(shaped(device, lanes, 1), scenes.NAMED[name]()))
     values[:, :, : values.shape[2] // 2] = 0.0
     values[:, 5] = 0.0
-    device_of = run.rasterizer.device
-    of = (device_of, run.rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
-    slots = [
-        blend_grad(*of, upload(device_of, values), fields=fields).get()[:, :SLOT_PLAIN] + np.float32(0)
-        for fields in (SlotFields(), SlotFields(contributions=True))
-    ]
+    ways = (SlotFields(), SlotFields(contributions=True))
+    slots = [run.slots(values, fields)[:, :SLOT_PLAIN] + np.float32(0) for fields in ways]
     assert_same_bits(slots[0], slots[1])
     assert slots[0].any()
 
@@ -290,14 +238,10 @@ def check_skip(device: Device, name: str) -> None:
 @pytest.mark.parametrize("rubbish", [np.nan, np.inf, 1e30])
 def test_gradients_in_padding_are_not_looked_at(shaped_device: Device, rubbish: float) -> None:
     """Nobody writes them: memory that was something else's lies there."""
-    run = Pipeline.run(shaped_device, scenes.random_cloud(200, 3, 33, 19))
-    frame, rasterizer = run.frame, run.rasterizer
-    values = np.random.default_rng(0).standard_normal(frame.blended.image.shape).astype(np.float32)
-    of = (rasterizer.device, rasterizer.work, frame.listed.lists, frame.inputs, frame.blended)
-    slots = []
+    values, slots = noise(run := Pipeline.run(shaped_device, scenes.random_cloud(200, 3, 33, 19))), []
     for padding in (0.0, rubbish):
         values[:, 19:], values[:, :, 33:] = padding, padding
-        slots.append(blend_grad(*of, upload(rasterizer.device, values)).get())
+        slots.append(run.slots(values))
     assert_same_bits(slots[0] + np.float32(0), slots[1] + np.float32(0))
 
 
@@ -310,3 +254,38 @@ def test_without_a_gradient_nothing_is_recorded(default_device: Device) -> None:
     without = frame.blended.image.get()
     assert frame.blended.cells_from_sorted is None
     assert_same_bits(without, rasterizer.forward(on_device, camera, background).blended.image.get())
+
+
+WAYS = {
+    "default": (RasterizerConfig(), SlotFields()),
+    "absolute and contributions": (RasterizerConfig(), SlotFields(absolute=True, contributions=True)),
+    "nothing recorded": (BenchSwitches(record_cells=False), SlotFields()),
+    "no early stop": (BenchSwitches(early_stop=False), SlotFields()),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", quick(["saturating", "random_cloud", "needles", "overlap"], "saturating", "needles"))
+def test_no_bit_knows_of_the_width(device: Device, name: str, way: str) -> None:
+    """Blending by two vectors of the shape in one has the bits of one at a time. Both are the same code without
+    AVX-512."""
+    config, fields = WAYS[way]
+    usual = shaped(device, 8, 1)
+    wide, narrow = (
+        Pipeline.run(each, scenes.NAMED[name](), config=config)
+        for each in (usual, usual.with_switches({"NARROW": True}))
+    )
+    for array in ("image", "transmittance", "stops"):
+        assert_same_bits(getattr(wide.frame.blended, array).get(), getattr(narrow.frame.blended, array).get(), array)
+    gradient = np.random.default_rng(3).normal(size=(wide.camera.height, wide.camera.width, 3))
+    gradient[:, : wide.camera.width // 3] = 0  # cells, and halves of them, that have none
+    got, wanted = (pipeline.screened(gradient, fields) for pipeline in (wide, narrow))
+    # a sum that is zero may be so with either sign
+    assert_same_arrays(*({name: a + np.float32(0) for name, a in each.arrays().items()} for each, _ in (got, wanted)))
+    shown = wide.visible  # nobody writes other rows
+    screens = [screen.gradients.get()[shown] + np.float32(0) for _, screen in (got, wanted)]
+    assert_same_bits(*screens, "screen")
+    if fields.contributions:
+        assert got[1].contributions is not None
+        assert wanted[1].contributions is not None
+        assert_same_bits(got[1].contributions.get()[shown], wanted[1].contributions.get()[shown], "contributions")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from _pytest.mark.structures import ParameterSet
+from compare import assert_same_arrays
 
 from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
@@ -41,6 +42,26 @@ def test_in_every_shape(shaped_device: Device, name: str, size: object) -> None:
 @pytest.mark.parametrize(("name", "size"), cases(by_shape=False))
 def test_kernels_that_know_of_no_shape(device: Device, name: str, size: object) -> None:
     check(device, name, size)
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.by_shape])
+def test_every_shape_has_the_same_bits(shaped_device: Device, default_device: Device, name: str) -> None:
+    """And every driver, of the results that have a digest in the self-test."""
+    case = CASES[name]
+    given, found = case.random(np.random.default_rng(0), max(case.sizes[:4], key=np.prod)), []
+    for device in (shaped_device, default_device):
+        got = case.launch(device, Workspace(device), given)()
+        found.append({result: got[result] for result in case.digested or got})
+    assert_same_arrays(*found)
+
+
+def test_one_workspace_for_every_size(default_device: Device) -> None:
+    """What is left in the memory of larger inputs is not read."""
+    for name, case in CASES.items():
+        work, largest = Workspace(default_device), sorted(case.sizes, key=np.prod)[::-1]
+        for size in (*largest[:2], *largest[-2:]):
+            given = case.random(np.random.default_rng(0), size)
+            assert faults(case.errors(default_device, given, work)) == [], f"{name} {size}"
 
 
 def test_errors() -> None:

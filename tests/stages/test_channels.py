@@ -10,7 +10,7 @@ import pytest
 import scenes
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
-from pipeline import EVERY_SHAPE, Pipeline, shaped, shapes_of
+from pipeline import Pipeline
 from quick import quick
 
 from clsplat.camera import Camera
@@ -84,15 +84,6 @@ def test_against_the_twin(shaped_device: Device, name: str) -> None:
         of = getattr(wanted, field).reshape(*solid.shape, -1)[solid]
         size = np.abs(of).max(axis=1, keepdims=True)
         assert_close(got[field][solid] / size, of / size, absolute=1e-4, name=field)
-
-
-@EVERY_SHAPE
-def test_the_same_bits_in_every_shape(device: Device, every: bool) -> None:
-    scene = scenes.random_cloud(2000, 8, 150, 100)
-    first, *others = (run(shaped(device, *shape), scene) for shape in shapes_of(device, (4, 1), every=every))
-    for other in others:
-        for name, values in first.items():
-            assert_same_bits(other[name], values)
 
 
 def test_what_is_not_wanted_is_not_there(default_device: Device) -> None:

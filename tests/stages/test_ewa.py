@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from compare import assert_close_gradient, assert_same_bits, relative_error
+from compare import assert_close_gradient, relative_error
 from ewa_cases import MODELS, OUTPUTS, Case, case, gradients
 from numpy.typing import NDArray
 from quick import quick
@@ -109,7 +109,7 @@ def assert_projected(run: Run, wanted: twin.EwaProjectedTwin, *, compensated: bo
     size = np.linalg.norm(wanted.conics[seen], axis=1)
     off = np.linalg.norm(run.get("conics")[seen] - wanted.conics[seen], axis=1) / size
     # rounding, times the ellipse's length over its width: up to 64, from where on it is made good in two floats
-    assert off.max() <= 3e-5 and np.quantile(off, 0.98) <= 3e-6
+    assert off.max(initial=0) <= 3e-5 and (off.size == 0 or np.quantile(off, 0.98) <= 3e-6)
     if compensated:
         np.testing.assert_allclose(run.get("compensations")[seen], wanted.compensations[seen], rtol=3e-5, atol=1e-7)
     for name in ("means2d", "depths", "conics", *(["compensations"] if compensated else [])):
@@ -121,13 +121,18 @@ def test_the_kernels_against_the_twin(shaped_device: Device, way: tuple[str, boo
     check_kernels(shaped_device, *way)
 
 
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 513])
+def test_sizes_at_the_seams(shaped_device: Device, count: int) -> None:
+    check_kernels(shaped_device, "pinhole", False, True, count=count)
+
+
 @pytest.mark.parametrize("way", OTHERS)
 def test_other_models_against_the_twin(device: Device, way: tuple[str, bool, bool]) -> None:
     check_kernels(device, *way)
 
 
-def check_kernels(device: Device, model: str, covariances: bool, full: bool) -> None:
-    subject = case(700, model)
+def check_kernels(device: Device, model: str, covariances: bool, full: bool, *, count: int = 700) -> None:
+    subject = case(count, model)
     run = Run.of(device, subject, covariances=covariances, full=full)
     wanted = subject.projected(rounded=covariances, opacities=full, compensated=full)
     assert_projected(run, wanted, compensated=full)
@@ -146,39 +151,15 @@ def check_kernels(device: Device, model: str, covariances: bool, full: bool) -> 
     else:
         shapes = (subject.quaternions.astype(np.float64), subject.scales.astype(np.float64), result["covariances"])
         expected["quaternions"], expected["scales"] = twin.covariances_grad(*shapes)
+    if not seen.any():
+        assert not any(values.any() for values in (*arrays.values(), by_viewmat, by_intrinsics))
+        return
     for name, values in expected.items():
         # means and sums are of many terms, of rounding each; shapes as the conics, by the Gaussians that weigh most
         assert_close_gradient(arrays[name], values, 1e-6 if name == "means" else 2e-5, name=name)
         assert not arrays[name][seen[:, 0] == 0].any()
     assert_close_gradient(by_viewmat, result["viewmat"], 2e-6, name="viewmat")
     assert_close_gradient(by_intrinsics, result["intrinsics"], 2e-6, name="intrinsics")
-
-
-@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 513])
-def test_sizes_at_the_seams(shaped_device: Device, count: int) -> None:
-    subject = case(count)
-    run = Run.of(shaped_device, subject, full=True)
-    wanted = subject.projected(opacities=True, compensated=True)
-    assert (np.abs(run.get("radii") - wanted.radii) > 1).sum() == 0
-    seen = wanted.visible
-    np.testing.assert_allclose(run.get("means2d")[seen], wanted.means2d[seen], rtol=1e-6, atol=1e-4)
-    by = gradients(replace(wanted, radii=run.get("radii")), *OUTPUTS)
-    arrays, by_viewmat, _ = run.gradient(by)
-    assert all(np.isfinite(values).all() for values in arrays.values())
-    assert np.isfinite(by_viewmat).all() and by_viewmat.any() == seen.any()
-
-
-def test_every_shape_has_the_same_bits(device: Device) -> None:
-    subject = case(300)
-    by = gradients(subject.projected(opacities=True, compensated=True), *OUTPUTS)
-    results = []
-    for other in (device, device.with_shape("1x64")):
-        run = Run.of(other, subject, full=True)
-        arrays, by_viewmat, by_intrinsics = run.gradient({name: np.nan_to_num(a) for name, a in by.items()})
-        forward = {name: run.get(name) for name in ("radii", *OUTPUTS)}
-        results.append({**forward, **arrays, "viewmat": by_viewmat, "intrinsics": by_intrinsics})
-    for name, values in results[0].items():
-        assert_same_bits(results[1][name], values, name)
 
 
 def test_gradients_of_cameras_add_up(device: Device) -> None:

@@ -17,8 +17,9 @@ from clsplat.camera import Camera
 from clsplat.device.buffers import Workspace, allocate, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.layouts.columns import POSE_ROWS, TILE
+from clsplat.layouts.columns import POSE_ROWS
 from clsplat.reference import render as reference
+from clsplat.selftest.harness import planes_of
 from clsplat.stages.device_gaussians import allocate_gaussians
 from clsplat.stages.pose import LENS_NUMBERS, lens_rows, sum_of, sums_of
 
@@ -51,8 +52,7 @@ def beyond(gaussians: Gaussians, camera: Camera) -> int:
 @pytest.mark.parametrize("kind", quick(KINDS, "perspective", "antialiased, wide"))
 def test_the_twin_by_central_differences(kind: str) -> None:
     gaussians, camera = subject(kind, 40)
-    arrays = {group: np.asarray(values, np.float64) for group, values in gaussians.arrays().items()}
-    model = Gaussians(**arrays, near=gaussians.near, antialiased=gaussians.antialiased)
+    model = scenes.in_float64(gaussians)
     assert kind == "orthographic" or beyond(model, camera) > 3
     d_image = direction_of_loss(model, camera, 2e-4)
     found = reference.render_lens_grad(model, camera, d_image, BACKGROUND)
@@ -75,14 +75,11 @@ def test_the_kernels_against_the_twin(shaped_device: Device, kind: str) -> None:
     wanted = reference.render_lens_grad(gaussians, camera, d_image, BACKGROUND)
     pipeline = Pipeline.run(shaped_device, (gaussians, camera))
     rasterizer, model, frame = pipeline.rasterizer, pipeline.gaussians, pipeline.frame
-    planes = np.zeros((3, -(-camera.height // TILE) * TILE, -(-camera.width // TILE) * TILE), np.float32)
-    planes[:, : camera.height, : camera.width] = d_image.transpose(2, 0, 1)
-    plain, gradients = (allocate_gaussians(rasterizer.device, model.count, model.coefficients) for _ in range(2))
+    of = (rasterizer.device, model.count, model.coefficients)
+    plain, gradients = (allocate_gaussians(*of, zero=True) for _ in range(2))
     by_lens = allocate(rasterizer.device, (model.count, LENS_NUMBERS), np.float32)
-    for array in (*plain.arrays.values(), *gradients.arrays.values()):
-        array.fill(0.0)
     by_lens.fill(np.nan)  # rows that are not seen are not read
-    image_gradient = upload(rasterizer.device, planes)
+    image_gradient = upload(rasterizer.device, planes_of(d_image))
     rasterizer.backward(model, frame, image_gradient, plain)
     rasterizer.backward(model, frame, image_gradient, gradients, by_lens=by_lens)
     for group, array in plain.arrays.items():  # the model's gradients are what they are without

@@ -38,16 +38,6 @@ def test_equal_images_have_no_loss(shaped_device: Device) -> None:
     assert squared == 0
 
 
-@pytest.mark.smoke
-def test_a_smaller_image_after_a_larger_one(device: Device) -> None:
-    """What is left in the workspace is not read."""
-    rng, work = np.random.default_rng(0), Workspace(device)
-    for width, height in ((70, 50), (23, 19), (41, 60)):
-        x, y = rng.random((2, height, width, 3)).astype(np.float32)
-        result = loss(device, work, upload(device, planes_of(x)), upload(device, planes_of(y)), width, height, 0.2)
-        assert_close(result.read()[0], l1_dssim(x.astype(float), y.astype(float), 0.2)[0], relative=1e-5)
-
-
 @pytest.mark.parametrize("channels", [3, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_target_composites_alpha(device: Device, channels: int, dtype: type) -> None:

@@ -60,12 +60,6 @@ def test_numbers_are_nearly_normal() -> None:
         assert abs(product.mean()) < of_error
 
 
-def test_every_driver_and_shape_has_the_same_bits(shaped_device: Device, default_device: Device) -> None:
-    gaussians, _ = scenes.random_cloud(500, 9, 70, 50, degree=0)
-    gaussians.opacity_logits -= 4
-    assert_same_bits(moved(shaped_device, gaussians, LOUD), moved(default_device, gaussians, LOUD), "means")
-
-
 def test_pieces_and_steps(device: Device) -> None:
     """A piece of the rows has the bits that these have in the whole; another step has others."""
     gaussians = faint(90)

@@ -4,36 +4,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 import scenes
-from compare import assert_close, assert_close_images, assert_same_bits
-from drivers import KEPT
-from pipeline import BACKGROUND, Pipeline, shaped, shapes_of
+from compare import assert_close, assert_same_arrays, assert_same_bits
+from pipeline import BACKGROUND
+from test_project_rays import FEATURES, assert_as_the_twin
 
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import BenchSwitches
 from clsplat.device.context import Device, open_device
 from clsplat.errors import InputError
-from clsplat.frame.deep import render_deep
 from clsplat.frame.draw import on_tiles
 from clsplat.frame.window import crop
-from clsplat.reference import deep as deep_twin
 from clsplat.reference import every_pixel
 from clsplat.reference import render as reference
 from clsplat.reference.cameras import pixel_from_world
 from clsplat.reference.project import rotation_matrices
-from clsplat.rendering.renderer import ChannelResult, Renderer, RenderResult
-
-FEATURES = ("normal", "position", "motion")
-
-
-def orthographic(scene: scenes.Scene, middle: float = 4.0) -> scenes.Scene:
-    """The scene through a camera that shows at the depth `middle` what its own did."""
-    gaussians, camera = scene
-    return gaussians, replace(camera, fx=camera.fx / middle, fy=camera.fy / middle, projection="orthographic")
+from clsplat.rendering.renderer import Renderer
 
 
 def moved(camera: Camera) -> Camera:
@@ -56,57 +45,18 @@ SCENES = {
 }
 
 
-@cache
-def expected(name: str) -> every_pixel.Picture:
-    gaussians, camera = orthographic(SCENES[name]())
-    return every_pixel.render(gaussians, camera, BACKGROUND, moved(camera))
-
-
-def drawn(device: Device, scene: scenes.Scene) -> tuple[RenderResult, ChannelResult]:
-    gaussians, camera = scene
-    renderer = Renderer(device)
-    return renderer.render_channels(gaussians, camera, FEATURES, after=moved(camera), background=BACKGROUND)
-
-
 @pytest.mark.parametrize("name", SCENES)
 def test_against_the_twin(device: Device, name: str) -> None:
-    image, found = drawn(device, orthographic(SCENES[name]()))
-    wanted = expected(name)
-    unsure = wanted.margin < 3e-4
-    assert unsure.mean() < 0.1
-    # As of a perspective frame: sums of a few hundred float32 products of order one.
-    assert_close_images(image.image, wanted.image, 2e-5, ignore=unsure)
-    assert_close_images(image.alpha, wanted.alpha, 2e-5, ignore=unsure)
-    solid = (wanted.alpha > 0.5) & ~unsure
-    assert solid.any()
-    # The issue's bound, relative to what a value is made of.
-    for field, plane in {name: found[name] for name in ("depth", *FEATURES)}.items():
-        of, got = (values.reshape(*solid.shape, -1)[solid] for values in (getattr(wanted, field), plane))
-        size = np.abs(of).max(axis=1, keepdims=True)
-        assert_close(got / size, of / size, absolute=1e-4, name=field)
-
-
-@pytest.mark.parametrize("name", ["overlap", "needles", "off_frustum"])
-def test_projection(device: Device, name: str) -> None:
-    scene = orthographic(SCENES[name]())
-    run, wanted = Pipeline.run(device, scene), reference.forward(*scene).projected
-    shown = run.visible
-    assert shown.any() and not np.any(shown & ~wanted.visible)
-    means2d = run.splat("PIXEL_X", "PIXEL_Y").astype(np.float64) + run.splat("SUB_X", "SUB_Y")
-    # The bounds of perspective cameras (test_project.py), for their reasons.
-    assert_close(means2d[shown], wanted.means2d[shown], relative=1e-7, absolute=1e-6)
-    assert_close(run.splat("DEPTH")[shown, 0], wanted.depths[shown], relative=1e-6)
-    assert_close(run.splat("RED", "GREEN", "BLUE")[shown], wanted.colors[shown], absolute=2e-6)
-    whitening = wanted.whitening[shown]
-    scale = np.abs(whitening).max(axis=1, keepdims=True)
-    k = np.sqrt(np.log2(np.e) / 2)
-    assert_close(run.splat("L11", "L12", "L22")[shown] / k / scale, whitening / scale, absolute=1e-5)
+    gaussians, camera = scene = scenes.orthographic(SCENES[name]())
+    wanted = every_pixel.render(gaussians, camera, BACKGROUND, moved(camera))
+    assert (wanted.margin < 3e-4).mean() < 0.1
+    assert_as_the_twin(device, scene, moved(camera), wanted)
 
 
 def test_the_twin_is_the_definition_of_the_projection() -> None:
     # The mean goes where pixel_from_world has it, and the covariance there is the world's through its derivative, of
     # which central differences are exact, as it is linear.
-    gaussians, camera = orthographic(scenes.overlap())
+    gaussians, camera = scenes.orthographic(scenes.overlap())
     arrays = reference.parameters(gaussians)
     means = arrays["means"]
     projected = reference.forward(gaussians, camera).projected
@@ -122,32 +72,9 @@ def test_the_twin_is_the_definition_of_the_projection() -> None:
 
 
 @pytest.mark.slow
-def test_the_same_bits_in_every_shape(device: Device) -> None:
-    scene = orthographic(scenes.random_cloud(2000, 8, 150, 100))
-    first, *others = (drawn(shaped(device, *shape), scene) for shape in shapes_of(device))
-    for other in others:
-        assert_same_pictures(other, first)
-
-
-def test_the_same_bits_on_every_driver() -> None:
-    scene = orthographic(scenes.random_cloud(2000, 8, 150, 100))
-    first, *others = (drawn(open_device(str(index)), scene) for index in KEPT)
-    for other in others:
-        assert_same_pictures(other, first)
-
-
-def assert_same_pictures(got: tuple[RenderResult, ChannelResult], wanted: tuple[RenderResult, ChannelResult]) -> None:
-    assert_same_bits(got[0].image, wanted[0].image)
-    assert_same_bits(got[0].alpha, wanted[0].alpha)
-    assert got[1].keys() == wanted[1].keys()
-    for name, values in wanted[1].items():
-        assert_same_bits(got[1][name], values)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("change", [{"frustum_cull": False}, {"tile_test": "square"}])
 def test_exact_switches_change_no_bit(default_device: Device, change: dict[str, bool]) -> None:
-    gaussians, camera = orthographic(scenes.off_frustum())
+    gaussians, camera = scenes.orthographic(scenes.off_frustum())
     plain = Renderer(default_device).render(gaussians, camera, BACKGROUND)
     other = Renderer(default_device, config=BenchSwitches(**change)).render(gaussians, camera, BACKGROUND)  # type: ignore[arg-type]
     assert_same_bits(other.image, plain.image)
@@ -174,7 +101,7 @@ def test_what_is_deeper_is_as_large_and_has_the_same_colour(device: Device) -> N
 
 
 def test_the_near_plane(device: Device) -> None:
-    gaussians, camera = orthographic(scenes.one())
+    gaussians, camera = scenes.orthographic(scenes.one())
     renderer = Renderer(device)
     assert renderer.render(gaussians, replace(camera, near=3.99)).alpha.any()
     assert not renderer.render(gaussians, replace(camera, near=4.0)).alpha.any()
@@ -207,29 +134,20 @@ def test_a_wall(device: Device) -> None:
 
 
 def test_windows_and_little_memory_change_no_bit() -> None:
-    gaussians, camera = orthographic(scenes.random_cloud(20_000, 4, 300, 200, degree=1))
-    whole = drawn(open_device(), (gaussians, camera))
+    gaussians, camera = scenes.orthographic(scenes.random_cloud(20_000, 4, 300, 200, degree=1))
+
+    def drawn(device: Device, view: Camera, after: Camera) -> dict[str, np.ndarray]:
+        image, found = Renderer(device).render_channels(gaussians, view, FEATURES, after=after, background=BACKGROUND)
+        return {"image": image.image, "alpha": image.alpha, **found}
+
+    whole = drawn(open_device(), camera, moved(camera))
     part, rows, columns = on_tiles(crop(camera, 37, 21, 100, 60))
     after = replace(moved(camera), width=part.width, height=part.height, window=part.window)
-    image, found = Renderer().render_channels(gaussians, part, FEATURES, after=after, background=BACKGROUND)
-    cut = np.s_[21:81, 37:137]
-    assert_same_bits(np.ascontiguousarray(image.image[rows, columns]), np.ascontiguousarray(whole[0].image[cut]))
-    for name in FEATURES:
-        got, wanted = found[name][rows, columns], whole[1][name][cut]
-        assert_same_bits(np.ascontiguousarray(got), np.ascontiguousarray(wanted))
+    got = {
+        name: np.ascontiguousarray(plane[rows, columns]) for name, plane in drawn(open_device(), part, after).items()
+    }
+    assert_same_arrays(got, {name: np.ascontiguousarray(plane[21:81, 37:137]) for name, plane in whole.items()})
     limit = 8 << 20
     device = open_device(None, limit)
-    assert_same_pictures(drawn(device, (gaussians, camera)), whole)
+    assert_same_arrays(drawn(device, camera, moved(camera)), whole)
     assert device.memory.peak <= limit
-
-
-def test_deep_slices(device: Device) -> None:
-    gaussians, camera = orthographic(scenes.random_cloud(600, 8, 70, 50))
-    got = render_deep(Renderer(device), gaussians, camera, 5)
-    forward = reference.forward(gaussians, camera)
-    wanted = deep_twin.deep(forward.projected, camera.width, camera.height, 5)
-    sure = (forward.blended.margin > 1e-4) & (wanted.margin > 3e-6)
-    assert sure.mean() > 0.9
-    # As of a perspective frame (test_deep.py).
-    assert_close(got[:, sure, :4], wanted.slices[:, sure, :4], absolute=2e-5)
-    assert_close(got[:, sure, 4], wanted.slices[:, sure, 4], relative=1e-6)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import assert_close, assert_close_images, assert_same_bits
-from pipeline import BACKGROUND, shaped, shapes_of
+from pipeline import BACKGROUND
 from quick import quick
 
 from clsplat.camera import Camera, Projection, focal_length
@@ -19,7 +19,7 @@ from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.reference import every_pixel
-from clsplat.rendering.renderer import ChannelResult, Renderer
+from clsplat.rendering.renderer import Renderer
 
 
 def all_around(count: int, seed: int) -> Gaussians:
@@ -58,11 +58,6 @@ def pinhole(width: int, height: int, angle: float) -> Camera:
     return replace(fisheye(width, height, 90), fx=focal, fy=1.1 * focal, projection="perspective", by_rays=True)
 
 
-def model_for(camera: Camera, count: int, seed: int) -> Gaussians:
-    """Gaussians all around, drawn as the camera does."""
-    return replace(all_around(count, seed), by_rays=camera.by_rays)
-
-
 CAMERAS = {
     "panorama": panorama(96, 48),
     "panorama of a width that is no multiple of a tile": panorama(70, 35),
@@ -74,9 +69,19 @@ CAMERAS = {
     "a whole sphere in a circle": fisheye(64, 64, 360),
     "perspective": pinhole(60, 50, 100),
     "perspective of 150 degrees": pinhole(60, 50, 150),
+    "antialiased half a turn": panorama(64, 40, np.pi),
+    "antialiased fisheye": fisheye(60, 50, 120),
 }
+"""By name; what begins with antialiased is."""
 
 
+def model_for(name: str, count: int, seed: int) -> Gaussians:
+    """Gaussians all around, drawn as the camera of this name does."""
+    antialiased = name.startswith("antialiased")
+    return replace(all_around(count, seed), by_rays=CAMERAS[name].by_rays, antialiased=antialiased)
+
+
+QUICK = ("panorama", "fisheye of 300 degrees", "perspective of 150 degrees", *list(CAMERAS)[-2:])
 FEATURES = ("normal", "position", "motion")
 
 
@@ -92,51 +97,37 @@ def moved(camera: Camera) -> Camera:
 
 @cache
 def expected(name: str) -> every_pixel.Picture:
-    return every_pixel.render(model_for(CAMERAS[name], 300, 5), CAMERAS[name], BACKGROUND, moved(CAMERAS[name]))
+    return every_pixel.render(model_for(name, 300, 5), CAMERAS[name], BACKGROUND, moved(CAMERAS[name]))
 
 
-@pytest.mark.parametrize("name", quick(CAMERAS, "panorama", "fisheye of 300 degrees", "perspective of 150 degrees"))
+@pytest.mark.parametrize("name", quick(CAMERAS, *QUICK))
 def test_against_the_twin(device: Device, name: str) -> None:
-    camera, wanted = CAMERAS[name], expected(name)
-    gaussians = model_for(camera, 300, 5)
-    after = moved(camera)
-    image, found = Renderer(device).render_channels(gaussians, camera, FEATURES, after=after, background=BACKGROUND)
+    wanted = expected(name)
+    assert ((wanted.alpha > 0.5) & (wanted.margin > 3e-4)).mean() > 0.2
+    assert_as_the_twin(device, (model_for(name, 300, 5), CAMERAS[name]), moved(CAMERAS[name]), wanted)
+
+
+def assert_as_the_twin(device: Device, scene: scenes.Scene, after: Camera, wanted: every_pixel.Picture) -> None:
+    """Image, alpha, and where that is over one half the channels."""
+    image, found = Renderer(device).render_channels(*scene, FEATURES, after=after, background=BACKGROUND)
+    unsure = wanted.margin < 3e-4
     # As of a frame; a direction of float32 is good to 1e-7, that of a pixel is 0.1.
-    assert_close_images(image.image, wanted.image, 2e-5, ignore=wanted.margin < 3e-4)
-    assert_close_images(image.alpha, wanted.alpha, 2e-5, ignore=wanted.margin < 3e-4)
-    assert_close_channels(found, wanted)
-
-
-def assert_close_channels(found: ChannelResult, wanted: every_pixel.Picture) -> None:
-    """The issue's bound where alpha is over one half, relative to what a value is made of."""
-    solid = (wanted.alpha > 0.5) & (wanted.margin > 3e-4)
-    assert solid.mean() > 0.2
+    assert_close_images(image.image, wanted.image, 2e-5, ignore=unsure)
+    assert_close_images(image.alpha, wanted.alpha, 2e-5, ignore=unsure)
+    solid = (wanted.alpha > 0.5) & ~unsure
+    assert solid.any()
     fields = {name: plane for name, plane in found.items() if name not in ("median", "first", "count", "index")}
     assert set(fields) == {"depth", *FEATURES}
     for name, plane in fields.items():
         of, got = (values.reshape(*solid.shape, -1)[solid] for values in (getattr(wanted, name), plane))
+        # The issue's bound, relative to what a value is made of.
         size = np.abs(of).max(axis=1, keepdims=True)
         assert_close(got / size, of / size, absolute=1e-4, name=name)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective of 150 degrees"])
-def test_the_same_bits_in_every_shape(device: Device, name: str) -> None:
-    camera, gaussians = CAMERAS[name], model_for(CAMERAS[name], 2000, 6)
-    first, *others = (
-        Renderer(shaped(device, *shape)).render_channels(gaussians, camera, FEATURES, after=moved(camera))
-        for shape in shapes_of(device)
-    )
-    for image, found in others:
-        assert_same_bits(image.image, first[0].image)
-        assert_same_bits(image.alpha, first[0].alpha)
-        for feature in FEATURES:
-            assert_same_bits(found[feature], first[1][feature])
-
-
 @pytest.mark.parametrize("name", ["panorama", "fisheye of 300 degrees", "perspective", "perspective of 150 degrees"])
 def test_gaussians_that_move_are_a_camera_that_moves(device: Device, name: str) -> None:
-    camera, gaussians = CAMERAS[name], model_for(CAMERAS[name], 300, 5)
+    camera, gaussians = CAMERAS[name], model_for(name, 300, 5)
     there = moved(camera)
     # R' x + t' is R (R^T (R' x + t' - t)) + t
     means = (gaussians.means @ there.rotation.T + there.translation - camera.translation) @ camera.rotation
@@ -317,7 +308,7 @@ def test_what_is_too_near_or_transparent_is_left_out(device: Device) -> None:
 )
 def test_what_is_not_finite_is_left_out_alone(default_device: Device, name: str, value: float, group: str) -> None:
     renderer, camera = Renderer(default_device), CAMERAS[name]
-    clean, broken = model_for(camera, 60, 9), model_for(camera, 60, 9)
+    clean, broken = model_for(name, 60, 9), model_for(name, 60, 9)
     clean.opacity_logits[7] = -20.0
     getattr(broken, group)[7] = value
     wanted, got = (renderer.render_channels(gaussians, camera, ("normal", "position")) for gaussians in (clean, broken))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -75,30 +76,48 @@ def relative_error(got: ArrayLike, wanted: ArrayLike) -> float:
     return difference / norm
 
 
-def cosine(got: ArrayLike, wanted: ArrayLike) -> float:
-    """Cosine of the angle between the arrays as vectors; 1 if both are zero, 0 if one is."""
-    a, b = np.asarray(got, np.float64).ravel(), np.asarray(wanted, np.float64).ravel()
-    norms = float(np.linalg.norm(a) * np.linalg.norm(b))
-    if norms == 0.0:
-        return 1.0 if not a.any() and not b.any() else 0.0
-    return float(a @ b) / norms
-
-
-def assert_close_gradient(
-    got: ArrayLike, wanted: ArrayLike, tolerance: float, minimum_cosine: float = 0.0, name: str = "gradient"
-) -> None:
-    """Relative error in norm at most `tolerance`, cosine at least `minimum_cosine`; the wanted gradient must not be
-    zero, or the test would show nothing."""
+def assert_close_gradient(got: ArrayLike, wanted: ArrayLike, tolerance: float, name: str = "gradient") -> None:
+    """Relative error in norm at most `tolerance`; the wanted gradient must not be zero, or the test would show
+    nothing."""
     a, b = _pair(got, wanted, name)
     assert b.any(), f"{name}: the wanted gradient is zero everywhere"
-    error, angle = relative_error(a, b), cosine(a, b)
-    if error <= tolerance and angle >= minimum_cosine:
+    error = relative_error(a, b)
+    if error <= tolerance:
         return
     worst = tuple(int(i) for i in np.unravel_index(int(np.argmax(np.abs(a - b))), a.shape))
     raise AssertionError(
-        f"{name}: relative error {error:.3g} (allowed {tolerance:g}), cosine {angle:.9f} (at least {minimum_cosine:g})"
-        f"; worst at {worst}: got {a[worst]:.9g}, wanted {b[worst]:.9g}"
+        f"{name}: relative error {error:.3g} (allowed {tolerance:g}); worst at {worst}: got {a[worst]:.9g}, "
+        f"wanted {b[worst]:.9g}"
     )
+
+
+def assert_close_gradients(
+    got: Mapping[str, NDArray[Any]], wanted: Mapping[str, NDArray[Any]], tolerance: float
+) -> None:
+    """Gradients by name, each as of `assert_close_gradient`."""
+    for name, values in wanted.items():
+        assert_close_gradient(got[name], values, tolerance, name=name)
+
+
+def assert_slopes(
+    loss: Callable[[dict[str, Any]], float], arrays: Mapping[str, NDArray[Any]], gradients: Mapping[str, NDArray[Any]],
+    *, step: float, tolerance: float,
+) -> None:  # fmt: skip
+    """Central differences of a loss of arrays along a random direction through each of them, relative to the norm of
+    the gradient by it."""
+    rng = np.random.default_rng(6)
+    for name, gradient in gradients.items():
+        direction = rng.standard_normal(gradient.shape)
+        ends = [loss({**arrays, name: arrays[name] + by * direction}) for by in (step, -step)]
+        error = abs((ends[0] - ends[1]) / (2 * step) - float((gradient * direction).sum()))
+        assert error <= tolerance * np.linalg.norm(gradient), name
+
+
+def assert_same_arrays(got: Mapping[str, NDArray[Any]], wanted: Mapping[str, NDArray[Any]]) -> None:
+    """Arrays by name, each with the same bits."""
+    assert got.keys() == wanted.keys()
+    for name, values in wanted.items():
+        assert_same_bits(got[name], values, name)
 
 
 def assert_same_bits(got: NDArray[Any], wanted: NDArray[Any], name: str = "array") -> None:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,27 +53,26 @@ def _of(run: Pipeline) -> dict[str, list[Array]]:
     camera = run.camera
     d_image = np.random.default_rng(1).random((camera.height, camera.width, 3)) - 0.5
     gradients, screen = run.backward(d_image)
-    names = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
     return {
         "image": [run.frame.blended.image.get()],
         "transmittance": [run.frame.blended.transmittance.get()],
-        "gradients": [getattr(gradients, name) for name in names],
+        "gradients": [*gradients.arrays().values()],
         "screen": [screen[run.visible]],
     }
 
 
 BINS = 4
+FOCALS = {"perspective": None, "orthographic": 0.2, "equirectangular": 1 / (2 * np.pi), "fisheye": 0.3}
+"""By projection, in widths of the picture; None: the scene's."""
 
 
-def pictures_of(device: Device) -> dict[str, dict[str, str]]:
+def pictures_of(device: Device, kinds: Iterable[str] = FOCALS) -> dict[str, dict[str, str]]:
     """Checksums by kind of camera and channel, and of slices by depth, in the device's own shape."""
     gaussians, camera = SCENES["cloud"]()
     found = {}
-    width = camera.width
-    focals = {"orthographic": 0.2 * width, "equirectangular": width / (2 * np.pi), "fisheye": 0.3 * width}
-    for kind in ("perspective", *focals):
-        focal = focals.get(kind)
-        view = camera if focal is None else replace(camera, fx=focal, fy=focal, projection=kind)  # type: ignore[arg-type]
+    for kind in kinds:
+        focal = (FOCALS[kind] or 0.0) * camera.width or camera.fx
+        view = replace(camera, fx=focal, fy=camera.fy if FOCALS[kind] is None else focal, projection=kind)  # type: ignore[arg-type]
         step = np.array([-0.0625, 0.03125, 0.125])
         after, before = (replace(view, translation=view.translation + moved) for moved in (step, -step))
         renderer = Renderer(device)

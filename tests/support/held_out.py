@@ -1,13 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Held-out views of a training, as its refined cameras are validated with them."""
+"""Photographs of a training that are changed, and its held-out views, with which refined cameras are validated."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
 from clsplat.camera import Camera
 from clsplat.runs.appearance import held_out_looks
+from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
+
+
+def change_photographs(monkeypatch: pytest.MonkeyPatch, change: Callable[[int, NDArray[Any]], object]) -> None:
+    """Let photographs be float, and what `change` makes of each, by its index."""
+    plain = ImageCache.load
+
+    def load(self: ImageCache, index: int, factor: float) -> Float32:
+        image = plain(self, index, factor)
+        values = image / np.float32(255) if image.dtype == np.uint8 else image
+        return np.ascontiguousarray(change(index, values), np.float32)
+
+    monkeypatch.setattr(ImageCache, "load", load)
 
 
 def psnr_of(trainer: Trainer, cameras: Sequence[Camera]) -> float:

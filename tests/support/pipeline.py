@@ -9,17 +9,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from compare import assert_close, assert_close_gradient, assert_close_gradients
 from drivers import why_not
 from numpy.typing import NDArray
 from quick import quick
+from scenes import Scene
 
 from clsplat.camera import Camera
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, all_devices, open_device
 from clsplat.gaussians import Gaussians
-from clsplat.layouts.columns import SPLAT, TILE, SlotFields
+from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT, SlotFields
+from clsplat.reference.render import forward, render_grad
 from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.selftest.harness import planes_of
+from clsplat.stages.blend import Blended, blend_grad
 from clsplat.stages.device_gaussians import DeviceGaussians, allocate_gaussians, download_gaussians, upload_gaussians
 from clsplat.stages.project import Screen
 
@@ -67,9 +72,12 @@ class Pipeline:
         scene: tuple[Gaussians, Camera],
         background: tuple[float, float, float] = BACKGROUND,
         config: RasterizerConfig | None = None,
+        capacity: int | None = None,
     ) -> Pipeline:
+        """capacity: pairs of a band."""
         gaussians, camera = scene
         rasterizer = Rasterizer(device, config)
+        rasterizer.capacity = rasterizer.capacity if capacity is None else capacity
         rasterizer.antialias(on=gaussians.antialiased)
         on_device = upload_gaussians(device, gaussians)
         frame = rasterizer.forward(on_device, camera, upload(device, np.array(background, np.float32)))
@@ -115,9 +123,39 @@ class Pipeline:
     def screened(self, d_image: NDArray[np.float64], fields: SlotFields) -> tuple[Gaussians, Screen]:
         """As `backward`, with all that density control has of a view."""
         device = self.rasterizer.device
-        height, width, _ = d_image.shape
-        planes = np.zeros((3, -(-height // TILE) * TILE, -(-width // TILE) * TILE), np.float32)
-        planes[:, :height, :width] = d_image.transpose(2, 0, 1)
         gradients = allocate_gaussians(device, self.gaussians.count, self.gaussians.coefficients, zero=True)
-        screen = self.rasterizer.backward(self.gaussians, self.frame, upload(device, planes), gradients, fields=fields)
+        by_image = upload(device, planes_of(d_image))
+        screen = self.rasterizer.backward(self.gaussians, self.frame, by_image, gradients, fields=fields)
         return download_gaussians(gradients), screen
+
+    def slots(
+        self, by_image: NDArray[np.float32], fields: SlotFields = PLAIN_SLOTS, blended: Blended | None = None
+    ) -> NDArray[np.float32]:
+        """Slots of the frame's pairs from dL/dimage in planes. blended: the frame's, unless given."""
+        device, frame = self.rasterizer.device, self.frame
+        how = (frame.listed.lists, frame.inputs, blended or frame.blended, upload(device, by_image))
+        values: NDArray[np.float32] = blend_grad(device, self.rasterizer.work, *how, fields=fields).get()
+        return values
+
+
+def steady(scene: Scene, seed: int = 1) -> NDArray[np.float64]:
+    """Random dL/dimage (H, W, 3) that is 0 where a threshold may fall the other way in float32."""
+    gaussians, camera = scene
+    d_image = np.random.default_rng(seed).standard_normal((camera.height, camera.width, 3))
+    d_image[forward(gaussians, camera).blended.margin < 1e-4] = 0
+    return d_image
+
+
+def assert_gradients(run: Pipeline, scene: Scene, fields: SlotFields = PLAIN_SLOTS) -> None:
+    """The gradients of a frame, and its contributions, beside those of the twin, for `steady`."""
+    d_image, shown = steady(scene), run.visible
+    got, screen = run.screened(d_image, fields)
+    wanted = render_grad(*scene, d_image, BACKGROUND)
+    assert_close_gradients(got.arrays(), wanted.parameters, 1e-4)
+    on_image = wanted.abs_means2d if fields.absolute else wanted.means2d
+    assert_close_gradient(screen.gradients.get()[shown], on_image[shown], 1e-4)
+    if screen.contributions is not None:
+        # Weights are as good as frames are, 2e-5 a pixel at most; 1e-4 of a Gaussian's own sum, and a few pixels at the
+        # edge of an ellipse, of a weight of 1/255, that are decided the other way.
+        contributions = screen.contributions.get()[shown]
+        assert_close(contributions, wanted.contributions[shown], relative=1e-4, absolute=4 / 255)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -176,6 +178,23 @@ def random_cloud(count: int, seed: int, width: int, height: int, degree: int = 3
     return make_gaussians(world_from_pixels(camera, pixels, depths), quaternions, log_scales, opacities, sh), camera
 
 
+def in_float64(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians in float64, so that a step of a difference is not rounded away."""
+    arrays: dict[str, Any] = {name: np.asarray(values, np.float64) for name, values in gaussians.arrays().items()}
+    return replace(gaussians, **arrays)
+
+
+def antialiased(scene: Scene) -> Scene:
+    """The scene with the antialiased model's low-pass."""
+    return replace(scene[0], antialiased=True), scene[1]
+
+
+def orthographic(scene: Scene, middle: float = 4.0) -> Scene:
+    """The scene through a camera that shows at the depth `middle` what its own did."""
+    gaussians, camera = scene
+    return gaussians, replace(camera, fx=camera.fx / middle, fy=camera.fy / middle, projection="orthographic")
+
+
 NAMED: dict[str, Callable[[], Scene]] = {
     "one": one,
     "overlap": overlap,
@@ -187,6 +206,9 @@ NAMED: dict[str, Callable[[], Scene]] = {
     "random_cloud": lambda: random_cloud(300, 11, 70, 50),
 }
 """Every scene without arguments, by name, for `pytest.mark.parametrize`."""
+
+ANTIALIASED = {f"antialiased {name}": lambda make=make: antialiased(make()) for name, make in NAMED.items()}
+"""Those scenes with the antialiased model's low-pass."""
 
 SHAPE_MATTERS = ("overlap", "many_per_tile", "saturating")
 """Of them those that take the branches in which kernels of other shapes differ: several batches, pixels that end."""

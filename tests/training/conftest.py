@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from tiny import write_scene
 
@@ -11,6 +13,12 @@ from clsplat.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """The tiny scene, read anew for each file of tests."""
-    return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene"))
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny scene, written anew for each file of tests."""
+    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
+
+
+@pytest.fixture(scope="module")
+def scene(folder: Path) -> Scene:
+    """That scene, read."""
+    return load_scene(folder)

@@ -1,27 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training with --antialiased: the same bytes however it is cut, scales that the pictures show, files that say so."""
+"""Training with --antialiased: scales that the pictures show. test_by_rays.py has the files that say so."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture
-from tiny import CONFIG, run_steps, short, write_scene
+from tiny import CONFIG, run_steps
 
-from clsplat.api import train
-from clsplat.cli.main import main
-from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.gaussians import Gaussians
-from clsplat.models.formats import load
 from clsplat.reference.sampling import sampling_limits
-from clsplat.rendering.renderer import Renderer
-from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training import mip_filter
@@ -29,36 +18,6 @@ from clsplat.training.mip_filter import MipFilter
 from clsplat.training.trainer import Trainer
 
 SMOOTH = replace(CONFIG, antialiased=True)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-
-
-@pytest.fixture(scope="module")
-def scene(folder: Path) -> Scene:
-    return load_scene(folder)
-
-
-def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: bool) -> bytes:
-    run = Run.create(folder, config, **options)
-    train(scene, config, device=device, run=run, **options)
-    return run.model_path.read_bytes()
-
-
-@pytest.mark.slow
-def test_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Resumed, and by capacity; without the setting they are others."""
-    whole = model_bytes(scene, SMOOTH, default_device, tmp_path / "whole")
-    for step in (7, 15, 23):
-        config = replace(short(iterations=step), antialiased=True)
-        model_bytes(scene, config, default_device, tmp_path / "cut", **({"resume": True} if step > 7 else {}))
-    assert model_bytes(scene, SMOOTH, default_device, tmp_path / "cut", resume=True) == whole
-    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "1")
-    assert model_bytes(scene, SMOOTH, default_device, tmp_path / "capacity") == whole
-    monkeypatch.delenv("CLSPLAT_BY_CAPACITY")
-    assert model_bytes(scene, CONFIG, default_device, tmp_path / "off") != whole
 
 
 def test_no_scale_is_less_than_the_pictures_show(scene: Scene, default_device: Device) -> None:
@@ -91,47 +50,3 @@ def test_the_cameras_are_looked_at_every_hundred_steps(
     while trainer.step < 48:
         trainer.train_step()
     assert [(step - 1) // 12 for step in looked] == [0, 1, 2, 3]
-
-
-@pytest.mark.slow
-def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: Capture) -> None:
-    run = tmp_path / "run"
-    assert main(["train", str(folder), "-o", str(run), "--iterations", "20", "--antialiased"]) == 0
-    model = load(run / "model.ply")
-    assert model.antialiased
-    assert b"\ncomment SplatRenderMode: mip\n" in (run / "model.ply").read_bytes()[:2000]
-    camera = scene.views[0].camera
-    plain = Renderer().render(replace(model, antialiased=False), camera).image
-    smooth = Renderer().render(model, camera).image
-    assert np.abs(plain - smooth).max() > 1e-3
-    for name in ("model.spz", "model.compressed.ply", "model.sog"):
-        capsys.readouterr()
-        assert main(["convert", str(run), str(tmp_path / name)]) == 0
-        assert load(tmp_path / name).antialiased
-        assert "cannot store antialiasing" not in capsys.readouterr().err
-        assert main(["info", str(tmp_path / name), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["antialiased"] is True
-    assert main(["info", str(run / "model.ply")]) == 0
-    assert "antialiased" in capsys.readouterr().out
-    assert main(["convert", str(run), str(tmp_path / "model.splat")]) == 0
-    assert "splat cannot store antialiasing" in capsys.readouterr().err
-
-
-def test_models_that_are_drawn_differently_do_not_merge(tmp_path: Path, scene: Scene, capsys: Capture) -> None:
-    plain = Gaussians.load(_saved(tmp_path / "plain.ply", antialiased=False))
-    assert not plain.antialiased
-    _saved(tmp_path / "smooth.ply", antialiased=True)
-    call = ["convert", str(tmp_path / "plain.ply"), str(tmp_path / "both.ply"), "--merge", str(tmp_path / "smooth.ply")]
-    assert main(call) == 2
-    assert "some are not" in capsys.readouterr().err
-    assert not (tmp_path / "both.ply").exists()
-
-
-def _saved(path: Path, *, antialiased: bool) -> Path:
-    zeros = np.zeros((2, 3), np.float32)
-    model = Gaussians(
-        zeros, np.ones((2, 4), np.float32), zeros - 2, np.zeros(2, np.float32), np.zeros((2, 1, 3), np.float32),
-        antialiased=antialiased,
-    )  # fmt: skip
-    model.save(path)
-    return path

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from compare import assert_close, assert_same_bits
+from compare import assert_close, assert_same_arrays
 from tiny import CONFIG, short
 
 from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device, open_devices
 from clsplat.errors import DeviceError, DriverError, InputError
-from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
+from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.optimisation.step_noise import Exploration
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
@@ -46,11 +46,6 @@ def halves(index: int) -> list[Device]:
         pytest.skip(str(error))
 
 
-def assert_same_model(got: Gaussians, wanted: Gaussians) -> None:
-    for name in ("means", "quaternions", "log_scales", "opacity_logits", "sh"):
-        assert_same_bits(getattr(got, name), getattr(wanted, name), name)
-
-
 def slow(method: Callable[..., Any], seconds: float) -> Callable[..., Any]:
     """The method, which takes longer."""
 
@@ -72,7 +67,7 @@ def test_halves_of_a_device_train_to_the_bytes_of_the_whole(
         monkeypatch.setattr(Batch, "_view", slow(Batch._view, 0.01))
     if late == "second":
         monkeypatch.setattr(Replica, "view", slow(Replica.view, 0.01))
-    assert_same_model(train(scene, TWO, device=devices), wanted)
+    assert_same_arrays(train(scene, TWO, device=devices).arrays(), wanted.arrays())
 
 
 @pytest.mark.slow
@@ -88,7 +83,7 @@ def test_halves_of_a_device_train_to_the_bytes_of_the_whole(
 )
 def test_the_number_of_devices_changes_no_byte(scene: Scene, default_device: Device, config: TrainConfig) -> None:
     wanted = train(scene, config, device=default_device)
-    assert_same_model(train(scene, config, device=halves(default_device.index)), wanted)
+    assert_same_arrays(train(scene, config, device=halves(default_device.index)).arrays(), wanted.arrays())
 
 
 @pytest.mark.slow
@@ -106,12 +101,13 @@ def test_little_memory_changes_no_byte(scene: Scene, default_device: Device) -> 
         on_plan=lambda plan: plans.append(plan.streamed),
     )
     assert any(plans)
-    assert_same_model(got, wanted)
+    assert_same_arrays(got.arrays(), wanted.arrays())
 
 
 def test_without_being_told_a_batch_has_a_view_for_each_device(scene: Scene, default_device: Device) -> None:
     devices = halves(default_device.index)
-    assert_same_model(train(scene, short(iterations=12), device=devices), train(scene, short(iterations=12, batch=2)))
+    wanted = train(scene, short(iterations=12, batch=2))
+    assert_same_arrays(train(scene, short(iterations=12), device=devices).arrays(), wanted.arrays())
     with pytest.raises(InputError, match=r"--batch 3: expected a multiple of 2, the number of devices"):
         train(scene, short(batch=3), device=devices)
     with pytest.raises(InputError, match="expected open devices"):
@@ -133,7 +129,7 @@ def test_a_run_goes_on_with_its_batch_on_any_devices(scene: Scene, default_devic
     assert [step for step, _ in run.checkpoints()] == [8, 14], "the first steps that have come to 7 and 14"
     assert run.config.batch == 2
     again = Run.create(run.path, Run.open(run.path).config, resume=True)
-    assert_same_model(train(scene, None, device=default_device, run=again, resume=True), wanted)
+    assert_same_arrays(train(scene, None, device=default_device, run=again, resume=True).arrays(), wanted.arrays())
     one = Run.create(tmp_path / "one", short(iterations=2))
     train(scene, None, device=default_device, run=one)
     with pytest.raises(InputError, match="--batch 1: expected a multiple of 2"):

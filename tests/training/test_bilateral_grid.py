@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from held_out import change_photographs
 from tiny import CONFIG
 
 from clsplat.api import train
@@ -17,7 +18,6 @@ from clsplat.device.context import Device
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.stages.grid import GRID_SHAPE
-from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 WITH_GRIDS = replace(CONFIG, appearance="grid")
@@ -39,14 +39,8 @@ def test_a_run_keeps_its_grids(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Photographs that are darker by turns: their grids are, and their mean is the identity after a pass."""
-    plain, count = ImageCache.load, len(scene.train_views)
-
-    def dimmed(self: ImageCache, index: int, factor: float) -> np.ndarray:
-        image = plain(self, index, factor)
-        values = image / np.float32(255) if image.dtype == np.uint8 else image
-        return np.ascontiguousarray(values * np.float32(0.6 if index % 2 else 1.0), np.float32)
-
-    monkeypatch.setattr(ImageCache, "load", dimmed)
+    count = len(scene.train_views)
+    change_photographs(monkeypatch, lambda index, values: values * np.float32(0.6 if index % 2 else 1.0))
     density = replace(CONFIG.density, every=0)
     config = replace(WITH_GRIDS, iterations=20 * count, density=density, warmup=())
     run = Run.create(tmp_path / "run", config)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training with pinholes' pictures along rays: when it is so, the same bytes however it is cut, files that say so."""
+"""Training with pinholes' pictures along rays: when it is so, and files that say so, of antialiased models too."""
 
 from __future__ import annotations
 
@@ -10,32 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture
-from compare import assert_same_bits
-from same_bytes import interrupted, model_bytes
 from test_intrinsics import write_lens_scene
-from tiny import CONFIG, hidden_model, short, write_scene
+from tiny import CONFIG, hidden_model
 
-from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
-from clsplat.gaussians import Gaussians
 from clsplat.models.formats import load
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.trainer import Trainer
-
-ALONG_RAYS = replace(CONFIG, perspective="rays")
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-
-
-@pytest.fixture(scope="module")
-def scene(folder: Path) -> Scene:
-    return load_scene(folder)
 
 
 @pytest.mark.slow
@@ -57,56 +41,46 @@ def test_it_is_so_where_the_scene_has_other_lenses(scene: Scene, default_device:
             assert trainer.gaussians().by_rays == by_rays
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("further", [{}, {"antialiased": True}, {"refine_poses": True}, {"batch": 2}])
-def test_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path, further: dict[str, bool]) -> None:
-    config = replace(short(report=False), perspective="rays", **further)
-    whole = model_bytes(scene, config, default_device, tmp_path / "whole")
-    assert interrupted(scene, config, default_device, tmp_path / "stopped") == whole
+DRAWN = {
+    "antialiased": ("--antialiased", b"SplatRenderMode: mip", ("spz", "compressed.ply", "sog"), "antialiasing"),
+    "by_rays": ("--perspective rays", b"clsplat rays", ("compressed.ply",), "drawing along rays"),
+}
+"""By its field in a model: the flags, the comment in a PLY, formats that store it, and its name where one cannot."""
 
 
 @pytest.mark.slow
-def test_by_capacity_and_with_less_memory(
-    scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def model(device: Device) -> Gaussians:
-        return train(scene, replace(ALONG_RAYS, report=False), device=device)
-
-    whole = model(default_device)
-    monkeypatch.setenv("CLSPLAT_BY_CAPACITY", "1")
-    assert_same_bits(model(default_device).means, whole.means)
-    monkeypatch.delenv("CLSPLAT_BY_CAPACITY")
-    monkeypatch.setenv("CLSPLAT_POISON", "1")
-    assert_same_bits(model(default_device).means, whole.means)
-
-
-@pytest.mark.slow
-def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: Capture) -> None:
-    run = tmp_path / "run"
-    assert main(["train", str(folder), "-o", str(run), "--iterations", "20", "--perspective", "rays"]) == 0
-    model = load(run / "model.ply")
-    assert model.by_rays
-    assert b"\ncomment clsplat rays\n" in (run / "model.ply").read_bytes()[:2000]
-    camera = replace(scene.views[0].camera, fx=0.4 * scene.views[0].camera.fx)
-    plane = Renderer().render(replace(model, by_rays=False), camera).image
-    assert np.abs(plane - Renderer().render(model, camera).image).max() > 1e-3
-    capsys.readouterr()
-    assert main(["convert", str(run), str(tmp_path / "model.compressed.ply")]) == 0
-    assert "along rays" not in capsys.readouterr().err
-    for name in (tmp_path / "model.compressed.ply", run / "model.ply"):
-        assert load(name).by_rays
-        assert main(["info", str(name), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["by_rays"] is True
+@pytest.mark.parametrize("field", DRAWN)
+def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: Capture, field: str) -> None:
+    run, (flags, comment, endings, name) = tmp_path / "run", DRAWN[field]
+    assert main(["train", str(folder), "-o", str(run), "--iterations", "20", *flags.split()]) == 0
+    assert b"\ncomment %s\n" % comment in (run / "model.ply").read_bytes()[:2000]
+    model, camera = load(run / "model.ply"), replace(scene.views[0].camera, fx=0.4 * scene.views[0].camera.fx)
+    images = [Renderer().render(replace(model, **{field: on}), camera).image for on in (False, True)]
+    assert np.abs(images[0] - images[1]).max() > 1e-3
+    for path in (run / "model.ply", *(tmp_path / f"model.{ending}" for ending in endings)):
+        capsys.readouterr()
+        assert path.exists() or main(["convert", str(run), str(path)]) == 0
+        assert f"cannot store {name}" not in capsys.readouterr().err
+        assert getattr(load(path), field)
+        assert main(["info", str(path), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)[field] is True
     assert main(["info", str(run / "model.ply")]) == 0
-    assert "along rays" in capsys.readouterr().out
+    assert {"by_rays": "along rays"}.get(field, field) in capsys.readouterr().out
     assert main(["convert", str(run), str(tmp_path / "model.splat")]) == 0
-    assert "splat cannot store drawing along rays" in capsys.readouterr().err
-    assert (
-        main(["render", str(run), "--cameras", str(folder), "-o", str(tmp_path / "{name}.exr"), "--frames", "1"]) == 0
-    )
-    again = ["train", str(folder), "-o", str(run), "--iterations", "30", "--resume", "--perspective", "plane"]
-    assert main(again) == 2
-    assert "perspective is rays, a resumed run cannot change it to plane" in capsys.readouterr().err
+    assert f"splat cannot store {name}" in capsys.readouterr().err
+    assert main(f"render {run} --cameras {folder} -o {tmp_path}/{{name}}.exr --frames 1".split()) == 0
+
+
+@pytest.mark.parametrize("field", DRAWN)
+def test_models_that_are_drawn_differently_do_not_merge(tmp_path: Path, capsys: Capture, field: str) -> None:
+    for name, on in (("plain", False), ("other", True)):
+        replace(hidden_model(), **{field: on}).save(tmp_path / f"{name}.ply")
+    assert not getattr(load(tmp_path / "plain.ply"), field)
+    call = ["convert", str(tmp_path / "plain.ply"), str(tmp_path / "both.ply"), "--merge", str(tmp_path / "other.ply")]
+    assert main(call) == 2
+    drawn = {"by_rays": "drawn along rays"}.get(field, field)
+    assert f"{drawn} and some are not" in capsys.readouterr().err
+    assert not (tmp_path / "both.ply").exists()
 
 
 def test_what_it_does_not_go_with(folder: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -115,15 +89,9 @@ def test_what_it_does_not_go_with(folder: Path, tmp_path: Path, capsys: Capture)
     assert "not supported with --perspective rays, expected --perspective plane" in capsys.readouterr().err
     assert main(["train", str(folder), "-o", str(tmp_path / "run"), "--perspective", "fisheye"]) == 2
     assert "--perspective" in capsys.readouterr().err
-
-
-def test_models_that_are_drawn_differently_do_not_merge(tmp_path: Path, capsys: Capture) -> None:
-    for name, by_rays in (("plane", False), ("rays", True)):
-        replace(hidden_model(), by_rays=by_rays).save(tmp_path / f"{name}.ply")
-    call = ["convert", str(tmp_path / "plane.ply"), str(tmp_path / "both.ply"), "--merge", str(tmp_path / "rays.ply")]
-    assert main(call) == 2
-    assert "some of the models are drawn along rays and some are not" in capsys.readouterr().err
-    assert not (tmp_path / "both.ply").exists()
+    assert main([*call[:-1], "--iterations", "2", "--no-report"]) == 0
+    assert main(["train", "-o", str(tmp_path / "run"), "--iterations", "3", "--resume", "--perspective", "plane"]) == 2
+    assert "perspective is rays, a resumed run cannot change it to plane" in capsys.readouterr().err
 
 
 def test_settings_are_not_compared_along_rays(tmp_path: Path, capsys: Capture) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_close
-from held_out import psnr_of
+from held_out import change_photographs, psnr_of
 from tiny import CONFIG, trained_to
 
 from clsplat.api import train
@@ -28,7 +28,6 @@ from clsplat.runs.checkpoints import Checkpoint
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.training.appearance.ppisp import PpispOfAll
-from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 OF_CAMERAS = replace(CONFIG, appearance="ppisp")
@@ -39,19 +38,15 @@ CORNERS = -1.0
 
 def taken_otherwise(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
     """Let photographs be float, mixed by MIXES and against them by turns, and dark in the corners."""
-    plain = ImageCache.load
 
-    def load(self: ImageCache, index: int, factor: float) -> np.ndarray:
-        image = plain(self, index, factor)
-        values = image / np.float32(255) if image.dtype == np.uint8 else image
+    def change(index: int, values: np.ndarray) -> np.ndarray:
         height, width, _ = values.shape
         camera = scene.train_views[index].camera
         centre = camera.cx / camera.width * width, camera.cy / camera.height * height
         values = values @ np.linalg.inv(unmixing(MIXES * (1 if index % 2 else -1))).T
-        values = values * light(np.array([CORNERS, 0, 0]), spread(width, height, centre))[:, :, None]
-        return np.ascontiguousarray(values, np.float32)
+        return values * light(np.array([CORNERS, 0, 0]), spread(width, height, centre))[:, :, None]
 
-    monkeypatch.setattr(ImageCache, "load", load)
+    change_photographs(monkeypatch, change)
 
 
 @pytest.fixture(scope="module")
@@ -207,21 +202,20 @@ def test_refined_cameras_are_judged_through_the_lens(
         record = {"held_out": {view.name: row for view in scene.test_views}}
         monkeypatch.setattr(trainer.appearance, "record", lambda record=record: record)
         with monkeypatch.context() as patch:
-            patch.setattr(ImageCache, "load", dark(trainer))
+            change_photographs(patch, dark(trainer))
             found[name] = psnr_of(trainer, cameras)
     assert found["through"] > 60  # rounded to float32
     assert found["without"] < found["through"] - 10
 
 
-def dark(trainer: Trainer) -> Callable[..., np.ndarray]:
-    """Loads what the model shows of a validation view, dark in the corners."""
+def dark(trainer: Trainer) -> Callable[[int, object], np.ndarray]:
+    """What the model shows of a validation view, dark in the corners."""
+    renderer = Renderer(trainer.device, trainer.rasterizer)
 
-    def load(self: ImageCache, index: int, factor: float) -> np.ndarray:
+    def change(index: int, _: object) -> np.ndarray:
         camera = trainer.validation_views.views[index].camera
-        renderer = Renderer(trainer.device, trainer.rasterizer)
         image = renderer.render(trainer.parameters, trainer.local(camera), (0, 0, 0)).image[:, :, :3]
         middle = camera.width / 2, camera.height / 2
-        left = light(np.array([CORNERS, 0, 0]), spread(camera.width, camera.height, middle))
-        return np.ascontiguousarray(image * left[:, :, None], np.float32)
+        return image * light(np.array([CORNERS, 0, 0]), spread(camera.width, camera.height, middle))[:, :, None]
 
-    return load
+    return change

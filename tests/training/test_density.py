@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 from marking import TwinMarker, on_host
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from clsplat.config.training import DensityConfig
 from clsplat.stages.device_gaussians import HostArray
@@ -42,8 +45,9 @@ def make_plan(
     seen: ArrayLike = 4,
     radii: ArrayLike = 5,
     opacities: ArrayLike = 0.5,
+    known: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> RowPlan:
-    """sizes: the largest axis of each; the others are a tenth of it."""
+    """sizes: the largest axis of each; the others are a tenth of it. known: further statistics."""
     largest = np.asarray(sizes, np.float32)
     n = len(largest)
     views = np.broadcast_to(np.asarray(seen, np.float32), n)
@@ -52,6 +56,7 @@ def make_plan(
         "gradient_sums": (np.asarray(gradients) * views).astype(np.float32),
         "seen": views,
         "radii": np.broadcast_to(np.asarray(radii, np.float32), n),
+        **known,
     }
     parameters = {"log_scales": log_scales, "opacity_logits": np.broadcast_to(logit(opacities), n)}
     parameters |= {"means": np.zeros((n, 3), np.float32), "quaternions": np.ones((n, 4), np.float32)}
@@ -164,14 +169,7 @@ def test_halves_are_smaller_by_the_factor_and_drawn_from_their_gaussian() -> Non
     )
     assert means.dtype == log_scales.dtype == np.float32
     np.testing.assert_allclose(np.exp(log_scales[7]), scales / 1.6, rtol=1e-6)
-    w, x, y, z = q / np.linalg.norm(q)
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = Rotation.from_quat(q[[1, 2, 3, 0]]).as_matrix()
     along = (means - centre) @ rotation  # in the Gaussian's own axes
     # 4 standard errors: sigma / sqrt(n) of a mean, 1 / sqrt(2 n) relative of a deviation
     assert np.all(np.abs(along.mean(axis=0)) < 4 * scales / np.sqrt(count))
@@ -189,3 +187,15 @@ def test_the_same_seed_gives_the_same_halves() -> None:
     first, again = (split_halves(CONFIG, **values, rng=np.random.default_rng(5))[0] for _ in range(2))
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(first, axis=0)) == 3, "two halves are drawn apart"
+
+
+def test_splitting_a_zero_quaternion_gives_finite_halves() -> None:
+    means, log_scales = split_halves(
+        CONFIG,
+        means=np.ones((4, 3), np.float32),
+        quaternions=np.array([[0, 0, 0, 0], [1e-42, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1e-20]], np.float32),
+        log_scales=np.zeros((4, 3), np.float32),
+        rng=np.random.default_rng(0),
+    )
+    assert np.isfinite(means).all()
+    assert np.isfinite(log_scales).all()

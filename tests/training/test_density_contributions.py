@@ -3,22 +3,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from marking import on_host
 from numpy.typing import ArrayLike
-from test_density import state
+from test_density import CONFIG, STRONG, WEAK, state
+from test_density import make_plan as plan_of
 
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.training.density import RowPlan, StatisticsNeeds
-from clsplat.training.density.adaptive import Adaptive, budget, is_due, is_pruning_due, plan, plan_pruning
+from clsplat.training.density.adaptive import Adaptive, budget, is_due, is_pruning_due, plan_pruning
 
-CONFIG = DensityConfig()
 GROWING = replace(CONFIG, growth="budget", max_gaussians=9000, start=500, stop=2500)
-WEAK, STRONG = 1e-4, 3e-4
-"""Mean gradients on either side of the threshold."""
 
 
 def contributions(totals: ArrayLike, largest: ArrayLike | None = None) -> dict[str, np.ndarray]:
@@ -28,15 +28,9 @@ def contributions(totals: ArrayLike, largest: ArrayLike | None = None) -> dict[s
     return {"whole_totals": values, "whole_largest": np.minimum(values, largest), "current_largest": largest}
 
 
-def make_plan(
-    gradients: ArrayLike, config: DensityConfig = CONFIG, step: int = 600, *, known: dict[str, np.ndarray] | None = None
-) -> RowPlan:
+def make_plan(gradients: Sequence[float], config: DensityConfig = CONFIG, **how: Any) -> RowPlan:
     """All small, so that who is densified is cloned, and seen in four views."""
-    sums = 4 * np.asarray(gradients, np.float32)
-    n = len(sums)
-    statistics = {"gradient_sums": sums, "seen": np.full(n, 4, np.float32), "radii": np.full(n, 5, np.float32)}
-    parameters = {"log_scales": np.full((n, 3), np.log(0.05), np.float32), "opacity_logits": np.zeros(n, np.float32)}
-    return on_host(plan(config, state(step, 10.0, parameters, {**statistics, **(known or {})})), parameters)
+    return plan_of(gradients, np.full(len(gradients), 0.05), config=config, **how)
 
 
 def cloned(made: RowPlan) -> list[int]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from compare import assert_same_bits
 from numpy.typing import NDArray
+from test_trainer import host
 from tiny import run_steps, trained_to
 
 from clsplat.config.training import TrainConfig
@@ -17,7 +18,6 @@ from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.runs.checkpoints import Checkpoint
 from clsplat.scenes.scene import Scene
-from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training.density import ModelState, RowPlan, StatisticsNeeds, Strategy
 from clsplat.training.trainer import Trainer
 
@@ -75,10 +75,6 @@ def trained(scene: Scene, device: Device, steps: int) -> tuple[Trainer, Juggler]
     trainer = trained_to(steps, scene, CONFIG, device, strategy=Juggler)
     assert isinstance(trainer.strategy, Juggler)
     return trainer, trainer.strategy
-
-
-def host(model: AnyGaussians) -> dict[str, NDArray[Any]]:
-    return {group: model[group].get() for group in PARAMETER_GROUPS}
 
 
 def test_rows_follow_the_plan_of_any_strategy(scene: Scene, default_device: Device) -> None:

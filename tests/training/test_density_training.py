@@ -12,24 +12,20 @@ import numpy as np
 import pytest
 from calls import warnings_of
 from compare import assert_close, assert_same_bits
-from quick import quick
-from same_bytes import model_bytes, stopped_at
+from same_bytes import model_bytes
 from scenes import random_cloud
 from test_trainer import host
-from tiny import run_steps, short, trained_to, write_scene
+from tiny import run_steps, short, trained_to
 
 from clsplat.api import train
-from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray
 from clsplat.device.context import Device
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.optimisation.density_rules import FRESH
 from clsplat.reference.render import render_grad
 from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.density import CONTRIBUTION_STATISTICS, DeviceRowList
-from clsplat.stages.device_gaussians import HostGaussians
 from clsplat.training.density import ModelState, RowPlan, adaptive
 from clsplat.training.trainer import Trainer
 
@@ -169,14 +165,6 @@ def test_what_crosses_the_bus(
     assert moved[0] <= most * trainer.parameters.count + 88 * (halves // 2) + 64
 
 
-@pytest.mark.parametrize("step", quick([7, 8, 12, 19, 20, 24, 40, 42, 45], 8, 20))
-def test_stopping_and_going_on_gives_the_same_bytes(
-    step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    """At the seams of epochs (8 views), of resets, of passes and of what is gathered."""
-    assert stopped_at(step, scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
 def test_settings_that_come_with_resume(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     """The checkpoint has no contributions: nothing is known until an epoch is over, and nothing is pruned by it."""
     plain = short(iterations=14)
@@ -193,38 +181,9 @@ def test_settings_that_come_with_resume(scene: Scene, default_device: Device, tm
     assert run.model_path.exists()
 
 
-MANY = replace(CONFIG, density=replace(CONFIG.density, max_gaussians=2500, min_contribution=0.02), random_points=400)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.6, 0.3])
-def test_in_less_memory_the_same_bytes(share: float, default_device: Device, tmp_path: Path) -> None:
-    scene = load_scene(write_scene(tmp_path / "scene", points=False))
-    free = default_device.with_memory_limit(None)
-    wanted = model_bytes(scene, MANY, free, tmp_path / "free")
-    device = default_device.with_memory_limit(int(share * free.memory.peak))
-    run = Run.create(tmp_path / "limited", MANY)
-    pieces = []
-    train(scene, MANY, device=device, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
-    assert run.model_path.read_bytes() == wanted
-    assert device.memory.limit is not None
-    assert device.memory.peak <= device.memory.limit
-    assert any(any(each) for each in pieces)
-    assert any(streamed for streamed, _ in pieces) or share > 0.5
-
-
 def test_the_budget_is_reached(scene: Scene, default_device: Device) -> None:
     counts: list[int] = []
     config = short(density={"growth": "budget", "max_gaussians": 150, "min_opacity": 1e-6, "max_world_fraction": 1e9})
     train(scene, config, device=default_device, on_step=lambda report: counts.append(report.gaussians))
     assert counts[-1] == 150, "nothing is pruned, and the last densification reaches it"
     assert len(scene.points) < counts[1] < 150
-
-
-def test_every_driver_prunes_alike(device: Device, default_device: Device, scene: Scene) -> None:
-    config: TrainConfig = replace(CONFIG, iterations=16)
-    trainers = [Trainer(scene, config, opened) for opened in (device, default_device)]
-    for trainer in trainers:
-        run_steps(config.iterations, trainer)
-        assert not isinstance(trainer.parameters, HostGaussians)
-    assert trainers[0].parameters.count == trainers[1].parameters.count

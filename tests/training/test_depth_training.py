@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from depths import add_maps, add_tracks
-from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
+from same_bytes import model_bytes
 from tiny import HEIGHT, WIDTH, short, trained_to, write_scene
 
 from clsplat.camera import DEFAULT_NEAR_PLANE
@@ -26,7 +26,6 @@ from clsplat.scenes.scene import Scene
 from clsplat.scenes.supervision.depth_samples import KnownDepth
 from clsplat.training.repro_bundle import read_bundle, replay, write_bundle
 from clsplat.training.stability.health import Incident
-from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.supervision.depth_targets import DepthTargets, weight_at
 from clsplat.training.trainer import Trainer
 
@@ -160,29 +159,6 @@ def test_without_weight_the_model_is_that_of_today(scene: Scene, default_device:
     """Blending's gradient has one term more, which is 0: the sums are the same."""
     plain = model_bytes(scene, short(iterations=40), default_device, tmp_path / "plain")
     assert model_bytes(scene, replace(CONFIG, depth_weight=0.0), default_device, tmp_path / "depth") == plain
-
-
-def test_an_interruption_gives_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-def test_by_capacity_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
-    assert model_bytes(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-@pytest.mark.slow
-def test_in_less_memory_the_same_bytes(scene: Scene, default_device: Device, tmp_path: Path) -> None:
-    check_in_less_memory(scene, replace(CONFIG, depth="maps"), default_device, tmp_path, part=0.6)
-
-
-@pytest.mark.slow
-def test_several_devices_and_one_give_the_same_bytes(scene: Scene, default_device: Device) -> None:
-    check_on_two_devices(with_depths(scene, CONFIG.depth_use), CONFIG, default_device, 10)
 
 
 @pytest.mark.slow

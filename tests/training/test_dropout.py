@@ -4,20 +4,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from compare import assert_close_gradients
 from numpy.typing import NDArray
+from pipeline import Pipeline
 from quick import quick
-from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
 from scenes import random_cloud
-from tiny import short, write_scene
+from tiny import short
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
-from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
@@ -25,13 +24,9 @@ from clsplat.optimisation.dropout import Thinning, thinning_of
 from clsplat.reference.dropout import factors, logit_grad, thinned_logits
 from clsplat.reference.render import forward, render_grad
 from clsplat.rendering.rasterizer import Rasterizer
-from clsplat.scenes.loading import load_scene
-from clsplat.scenes.scene import Scene
-from clsplat.stages.device_camera import padded_size
-from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
+from clsplat.stages.device_gaussians import upload_gaussians
 
 CONFIG = replace(short(iterations=40), thinning=0.5)
-GROUP_FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 THINNING = Thinning(0.3, (0x12345678, 0x9ABCDEF0))
 
 
@@ -77,13 +72,8 @@ def gradients_of(
     """The kernels' image (H, W, 3), counts of tiles and gradients."""
     rasterizer, held = Rasterizer(device), upload_gaussians(device, model)
     frame = rasterizer.forward(held, camera, np.zeros(3, np.float32), thinning=thinning)
-    (rows, stride), (height, width) = padded_size(camera.width, camera.height), (camera.height, camera.width)
-    image = frame.blended.image.get().reshape(3, rows, stride)[:, :height, :width].transpose(1, 2, 0)
-    tiles, planes = frame.projected.tile_counts.get(), np.zeros((3, rows, stride), np.float32)
-    planes[:, :height, :width] = d_image.transpose(2, 0, 1)
-    gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
-    rasterizer.backward(held, frame, upload(device, planes), gradients)
-    return image, tiles, download_gaussians(gradients)
+    run = Pipeline(rasterizer, held, camera, frame)
+    return run.image, frame.projected.tile_counts.get(), run.backward(d_image)[0]
 
 
 @pytest.mark.slow_in_groups
@@ -102,37 +92,12 @@ def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device
         gradients = render_grad(wanted, camera, d_image).parameters
     else:
         picture, _, found = gradients_of(shaped_device, wanted, camera, d_image, None)
-        gradients = {name: getattr(found, name).astype(np.float64) for name in GROUP_FIELDS}
+        gradients = {name: values.astype(np.float64) for name, values in found.arrays().items()}
     image, tiles, got = gradients_of(shaped_device, model, camera, d_image, THINNING)
     assert not tiles[by == 0].any() and tiles.any()
     assert np.abs(image - picture)[np.broadcast_to(steady, image.shape[:2])].max() < 1e-4
     gradients["opacity_logits"] = logit_grad(model.opacity_logits.astype(np.float64), by, gradients["opacity_logits"])
-    for name, values in gradients.items():
-        assert values.any()
-        difference = np.linalg.norm(getattr(got, name).astype(np.float64) - values)
-        assert difference <= 1e-4 * np.linalg.norm(values), name
-
-
-def test_stopping_and_going_on_gives_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-def test_it_changes_the_model(scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes) -> None:
-    assert model_bytes(scene, replace(CONFIG, thinning=0.0), default_device, tmp_path / "whole") != undisturbed
-
-
-@pytest.mark.slow
-def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
-    """Rows that come in parts are thinned by their place in the model."""
-    scene = load_scene(write_scene(tmp_path / "scene", points=False))
-    many = replace(CONFIG, random_points=1500, thinning=0.5)
-    check_in_less_memory(scene, many, default_device, tmp_path)
-
-
-def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
-    check_on_two_devices(scene, CONFIG, default_device, 12)
+    assert_close_gradients(got.arrays(), gradients, 1e-4)
 
 
 @pytest.mark.parametrize("rate", [-0.1, 0.95])

@@ -11,6 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from compare import assert_same_bits
+from held_out import change_photographs
 from tiny import CONFIG, trained_to
 
 from clsplat.api import train
@@ -28,7 +29,6 @@ from clsplat.scenes.analysis.visible_points import VisiblePoints
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.appearance import exposure as gains
 from clsplat.training.appearance.exposure import GainsOfAll
-from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.trainer import Trainer
 
 EXPOSED = replace(CONFIG, appearance="exposure")
@@ -81,14 +81,7 @@ def test_gains_that_points_tell_are_held_there(
 
 def exposed(monkeypatch: pytest.MonkeyPatch, logs: np.ndarray) -> None:
     """Let photographs be float, of these exposures (photographs,)."""
-    plain = ImageCache.load
-
-    def load(self: ImageCache, index: int, factor: float) -> np.ndarray:
-        image = plain(self, index, factor)
-        values = image / np.float32(255) if image.dtype == np.uint8 else image
-        return np.ascontiguousarray(values * np.float32(2.0 ** logs[index]), np.float32)
-
-    monkeypatch.setattr(ImageCache, "load", load)
+    change_photographs(monkeypatch, lambda index, values: values * np.float32(2.0 ** logs[index]))
 
 
 def test_exposures_that_are_known_change_no_bit(

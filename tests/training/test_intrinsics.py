@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compare import assert_close, assert_same_bits
-from same_bytes import interrupted, model_bytes
+from compare import assert_close, assert_same_arrays, assert_same_bits
+from same_bytes import outcome, stopped
 from test_trainer import host, quiet
 from tiny import HEIGHT, WIDTH, cameras, hidden_model, short, write_scene
 
@@ -117,9 +117,9 @@ def test_a_resumed_run_is_an_uninterrupted_one(
     scene: Scene, default_device: Device, tmp_path: Path, batch: int
 ) -> None:
     config = short(batch=batch, report=False)
-    whole = model_bytes(scene, config, default_device, tmp_path / "whole")
-    assert model_bytes(scene, config, default_device, tmp_path / "again") == whole
-    assert interrupted(scene, config, default_device, tmp_path / "stopped") == whole
+    whole = outcome(scene, config, default_device, tmp_path / "whole")
+    assert_same_arrays(outcome(scene, config, default_device, tmp_path / "again"), whole)
+    assert_same_arrays(stopped(10, scene, config, default_device, tmp_path / "stopped"), whole)
 
 
 def test_gradients_in_memory_change_no_bit(scene: Scene, default_device: Device) -> None:

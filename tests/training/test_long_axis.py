@@ -3,21 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
-from quick import quick
-from same_bytes import check_in_less_memory, model_bytes, stopped_at
 from scipy.spatial.transform import Rotation
-from tiny import run_steps, short, trained_to, write_scene
+from tiny import run_steps, short, trained_to
 
 from clsplat.device.context import Device
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.density.adaptive import long_halves
-from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 
 CONFIG = short(iterations=48, density={"growth": "budget", "max_gaussians": 120, "long_axis": True})
 
@@ -47,26 +40,6 @@ def test_extreme_opacities_stay_finite(logit: float) -> None:
     halves = long_halves(split | {"opacity_logits": np.array([logit], np.float32)})
     assert all(np.isfinite(array).all() for array in halves.values())
     assert halves["opacity_logits"][0] == pytest.approx(np.log(0.6) + logit if logit < 0 else np.log(1.5), rel=1e-6)
-
-
-@pytest.mark.parametrize("step", quick([7, 15, 16, 20, 40], 16, 40))
-def test_stopping_and_going_on_gives_the_same_bytes(
-    step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    assert stopped_at(step, scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-def test_by_capacity_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
-    assert model_bytes(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
-    scene = load_scene(write_scene(tmp_path / "scene", points=False))
-    many = replace(CONFIG, random_points=400, density=replace(CONFIG.density, max_gaussians=2500))
-    check_in_less_memory(scene, many, default_device, tmp_path)
 
 
 def test_it_grows_by_splits_alone(scene: Scene, default_device: Device) -> None:

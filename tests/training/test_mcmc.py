@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from quick import quick
-from same_bytes import check_on_two_devices, model_bytes, stopped_at
-from tiny import run_steps, short, trained_to, write_scene
+from tiny import short, trained_to
 
 from clsplat.api import train
 from clsplat.arrays import Float32
@@ -23,12 +21,10 @@ from clsplat.errors import ClsplatError
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.optimisation.step_noise import exploration_of
 from clsplat.runs.run import Run
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.density import SPLIT_GROUPS, RowPlan
 from clsplat.training.density.adaptive import long_halves
 from clsplat.training.density.mcmc import MAX_GAUSSIANS_PER_PLACE, Mcmc, draw, last_growth, shared, strongest, wanted
-from clsplat.training.step.speculative_steps import BY_CAPACITY_VARIABLE
 from clsplat.training.trainer import Trainer
 
 GROWN = 150
@@ -225,62 +221,3 @@ def test_it_grows_learns_and_leaves_nothing_undrawn(scene: Scene, default_device
     kept = trainer.gaussians().opacity_logits
     assert 0 < len(kept) < len(scene.points)
     assert kept.min() > -5.54
-
-
-@pytest.mark.parametrize("step", quick([7, 15, 16, 20, 40], 16, 40))
-def test_stopping_and_going_on_gives_the_same_bytes(
-    step: int, scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    assert stopped_at(step, scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.6, 0.5])
-def test_in_less_memory_the_same_bytes(share: float, default_device: Device, tmp_path: Path) -> None:
-    scene = load_scene(write_scene(tmp_path / "scene", points=False))
-    many = replace(CONFIG, random_points=400, density=replace(CONFIG.density, max_gaussians=2500))
-    free = default_device.with_memory_limit(None)
-    whole = model_bytes(scene, many, free, tmp_path / "free")
-    device = default_device.with_memory_limit(int(share * free.memory.peak))
-    run, pieces = Run.create(tmp_path / "limited", many), []
-    train(scene, many, device=device, run=run, on_plan=lambda plan: pieces.append(plan.pieces))
-    assert run.model_path.read_bytes() == whole
-    assert any(streamed for streamed, _ in pieces) or share > 0.5
-
-
-def test_by_capacity_the_same_bytes(scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step that has stopped adds no noise, and the one that is made again has its own."""
-    ends = []
-    for capacity in (False, True):
-        monkeypatch.setenv(BY_CAPACITY_VARIABLE, "01"[capacity])
-        trainer = Trainer(scene, CONFIG, default_device)
-        real = trainer.pending.room
-        monkeypatch.setattr(
-            trainer.pending,
-            "room",
-            lambda *size, real=real, trainer=trainer: (
-                (room := real(*size)) and (8 if trainer.step in (12, 31) else room)
-            ),
-        )
-        run_steps(CONFIG.iterations, trainer)
-        ends.append(trainer.checkpoint()[0])
-        assert (trainer.pending.redone > 0) == capacity
-    for name, values in ends[0].items():
-        assert_same_bits(ends[1][name], values, name)
-
-
-@pytest.mark.slow
-def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
-    check_on_two_devices(scene, CONFIG, default_device, CONFIG.iterations // 2)
-
-
-@pytest.mark.slow
-def test_every_driver_trains_alike(device: Device, default_device: Device, scene: Scene) -> None:
-    """In one shape of the kernels, to the bit."""
-    ends = []
-    for opened in (device, default_device):
-        trainer = Trainer(scene, replace(CONFIG, iterations=24), opened.with_shape(lanes=1, items=1))
-        run_steps(24, trainer)
-        ends.append(trainer.gaussians().arrays())
-    for name, values in ends[0].items():
-        assert_same_bits(ends[1][name], values, name)

@@ -9,15 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from same_bytes import check_in_less_memory, check_on_two_devices, interrupted, model_bytes
-from tiny import short, trained_to, write_scene
+from same_bytes import model_bytes
+from tiny import short, trained_to
 
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.optimisation.step_noise import NO_EXPLORATION, Exploration, exploration_of
-from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.training.density import StatisticsNeeds, Strategy
 from clsplat.training.density.choice import strategy_of
@@ -76,22 +75,6 @@ def test_a_strategy_of_your_own_keeps_the_penalty(scene: Scene, default_device: 
         assert_same_bits(own[name], values, name)
     for name in ("opacity_logits", "log_scales"):
         assert (own[name] < without[name]).mean() > 0.5, name
-
-
-def test_stopping_and_going_on_gives_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    assert interrupted(scene, CONFIG, default_device, tmp_path / "run") == undisturbed
-
-
-def test_a_batch_on_two_devices_has_the_bytes_of_one(scene: Scene, default_device: Device) -> None:
-    check_on_two_devices(scene, CONFIG, default_device, 12)
-
-
-@pytest.mark.slow
-def test_in_less_memory_the_same_bytes(default_device: Device, tmp_path: Path) -> None:
-    scene = load_scene(write_scene(tmp_path / "scene", points=False))
-    check_in_less_memory(scene, replace(CONFIG, random_points=1500), default_device, tmp_path)
 
 
 @pytest.mark.parametrize(

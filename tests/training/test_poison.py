@@ -10,20 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import assert_same_bits
-from depths import add_maps
 from golden_frames import checksums
-from pipeline import shaped
-from quick import quick
-from tiny import HEIGHT, WIDTH, short, trained_to, write_scene
+from tiny import short, trained_to, write_scene
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.gaussians import PARAMETER_GROUPS
-from clsplat.images.writing import write_image
 from clsplat.layouts.columns import SPLAT
-from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import allocate_gaussians
@@ -45,26 +40,6 @@ ROW = 5
 def many_points(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     """The same pictures, and random points to start from."""
     return load_scene(write_scene(tmp_path_factory.mktemp("tiny") / "scene", points=False))
-
-
-@pytest.fixture(scope="module")
-def masked(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """Pictures with alpha, and masks that leave out whole tiles and parts of others."""
-    folder = write_scene(tmp_path_factory.mktemp("tiny") / "scene", alpha=True)
-    mask = np.ones((HEIGHT, WIDTH, 3), np.float32)
-    mask[: HEIGHT // 2 + 3, : WIDTH // 2 + 5] = 0
-    (folder / "masks").mkdir()
-    for path in sorted((folder / "images").iterdir()):
-        write_image(folder / "masks" / path.name, mask)
-    return load_scene(folder, masks=MASKED.mask_use)
-
-
-@pytest.fixture(scope="module")
-def deep(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """Pictures with depth maps, which know nothing of a quarter of each."""
-    folder = write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-    add_maps(folder)
-    return with_depths(load_scene(folder), DEEP.depth_use)
 
 
 # Memory that nobody has written
@@ -94,72 +69,12 @@ def test_frames_and_gradients_in_poisoned_memory(device: Device, monkeypatch: py
     assert checksums(device) == wanted
 
 
-GROWING = {"iterations": 24, "warmup": (2, 4), "sh_degree_every": 8}
-EVERYTHING = short(**GROWING, density={"start": 5, "every": 4, "min_contribution": 0.05, "absolute_gradients": True})
-"""Growth of every array, contributions, two SH degrees, an opacity reset."""
-
-EXPLORING = short(
-    **GROWING,
-    density={"start": 5, "every": 4, "growth": "mcmc", "max_gaussians": 150, "max_screen_radius": 20.0},
-)
-"""Moves, growth, penalties and noise."""
-
-MASKED = short(iterations=24, warmup=(2, 4), masks="ignore", alpha="transparent")
-"""Masks at every size of the warm-up, and the alpha loss."""
-
-DEEP = short(iterations=16, warmup=(2, 4), depth="maps")
-"""Depth maps at every size of the warm-up."""
-
-REFINED = short(iterations=24, warmup=(2, 4), refine_poses=True, refine_lenses=True, thinning=0.2, penalty=0.02)
-"""Poses, lenses, thinning and penalties."""
-
-RAYS = short(iterations=16, warmup=(2, 4), perspective="rays", antialiased=True)
-"""Along rays, with the sampling filter."""
-
 MANY = short(
     iterations=32,
     random_points=400,
     density={"gradient_threshold": 1e-4, "max_gaussians": 2500, "opacity_reset_every": 0},
 )
 """Gaussians that become so many that memory is a matter of them and not of the planes."""
-
-
-HOW = {
-    "at once": EVERYTHING,
-    "mcmc": EXPLORING,
-    "exposure": short(iterations=16, warmup=(2, 4), appearance="exposure"),
-    "ppisp": short(iterations=16, warmup=(2, 4), appearance="ppisp"),
-    "grid": short(iterations=24, warmup=(2, 4), appearance="grid"),
-    "masked": MASKED,
-    "depths": DEEP,
-    "cameras": REFINED,
-    "rays": RAYS,
-    "in pieces": MANY,
-    "in vectors of 1": EVERYTHING,
-}
-
-
-@pytest.mark.parametrize("word", quick(["NaN", "garbage"], "NaN"))
-@pytest.mark.parametrize("how", quick(list(HOW), "at once", "grid", "depths"))
-def test_training_in_poisoned_memory(
-    request: pytest.FixtureRequest, default_device: Device, monkeypatch: pytest.MonkeyPatch, word: str, how: str
-) -> None:
-    device = shaped(default_device, 1, 64) if how == "in vectors of 1" else default_device
-    pieces = how == "in pieces"
-    config = HOW[how]
-    pictures = {"masked": "masked", "depths": "deep", "in pieces": "many_points"}.get(how, "scene")
-    scene = request.getfixturevalue(pictures)
-    found = []
-    for value in ("", WORDS[word]):
-        monkeypatch.setenv("CLSPLAT_POISON", value)
-        memory = little_memory(scene, default_device) if pieces else device
-        trainer = trained_to(config.iterations, scene, config, memory)
-        assert trainer.monitor.latest is None
-        assert trainer.plan.streamed == pieces
-        found.append(trainer.checkpoint()[0])
-    assert found[0].keys() == found[1].keys()
-    for name, array in found[0].items():
-        assert_same_bits(found[1][name], array, name)
 
 
 def little_memory(scene: Scene, device: Device) -> Device:
@@ -238,17 +153,6 @@ def test_broken_parameters_are_not_drawn_and_removed(
         assert_well(poisoned)
 
 
-@pytest.mark.parametrize("group", PARAMETER_GROUPS)
-def test_garbage_in_parameters_spoils_nothing_else(scene: Scene, default_device: Device, group: str) -> None:
-    for value in GARBAGE:
-        trainer = started(scene, default_device)
-        put(trainer.parameters[group], value)
-        for _ in range(3):
-            assert np.isfinite(trainer.train_step().read()).all(), value
-        assert trainer.parameters.count >= 39
-        assert_well(trainer)
-
-
 def poison_gradients(trainer: Trainer, monkeypatch: pytest.MonkeyPatch, group: str, value: float) -> None:
     """In the next step alone, after the backward pass, with gradients in memory."""
     model = trainer.parameters
@@ -318,16 +222,18 @@ def test_broken_moments_begin_again(scene: Scene, default_device: Device, which:
 
 
 @pytest.mark.parametrize("group", PARAMETER_GROUPS)
-@pytest.mark.parametrize("which", ["first", "second"])
-def test_garbage_in_moments_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
+@pytest.mark.parametrize("which", ["parameters", "first", "second"])
+def test_garbage_spoils_nothing_else(scene: Scene, default_device: Device, which: str, group: str) -> None:
     for value in GARBAGE:
         poisoned, plain = started(scene, default_device), started(scene, default_device)
         put(getattr(poisoned, which)[group], value)
-        poisoned.train_step()
+        assert np.isfinite(poisoned.train_step().read()).all(), value
         plain.train_step()
-        assert_others_alike(poisoned, plain)
+        if which != "parameters":  # garbage there is drawn, and has its place in the others' gradients
+            assert_others_alike(poisoned, plain)
         for _ in range(3):
             assert np.isfinite(poisoned.train_step().read()).all(), value
+        assert poisoned.parameters.count >= 39
         assert_well(poisoned)
 
 

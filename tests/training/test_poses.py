@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import Capture, no_warnings
-from same_bytes import model_bytes
-from tiny import run_steps, short, trained_to, write_scene
+from tiny import run_steps, short, trained_to
 
 from clsplat.api import train
 from clsplat.camera import Camera
@@ -32,16 +31,6 @@ from clsplat.training.held_out_alignment import aligned
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, refine_poses=True)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-
-
-@pytest.fixture(scope="module")
-def scene(folder: Path) -> Scene:
-    return load_scene(folder)
 
 
 def disturbed(scene: Scene, degrees: float, shift: float) -> Scene:
@@ -100,12 +89,6 @@ def test_a_held_out_view_is_aligned(scene: Scene, default_device: Device) -> Non
     assert all(still.values()), still
     assert pixels_off(away.camera, view.camera, scene.points) > 1
     assert pixels_off(found, view.camera, scene.points) < 0.33
-
-
-def test_moving_poses_make_another_model(
-    scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes
-) -> None:
-    assert model_bytes(scene, replace(CONFIG, refine_poses=False), default_device, tmp_path) != undisturbed
 
 
 def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Device, tmp_path: Path) -> None:

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from same_bytes import model_bytes
-from tiny import short, write_scene
+from tiny import short
 
 from clsplat.api import train
 from clsplat.cli.main import main as clsplat
@@ -28,16 +27,6 @@ from clsplat.training.cameras.intrinsics import RefinedLenses
 from clsplat.training.trainer import Trainer
 
 CONFIG = short(iterations=40, refine_lenses=True)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_scene(tmp_path_factory.mktemp("tiny") / "scene")
-
-
-@pytest.fixture(scope="module")
-def scene(folder: Path) -> Scene:
-    return load_scene(folder)
 
 
 def disturbed(scene: Scene, log: float, x: float, y: float) -> Scene:
@@ -63,15 +52,6 @@ def test_a_lens_comes_back(scene: Scene, default_device: Device) -> None:
         scores[refines] = float(np.mean(found))
     assert -0.03 < trainer.cameras.lenses.changes[0, 1] < -0.01
     assert scores[True] > scores[False] + 1
-
-
-def test_with_poses_too(scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes) -> None:
-    both = model_bytes(scene, replace(CONFIG, refine_poses=True), default_device, tmp_path / "both")
-    assert both != undisturbed
-    poses = model_bytes(
-        scene, replace(CONFIG, refine_poses=True, refine_lenses=False), default_device, tmp_path / "poses"
-    )
-    assert both != poses
 
 
 def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Device, tmp_path: Path) -> None:

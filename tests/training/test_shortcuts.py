@@ -4,23 +4,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny import CONFIG, run_steps, short
+from tiny import run_steps, short
 
-from clsplat.api import train
 from clsplat.config.training import OptimiserConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
-from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.start.initialise import from_points
 from clsplat.stages.device_gaussians import download_gaussians
 from clsplat.training.trainer import Trainer
-
-ALL = replace(CONFIG, optimiser=replace(CONFIG.optimiser, sparse=True, sh_rest_every=3))
 
 
 def with_one_behind(scene: Scene) -> Gaussians:
@@ -62,17 +57,3 @@ def test_sh_rest_moves_in_its_steps_alone(scene: Scene, default_device: Device) 
         kept[:, : before[0].shape[1]] = before[0]
         assert np.array_equal(after[0], kept) == (step % 3 != 0)
         assert not np.array_equal(after[1], before[1]), "the constant moves in every step"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("step", [1, 4, 15, 20, 33])
-def test_stopping_and_going_on_gives_the_same_bytes(
-    scene: Scene, default_device: Device, tmp_path: Path, step: int
-) -> None:
-    straight = Run.create(tmp_path / "straight", ALL)
-    train(scene, ALL, device=default_device, run=straight)
-    part = replace(ALL, iterations=step)
-    train(scene, part, device=default_device, run=Run.create(tmp_path / "run", part))
-    run = Run.create(tmp_path / "run", ALL, resume=True)
-    train(scene, ALL, device=default_device, run=run, resume=True)
-    assert run.model_path.read_bytes() == straight.model_path.read_bytes()

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +12,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from calls import Capture, error_line, no_warnings, warnings_of
+from calls import Capture, error_line, no_warnings, python, warnings_of
 from tiny import FEW, short, write_scene
 
 import clsplat
@@ -34,9 +32,7 @@ from clsplat.training.preparation import late_settings
 
 
 def test_the_module_of_the_command_line_is_one() -> None:
-    line = [sys.executable, "-m", "clsplat.cli", "--version"]
-    done = subprocess.run(line, capture_output=True, text=True, check=False)
-    assert done.stdout == f"clsplat {clsplat.__version__}\n"
+    assert python("-m", "clsplat.cli", "--version").stdout == f"clsplat {clsplat.__version__}\n"
 
 
 @pytest.mark.parametrize("value", ['""', "5", "[]"])

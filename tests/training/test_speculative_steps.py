@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 import pytest
-from compare import assert_same_bits
-from numpy.typing import NDArray
 from quick import quick
+from same_bytes import assert_alike, stepped
 from tiny import run_steps, short, trained_to
 
 from clsplat.bench import stages as bench_stages
@@ -30,43 +28,14 @@ CONFIG = short(density={"min_contribution": 0.01})
 """Densifies and prunes after steps 15, 20, 25, ...; resets opacities after 20; contributions make an epoch matter."""
 
 
-Result = tuple[dict[str, NDArray[Any]], list[tuple[float, float]], Trainer]
-
-
-def trained(
-    scene: Scene,
-    device: Device,
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    capacity: bool,
-    too_small: Collection[int] = (),
-    before: Callable[[Trainer], None] = lambda _trainer: None,
-) -> Result:
-    """Everything that a checkpoint has after CONFIG, the losses that were read, and the trainer. too_small: the steps
-    whose room is for 8 pairs, where they have any; before: called before each step."""
-    monkeypatch.setenv(BY_CAPACITY_VARIABLE, "01"[capacity])
-    trainer, losses = Trainer(scene, CONFIG, device), []
-    real = trainer.pending.room
-    monkeypatch.setattr(
-        trainer.pending, "room", lambda *size: (room := real(*size)) and (8 if trainer.step in too_small else room)
-    )
-    for step in range(1, CONFIG.iterations + 1):
-        before(trainer)
-        result = trainer.train_step(reads_loss=step % 10 == 0)
-        if step % 10 == 0 or step == 17:
-            losses.append(result.read())
-    return trainer.checkpoint()[0], losses, trainer
-
-
-def assert_alike(one: Result, other: Result) -> None:
-    assert one[0].keys() == other[0].keys()
-    for name, values in one[0].items():
-        assert_same_bits(values, other[0][name], name)
-    assert one[1] == other[1]
-    assert list(map(str, one[2].monitor.incidents)) == list(map(str, other[2].monitor.incidents))
-
-
-TOO_SMALL = {"none": (), "within": (7,), "twice": (12, 13), "before density control": (15, 25), "last": (40,)}
+TOO_SMALL = {
+    "none": (),
+    "within": (7,),
+    "twice": (12, 13),
+    "before density control": (15, 25),
+    "last": (40,),
+    "in groups": (16, 31),
+}
 
 
 @pytest.mark.slow
@@ -74,20 +43,12 @@ TOO_SMALL = {"none": (), "within": (7,), "twice": (12, 13), "before density cont
 def test_trained_by_capacity_is_trained_with_exact_counts(
     device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch, steps: str
 ) -> None:
-    exact = trained(scene, device, monkeypatch, capacity=False)
-    other = trained(scene, device, monkeypatch, capacity=True, too_small=TOO_SMALL[steps])
+    device = device.with_shape(lanes=1, items=64) if steps == "in groups" else device
+    exact = stepped(scene, CONFIG, device, monkeypatch, capacity=False)
+    other = stepped(scene, CONFIG, device, monkeypatch, capacity=True, too_small=TOO_SMALL[steps])
     assert exact[2].pending.redone == 0
     assert (other[2].pending.redone > 0) == (steps != "none")
     assert_alike(exact, other)
-
-
-@pytest.mark.slow
-def test_a_group_s_shape_has_the_same_bytes_by_capacity(
-    device: Device, scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    device = device.with_shape(lanes=1, items=64)
-    exact = trained(scene, device, monkeypatch, capacity=False)
-    assert_alike(exact, trained(scene, device, monkeypatch, capacity=True, too_small=(16, 31)))
 
 
 @pytest.mark.parametrize("kind", ["parameters", "first"])
@@ -102,7 +63,7 @@ def test_trouble_is_mended_and_told_as_with_exact_counts(
             values[5, 0] = np.nan
             array.set(values)
 
-    results = [trained(scene, default_device, monkeypatch, capacity=on, before=spoil) for on in (False, True)]
+    results = [stepped(scene, CONFIG, default_device, monkeypatch, capacity=on, before=spoil) for on in (False, True)]
     assert_alike(*results)
     assert len(results[1][2].monitor.incidents) == 1
     assert results[1][2].pending.redone == 2

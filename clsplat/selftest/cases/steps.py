@@ -39,7 +39,7 @@ def _random_step(rng: Generator, count: int) -> Inputs:
     visible = (rng.random(count) < 0.5) | (np.arange(count) >= 2 * count // 3)  # whole vectors among them
     visible[: count // 3] = False
     made: dict[str, Arrays] = {name: {} for name in ADAM_ENDS}
-    for group, shape in group_shapes(count, 4).items():
+    for group, shape in group_shapes(count, int(rng.choice([4, 16]))).items():
         size = 10 ** rng.uniform(-15, 6, shape)
         values = {
             "parameters": rng.standard_normal(shape) * rng.choice([0.0, 1e-2, 1.0]),
