@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import no_warnings
+from calls import no_warnings, warned
 from models import random_gaussians
 
 from clsplat.cli.main import main
@@ -38,8 +38,7 @@ def test_a_warning_of_a_reader_reaches_the_command_line(tmp_path: Path, capsys: 
 
 
 def test_a_warning_is_one_line() -> None:
-    with pytest.warns(UserWarning, match=r"^a\\nb\\x1b$"):
-        warn("a\nb\x1b")
+    warned(r"^a\\nb\\x1b$", warn, "a\nb\x1b")
 
 
 def test_a_scene_gathers_what_its_readers_warn_of(tmp_path: Path) -> None:
