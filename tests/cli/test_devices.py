@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
-from calls import error_line
+from calls import error_line, printed
 
 from clsplat.bench.workload import synthetic
 from clsplat.cli.main import main
@@ -18,8 +18,7 @@ Capture = pytest.CaptureFixture[str]
 
 
 def listed(capsys: Capture, *flags: str) -> list[dict[str, object]]:
-    assert main(["devices", "--json", *flags]) == 0
-    devices: list[dict[str, object]] = json.loads(capsys.readouterr().out)
+    devices: list[dict[str, object]] = json.loads(printed(capsys, ["devices", "--json", *flags]).out)
     return devices
 
 
@@ -41,8 +40,7 @@ def test_it_is_the_one_that_the_other_verbs_take(capsys: Capture) -> None:
 
 
 def test_the_table_has_one_line(capsys: Capture) -> None:
-    assert main(["devices", "--device", "0"]) == 0
-    header, line = capsys.readouterr().out.splitlines()
+    header, line = printed(capsys, ["devices", "--device", "0"]).out.splitlines()
     assert header.split()[:2] == ["name", "kind"]
     assert line.startswith("0 ")
 
@@ -54,8 +52,7 @@ def test_the_environment_does_not_shorten_the_list(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.smoke
 def test_an_unknown_one(capsys: Capture) -> None:
-    assert main(["devices", "--device", "abacus"]) == 2
-    captured = capsys.readouterr()
+    captured = printed(capsys, ["devices", "--device", "abacus"], status=2)
     assert captured.out == ""
     assert captured.err.startswith("clsplat: error: --device abacus: no such device, expected ")
     assert captured.err.count("\n") == 1
