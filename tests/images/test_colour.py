@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from calls import refuses
 from scenes import one
 
 from clsplat.config.pictures import ColourConfig, Encoding
@@ -118,8 +119,7 @@ def test_a_space_that_is_not_there() -> None:
         Colours(ColourConfig(colorspace="ACEScq"))
     with pytest.raises(InputError, match=r"^--model-colorspace zzz: .*; it has .+, .+, .+ and \d+ more"):
         Colours(ColourConfig(model_colorspace="zzz"))
-    with pytest.raises(InputError, match=r"^the model's colour space sRBG: .*sRGB"):
-        Colours(recorded="sRBG")
+    refuses(r"^the model's colour space sRBG: .*sRGB", Colours, recorded="sRBG")
 
 
 def test_a_configuration_that_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
