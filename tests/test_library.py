@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from calls import refuses
 
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -51,7 +52,6 @@ def test_arrays(default_device: Device, name: str, value: Any, message: str) -> 
 )
 def test_cameras(default_device: Device, changes: dict[str, Any], message: str) -> None:
     gaussians, camera = scenes.random_cloud(10, 1, 20, 16, degree=0)
-    with pytest.raises(InputError, match=f"camera: {message}"):
-        Renderer(default_device).render(gaussians, replace(camera, **changes))
+    refuses(f"camera: {message}", Renderer(default_device).render, gaussians, replace(camera, **changes))
     with pytest.raises(InputError, match=f"camera: {message}"):
         Renderer(default_device).render_channels(gaussians, camera, after=replace(camera, **changes))

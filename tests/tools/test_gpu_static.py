@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -148,41 +149,24 @@ def test_loops_of_amd() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("kind_of", "kind", "names"),
     [
-        ("FFMA", "fp32"),
-        ("FSETP.GEU.AND", "fp32"),
-        ("IMAD.MOV.U32", "integer"),
-        ("I2FP.F32.S32", "other"),
-        ("LDL.64", "shared"),
-        ("ATOMS.MAX", "shared"),
-        ("STG.E.128", "global"),
-        ("LDGSTS.E", "other"),
-        ("BAR.SYNC.DEFER_BLOCKING", "control"),
-        ("ULDC.64", "other"),
-        ("VOTE.ANY", "other"),
-        ("UISETP.NE.AND", "integer"),
+        (sass_kind, "fp32", "FFMA FSETP.GEU.AND"),
+        (sass_kind, "integer", "IMAD.MOV.U32 UISETP.NE.AND"),
+        (sass_kind, "other", "I2FP.F32.S32 LDGSTS.E ULDC.64 VOTE.ANY"),
+        (sass_kind, "shared", "LDL.64 ATOMS.MAX"),
+        (sass_kind, "global", "STG.E.128"),
+        (sass_kind, "control", "BAR.SYNC.DEFER_BLOCKING"),
+        (gcn_kind, "fp32", "v_dual_fmac_f32 v_cmp_lt_f32_e32"),
+        (gcn_kind, "integer", "v_cndmask_b32_e32"),
+        (gcn_kind, "shared", "ds_load_b128 scratch_store_b32"),
+        (gcn_kind, "control", "s_delay_alu"),
+        (gcn_kind, "scalar", "s_and_b32"),
+        (gcn_kind, "other", "v_cvt_f32_i32_e32"),
     ],
 )
-def test_kinds_of_sass(name: str, kind: str) -> None:
-    assert sass_kind(name) == kind
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("v_dual_fmac_f32", "fp32"),
-        ("v_cmp_lt_f32_e32", "fp32"),
-        ("v_cndmask_b32_e32", "integer"),
-        ("ds_load_b128", "shared"),
-        ("scratch_store_b32", "shared"),
-        ("s_delay_alu", "control"),
-        ("s_and_b32", "scalar"),
-        ("v_cvt_f32_i32_e32", "other"),
-    ],
-)
-def test_kinds_of_amd(name: str, kind: str) -> None:
-    assert gcn_kind(name) == kind
+def test_kinds_of_instructions(kind_of: Callable[[str], str], kind: str, names: str) -> None:
+    assert {name: kind_of(name) for name in names.split()} == dict.fromkeys(names.split(), kind)
 
 
 def test_what_ptxas_says() -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from calls import ran
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="tools/ci/machines.py is for systems with process groups")
@@ -97,10 +98,8 @@ def test_a_home_is_read_only_without_mounts_too(tmp_path: Path) -> None:
 def test_one_that_fails_fails_the_run_and_the_others_are_run(capsys: pytest.CaptureFixture[str]) -> None:
     good = Machine("good", "passes", (python("print('fine')"),))
     bad = Machine("bad", "fails", (python("import sys; sys.exit('the trouble')"), python("print('never')")))
-    assert run_all([good]) == 0
-    assert "1 passed, 0 failed, 0 not run" in capsys.readouterr().out
-    assert run_all([bad, good], jobs=2) == 1
-    printed = capsys.readouterr().out
+    assert "1 passed, 0 failed, 0 not run" in ran(capsys, run_all, [good]).out
+    printed = ran(capsys, run_all, [bad, good], jobs=2, status=1).out
     assert "bad: FAILED: it: exit status 1, expected 0\n    the trouble\n" in printed
     assert "1 passed, 1 failed, 0 not run" in printed
     assert "never" not in printed
