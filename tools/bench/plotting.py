@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plots of the tools: training, growth and errors. Legible at a width of 800 pixels, like the plots of `bench`."""
+"""Plots of the tools: growth, errors, parts of a step. Legible at a width of 800 pixels, like the plots of `bench`."""
 
 from __future__ import annotations
 
@@ -39,20 +39,6 @@ class Panel:
     y: str
     measured: Mapping[str, Points]
     fitted: Mapping[str, Points] = field(default_factory=dict)
-
-
-def plot_training(path: Path, runs: Mapping[str, Points], title: str, time: str = "seconds of training") -> None:
-    """Plot each run, keyed by name: (seconds of training, held-out PSNR in dB). time: label for the seconds."""
-    figure = _figure(5.2, title)
-    axes = figure.subplots()
-    for number, (name, points) in enumerate(runs.items()):
-        axes.plot(*zip(*sorted(points), strict=True), **_style(number), markersize=6, label=name)
-    axes.set_xlabel(time, fontsize=FONT_SIZE_POINTS)
-    axes.set_ylabel("PSNR of the held-out views, dB", fontsize=FONT_SIZE_POINTS)
-    axes.tick_params(labelsize=FONT_SIZE_POINTS)
-    axes.grid(alpha=0.3)
-    _legend_below(figure, axes, columns=4 if max(map(len, runs)) < 20 else 2)
-    save_figure(figure, path)
 
 
 def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
