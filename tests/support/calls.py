@@ -49,6 +49,12 @@ def no_warnings() -> Iterator[None]:
         yield
 
 
+def only(items: Iterable[Any]) -> Any:
+    """The one item that there is."""
+    (item,) = items
+    return item
+
+
 def peak_of(work: Callable[[], object]) -> int:
     """Bytes that Python and NumPy have at most during a piece of work."""
     tracemalloc.start()
@@ -87,13 +93,15 @@ def command(*arguments: str) -> subprocess.CompletedProcess[str]:
     return python("-m", "clsplat", *arguments, timeout=120)
 
 
-def refuses(match: str, call: Callable[..., object], *arguments: Any, **options: Any) -> str:
-    """The message of the InputError that the call raises, which is one line; fails unless it matches."""
-    with pytest.raises(InputError, match=match) as caught:
+def refuses(
+    match: str, call: Callable[..., object], *arguments: Any, error: type[Exception] = InputError, **options: Any
+) -> str:
+    """The message of the error that the call raises, of an InputError one line; fails unless it matches."""
+    with pytest.raises(error, match=match) as caught:
         call(*arguments, **options)
     message = str(caught.value)
     del caught  # else the frames of the call, and the files that they have open, live until garbage is collected
-    assert "\n" not in message
+    assert error is not InputError or "\n" not in message
     return message
 
 
