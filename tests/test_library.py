@@ -31,8 +31,7 @@ from clsplat.rendering.renderer import Renderer
 def test_arrays(default_device: Device, name: str, value: Any, message: str) -> None:
     gaussians, camera = scenes.random_cloud(100, 1, 20, 16, degree=0)
     setattr(gaussians, name, value)
-    with pytest.raises(ValueError, match=message):
-        Renderer(default_device).render(gaussians, camera)
+    refuses(message, Renderer(default_device).render, gaussians, camera, error=ValueError)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,11 @@ import re
 from pathlib import Path
 
 import pytest
-from calls import error_line, printed
+from calls import Capture, error_line, only, printed
 
 from clsplat.bench.workload import synthetic
 from clsplat.cli.main import main
 from clsplat.device.context import list_devices, open_device
-
-Capture = pytest.CaptureFixture[str]
 
 
 def listed(capsys: Capture, *flags: str) -> list[dict[str, object]]:
@@ -27,8 +25,7 @@ def test_each_by_its_index_and_by_its_version(capsys: Capture) -> None:
     assert len(everything) == len(list_devices())
     for device in everything:
         assert listed(capsys, "--device", str(device["index"])) == [device]
-        (found,) = listed(capsys, "--device", str(device["version"]))
-        assert found["version"] == device["version"]
+        assert only(listed(capsys, "--device", str(device["version"])))["version"] == device["version"]
 
 
 @pytest.mark.smoke

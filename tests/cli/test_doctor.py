@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from calls import printed, rejected
+from calls import Capture, printed, rejected
 
 from clsplat.device.context import list_devices
 from clsplat.device.drivers import diagnostics
-
-Capture = pytest.CaptureFixture[str]
 
 
 @pytest.mark.smoke

@@ -57,9 +57,7 @@ def test_names_that_windows_refuses(name: str) -> None:
     assert name_trouble(name, windows=True)
 
 
-@pytest.mark.parametrize(
-    "name", ["a", "sub/a.b c", "console", "null", "com", "com10", "a.con", "日本", ".a", "a,b;c=d+e"]
-)
+@pytest.mark.parametrize("name", TAKEN)
 def test_names_that_every_system_takes(name: str) -> None:
     assert name_trouble(name, windows=True) is None
     assert name_trouble(name, windows=False) is None

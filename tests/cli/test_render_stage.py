@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line, printed
+from calls import Capture, error_line, only, printed
 from headers import exr_attributes
 from needs import require
 from tiny import HEIGHT, WIDTH, hidden_model
@@ -220,11 +220,9 @@ def test_one_warning_of_what_is_not_applied(model: Path, tmp_path: Path, capsys:
     assert line.endswith(f"{stage}: not applied: exposure (1), dataWindowNDC (-0.25, 0, 1, 1)")
     (line,) = warnings_of(capsys, model, stage, "--region 0,0,9,9 --samples 3")
     assert line.endswith(": not applied: exposure (1)")
-    (line,) = warnings_of(capsys, model, stage, "--deep --region 0,0,9,9")
-    assert line.endswith(": not applied: exposure (1)")
+    assert only(warnings_of(capsys, model, stage, "--deep --region 0,0,9,9")).endswith(": not applied: exposure (1)")
     unfocused = write_stage(tmp_path / "unfocused.usda", "float fStop = 1")
-    (line,) = warnings_of(capsys, model, unfocused)
-    assert line.endswith(": not applied: fStop (1)")
+    assert only(warnings_of(capsys, model, unfocused)).endswith(": not applied: fStop (1)")
     assert warnings_of(capsys, model, unfocused, "--focus 3") == []
     assert warnings_of(capsys, model, unfocused, "--aperture 0") == []
 

@@ -14,6 +14,7 @@ from compare import assert_same_bits
 from needs import require
 from rendered import pixels_of
 from tiny import HEIGHT, WIDTH, hidden_model
+from usd_stages import saved, stage_with_camera
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
@@ -63,15 +64,8 @@ def shot(folder: Path) -> Usd.Stage:
     """A stage with a camera, and under /Asset the model of another file by reference."""
     usd.write(folder / "asset" / "model.usdc", MODEL)
     (folder / "shots").mkdir()
-    stage = Usd.Stage.CreateNew(str(folder / "shots" / "shot.usda"))
+    stage = stage_with_camera(folder / "shots" / "shot.usda")
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
-    stage.SetStartTimeCode(1)
-    stage.SetEndTimeCode(5)
-    camera = UsdGeom.Camera.Define(stage, "/Camera")
-    camera.CreateHorizontalApertureAttr(20.0)
-    camera.CreateVerticalApertureAttr(20.0 * HEIGHT / WIDTH)
-    camera.CreateFocalLengthAttr(20.0)
-    UsdGeom.Xformable(camera).AddTranslateOp().Set(Gf.Vec3d(0, 0, 5))
     asset = UsdGeom.Xform.Define(stage, "/Asset").GetPrim()
     asset.GetReferences().AddReference("../asset/model.usdc")
     return stage
@@ -88,11 +82,6 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Usd.Stage:
 CAMERA = Camera(
     WIDTH, HEIGHT, float(WIDTH), float(WIDTH), WIDTH / 2, HEIGHT / 2, np.diag([1.0, -1, -1]), np.array([0, 0, 5.0])
 )
-
-
-def saved(stage: Usd.Stage) -> str:
-    stage.GetRootLayer().Save()
-    return str(stage.GetRootLayer().realPath)
 
 
 def render(stage: Usd.Stage | str, out: Path, flags: str = "", cameras: str = "") -> int:

@@ -155,8 +155,7 @@ def test_what_a_model_records(tmp_path: Path) -> None:
     assert recorded_space(path) == SRGB
     path.write_bytes(plain.replace(b"element vertex", b"obj_info clsplat colorspace ACEScg\nelement vertex", 1))
     assert recorded_space(path) == "ACEScg"
-    with pytest.raises(ValueError, match="expected one line"):
-        gaussians.save(path, comments=["a\nelement vertex 7"])
+    refuses("expected one line", gaussians.save, path, comments=["a\nelement vertex 7"], error=ValueError)
 
 
 def test_what_photos_are_in() -> None:

@@ -259,8 +259,7 @@ def test_nowhere_to_write(tmp_path: Path) -> None:
     layers = {"rgb": np.zeros((4, 4, 3), np.float32)}
     refuses("no such folder to write", write_channels, tmp_path / "none" / "a.exr", layers)
     (tmp_path / "a.exr").mkdir()
-    with pytest.raises(ClsplatError, match=r"a\.exr: cannot be written"):
-        write_channels(tmp_path / "a.exr", layers)
+    refuses(r"a\.exr: cannot be written", write_channels, tmp_path / "a.exr", layers, error=ClsplatError)
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 

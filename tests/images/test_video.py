@@ -195,12 +195,10 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
         video.add(frame_planes(made[0]))
         raise KeyboardInterrupt
     refuses("the video has no frames", write_video, path, [])
-    with pytest.raises(ValueError, match=r"frame is 32x16, expected 32x32"):
-        write_video(path, [made[0], made[0][:16]])
+    refuses(r"frame is 32x16, expected 32x32", write_video, path, [made[0], made[0][:16]], error=ValueError)
     assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
     (tmp_path / "folder.mp4").mkdir()
-    with pytest.raises(ClsplatError, match=r"folder\.mp4: cannot be written"):
-        write_video(tmp_path / "folder.mp4", made)
+    refuses(r"folder\.mp4: cannot be written", write_video, tmp_path / "folder.mp4", made, error=ClsplatError)
 
 
 def test_what_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

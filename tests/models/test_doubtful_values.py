@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture, no_warnings, printed, warnings_of
+from calls import Capture, no_warnings, only, printed, warnings_of
 from models import random_gaussians
 from splats import lopsided
 
@@ -65,8 +65,7 @@ def test_levels_of_any_white(tmp_path: Path, white: int, dark: bool) -> None:
     levels = np.rint(RNG.uniform(0, (0.66 if dark else 1) * white, 400))
     model.opacity_logits = levels.astype(np.float32)
     model.save(path)
-    (text,) = warnings_of(lambda: formats.load(path))
-    assert ("as percentages do" if white == 100 else "as levels do") in text
+    assert ("as percentages do" if white == 100 else "as levels do") in only(warnings_of(lambda: formats.load(path)))
     right = formats.load(path, activated="opacities")
     np.testing.assert_allclose(values.opacities(right.opacity_logits), levels / white, atol=1e-6)  # float32's
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import printed, refuses, warned
+from calls import Capture, printed, refuses, warned
 from models import assert_equal, random_gaussians
 from needs import SCENES, require
 from scipy.spatial.transform import Rotation
@@ -298,9 +298,7 @@ def test_the_table_is_sound() -> None:
         assert "http" in (sys.modules[row.read.__module__].__doc__ or ""), f"{row.name} cites no specification"
 
 
-def test_a_format_is_one_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_format_is_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     """A row in the table is all that load, save, info and convert want to know a format."""
 
     def write(path: Path, gaussians: Gaussians) -> None:

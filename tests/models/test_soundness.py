@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import no_warnings, refuses, warned, warnings_of
+from calls import no_warnings, only, refuses, warned, warnings_of
 from models import assert_equal, random_gaussians
 from needs import require
 from splats import lopsided, with_origin
@@ -338,8 +338,7 @@ def test_a_kernel_that_is_not_known_is_drawn_as_an_ellipse(tmp_path: Path, kerne
     document["meshes"][0]["primitives"][0]["extensions"][gltf.GAUSSIAN_EXTENSION]["kernel"] = kernel
     path.write_text(json.dumps(document))
     read, texts = told(path)
-    (text,) = texts
-    assert text.startswith(
+    assert only(texts).startswith(
         f"primitive 0 of node 0 has the kernel {str(kernel)!r}, expected ellipse; it is drawn as one"
     )
     assert_equal(read, wanted)

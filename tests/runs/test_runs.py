@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
-from calls import no_warnings, refuses, warned
+from calls import Capture, no_warnings, refuses, warned
 from models import random_gaussians
 
 import clsplat
@@ -78,9 +78,7 @@ def test_whole_numbers_serve_as_floats_and_missing_keys_as_defaults(tmp_path: Pa
 
 
 @pytest.mark.parametrize("angle", [0.0, 2.5])
-def test_a_setting_of_an_earlier_version_still_loads(
-    angle: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_setting_of_an_earlier_version_still_loads(angle: float, tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "config.toml"
     path.write_text(f'clsplat = "1"\n[train]\niterations = 9\n[train.rasterizer]\nsh_angle = {angle}\n')
     verb = parse(["train", "S", "-o", str(tmp_path), "--resume"])
@@ -220,8 +218,7 @@ def test_what_the_model_was_trained_for(tmp_path: Path) -> None:
 
 def test_numbers_that_are_not_finite_stop_the_run(tmp_path: Path) -> None:
     run = Run.create(tmp_path, CONFIG)
-    with pytest.raises(ClsplatError, match="diverged at step 3"):
-        run.append_metrics({"step": 3, "loss": float("nan")})
+    refuses("diverged at step 3", run.append_metrics, {"step": 3, "loss": float("nan")}, error=ClsplatError)
     assert run.read_metrics() == []
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import refuses, warned
+from calls import only, refuses, warned
 from PIL import Image as Pillow
 from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 
@@ -167,36 +167,28 @@ def masks_at(scene: Path, *places: str) -> None:
         write_image(scene / place, mask_of(30, 20))
 
 
+MASKS = {
+    "IMG_1.jpg": (
+        *("masks/IMG_1.jpg.mask.png", "mask/IMG_1.jpg_mask.png", ".mask/IMG_1.jpg.mask.png", "images/.mask/IMG_1.png"),
+        *(".masks/IMG_1.jpg.png", "Masks/IMG_1.png", "images/IMG_1.mask.png", "images/IMG_1_mask.png"),
+        *("images/IMG_1.jpg.mask.png", "images/IMG_1.jpg.png", "masks/IMG_1-mask.png", "images/IMG_1-mask.png"),
+    ),
+    "IMG_1.JPG": ("masks/IMG_1.jpg.PNG", "masks/img_1.jpg.mask.png", "masks/mask-IMG_1.png"),
+    "IMG_1.png": ("masks/IMG_1.jpg.mask.png",),
+    "a/IMG_1.jpg": (
+        *("masks/IMG_1.png", "images/a/.mask/IMG_1.jpg.mask.png", "images/a/masks/IMG_1.png"),
+        "images/a/IMG_1.jpg-mask.png",
+    ),
+    "a/b/IMG_1.jpg": ("masks/IMG_1.jpg.mask.png",),
+    "a/IMG_1.JPG": ("images/a/img_1_MASK.PNG",),
+}
+"""Masks by their photograph."""
+
+
 @pytest.mark.brings(
     "RealityScan, Brush, LichtFeld", "masks as `IMG.jpg.mask.png`, in `.mask/`, flat, beside the picture", "masks"
 )
-@pytest.mark.parametrize(
-    ("photo", "mask"),
-    [
-        ("IMG_1.jpg", "masks/IMG_1.jpg.mask.png"),
-        ("IMG_1.jpg", "mask/IMG_1.jpg_mask.png"),
-        ("IMG_1.jpg", ".mask/IMG_1.jpg.mask.png"),
-        ("IMG_1.jpg", "images/.mask/IMG_1.png"),
-        ("IMG_1.jpg", ".masks/IMG_1.jpg.png"),
-        ("IMG_1.jpg", "Masks/IMG_1.png"),
-        ("IMG_1.JPG", "masks/IMG_1.jpg.PNG"),
-        ("IMG_1.JPG", "masks/img_1.jpg.mask.png"),
-        ("IMG_1.png", "masks/IMG_1.jpg.mask.png"),
-        ("a/IMG_1.jpg", "masks/IMG_1.png"),
-        ("a/b/IMG_1.jpg", "masks/IMG_1.jpg.mask.png"),
-        ("a/IMG_1.jpg", "images/a/.mask/IMG_1.jpg.mask.png"),
-        ("a/IMG_1.jpg", "images/a/masks/IMG_1.png"),
-        ("IMG_1.jpg", "images/IMG_1.mask.png"),
-        ("IMG_1.jpg", "images/IMG_1_mask.png"),
-        ("IMG_1.jpg", "images/IMG_1.jpg.mask.png"),
-        ("IMG_1.jpg", "images/IMG_1.jpg.png"),
-        ("a/IMG_1.JPG", "images/a/img_1_MASK.PNG"),
-        ("IMG_1.jpg", "masks/IMG_1-mask.png"),
-        ("IMG_1.jpg", "images/IMG_1-mask.png"),
-        ("IMG_1.JPG", "masks/mask-IMG_1.png"),
-        ("a/IMG_1.jpg", "images/a/IMG_1.jpg-mask.png"),
-    ],
-)
+@pytest.mark.parametrize(("photo", "mask"), [(photo, mask) for photo, masks in MASKS.items() for mask in masks])
 def test_masks_of_other_programs(photo: str, mask: str, tmp_path: Path) -> None:
     """For scenes and for structure from motion, which takes none of them for a photograph."""
     images = photographs(tmp_path / "images", photo, "other/IMG_2.jpg")
@@ -238,10 +230,9 @@ def test_white_may_be_what_moves(tmp_path: Path) -> None:
         write_image(scene / "dynamic_masks" / f"{index:02d}.png", mask_of())
     read = load_scene(scene, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * VIEWS
-    (told,) = [text for text in read.warnings if "dynamic_masks" in text]
     assert (
         "white pixels are the ones that count, as in all masks; if white marks moving objects there, add --invert-masks"
-        in told
+        in only([text for text in read.warnings if "dynamic_masks" in text])
     )
     inverted = load_scene(scene, masks=MaskUse("ignore", invert=True))
     assert not [text for text in inverted.warnings if "dynamic_masks" in text]

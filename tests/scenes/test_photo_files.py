@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import refuses
+from calls import only, refuses
 from ring import COUNT, HEIGHT, NAMES, WIDTH, level, write_colmap, write_pictures, write_transforms
 from systems import posix
 
@@ -115,8 +115,7 @@ def test_masks_and_smaller_copies_are_no_pictures(tmp_path: Path) -> None:
     (tmp_path / "images" / NAMES[3]).unlink()
     for folder in ("masks", "images/masks", "images_2", "images_4", "depth"):
         write_pictures(tmp_path / folder, [NAMES[3]])
-    (warning,) = load_scene(tmp_path).warnings
-    assert "lists 1 image(s) that are missing" in warning
+    assert "lists 1 image(s) that are missing" in only(load_scene(tmp_path).warnings)
 
 
 def test_one_deleted_picture_is_not_one_of_another_folder(tmp_path: Path) -> None:
@@ -251,8 +250,7 @@ def test_smaller_copies_are_taken_where_there_is_nothing_else(
         path.unlink()
     (tmp_path / "images").rmdir()
     scene = load_scene(tmp_path)
-    (warning,) = scene.warnings
-    assert f"the pictures are read from {tmp_path / f'images_{min(factors)}'}" in warning
+    assert f"the pictures are read from {tmp_path / f'images_{min(factors)}'}" in only(scene.warnings)
     assert_each_has_its_picture(scene)
     assert scene.views[0].camera.width == WIDTH // min(factors)
     assert scene.views[0].camera.fx == pytest.approx(40 / min(factors))
@@ -324,8 +322,7 @@ def test_uneven_pictures(camera: str, focal: tuple[float, float], tmp_path: Path
     write_colmap(tmp_path, camera=camera)
     write_pictures(tmp_path / "images", size=(WIDTH, 24))
     scene = load_scene(tmp_path)
-    (warning,) = scene.warnings
-    assert "has 1 times the width and 0.75 times the height of its camera" in warning
+    assert "has 1 times the width and 0.75 times the height of its camera" in only(scene.warnings)
     seen = scene.views[0].camera
     assert (seen.width, seen.height, seen.fx, seen.fy, seen.cx, seen.cy) == (WIDTH, 24, *focal, 24, 12)
     assert_each_has_its_picture(scene)

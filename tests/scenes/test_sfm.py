@@ -361,8 +361,7 @@ def test_interrupt_leaves_nothing(photos, tmp_path, stage):
 
 def test_failing_worker_is_an_error_with_its_last_words(photos, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(ClsplatError, match="structure from motion failed"):
-        sfm.reconstruct(photos, tmp_path / "out")
+    refuses("structure from motion failed", sfm.reconstruct, photos, tmp_path / "out", error=ClsplatError)
     assert leftovers(tmp_path) == []
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import left_behind, refuses
+from calls import left_behind, only, refuses
 from rendered import contents
 from scenes import tilted_camera
 
@@ -115,8 +115,7 @@ def test_tasks_know_the_whole_shot(tmp_path: Path) -> None:
     assert (task.number, task.path, task.camera.width) == (3, tmp_path / "3.exr", 20)
     assert (task.after.width, task.after.fx) == (20, 17.5)
     assert_same_pose(task.after, turned(0.3))
-    (still,) = make_tasks(whole.only("3"), whole, pattern, half, ("rgb",))
-    assert still.after is None
+    assert only(make_tasks(whole.only("3"), whole, pattern, half, ("rgb",))).after is None
     panorama = replace(turned(0), projection="equirectangular")
     mixed = Shot((*whole.frames, Frame(6, panorama, "0006")))
     with pytest.raises(InputError, match="--channels motion: frame 6 is equirectangular"):

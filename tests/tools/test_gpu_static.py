@@ -17,6 +17,7 @@ import gpu_page
 import gpu_rules
 import gpu_static
 import pytest
+from calls import Capture, refuses
 from gpu_assembly import Block, Instruction, Loop, gcn_kind, parse_gcn, parse_sass, sass_kind
 from gpu_compilers import Built, NoCompilerError, Source, ask_package, read_amd, read_nvidia
 from gpu_devices import Gpu, occupancy, waves_at_a_time
@@ -190,7 +191,7 @@ def test_a_binary_that_says_nothing() -> None:
         read_intel(Source("ranges", ("-DITEMS=64",)), "tgllp", b"\x7fELF")
 
 
-def test_without_ocloc(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_ocloc(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setattr(gpu_intel, "ocloc", lambda: None)
     monkeypatch.setattr(gpu_static, "ask_package", lambda *_: [[{"stem": "ranges", "options": ["-DITEMS=64"]}]])
     assert gpu_static.main(["--intel"]) == 2
@@ -218,8 +219,7 @@ def test_a_loop_that_no_rule_knows_is_told() -> None:
         UnknownLoopError, match=r"blend for sm_89 .*gpu_rules.* the loop of `while \(outer\);` \(6 instr"
     ):
         cost_of(kernel, LINES, rules, Run(64))
-    with pytest.raises(UnknownLoopError, match="walk: no kernel of BY_PAIR or BY_ITEM"):
-        rules_of("walk")
+    refuses("walk: no kernel of BY_PAIR or BY_ITEM", rules_of, "walk", error=UnknownLoopError)
 
 
 def test_an_unrolled_loop_runs_less_often() -> None:
@@ -381,11 +381,10 @@ def test_a_page_of_older_kernels_is_told() -> None:
     assert gpu_page.stale_tables(page, {"compilers": "clang 1", "kernels": "| 7 |"}) == []
     assert gpu_page.stale_tables(page, {"compilers": "clang 1", "kernels": "| 8 |"}) == ["kernels"]
     assert gpu_page.stale_tables(page, {"compilers": "clang 2", "kernels": "| 8 |"}) == []  # other compilers
-    with pytest.raises(ClsplatError, match="has no place for the table pairs"):
-        gpu_page.stale_tables(page, {"pairs": ""})
+    refuses("has no place for the table pairs", gpu_page.stale_tables, page, {"pairs": ""}, error=ClsplatError)
 
 
-def test_without_clang(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_clang(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setattr(gpu_compilers.shutil, "which", lambda _: None)
     monkeypatch.setattr(gpu_static, "ask_package", lambda *_: [[]])
     assert gpu_static.main(["--check"]) == 2
@@ -397,8 +396,7 @@ def test_another_clang(monkeypatch: pytest.MonkeyPatch) -> None:
     done = subprocess.CompletedProcess([], 0, "clang version 15.0.6\n", "")
     monkeypatch.setattr(gpu_compilers, "_run", lambda _: done)
     told = "no clang 19 found; /bin/clang is another version: apt install clang-19"
-    with pytest.raises(NoCompilerError, match=told):
-        gpu_compilers.clang()
+    refuses(told, gpu_compilers.clang, error=NoCompilerError)
 
 
 def test_without_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -406,12 +404,11 @@ def test_without_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     monkeypatch.setattr(gpu_compilers, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(gpu_compilers, "_run", lambda _: subprocess.CompletedProcess([], 1, "", "ERROR: no index\n"))
     told = r"no ptxas found: .*pip download nvidia-cuda-nvcc==\S+ failed: ERROR: no i"
-    with pytest.raises(NoCompilerError, match=told):
-        gpu_compilers.nvidia("ptxas")
+    refuses(told, gpu_compilers.nvidia, "ptxas", error=NoCompilerError)
 
 
 @pytest.mark.parametrize("arguments", [["--shapes", "8x1"], ["--targets", "sm_20"]])
-def test_what_is_not_known_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_known_is_told(arguments: list[str], capsys: Capture) -> None:
     assert gpu_static.main(arguments) != 0
     assert capsys.readouterr().err.startswith(f"gpu_static: error: {arguments[0]} {arguments[1]}: expected one of")
 
@@ -453,8 +450,7 @@ def test_tables_have_a_place_in_the_page() -> None:
     names = ("kernels", "pairs", "frames", "stages", "goals", "steps", "devices", "intel")
     filled = gpu_page.fill_in(page, {name: f"table of {name}" for name in names})
     assert all(f"<!-- {name} -->\ntable of {name}\n<!-- end -->" in filled for name in names)
-    with pytest.raises(ClsplatError, match="has no place for the table costs"):
-        gpu_page.fill_in(page, {"costs": ""})
+    refuses("has no place for the table costs", gpu_page.fill_in, page, {"costs": ""}, error=ClsplatError)
 
 
 def predictions() -> dict[tuple[str, str, str], dict[str, Stage]]:
@@ -472,8 +468,7 @@ def test_a_step_by_parts() -> None:
     (loss,) = [line for line in lines if line.startswith("| loss |")]
     assert loss.startswith("| loss | 4 | 2.00 | 1.00 | 3.00 | 3.00 |")  # target is of it
     assert lines[-1].startswith("| all | 10 | 5.00 | 2.50 | 7.50 | 7.50 |")
-    with pytest.raises(ClsplatError, match="stages turn: of no part in PARTS"):
-        gpu_page.parts_of({"turn": Stage()})
+    refuses("stages turn: of no part in PARTS", gpu_page.parts_of, {"turn": Stage()}, error=ClsplatError)
 
 
 def test_what_is_wanted() -> None:
