@@ -55,9 +55,8 @@ def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
         axes.set_ylabel(panel.y, fontsize=FONT_SIZE_POINTS)
         axes.grid(alpha=0.3)
         if not alike:
-            axes.legend(
-                fontsize=FONT_SIZE_POINTS, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2
-            )
+            place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+            axes.legend(fontsize=FONT_SIZE_POINTS, frameon=False, **place)
     if alike:
         _legend_below(figure, figure.axes[0], columns=4)
     save_figure(figure, path)
@@ -95,14 +94,8 @@ def plot_stacks(path: Path, bars: Mapping[str, Mapping[str, float]], title: str,
     ends = [0.0] * len(names)
     for number, part in enumerate(next(iter(bars.values()))):
         widths = [bars[name][part] for name in names]
-        axes.barh(
-            names,
-            widths,
-            left=ends,
-            color=OKABE_ITO_COLOURS[number % len(OKABE_ITO_COLOURS)],
-            edgecolor="white",
-            label=part,
-        )
+        colour = OKABE_ITO_COLOURS[number % len(OKABE_ITO_COLOURS)]
+        axes.barh(names, widths, left=ends, color=colour, edgecolor="white", label=part)
         ends = [end + width for end, width in zip(ends, widths, strict=True)]
     for place, end in enumerate(ends):
         axes.text(end, place, f" {end:.1f}", va="center", fontsize=FONT_SIZE_POINTS)

@@ -165,22 +165,11 @@ def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
 
 def table(rows: Sequence[Row]) -> list[str]:
     """Text table of the rows. The last column has the defines that do not come from the shape."""
-    head = (
-        "kernel",
-        "shape",
-        "target",
-        "registers",
-        "spills",
-        "stack",
-        "shared",
-        "occupancy",
-        "instructions",
-        "a pair",
-    )
-    lines: list[tuple[str, ...]] = [head]
+    names = ("registers", "spills", "stack", "shared")
+    lines: list[tuple[str, ...]] = [("kernel", "shape", "target", *names, "occupancy", "instructions", "a pair")]
     for row in rows:
         told = row.told()
-        numbers = [str(told[name]) for name in ("registers", "spills", "stack", "shared")]
+        numbers = [str(told[name]) for name in names]
         pair = "unknown" if row.unknown else "-" if row.a_pair is None else f"{row.a_pair:.0f}"
         last = (f"{told['occupancy']:.0%}", str(told["instructions"]), pair)
         lines.append((row.built.kernel, told["shape"], row.built.target, *numbers, *last))
