@@ -7,6 +7,7 @@ import pickle
 from pathlib import Path
 
 import pytest
+from calls import refuses
 from systems import posix
 
 from clsplat.cli.main import one_line
@@ -42,8 +43,7 @@ def test_disk_full_while_flushing_leaves_the_previous_file(tmp_path: Path, monke
     path = tmp_path / "model.ply"
     path.write_bytes(b"old")
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="the disk is full"):
-        atomic_write(path, b"new")
+    refuses("the disk is full", atomic_write, path, b"new", error=OSError)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -58,8 +58,7 @@ def test_disk_full_for_real(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     path.write_bytes(b"old")
     monkeypatch.setattr(builtins, "open", lambda *_: real_open("/dev/full", "wb"))
     for size in (10, 1 << 20):
-        with pytest.raises(OSError, match="the disk is full"):
-            atomic_write(path, bytes(size))
+        refuses("the disk is full", atomic_write, path, bytes(size), error=OSError)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from calls import refuses
 
 from clsplat.device.context import Device
 from clsplat.errors import InputError
@@ -30,8 +31,7 @@ from clsplat.rendering.renderer import Renderer
 def test_arrays(default_device: Device, name: str, value: Any, message: str) -> None:
     gaussians, camera = scenes.random_cloud(100, 1, 20, 16, degree=0)
     setattr(gaussians, name, value)
-    with pytest.raises(ValueError, match=message):
-        Renderer(default_device).render(gaussians, camera)
+    refuses(message, Renderer(default_device).render, gaussians, camera, error=ValueError)
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,6 @@ def test_arrays(default_device: Device, name: str, value: Any, message: str) -> 
 )
 def test_cameras(default_device: Device, changes: dict[str, Any], message: str) -> None:
     gaussians, camera = scenes.random_cloud(10, 1, 20, 16, degree=0)
-    with pytest.raises(InputError, match=f"camera: {message}"):
-        Renderer(default_device).render(gaussians, replace(camera, **changes))
+    refuses(f"camera: {message}", Renderer(default_device).render, gaussians, replace(camera, **changes))
     with pytest.raises(InputError, match=f"camera: {message}"):
         Renderer(default_device).render_channels(gaussians, camera, after=replace(camera, **changes))

@@ -14,6 +14,7 @@ require("torch")
 import clouds
 import numpy as np
 import torch
+from clouds import given
 from torch import Tensor
 
 import clsplat.torch
@@ -31,11 +32,6 @@ from clsplat.torch import (
 from clsplat.torch.gsplat.absent_names import CUDA_ONLY_MODULES, CUDA_ONLY_NAMES, PURE_PYTHON_NAMES
 
 pytestmark = pytest.mark.needs("torch")
-
-
-def given(count: int = 8, **changes: Any) -> dict[str, Any]:
-    made = {name: value.float() if isinstance(value, Tensor) else value for name, value in clouds.cloud(count).items()}
-    return {**made, **changes}
 
 
 @pytest.mark.parametrize(
@@ -191,7 +187,6 @@ def test_torch_func_may_call_what_is_plain_pytorch() -> None:
 
     def size(scales: Tensor) -> Tensor:
         covars, _ = quat_scale_to_covar_preci(made["quats"], scales, compute_preci=False)
-        assert covars is not None
         return covars.diagonal(dim1=-2, dim2=-1).sum()
 
     # the trace of R S S^T R^T is the sum of squared scales

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from calls import python
 from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 from tiny import run_steps, write_scene
@@ -628,21 +627,3 @@ def test_preset_in_training(tmp_path: Path, capsys: Capture) -> None:
     assert "alpha_min = 0.0078" in (run / "config.toml").read_text()
     assert main(["train", "-o", str(run), "--resume", "--preset", "fast"]) == 2
     assert "--preset fast and --resume" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.needs("matplotlib")
-def test_plot_of_training(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    scene = write_scene(tmp_path / "scene")
-    assert main(["train", str(scene), "-o", str(run), "--iterations", "4", "--eval-at", "2"]) == 0
-    tool = Path(__file__).parents[2] / "tools" / "bench" / "plot_training.py"
-    output = tmp_path / "training.svg"
-    done = python(tool, run, "-o", output)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("run  ")
-    assert done.stdout.count(" dB") == 2
-    assert "run" in output.read_text()
-    wrong = python(tool, scene, "-o", output)
-    assert wrong.returncode == 2
-    assert wrong.stderr.count("\n") == 1

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import Capture, command, error_line, one_error, train
+from calls import Capture, command, one_error, rejected, train
 from tiny import CONFIG, HEIGHT, VIEWS, WIDTH, write_scene
 
 from clsplat.cli.main import main
@@ -32,8 +32,7 @@ from clsplat.cli.main import main
     ],
 )
 def test_wrong_calls_are_one_line(line: str, message: str, capsys: Capture) -> None:
-    assert main(line.split()) == 2
-    assert message in error_line(capsys)
+    assert message in rejected(capsys, line.split())
 
 
 def test_no_such_scene_for_real(tmp_path: Path) -> None:
@@ -183,7 +182,14 @@ def cut_short(head: bytes, data: bytes) -> tuple[bytes, str]:
     return head + data[:-100], "truncated"
 
 
-@pytest.mark.parametrize("spoil", [no_opacity, all_nan, no_gaussians, cut_short], ids=lambda spoil: spoil.__name__)
+def not_a_ply(head: bytes, data: bytes) -> tuple[bytes, str]:
+    return b"hello", "not a PLY"
+
+
+BAD_MODELS = (no_opacity, all_nan, no_gaussians, cut_short, not_a_ply)
+
+
+@pytest.mark.parametrize("spoil", BAD_MODELS, ids=lambda spoil: spoil.__name__)
 @pytest.mark.parametrize("verb", ["render", "eval"])
 def test_bad_models(
     verb: str,

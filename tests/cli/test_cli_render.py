@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, rejected
 from fakes import Pipeline, camera
 
 from clsplat.cli.main import main, parse
@@ -58,8 +58,7 @@ def test_rasterizer_flags_of_render(model: str, tmp_path: Path, capsys: Capture)
     assert parsed(run, "--rasterizer.sh-tolerance", "0").rasterizer == replace(own, sh_tolerance=0.0)
     assert main(["render", model, "--cameras", "S", "-o", "{name}.png", "--rasterizer.sh-tolerance", "-1"]) == 2
     assert "--rasterizer.sh-tolerance -1.0: expected 0 to 1" in error_line(capsys)
-    assert main(["render", str(tmp_path), "--cameras", "S", "-o", "{name}.png"]) == 2
-    assert "not a run" in error_line(capsys)
+    assert "not a run" in rejected(capsys, ["render", tmp_path, "--cameras", "S", "-o", "{name}.png"])
 
 
 @pytest.mark.parametrize("extension", ["exr", "png"])
@@ -137,8 +136,6 @@ def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_pat
     cameras, out = tmp_path / "camera_path.json", ["-o", str(tmp_path / "shot" / "####.exr")]
     cases: list[tuple[dict[str, object], list[str], str]] = [
         ({"camera_path": []}, out, f"{cameras}: has no keys in 'camera_path'"),
-        ({}, [*out, "--frames", "20-30"], "--frames 20-30: holds none of the frames to render"),
-        ({}, [*out, "--frames", "9-"], "--frames 9-: '9-' is no frame or range"),
         ({}, [*out, "--count", "3"], "--count 3: expected --path with it"),
         ({}, [*out, "--path", "turntable", "--count", "0"], "--count 0: expected 1 to 100,000 frames"),
         ({}, [*out, "--usd-camera", "c"], "is no USD stage"),
@@ -147,8 +144,7 @@ def test_cameras_that_cannot_be_rendered(model: str, pipeline: Pipeline, tmp_pat
     ]
     for changes, arguments, message in cases:
         cameras.write_text(json.dumps({**PATH, **changes}))
-        assert pipeline.main(["render", model, "--cameras", str(cameras), *arguments]) == 2, arguments
-        assert message in error_line(capsys)
+        assert message in rejected(capsys, ["render", model, "--cameras", cameras, *arguments], call=pipeline.main)
     assert pipeline.main(["render", model, "--cameras", str(cameras), *out, "--path", "zigzag"]) == 2
     assert "zigzag" in error_line(capsys)
     assert not pipeline.written
@@ -167,19 +163,16 @@ def test_render_that_cannot_be(model: str, folder: str, pipeline: Pipeline, tmp_
         (["--cameras", folder, "-o", out, "--background", "white", "--alpha"], "exclude each other"),
         (["--cameras", folder, "-o", out, "--width", "0"], "--width 0: expected a number above 0"),
         (["--cameras", folder, "-o", out, "--scale", "2", "--width", "9"], "exclude each other"),
-        (["--cameras", folder, "-o", out, "--device", "nosuch"], "no such device"),
     ]
     for arguments, message in cases:
-        assert pipeline.main(["render", model, *arguments]) == 2, arguments
-        assert message in error_line(capsys)
+        assert message in rejected(capsys, ["render", model, *arguments], call=pipeline.main)
     for names, message in [
         (["a.jpg", "a.png"], "would be the file of both a.jpg and a.png"),
         (["../../a.jpg"], "leads out of the output folder"),
         ([], "has no images"),
     ]:
         pipeline.cameras = {name: camera() for name in names}
-        assert pipeline.main(["render", model, "--cameras", folder, "-o", out]) == 2
-        assert message in error_line(capsys)
+        assert message in rejected(capsys, ["render", model, "--cameras", folder, "-o", out], call=pipeline.main)
     assert not pipeline.written
 
 

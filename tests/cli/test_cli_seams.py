@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import tyro
-from calls import Capture
+from calls import Capture, ran
 
 from clsplat.cli import parsing
 from clsplat.cli.main import main, parse
@@ -129,8 +129,7 @@ def test_a_verb_gets_the_services_of_its_call(tmp_path: Path, capsys: Capture) -
         return {"output": output.name}
 
     services = Services(open_device=lambda *_: None, require=lambda *_: None, run_demo=run_demo)  # type: ignore[arg-type,return-value]
-    assert main(["demo", "-o", str(tmp_path / "d"), "--json"], services) == 0
-    assert capsys.readouterr().out == '{\n  "output": "d"\n}\n'
+    assert ran(capsys, main, ["demo", "-o", str(tmp_path / "d"), "--json"], services).out == '{\n  "output": "d"\n}\n'
 
 
 def test_a_table_is_aligned() -> None:

@@ -8,18 +8,15 @@ import re
 from pathlib import Path
 
 import pytest
-from calls import error_line
+from calls import Capture, error_line, only, printed
 
 from clsplat.bench.workload import synthetic
 from clsplat.cli.main import main
 from clsplat.device.context import list_devices, open_device
 
-Capture = pytest.CaptureFixture[str]
-
 
 def listed(capsys: Capture, *flags: str) -> list[dict[str, object]]:
-    assert main(["devices", "--json", *flags]) == 0
-    devices: list[dict[str, object]] = json.loads(capsys.readouterr().out)
+    devices: list[dict[str, object]] = json.loads(printed(capsys, ["devices", "--json", *flags]).out)
     return devices
 
 
@@ -28,8 +25,7 @@ def test_each_by_its_index_and_by_its_version(capsys: Capture) -> None:
     assert len(everything) == len(list_devices())
     for device in everything:
         assert listed(capsys, "--device", str(device["index"])) == [device]
-        (found,) = listed(capsys, "--device", str(device["version"]))
-        assert found["version"] == device["version"]
+        assert only(listed(capsys, "--device", str(device["version"])))["version"] == device["version"]
 
 
 @pytest.mark.smoke
@@ -41,8 +37,7 @@ def test_it_is_the_one_that_the_other_verbs_take(capsys: Capture) -> None:
 
 
 def test_the_table_has_one_line(capsys: Capture) -> None:
-    assert main(["devices", "--device", "0"]) == 0
-    header, line = capsys.readouterr().out.splitlines()
+    header, line = printed(capsys, ["devices", "--device", "0"]).out.splitlines()
     assert header.split()[:2] == ["name", "kind"]
     assert line.startswith("0 ")
 
@@ -54,8 +49,7 @@ def test_the_environment_does_not_shorten_the_list(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.smoke
 def test_an_unknown_one(capsys: Capture) -> None:
-    assert main(["devices", "--device", "abacus"]) == 2
-    captured = capsys.readouterr()
+    captured = printed(capsys, ["devices", "--device", "abacus"], status=2)
     assert captured.out == ""
     assert captured.err.startswith("clsplat: error: --device abacus: no such device, expected ")
     assert captured.err.count("\n") == 1

@@ -9,19 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from calls import error_line
+from calls import Capture, printed, rejected
 
-from clsplat.cli.main import main
 from clsplat.device.context import list_devices
 from clsplat.device.drivers import diagnostics
-
-Capture = pytest.CaptureFixture[str]
 
 
 @pytest.mark.smoke
 def test_it_names_packages_and_devices(capsys: Capture) -> None:
-    assert main(["doctor", "--json"]) == 0
-    lines: list[dict[str, str]] = json.loads(capsys.readouterr().out)
+    lines: list[dict[str, str]] = json.loads(printed(capsys, ["doctor", "--json"]).out)
     texts = [line["text"] for line in lines if line["part"] == "device"]
     assert len(texts) == len(list_devices())
     assert list_devices()[0].name in texts[0]
@@ -33,8 +29,7 @@ def test_what_is_missing_has_advice_and_status_1(capsys: Capture, monkeypatch: p
     monkeypatch.setattr(diagnostics, "listed_devices", lambda: ([], "a driver took the process down (signal 6)"))
     monkeypatch.setattr(diagnostics, "gpus", lambda: ["NVIDIA"])
     monkeypatch.setattr(diagnostics, "families", lambda: ["debian"])
-    assert main(["doctor"]) == 1
-    text = capsys.readouterr().out
+    text = printed(capsys, ["doctor"], status=1).out
     assert re.search(r"^missing +device +a driver took the process down \(signal 6\)$", text, re.MULTILINE)
     assert "-> apt install nvidia-opencl-icd" in text
     assert text.splitlines()[-1].startswith("1 missing.")
@@ -42,15 +37,13 @@ def test_what_is_missing_has_advice_and_status_1(capsys: Capture, monkeypatch: p
 
 def test_variables_are_shown(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CLSPLAT_DRIVER_TIMEOUT", "77")
-    assert main(["doctor"]) == 0
-    assert "CLSPLAT_DRIVER_TIMEOUT=77" in capsys.readouterr().out
+    assert "CLSPLAT_DRIVER_TIMEOUT=77" in printed(capsys, ["doctor"]).out
 
 
 @pytest.mark.slow
 def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture) -> None:
     file = tmp_path / "report.json"
-    assert main(["selftest", "--device", "0", "--report", str(file)]) == 0
-    assert f"Wrote {file}." in capsys.readouterr().out
+    assert f"Wrote {file}." in printed(capsys, ["selftest", "--device", "0", "--report", file]).out
     report: dict[str, Any] = json.loads(file.read_text())
     (device,) = report["devices"]
     assert device["trusted"]
@@ -58,10 +51,8 @@ def test_the_report_of_a_bug(tmp_path: Path, capsys: Capture) -> None:
     assert device["refused"] == {}
     assert len(device["digests"]) == 3 * len(device["stages"])  # three scenes
     assert any(line["part"] == "package" for line in report["installation"])
-    assert main(["selftest", "--report", str(file)]) == 2
-    assert "exists already" in error_line(capsys)
+    assert "exists already" in rejected(capsys, ["selftest", "--report", file])
 
 
 def test_the_report_is_refused_before_the_test(tmp_path: Path, capsys: Capture) -> None:
-    assert main(["selftest", "--report", str(tmp_path / "none" / "report.json")]) == 2
-    assert "no such folder" in error_line(capsys)
+    assert "no such folder" in rejected(capsys, ["selftest", "--report", tmp_path / "none" / "report.json"])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import tyro
-from calls import Capture, error_line
+from calls import Capture, error_line, printed, rejected
 from models import random_gaussians
 
 from clsplat.cli.flags import OTHER_FLAGS_TITLE, grouped_help, near, options
@@ -33,8 +33,7 @@ def section(text: str, title: str) -> list[str]:
 
 def render_help(capsys: Capture, monkeypatch: pytest.MonkeyPatch, width: int = 80) -> str:
     monkeypatch.setenv("COLUMNS", str(width))
-    assert main(["render", "--help"]) == 0
-    return str(capsys.readouterr().out)
+    return str(printed(capsys, ["render", "--help"]).out)
 
 
 @pytest.mark.filterwarnings("ignore:get_parser:DeprecationWarning")
@@ -98,43 +97,39 @@ def test_a_flag_of_no_group_is_among_others() -> None:
     assert {"--cameras", "--samples"} <= set(section(text, OTHER_FLAGS_TITLE))
 
 
+NO_NUMBER = "could not convert string to float"
+
+
 @pytest.mark.parametrize(
-    ("flags", "said"),
+    ("words", "said"),
     [
-        (["--shutter-angel", "180"], "--shutter-angel is no flag, did you mean --shutter-angle?"),
-        (["--shutter-angel=180"], "--shutter-angel is no flag, did you mean --shutter-angle?"),
-        (["--colourspace", "ACEScg"], "--colourspace is no flag, did you mean --colorspace?"),
-        (["--colour_space", "ACEScg"], "--colour_space is no flag, did you mean --colorspace?"),
-        (["--fps", "25"], "--fps is no flag, did you mean --video.fps?"),
-        (["--shutter", "180"], "--shutter is no flag, did you mean --shutter-angle?"),
+        ([*CALL, "--shutter-angel", "180"], "--shutter-angel is no flag, did you mean --shutter-angle?"),
+        ([*CALL, "--shutter-angel=180"], "--shutter-angel is no flag, did you mean --shutter-angle?"),
+        ([*CALL, "--colourspace", "ACEScg"], "--colourspace is no flag, did you mean --colorspace?"),
+        ([*CALL, "--colour_space", "ACEScg"], "--colour_space is no flag, did you mean --colorspace?"),
+        ([*CALL, "--fps", "25"], "--fps is no flag, did you mean --video.fps?"),
+        ([*CALL, "--shutter", "180"], "--shutter is no flag, did you mean --shutter-angle?"),
         (
-            ["--Frames", "1", "--over-scan", "5"],
+            [*CALL, "--Frames", "1", "--over-scan", "5"],
             "--Frames is no flag, did you mean --frames? --over-scan is no flag, did you mean --overscan?",
         ),
-        (["--frobnicate"], "--frobnicate is no flag, expected one of clsplat render --help"),
+        ([*CALL, "--frobnicate"], "--frobnicate is no flag, expected one of clsplat render --help"),
+        # a wrong name of what is needed is said before what is missing
+        (["render", "model.ply", "--ouput", "x.png"], "--ouput is no flag, did you mean --output?"),
+        (
+            ["train", "S", "-o", "R", "--densty.split-factor", "2"],
+            "--densty.split-factor is no flag, did you mean --density.split-factor?",
+        ),
+        (["rendr", "x"], "rendr is no verb, did you mean render?"),
+        (["vew", "x"], "vew is no verb, did you mean view?"),
+        (["Train", "x"], "Train is no verb, did you mean train?"),
+        (["nonsense", "x"], "Unrecognized options: nonsense, x"),
+        ([*CALL, "--f-stop", "2,8"], f"Error parsing --f-stop: {NO_NUMBER}: '2,8'"),
+        (["convert", "a.ply", "b.ply", "--scale", "1,2,1"], f"Error parsing --scale: {NO_NUMBER}: '1,2,1'"),
     ],
 )
-def test_a_flag_that_is_nearly_right_gets_its_name(flags: list[str], said: str, capsys: Capture) -> None:
-    assert main([*CALL, *flags]) == 2
-    assert error_line(capsys) == f"clsplat: error: {said}"
-
-
-def test_a_wrong_name_of_what_is_needed_is_said_before_what_is_missing(capsys: Capture) -> None:
-    assert main(["render", "model.ply", "--ouput", "x.png"]) == 2
-    assert error_line(capsys) == "clsplat: error: --ouput is no flag, did you mean --output?"
-    assert main(["train", "S", "-o", "R", "--densty.split-factor", "2"]) == 2
-    assert error_line(capsys).endswith("did you mean --density.split-factor?")
-
-
-def test_a_verb_that_is_nearly_right_gets_its_name(capsys: Capture) -> None:
-    for word, said in (
-        ("rendr", "rendr is no verb, did you mean render?"),
-        ("vew", "vew is no verb, did you mean view?"),
-        ("Train", "Train is no verb, did you mean train?"),
-        ("nonsense", "Unrecognized options: nonsense, x"),
-    ):
-        assert main([word, "x"]) == 2
-        assert error_line(capsys) == f"clsplat: error: {said}"
+def test_a_word_that_is_nearly_right_gets_its_name(words: list[str], said: str, capsys: Capture) -> None:
+    assert rejected(capsys, words) == f"clsplat: error: {said}"
 
 
 def test_no_name_is_made_up() -> None:
@@ -178,8 +173,7 @@ def test_an_error_is_json_where_json_is_asked_for(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = [*words, "--path", "turntable"] if words[0] == "render" else words
-    assert main(words) == 2
-    captured = capsys.readouterr()
+    captured = printed(capsys, words, status=2)
     said = json.loads(captured.out)
     assert said["status"] == 2
     assert message in said["error"]
@@ -201,9 +195,7 @@ def test_work_that_failed_or_was_interrupted_is_json_too(capsys: Capture, monkey
         (KeyboardInterrupt("after 3 of 9 frames"), 130, "interrupted after 3 of 9 frames"),
     ):
         failing(error)
-        assert main(["devices", "--json"]) == status
-        found = json.loads(capsys.readouterr().out)
+        found = json.loads(printed(capsys, ["devices", "--json"], status=status).out)
         assert found["status"] == status
         assert said in found["error"]
-        assert main(["devices"]) == status
-        assert capsys.readouterr().out == ""
+        assert printed(capsys, ["devices"], status=status).out == ""

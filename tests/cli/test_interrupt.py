@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
+from calls import python
 
 INTERRUPTED = """
 import runpy, sys
@@ -32,5 +30,5 @@ STARTS = {
 )
 def test_ctrl_c_during_an_import(start: str, module: str) -> None:
     code = INTERRUPTED.format(module=module, start=STARTS[start])
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    done = python("-c", code, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "clsplat: interrupted\n")

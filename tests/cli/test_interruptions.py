@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from calls import Capture, error_line, python
+from calls import Capture, error_line, printed, python, refuses, rejected
 from quick import quick
 from tiny import short, write_scene
 
@@ -53,13 +53,11 @@ def holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
     """Another process that has the folder locked."""
     other = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True)
     try:
-        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         yield other
     finally:
         other.kill()
         other.wait()
-        assert other.stdout is not None
         other.stdout.close()
 
 
@@ -112,11 +110,10 @@ def test_what_is_ignored_stays_so() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-@posix
-def test_every_verb_ends_with_the_signals_number(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    monkeypatch.setattr("clsplat.cli.devices.run", lambda *_: signal.raise_signal(signal.SIGTERM))
-    assert main(["devices"]) == 143
-    assert capsys.readouterr().err == "clsplat: interrupted\n"
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=posix)])
+def test_every_verb_ends_with_the_signals_number(number: int, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    monkeypatch.setattr("clsplat.cli.devices.run", lambda *_: signal.raise_signal(number))
+    assert printed(capsys, ["devices"], status=128 + number).err == "clsplat: interrupted\n"
 
 
 @posix
@@ -132,32 +129,36 @@ def test_a_signal_waits_where_nobody_may_be_disturbed() -> None:
     assert done == ["the work"]
 
 
+def assert_interrupted(number: int, before: str) -> None:
+    """A signal in the command line, which it comes to by the code before."""
+    code = f"import os, sys\n{before}from clsplat.__main__ import main\nsys.exit(main())\n"
+    done = python("-c", code, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
+
+
 @posix
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_while_pyopencl_is_imported(number: signal.Signals) -> None:
     """An exception that is raised in the import of its binary part aborts the process."""
-    code = (
-        "import os, sys\n"
+    assert_interrupted(
+        number,
         "def hook(event, arguments):\n"
         "    inside = event == 'object.__setattr__' and arguments[0].__module__ == 'pyopencl._cl'\n"
         "    if inside and 'sent' not in sys.__dict__:\n"
         "        sys.sent = True\n"
         f"        os.kill(os.getpid(), {int(number)})\n"
         "sys.addaudithook(hook)\n"
-        "sys.argv = ['clsplat', 'devices']\n"
-        "from clsplat.__main__ import main\n"
-        "sys.exit(main())\n"
+        "sys.argv = ['clsplat', 'devices']\n",
     )
-    done = python("-c", code, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
 
 
 @posix
 @pytest.mark.parametrize("number", quick(SIGNALS, signal.SIGINT))
 def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
     """pycolmap takes a Ctrl-C for a sign that it is not installed."""
-    code = (
-        "import os, sys, types, importlib.abc, importlib.util\n"
+    assert_interrupted(
+        number,
+        "import types, importlib.abc, importlib.util\n"
         "class Slow(importlib.abc.MetaPathFinder, importlib.abc.Loader):\n"
         "    def find_spec(self, name, path=None, target=None):\n"
         "        return importlib.util.spec_from_loader(name, self) if name == 'pycolmap' else None\n"
@@ -169,17 +170,11 @@ def test_a_signal_while_pycolmap_is_imported(number: signal.Signals) -> None:
         "        except BaseException as error: raise RuntimeError('not installed') from error\n"
         "sys.meta_path.insert(0, Slow())\n"
         "sys.argv = ['clsplat', 'train', '.', '-o', 'nowhere']\n"
-        "from clsplat.__main__ import main\n"
-        "from clsplat.process import terminable\n"
-        "from clsplat.cli import main as cli\n"
         "from clsplat.cli import train\n"
         "def work(*_):\n"
         "    import clsplat.scenes.dataset\n"
-        "train.run = work\n"
-        "sys.exit(main())\n"
+        "train.run = work\n",
     )
-    done = python("-c", code, timeout=60)
-    assert (done.returncode, done.stdout, done.stderr) == (128 + number, "", "clsplat: interrupted\n")
 
 
 # Two processes
@@ -223,10 +218,8 @@ def test_a_second_training_changes_nothing(flag: str, tmp_path: Path, capsys: Ca
 def test_verbs_that_write_into_a_run_are_kept_out(verb: str, tmp_path: Path, capsys: Capture) -> None:
     run = Run.create(tmp_path / "run", TrainConfig(), scene=tmp_path)
     with holder(run.path):
-        assert main([verb, str(run.path)]) == 2
-        assert "is being written by clsplat train" in error_line(capsys)
-        with pytest.raises(InputError, match="is being written"):
-            Run.create(run.path, TrainConfig(), overwrite=True)
+        assert "is being written by clsplat train" in rejected(capsys, [verb, run.path])
+        refuses("is being written", Run.create, run.path, TrainConfig(), overwrite=True)
         assert main(["report", str(run.path), "-o", str(tmp_path / "a.html")]) == 0, "readers come in"
 
 

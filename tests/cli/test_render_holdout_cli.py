@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, fails, ran
 from cg import sphere, sphere_samples, write_flat, write_samples
 from numpy.typing import NDArray
+from rendered import camera_file, pixels_of
 from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.camera import Camera
@@ -33,11 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A model, a camera that goes to the right, and the sphere's depths of each frame, flat and deep."""
     folder = tmp_path_factory.mktemp("holdout")
     hidden_model().save(folder / "model.ply")
-    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": 1, "position": [-0.5, 0, -4], **key}, {"frame": COUNT, "position": [0.5, 0, -4], **key}]
-    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-    (folder / "cameras.json").write_text(json.dumps(document))
-    for frame in choose_shot(folder / "cameras.json").frames:
+    for frame in choose_shot(camera_file(folder / "cameras.json", {1: -0.5, COUNT: 0.5})).frames:
         write_flat(folder / f"z.{frame.number:04d}.exr", {"Z": sphere(frame.camera, CENTRE, RADIUS)})
         samples = sphere_samples(frame.camera, CENTRE, RADIUS)
         write_samples(folder / f"deep.{frame.number:04d}.exr", (WIDTH, HEIGHT), samples)
@@ -50,7 +47,7 @@ def render(folder: Path, output: Path, flags: str = "") -> int:
 
 
 def pixels(path: Path) -> NDArray[np.float64]:
-    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT), np.float64)
+    return pixels_of(path).astype(np.float64)
 
 
 def camera_of(folder: Path, number: int) -> Camera:
@@ -160,8 +157,7 @@ def test_one_file_for_all_frames_and_the_plan(folder: Path, tmp_path: Path, caps
     assert render(folder, tmp_path, f"--holdout {folder}/z.0002.exr --frames 1-2 --dry-run --json") == 0
     plan = json.loads(capsys.readouterr().out)
     assert [frame["holdout"] for frame in plan["frames"]] == [str(folder / "z.0002.exr")] * 2
-    assert render(folder, tmp_path, f"--holdout {folder}/z.####.exr --dry-run") == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = ran(capsys, render, folder, tmp_path, f"--holdout {folder}/z.####.exr --dry-run").out.splitlines()
     assert f"holdout   {folder}/z.0001.exr to {folder}/z.0003.exr" in lines
 
 
@@ -173,8 +169,7 @@ def test_cg_that_ends_with_the_frame_is_told_with_overscan(folder: Path, tmp_pat
     assert "z.exr: ends with the frame, and nothing is held out in the overscan" in capsys.readouterr().err
     larger = {"Z": np.full((HEIGHT + 8, WIDTH + 8), 4.0)}
     write_flat(tmp_path / "z.exr", larger, size=(WIDTH, HEIGHT), window=(-4, -4, WIDTH + 8, HEIGHT + 8))
-    assert render(folder, tmp_path, flags) == 0
-    assert "overscan" not in capsys.readouterr().err
+    assert "overscan" not in ran(capsys, render, folder, tmp_path, flags).err
 
 
 def test_a_bent_picture_is_held_out_straight(folder: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -194,10 +189,9 @@ def test_a_bent_picture_is_held_out_straight(folder: Path, tmp_path: Path, capsy
     capsys.readouterr()
     write_flat(tmp_path / "all.exr", {"Z": np.full((HEIGHT, WIDTH), 4.0)})
     call = f"--frames 2 --holdout {tmp_path}/all.exr --stmap {tmp_path}/shift.exr"
-    assert render(folder, tmp_path / "told", call) == 0
     assert (
         "all.exr: ends with the frame, and nothing is held out where the warped picture extends"
-        in capsys.readouterr().err
+        in ran(capsys, render, folder, tmp_path / "told", call).err
     )
 
 
@@ -249,6 +243,5 @@ def test_calls_that_make_no_sense(folder: Path, tmp_path: Path, capsys: Capture)
         (f"--holdout {tmp_path}/nan.exr", "values of Z are not a number, expected depths and alpha of surfaces"),
     ]
     for flags, message in cases:
-        assert render(folder, tmp_path / "new", flags) == 2, flags
-        assert message in error_line(capsys), flags
+        assert message in fails(capsys, render, folder, tmp_path / "new", flags), flags
     assert not any((tmp_path / "new").glob("*.exr"))

@@ -15,9 +15,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import stress_render_kills
-from calls import Capture, error_line, left_behind
+from calls import Capture, error_line, fails, left_behind, ran
 from needs import require
 from quick import quick
+from rendered import contents
 from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
@@ -53,10 +54,6 @@ def render(shot: list[str], folder: Path, *more: str, pattern: str = "a.####.exr
     return main(["render", *shot, "-o", str(folder / pattern), *more])
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
 def read(path: Path) -> tuple[dict[str, np.ndarray], list[Any]]:
     source = oiio.ImageInput.open(str(path))
     found, specs = {}, []
@@ -69,8 +66,7 @@ def read(path: Path) -> tuple[dict[str, np.ndarray], list[Any]]:
 
 
 def test_every_channel_is_that_of_the_renderer(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    assert render(shot, tmp_path, "--channels", ALL, "--frames", "2,6", "--json") == 0
-    records = json.loads(capsys.readouterr().out)
+    records = json.loads(ran(capsys, render, shot, tmp_path, "--channels", ALL, "--frames", "2,6", "--json").out)
     assert [(record["frame"], record["skipped"]) for record in records] == [(2, False), (6, False)]
     whole = choose_shot(Path(shot[2]), path="turntable", count=COUNT)
     frames = whole.frames
@@ -158,8 +154,7 @@ def test_gaps_alone_are_rendered(shot: list[str], tmp_path: Path, capsys: Captur
     (tmp_path / "a.0004.exr").write_bytes(whole["a.0004.exr"][:-50])
     left_behind(tmp_path / "a.0005.exr")
     kept = {name: (tmp_path / name).stat().st_mtime_ns for name in ("a.0001.exr", "a.0003.exr", "a.0005.exr")}
-    assert render(shot, tmp_path, "--skip-existing", "--dry-run") == 0
-    assert "skipped   4: 1,3,5-6" in capsys.readouterr().out
+    assert "skipped   4: 1,3,5-6" in ran(capsys, render, shot, tmp_path, "--skip-existing", "--dry-run").out
     assert render(shot, tmp_path, "--skip-existing", "--progress", "json") == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert {line["frame"]: line["skipped"] for line in lines} == {n: n not in (2, 4) for n in range(1, COUNT + 1)}
@@ -179,8 +174,7 @@ def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_
     """By their cameras, precision or model; a frame that is broken is rendered without a word."""
     assert render(shot, tmp_path) == 0
     capsys.readouterr()
-    assert render(shot, tmp_path, "--skip-existing") == 0
-    assert capsys.readouterr().err == ""
+    assert ran(capsys, render, shot, tmp_path, "--skip-existing").err == ""
     for change in (("--frames", "1-4", "--exr", "half"), ("--background", "white"), ("--rasterizer.alpha-min", "0.01")):
         assert render(shot, tmp_path, "--skip-existing", *change) == 0
         count = 4 if "half" in change else COUNT
@@ -194,8 +188,7 @@ def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_
     assert render([str(tmp_path / "other.ply"), *shot[1:]], tmp_path, "--skip-existing", "--dry-run") == 0
     assert f"{COUNT} of the frames" in capsys.readouterr().err
     (tmp_path / "a.0003.exr").write_bytes(b"")
-    assert render(shot, tmp_path, "--skip-existing", "--rasterizer.alpha-min", "0.01") == 0
-    assert capsys.readouterr().err == ""
+    assert ran(capsys, render, shot, tmp_path, "--skip-existing", "--rasterizer.alpha-min", "0.01").err == ""
 
 
 @pytest.mark.slow
@@ -216,27 +209,23 @@ def test_two_jobs_started_together_write_each_frame_once(shot: list[str], tmp_pa
 
 
 def test_progress_beside_json(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    assert render(shot, tmp_path, "--json", "--progress", "json", "--frames", "1-2", "--profile") == 0
-    captured = capsys.readouterr()
+    captured = ran(capsys, render, shot, tmp_path, "--json", "--progress", "json", "--frames", "1-2", "--profile")
     records = json.loads(captured.out)
     lines = captured.err.splitlines()
     assert [json.loads(line)["done"] for line in lines[:2]] == [1, 2]
     assert "the device ran kernels" in lines[2]
     assert all(record["kernel_ms"] > 0 and record["transfer_ms"] > 0 for record in records)
-    assert render(shot, tmp_path, "--progress", "none") == 0
-    assert capsys.readouterr() == ("", "")
+    assert ran(capsys, render, shot, tmp_path, "--progress", "none") == ("", "")
 
 
 def test_a_dry_run_writes_nothing(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     folder = tmp_path / "new"
-    assert render(shot, folder, "--dry-run", "--channels", "rgb,depth", "--width", "96") == 0
-    text = capsys.readouterr().out
+    text = ran(capsys, render, shot, folder, "--dry-run", "--channels", "rgb,depth", "--width", "96").out
     for part in ("40 Gaussians, SHA-256 ", f"frames    {COUNT}: 1-{COUNT}; 96x80", "channels  rgb, depth"):
         assert part in text
     assert "of device memory needed" in text
     assert f"a.0001.exr to {folder / f'a.{COUNT:04d}.exr'}" in text
-    assert render(shot, folder, "--dry-run", "--json", "--max-device-mem", "400KiB") == 0
-    plan = json.loads(capsys.readouterr().out)
+    plan = json.loads(ran(capsys, render, shot, folder, "--dry-run", "--json", "--max-device-mem", "400KiB").out)
     assert [frame["frame"] for frame in plan["frames"]] == list(range(1, COUNT + 1))
     assert {(frame["width"], frame["height"], frame["skipped"]) for frame in plan["frames"]} == {(WIDTH, HEIGHT, False)}
     assert (plan["gaussians"], plan["channels"]) == (40, ["rgb"])
@@ -252,8 +241,7 @@ def test_several_devices_share_the_frames(shot: list[str], tmp_path: Path, capsy
     assert render(shot, tmp_path / "all", "--device", "all") == 0
     assert contents(tmp_path / "one") == contents(tmp_path / "all")
     capsys.readouterr()
-    assert render(shot, tmp_path / "twice", "--device", "0,0") == 2
-    assert "--device 0,0: names a device twice" in error_line(capsys)
+    assert "--device 0,0: names a device twice" in fails(capsys, render, shot, tmp_path / "twice", "--device", "0,0")
     if len(list_devices()) > 1:
         assert render(shot, tmp_path / "two", "--device", "0,1") == 0
         assert contents(tmp_path / "one") == contents(tmp_path / "two")
@@ -277,8 +265,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         (f"-o {tmp_path}/file/#.png", "file: is a file, expected a folder"),
     ]
     for flags, message in cases:
-        assert render(shot, tmp_path / "new", *flags.split()) == 2, flags
-        assert message in error_line(capsys), flags
+        assert message in fails(capsys, render, shot, tmp_path / "new", *flags.split()), flags
     assert not (tmp_path / "new").exists()
 
 
@@ -291,7 +278,6 @@ def start(shot: list[str], folder: Path, *more: str) -> subprocess.Popen[str]:
 @pytest.mark.parametrize("number", quick([signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 1)], signal.SIGINT))
 def test_interrupted(number: int, shot: list[str], tmp_path: Path) -> None:
     process = start(shot, tmp_path, "--count", "3000", "--progress", "json")
-    assert process.stdout is not None
     for _ in range(3):
         process.stdout.readline()
     process.send_signal(number)
@@ -307,7 +293,6 @@ def test_interrupted(number: int, shot: list[str], tmp_path: Path) -> None:
 
 def test_a_reader_that_has_gone(shot: list[str], tmp_path: Path) -> None:
     process = start(shot, tmp_path, "--count", "3000", "--progress", "json")
-    assert process.stdout is not None
     process.stdout.readline()
     process.stdout.close()
     assert process.wait(timeout=60) == 1
@@ -355,13 +340,11 @@ def test_frames_that_show_nothing(shot: list[str], tmp_path: Path, capsys: Captu
     away.save(tmp_path / "away.ply")
     for channels in ("rgb", "rgb,alpha"):
         call = [str(tmp_path / "away.ply"), *shot[1:]]
-        assert render(call, tmp_path, "--json", "--channels", channels, "--overwrite") == 0
-        captured = capsys.readouterr()
+        captured = ran(capsys, render, call, tmp_path, "--json", "--channels", channels, "--overwrite")
         assert [record["blank"] for record in json.loads(captured.out)] == [True] * COUNT
         said = "6 of 6 frames show nothing of the model: 1, 2, 3 and 3 more; are the cameras in the model's world?"
         assert captured.err.splitlines() == [f"clsplat: warning: {said}"]
-    assert render(shot, tmp_path, "--json", "--frames", "2") == 0
-    captured = capsys.readouterr()
+    captured = ran(capsys, render, shot, tmp_path, "--json", "--frames", "2")
     assert json.loads(captured.out)[0]["blank"] is False
     assert captured.err == ""
 

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, fails, ran
 from cg import write_flat
+from rendered import camera_file
 from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.arrays import Float32, Float64
@@ -39,10 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mattes")
     A.save(folder / "a.ply")
     B.save(folder / "b.ply")
-    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": 1, "position": [0, 0, -4], **key}, {"frame": 2, "position": [0.5, 0, -4], **key}]
-    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-    (folder / "cameras.json").write_text(json.dumps(document))
+    camera_file(folder / "cameras.json", {1: 0, 2: 0.5})
     mattes = [{"name": "ball", "sphere": SPHERE}, {"name": "left", "box": BOX}]
     models = [{"name": "a", "path": "a.ply"}, {"name": "b ü", "path": "b.ply", "mattes": mattes}]
     (folder / "shot.json").write_text(json.dumps({"clsplat_shot": 1, "models": models}))
@@ -217,8 +215,7 @@ def test_skip_existing_sees_the_mattes(folder: Path, tmp_path: Path, capsys: Cap
         labelled(folder / "changing.ply", ids)
         capsys.readouterr()
         flags = "--channels semantic --ids-from label --skip-existing --json"
-        assert render(folder, tmp_path, flags, "changing.ply") == 0
-        return bool(json.loads(capsys.readouterr().out)[0]["skipped"])
+        return bool(json.loads(ran(capsys, render, folder, tmp_path, flags, "changing.ply").out)[0]["skipped"])
 
     assert [skipped(np.arange(15) % 3), skipped(np.arange(15) % 3), skipped(np.arange(15) % 4)] == [False, True, False]
 
@@ -237,8 +234,7 @@ def test_skip_existing_sees_the_mattes(folder: Path, tmp_path: Path, capsys: Cap
 def test_wrong_mattes_are_one_line(
     flags: str, model: str, message: str, folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    assert render(folder, tmp_path / "none", flags, model) == 2
-    assert message in error_line(capsys)
+    assert message in fails(capsys, render, folder, tmp_path / "none", flags, model)
 
 
 @pytest.mark.parametrize(
@@ -255,8 +251,7 @@ def test_wrong_mattes_are_one_line(
 def test_wrong_volumes_are_one_line(mattes: Any, message: str, folder: Path, tmp_path: Path, capsys: Capture) -> None:
     shot = {"clsplat_shot": 1, "models": [{"name": "a", "path": "a.ply", "mattes": mattes}]}
     (folder / "wrong.json").write_text(json.dumps(shot))
-    assert render(folder, tmp_path / "none", "--channels objects", "wrong.json") == 2
-    assert message in error_line(capsys)
+    assert message in fails(capsys, render, folder, tmp_path / "none", "--channels objects", "wrong.json")
 
 
 def test_far_more_objects_than_a_matte_has(folder: Path, tmp_path: Path, capsys: Capture) -> None:

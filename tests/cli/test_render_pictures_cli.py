@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, fails, printed, ran
 from headers import exr_attributes, png_chunks
 from quick import quick
+from rendered import camera_file, contents
 from systems import can_link
 from tiny import HEIGHT, WIDTH, hidden_model
 
@@ -39,11 +40,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """A model and a camera that goes to the right, as arguments of render."""
     folder = tmp_path_factory.mktemp("shot")
     hidden_model().save(folder / "model.ply")
-    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": 1, "position": [-0.5, 0, -4], **key}, {"frame": COUNT, "position": [0.5, 0, -4], **key}]
-    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-    (folder / "cameras.json").write_text(json.dumps(document))
-    return [str(folder / "model.ply"), "--cameras", str(folder / "cameras.json")]
+    return [str(folder / "model.ply"), "--cameras", str(camera_file(folder / "cameras.json", {1: -0.5, COUNT: 0.5}))]
 
 
 def render(shot: list[str], folder: Path, flags: str = "", pattern: str = "a.####.exr") -> int:
@@ -72,13 +69,8 @@ def plain(shot: list[str], tmp_path_factory: pytest.TempPathFactory) -> np.ndarr
     return picture(shot, tmp_path_factory.mktemp("plain"), "--channels rgb,alpha,depth")[0]
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
 def test_the_help_has_every_flag(capsys: Capture) -> None:
-    assert main(["render", "--help"]) == 0
-    words = capsys.readouterr().out.split()
+    words = printed(capsys, ["render", "--help"]).out.split()
     assert [flag for flag in FLAGS if flag not in words] == []
 
 
@@ -303,8 +295,7 @@ def test_files_without_attributes_say_how_they_were_made(
     document["keys"][1]["position"] = [0.5, 0, -3.9]  # frame 1 is where it was, frame 2 is not
     (tmp_path / "moved.json").write_text(json.dumps(document))
     moved = [*shot[:2], str(tmp_path / "moved.json")]
-    assert render(moved, tmp_path, "--frames 1,2 --skip-existing", pattern) == 0
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = ran(capsys, render, moved, tmp_path, "--frames 1,2 --skip-existing", pattern).err.splitlines()
     assert "1 of the frames that are there were made of another model, or with other cameras or settings" in line
     changed = {path.name for path, stamp in before.items() if path.stat().st_mtime_ns != stamp}
     assert changed == {f"a.0002.{extension}"}
@@ -341,8 +332,7 @@ def test_video(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
 
     small = tmp_path / "small.mp4"
     flags = "--video.fps 12 --video.crf 10 --video.preset fast --count 9 --path through --json"
-    assert render(shot, tmp_path, flags, "a.mp4") == 0
-    records = json.loads(capsys.readouterr().out)
+    records = json.loads(ran(capsys, render, shot, tmp_path, flags, "a.mp4").out)
     assert [record["frame"] for record in records] == list(range(1, 10))
     assert {record["path"] for record in records} == {str(tmp_path / "a.mp4")}
     assert render(shot, tmp_path, flags.replace("crf 10", "crf 45"), small.name) == 0
@@ -368,8 +358,7 @@ def test_a_video_says_how_it_was_made(name: str, flags: str, shot: list[str], tm
     video = tmp_path / name
     assert render(shot, tmp_path, flags, name) == 0
     stamp, whole = video.stat().st_mtime_ns, video.read_bytes()
-    assert render(shot, tmp_path, f"{flags} --skip-existing --json", name) == 0
-    captured = capsys.readouterr()
+    captured = ran(capsys, render, shot, tmp_path, f"{flags} --skip-existing --json", name)
     assert captured.err == ""
     assert all(record["skipped"] for record in json.loads(captured.out))
     assert video.stat().st_mtime_ns == stamp
@@ -381,8 +370,7 @@ def test_a_video_says_how_it_was_made(name: str, flags: str, shot: list[str], tm
         )
     assert video.read_bytes() == whole
     video.write_bytes(b"precious")
-    assert render(shot, tmp_path, f"{flags} --skip-existing", name) == 2
-    assert "exists already" in error_line(capsys)
+    assert "exists already" in fails(capsys, render, shot, tmp_path, f"{flags} --skip-existing", name)
     assert video.read_bytes() == b"precious"
 
 
@@ -431,8 +419,7 @@ def test_strips(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     flags = f"--width {20 * WIDTH} --frames 2 --channels rgb,alpha,depth --max-device-mem"
     plenty, little = (f"{flags} {size}" for size in ("1GiB", "4MiB"))
     assert render(shot, tmp_path / "plenty", plenty) == 0
-    assert render(shot, tmp_path, f"{little} --dry-run --json") == 0
-    plan = json.loads(capsys.readouterr().out)
+    plan = json.loads(ran(capsys, render, shot, tmp_path, f"{little} --dry-run --json").out)
     assert plan["devices"][0]["strips"] > 1
     assert plan["devices"][0]["needed"] <= 4 << 20
     assert render(shot, tmp_path / "little", little) == 0
@@ -447,16 +434,14 @@ EVERYTHING += "--samples 3 --aperture 0.1 --focus 4"
 
 
 def test_the_plan(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    assert render(shot, tmp_path / "new", f"{EVERYTHING} --dry-run") == 0
-    text = capsys.readouterr().out
+    text = ran(capsys, render, shot, tmp_path / "new", f"{EVERYTHING} --dry-run").out
     for part in (
         f"{WIDTH + 6}x{HEIGHT + 6} at -3,-3 of {WIDTH}x{HEIGHT}",
         "colour    sRGB to ACEScg",
         "samples   3 frames for one, shutter from -0.25 to 0.25 frames, lens in focus at 4, 2x2 a pixel, box",
     ):
         assert part in text
-    assert render(shot, tmp_path / "new", f"{EVERYTHING} --dry-run --json") == 0
-    plan = json.loads(capsys.readouterr().out)
+    plan = json.loads(ran(capsys, render, shot, tmp_path / "new", f"{EVERYTHING} --dry-run --json").out)
     wanted = {"model_colorspace": "sRGB", "colorspace": "ACEScg", "samples": 3, "supersample": 2, "deep_bins": 0}
     assert {name: plan[name] for name in wanted} == wanted
     assert plan["frames"][0]["window"] == [-3, -3, WIDTH, HEIGHT]
@@ -559,8 +544,7 @@ def test_calls_that_make_no_sense(shot: list[str], tmp_path: Path, capsys: Captu
         ("--colorspace ACEScct", "a.mp4", "its colours would be ACEScct, expected sRGB's primaries; write .exr, or"),
     ]
     for flags, pattern, message in cases:
-        assert render(shot, tmp_path / "new", flags, pattern) == 2, flags
-        assert message in error_line(capsys), flags
+        assert message in fails(capsys, render, shot, tmp_path / "new", flags, pattern), flags
     monkeypatch.setitem(sys.modules, "av", None)
     assert render(shot, tmp_path / "new", "", "a.mp4") == 2
     assert "a.mp4: video needs PyAV, which is not installed" in error_line(capsys)

@@ -7,14 +7,14 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, fails, ran
 from compare import assert_same_bits
 from needs import require
+from rendered import camera_file, pixels_of
 from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.arrays import Float32
@@ -41,12 +41,8 @@ def folder(tmp_path: Path) -> Path:
     """Frames 1 to COUNT, and a camera that goes to the right."""
     for frame in range(1, COUNT + 1):
         at(frame).save(tmp_path / f"capture.{frame:04d}.ply")
-    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": 1, "position": [-0.3, 0, -4], **key}, {"frame": COUNT, "position": [0.3, 0, -4], **key}]
-    document: dict[str, Any] = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-    (tmp_path / "cameras.json").write_text(json.dumps(document))
-    document["keys"] = keys[:1]
-    (tmp_path / "one.json").write_text(json.dumps(document))
+    camera_file(tmp_path / "cameras.json", {1: -0.3, COUNT: 0.3})
+    camera_file(tmp_path / "one.json", {1: -0.3})
     return tmp_path
 
 
@@ -63,7 +59,7 @@ def named(folder: Path, out: str, frame: int) -> dict[str, Float32]:
 
 
 def pixels(folder: Path, out: str, frame: int) -> Float32:
-    return np.asarray(oiio.ImageBuf(str(folder / out / f"{frame:04d}.exr")).get_pixels(oiio.FLOAT))
+    return pixels_of(folder / out / f"{frame:04d}.exr")
 
 
 @pytest.mark.parametrize("pattern", ["capture.####.ply", "capture.%04d.ply", "capture.$F4.ply"])
@@ -143,9 +139,8 @@ def test_motion_blur_is_the_mean_over_the_shutter(folder: Path) -> None:
 
 def test_gaps_are_filled_and_told(folder: Path, capsys: Capture) -> None:
     (folder / "capture.0003.ply").unlink()
-    assert render(folder, "capture.####.ply", "all", "--channels alpha --exr float") == 0
     assert "has no file of the frame(s) 3, made from the neighbouring files; there are the frames 1-2,4-5" in (
-        capsys.readouterr().err
+        ran(capsys, render, folder, "capture.####.ply", "all", "--channels alpha --exr float").err
     )
     means = (at(2).means.astype(float) + at(4).means) / 2
     replace(MODEL, means=means.astype(np.float32)).save(folder / "between.ply")
@@ -201,13 +196,11 @@ def test_what_is_wrong(model: str, flags: str, words: str, folder: Path, capsys:
         replace(at(frame), antialiased=frame == 2).save(folder / f"odd.{frame:04d}.ply")
         at(frame).save(folder / f"torn.{frame:04d}.ply")
     os.truncate(folder / "torn.0002.ply", 700)
-    assert render(folder, model, "none", f"--exr half {flags}") == 2
-    assert words in error_line(capsys)
+    assert words in fails(capsys, render, folder, model, "none", f"--exr half {flags}")
 
 
 def test_the_plan(folder: Path, capsys: Capture) -> None:
-    assert render(folder, "capture.####.ply", "none", "--dry-run --json") == 0
-    plan = json.loads(capsys.readouterr().out)
+    plan = json.loads(ran(capsys, render, folder, "capture.####.ply", "none", "--dry-run --json").out)
     assert (plan["gaussians"], len(plan["frames"])) == (30, COUNT)
     assert load_cast(folder / "capture.####.ply").digest == plan["digest"]
 
@@ -235,8 +228,7 @@ def stage_of(folder: Path, name: str, **samples: Gaussians) -> Path:
 def test_time_samples_of_a_stage(folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(usd, "_lives", lambda *_: True)
     stage_of(folder, "capture", **{f"f{frame}": at(frame) for frame in (1, 2, 4)})
-    assert render(folder, "capture.usda", "all", EVERYTHING) == 0
-    assert capsys.readouterr().err == ""
+    assert ran(capsys, render, folder, "capture.usda", "all", EVERYTHING).err == ""
     between_them = replace(MODEL, means=((at(2).means.astype(float) + at(4).means) / 2).astype(np.float32))
     for frame, model in ((1, at(1)), (2, at(2)), (4, at(4)), (5, at(4)), (3, between_them)):
         stage_of(folder, f"one{frame}", f1=model)

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, fails
 from cg import write_flat
 from compare import assert_same_bits
 from models import random_gaussians
+from rendered import camera_file, pixels_of
 from tiny import HEIGHT, WIDTH, hidden_model
 
-from clsplat.arrays import Float32, Float64
+from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.pictures import SamplingConfig
@@ -59,10 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("shot")
     A.save(folder / "a.ply")
     B.save(folder / "b.ply")
-    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": 1, "position": [-0.3, 0, -4], **key}, {"frame": 5, "position": [0.3, 0, -4], **key}]
-    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-    (folder / "cameras.json").write_text(json.dumps(document))
+    camera_file(folder / "cameras.json", {1: -0.3, 5: 0.3})
     return folder
 
 
@@ -77,10 +74,6 @@ def layout(folder: Path, file: str, /, **of_b: Any) -> Path:
 def render(folder: Path, model: Path, out: Path, flags: str = "", *more: str) -> int:
     cameras = ["--cameras", str(folder / "cameras.json"), "-o", str(out / "####.exr"), "--progress", "none"]
     return main(["render", str(model), *cameras, *flags.split(), *more])
-
-
-def pixels(path: Path) -> Float32:
-    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
 
 
 def camera_at(frame: float) -> Camera:
@@ -119,11 +112,11 @@ def test_models_over_time_are_one_model_merged_beforehand(folder: Path, tmp_path
         merged, one = tmp_path / "merged.ply", tmp_path / "one"
         edit.merge([A, B if frame == 1 else edit.transform(B, moved_by(frame))]).save(merged)
         assert render(folder, merged, one, f"--frames {frame} {channels}") == 0
-        got, wanted = pixels(tmp_path / f"{frame:04d}.exr"), pixels(one / f"{frame:04d}.exr")
+        got, wanted = pixels_of(tmp_path / f"{frame:04d}.exr"), pixels_of(one / f"{frame:04d}.exr")
         if frame == 1:  # B is where it was
             assert_same_bits(got, wanted)
         assert np.abs(got - wanted).max() < CLOSE
-    assert np.abs(pixels(tmp_path / "0003.exr") - pixels(tmp_path / "0001.exr"))[:, :, :3].max() > 0.1
+    assert np.abs(pixels_of(tmp_path / "0003.exr") - pixels_of(tmp_path / "0001.exr"))[:, :, :3].max() > 0.1
 
 
 def test_sh_turn_with_the_model() -> None:
@@ -143,7 +136,7 @@ def test_sh_turn_with_the_model() -> None:
 def test_a_hidden_model_is_not_there(hidden: dict[str, Any], folder: Path, tmp_path: Path) -> None:
     assert render(folder, layout(folder, "hidden", **hidden), tmp_path, "--frames 2 --channels rgb,alpha,id") == 0
     assert render(folder, folder / "a.ply", tmp_path / "a", "--frames 2 --channels rgb,alpha,id") == 0
-    assert_same_bits(pixels(tmp_path / "0002.exr"), pixels(tmp_path / "a" / "0002.exr"))
+    assert_same_bits(pixels_of(tmp_path / "0002.exr"), pixels_of(tmp_path / "a" / "0002.exr"))
 
 
 def test_visibility_changes_at_its_key(folder: Path) -> None:
@@ -168,7 +161,7 @@ def test_opacity_and_colour_over_time(folder: Path, tmp_path: Path) -> None:
     by_hand = replace(B, sh=sh.astype(np.float32), opacity_logits=np.log(opacity / (1 - opacity)).astype(np.float32))
     edit.merge([A, by_hand]).save(tmp_path / "merged.ply")
     assert render(folder, tmp_path / "merged.ply", tmp_path / "one", "--frames 2") == 0
-    assert np.abs(pixels(tmp_path / "0002.exr") - pixels(tmp_path / "one" / "0002.exr")).max() < CLOSE
+    assert np.abs(pixels_of(tmp_path / "0002.exr") - pixels_of(tmp_path / "one" / "0002.exr")).max() < CLOSE
 
 
 def test_a_colour_within_a_colour() -> None:
@@ -190,11 +183,11 @@ def test_a_moving_model_blurs(folder: Path, tmp_path: Path) -> None:
         means.append(srgb_to_linear(renderer.render(merged, camera_at(2 + time)).image))
     wanted, got = (
         linear_to_srgb(np.mean(means, axis=0, dtype=np.float64).astype(np.float32)),
-        pixels(tmp_path / "0002.exr"),
+        pixels_of(tmp_path / "0002.exr"),
     )
     assert np.abs(got - wanted).max() < 5e-5  # sRGB's curve is steep where it is dark: 12.9 times CLOSE and less
     assert render(folder, layout(folder, "still", matrix=moved_by(2).ravel().tolist()), tmp_path / "still", flags) == 0
-    assert np.abs(got - pixels(tmp_path / "still" / "0002.exr")).max() > 0.03  # and the model's own motion is in it
+    assert np.abs(got - pixels_of(tmp_path / "still" / "0002.exr")).max() > 0.03  # and the model's own motion is in it
 
 
 OPEN = "--shutter-open 0 --shutter-close 0.5 --samples 2"
@@ -213,7 +206,7 @@ def test_motion_is_the_models_too(shutter: str, wall: float, folder: Path, tmp_p
         p = model.means.astype(np.float64) @ camera.rotation.T + camera.translation
         places.append(p[:, :2] / p[:, 2:] * camera.fx)
     wanted = blended(here, camera_at(now), places[1] - places[0], wall)[0]
-    got = pixels(tmp_path / "0002.exr")
+    got = pixels_of(tmp_path / "0002.exr")
     alpha, motion = got[:, :, 0], got[:, :, 1:] * [1, -1]  # v is up in a file
     opaque = alpha > 0.5
     assert opaque.sum() > 200
@@ -249,7 +242,7 @@ def test_the_same_file_twice_and_a_transform_of_all(folder: Path, tmp_path: Path
     outer = edit.shifting(shift) @ edit.turning([0, 30, 0])
     merged = edit.merge([edit.transform(A, outer @ edit.shifting([x, 0, 0])) for x in (-0.5, 0.5)])
     wanted = Renderer().render(merged, camera_at(2)).image
-    assert np.abs(pixels(tmp_path / "0002.exr") - wanted).max() < CLOSE
+    assert np.abs(pixels_of(tmp_path / "0002.exr") - wanted).max() < CLOSE
 
 
 @pytest.mark.parametrize("kind", ["numbers", "text", "keys", "matrices"])
@@ -302,7 +295,6 @@ def test_an_ensemble_makes_what_changes() -> None:
     assert ensemble.moved((still, there), (still, there)) is None
     assert ensemble.moved((still, there), (still, Placement(there.matrix, 0.5))) is None
     moved = ensemble.moved((still, still), (still, there))
-    assert moved is not None
     np.testing.assert_array_equal(moved.means, both.means)
 
 
@@ -336,8 +328,7 @@ def test_wrong_shots_are_one_line(
         path.write_text(wrong)
     else:
         layout(folder, "wrong", **wrong)
-    assert render(folder, path, tmp_path / "none", "--frames 1") == 2
-    line = error_line(capsys)
+    line = fails(capsys, render, folder, path, tmp_path / "none", "--frames 1")
     assert str(path) in line and message in line
     assert not (tmp_path / "none").exists()
 
@@ -353,8 +344,7 @@ def test_wrong_shots_are_one_line(
     ],
 )
 def test_wrong_transforms_are_one_line(text: str, message: str, folder: Path, tmp_path: Path, capsys: Capture) -> None:
-    assert render(folder, folder / "a.ply", tmp_path / "none", "", "--transform", text) == 2
-    assert message in error_line(capsys)
+    assert message in fails(capsys, render, folder, folder / "a.ply", tmp_path / "none", "", "--transform", text)
 
 
 def test_models_that_are_not_drawn_alike(folder: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -381,7 +371,7 @@ def test_a_worker_places_what_it_has_read(folder: Path, tmp_path: Path) -> None:
     renderer = Renderer()
     here, there = cast.at(2), cast.at(3)
     picture, made = renderer.render_channels(here, camera_at(2), ("motion",), after=camera_at(3), moved=there)
-    found = pixels(tmp_path / "2.exr")
+    found = pixels_of(tmp_path / "2.exr")
     np.testing.assert_allclose(found[:, :, :3], picture.image, atol=CLOSE)
     np.testing.assert_allclose(found[:, :, 3:] * [1, -1], made["motion"], atol=1e-4)
     replace(B, opacity_logits=B.opacity_logits + 1).save(folder / "c.ply")
@@ -400,4 +390,4 @@ def test_a_path_goes_around_all_models(folder: Path, tmp_path: Path) -> None:
     shot = str(layout(folder, "around"))
     out = ["-o", str(tmp_path / "####.exr"), "--progress", "none", "--width", "20", "--height", "20"]
     assert main(["render", shot, "--path", "turntable", "--count", "1", *out]) == 0
-    assert pixels(tmp_path / "0001.exr").max() > 0.1
+    assert pixels_of(tmp_path / "0001.exr").max() > 0.1

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, only, printed
 from headers import exr_attributes
 from needs import require
 from tiny import HEIGHT, WIDTH, hidden_model
@@ -209,8 +209,7 @@ def test_the_data_window(model: Path, tmp_path: Path) -> None:
 def warnings_of(capsys: Capture, model: Path, stage: Path, flags: str = "") -> list[str]:
     words = ["render", str(model), "--cameras", str(stage), "-o", str(stage.parent / "b.####.exr"), "--dry-run"]
     capsys.readouterr()
-    assert main([*words, *flags.split()]) == 0
-    return [line for line in capsys.readouterr().err.splitlines() if "not applied" in line]
+    return [line for line in printed(capsys, [*words, *flags.split()]).err.splitlines() if "not applied" in line]
 
 
 @pytest.mark.slow
@@ -221,11 +220,9 @@ def test_one_warning_of_what_is_not_applied(model: Path, tmp_path: Path, capsys:
     assert line.endswith(f"{stage}: not applied: exposure (1), dataWindowNDC (-0.25, 0, 1, 1)")
     (line,) = warnings_of(capsys, model, stage, "--region 0,0,9,9 --samples 3")
     assert line.endswith(": not applied: exposure (1)")
-    (line,) = warnings_of(capsys, model, stage, "--deep --region 0,0,9,9")
-    assert line.endswith(": not applied: exposure (1)")
+    assert only(warnings_of(capsys, model, stage, "--deep --region 0,0,9,9")).endswith(": not applied: exposure (1)")
     unfocused = write_stage(tmp_path / "unfocused.usda", "float fStop = 1")
-    (line,) = warnings_of(capsys, model, unfocused)
-    assert line.endswith(": not applied: fStop (1)")
+    assert only(warnings_of(capsys, model, unfocused)).endswith(": not applied: fStop (1)")
     assert warnings_of(capsys, model, unfocused, "--focus 3") == []
     assert warnings_of(capsys, model, unfocused, "--aperture 0") == []
 
@@ -241,10 +238,8 @@ def test_pixels_that_a_file_shows_as_squares(model: Path, tmp_path: Path, capsys
 def test_the_plan_and_errors(model: Path, tmp_path: Path, capsys: Capture) -> None:
     stage = write_stage(tmp_path / "shot.usda", LENS + SHUTTER)
     words = ["render", str(model), "--cameras", str(stage), "-o", str(tmp_path / "b.####.exr"), "--samples", "7"]
-    assert main([*words, "--dry-run", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["samples"] == 7
-    assert main([*words, "--dry-run"]) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("samples"))
+    assert json.loads(printed(capsys, [*words, "--dry-run", "--json"]).out)["samples"] == 7
+    line = next(line for line in printed(capsys, [*words, "--dry-run"]).out.splitlines() if line.startswith("samples"))
     assert line == "samples   7 frames for one, shutter from -0.5 to 0.5 frames, lens in focus at 3"
     thin = write_stage(tmp_path / "thin.usda", settings="float4 dataWindowNDC = (0.5, 0, 0.501, 1)")
     assert main(["render", str(model), "--cameras", str(thin), "-o", str(tmp_path / "c.####.exr")]) == 2

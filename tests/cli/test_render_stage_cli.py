@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, error_line, ran
 from compare import assert_same_bits
 from needs import require
+from rendered import pixels_of
 from tiny import HEIGHT, WIDTH, hidden_model
+from usd_stages import saved, stage_with_camera
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
@@ -63,15 +64,8 @@ def shot(folder: Path) -> Usd.Stage:
     """A stage with a camera, and under /Asset the model of another file by reference."""
     usd.write(folder / "asset" / "model.usdc", MODEL)
     (folder / "shots").mkdir()
-    stage = Usd.Stage.CreateNew(str(folder / "shots" / "shot.usda"))
+    stage = stage_with_camera(folder / "shots" / "shot.usda")
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
-    stage.SetStartTimeCode(1)
-    stage.SetEndTimeCode(5)
-    camera = UsdGeom.Camera.Define(stage, "/Camera")
-    camera.CreateHorizontalApertureAttr(20.0)
-    camera.CreateVerticalApertureAttr(20.0 * HEIGHT / WIDTH)
-    camera.CreateFocalLengthAttr(20.0)
-    UsdGeom.Xformable(camera).AddTranslateOp().Set(Gf.Vec3d(0, 0, 5))
     asset = UsdGeom.Xform.Define(stage, "/Asset").GetPrim()
     asset.GetReferences().AddReference("../asset/model.usdc")
     return stage
@@ -90,19 +84,10 @@ CAMERA = Camera(
 )
 
 
-def saved(stage: Usd.Stage) -> str:
-    stage.GetRootLayer().Save()
-    return str(stage.GetRootLayer().realPath)
-
-
 def render(stage: Usd.Stage | str, out: Path, flags: str = "", cameras: str = "") -> int:
     path = stage if isinstance(stage, str) else saved(stage)
     words = ["render", path, "--cameras", cameras or path, "-o", str(out / "####.exr"), "--progress", "none"]
     return main([*words, "--width", str(WIDTH), *flags.split()])
-
-
-def pixels(path: Path) -> Float32:
-    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
 
 
 def image(model: Gaussians) -> Float32:
@@ -121,7 +106,7 @@ def test_a_stage_places_its_models(stage: Usd.Stage, tmp_path: Path) -> None:
     for frame in (1, 2, 4):
         moved = own if frame == 1 else edit.transform(own, turned(frame))
         wanted = image(edit.merge([moved, own]) if frame < 3 else moved)
-        got = pixels(tmp_path / f"{frame:04d}.exr")
+        got = pixels_of(tmp_path / f"{frame:04d}.exr")
         if frame == 1:
             assert_same_bits(got, wanted)
         assert np.abs(got - wanted).max() < CLOSE
@@ -135,7 +120,7 @@ def test_a_stages_model_blurs_and_moves(stage: Usd.Stage, tmp_path: Path) -> Non
     times = [3 + time for time in sample_moments(SamplingConfig(samples=6, shutter_angle=180))]
     pictures = [Renderer().render(edit.transform(own, turned(time)), CAMERA) for time in times]
     alpha = np.mean([picture.alpha for picture in pictures], axis=0, dtype=np.float64)
-    got = pixels(tmp_path / "0003.exr")
+    got = pixels_of(tmp_path / "0003.exr")
     assert np.abs(got[:, :, 3] - alpha).max() < CLOSE
     light = np.mean(
         [srgb_to_linear(p.image / p.alpha.clip(1e-9)[..., None]) * p.alpha[..., None] for p in pictures], axis=0
@@ -156,7 +141,7 @@ def test_units_move_nothing_and_cameras_may_be_others(stage: Usd.Stage, tmp_path
     cameras.GetRootLayer().Save()
     own = image(load(tmp_path / "asset" / "model.usdc"))
     assert render(path, tmp_path / "a", "", str(other)) == 0
-    assert_same_bits(pixels(tmp_path / "a" / "0001.exr"), own)
+    assert_same_bits(pixels_of(tmp_path / "a" / "0001.exr"), own)
 
 
 def test_prims_without_sh(stage: Usd.Stage, tmp_path: Path) -> None:
@@ -177,7 +162,7 @@ def test_prims_without_sh(stage: Usd.Stage, tmp_path: Path) -> None:
     opacities = 1 / (1 + np.exp(-model.opacity_logits.astype(np.float64)))
     np.testing.assert_allclose(opacities, [0.25] * 4 + [1] * 2, atol=1e-6)
     assert render(stage, tmp_path, "--frames 1") == 0
-    assert_same_bits(pixels(tmp_path / "0001.exr"), image(model))
+    assert_same_bits(pixels_of(tmp_path / "0001.exr"), image(model))
 
 
 @pytest.mark.slow
@@ -192,7 +177,7 @@ def test_a_linear_stage(where: str, stage: Usd.Stage, tmp_path: Path, capsys: Ca
     assert render(stage, tmp_path, "--frames 1 --colorspace sRGB") == 0
     own = load(tmp_path / "asset" / "model.usdc")
     picture = Renderer().render(own, CAMERA)
-    assert np.abs(pixels(tmp_path / "0001.exr") - linear_to_srgb(picture.image)).max() < 1e-6
+    assert np.abs(pixels_of(tmp_path / "0001.exr") - linear_to_srgb(picture.image)).max() < 1e-6
     stage.Flatten().Export(str(tmp_path / "flat.usda"))
     assert (colour_space(tmp_path / "flat.usda"), colour_space(tmp_path / "asset" / "model.usdc")) == (LINEAR, SRGB)
     other = UsdGeom.Xform.Define(stage, "/Other").GetPrim()
@@ -217,6 +202,5 @@ def test_only_frames_in_which_something_moves_are_made_again(stage: Usd.Stage, t
     assert render(stage, tmp_path, "--frames 1-3") == 0
     UsdGeom.Xformable(stage.GetPrimAtPath("/Asset")).GetOrderedXformOps()[1].Set(30.0, 2)
     capsys.readouterr()
-    assert render(stage, tmp_path, "--frames 1-3 --skip-existing") == 0
-    lines = capsys.readouterr()
+    lines = ran(capsys, render, stage, tmp_path, "--frames 1-3 --skip-existing")
     assert "2 of the frames that are there were made of another model" in lines.err  # 3 is between 2 and 5

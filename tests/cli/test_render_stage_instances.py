@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
-from calls import Capture, error_line
+from calls import Capture, rejected
 from compare import assert_same_bits
 from needs import require
-from tiny import HEIGHT, WIDTH, hidden_model
+from rendered import pixels_of
+from tiny import WIDTH, hidden_model
+from usd_stages import saved, stage_with_camera
 
 from clsplat.arrays import Float32, Float64
 from clsplat.cli.main import main
@@ -37,15 +38,7 @@ def new_stage(folder: Path, name: str) -> Usd.Stage:
     """A stage of frames 1 to 5 with a camera; the model is a file beside it."""
     if not (folder / "model.usdc").exists():
         usd.write(folder / "model.usdc", MODEL)
-    stage = Usd.Stage.CreateNew(str(folder / f"{name}.usda"))
-    stage.SetStartTimeCode(1)
-    stage.SetEndTimeCode(5)
-    camera = UsdGeom.Camera.Define(stage, "/Camera")
-    camera.CreateHorizontalApertureAttr(20.0)
-    camera.CreateVerticalApertureAttr(20.0 * HEIGHT / WIDTH)
-    camera.CreateFocalLengthAttr(20.0)
-    UsdGeom.Xformable(camera).AddTranslateOp().Set(Gf.Vec3d(0, 0, 5))
-    return stage
+    return stage_with_camera(folder / f"{name}.usda")
 
 
 def with_model(stage: Usd.Stage, path: str) -> Any:
@@ -62,17 +55,12 @@ def instancer(stage: Usd.Stage, path: str, prototypes: list[str], indices: list[
     return made
 
 
-def saved(stage: Usd.Stage) -> str:
-    stage.GetRootLayer().Save()
-    return str(stage.GetRootLayer().realPath)
-
-
 def pixels(stage: Usd.Stage, frame: int, flags: str = "") -> Float32:
     path = Path(saved(stage))
     out = path.parent / path.stem
     words = ["render", str(path), "--cameras", str(path), "-o", str(out / "####.exr"), "--frames", str(frame)]
     assert main([*words, "--progress", "none", "--width", str(WIDTH), "--overwrite", *flags.split()]) == 0
-    return np.asarray(oiio.ImageBuf(str(out / f"{frame:04d}.exr")).get_pixels(oiio.FLOAT))
+    return pixels_of(out / f"{frame:04d}.exr")
 
 
 def tracks(stage: Usd.Stage) -> dict[str, Any]:
@@ -229,8 +217,7 @@ def shifted(x: float, y: float) -> Float64:
 def test_wrong_instancers_are_one_line(tmp_path: Path, capsys: Capture) -> None:
     def error_of(stage: Usd.Stage) -> str:
         path = saved(stage)
-        assert main(["render", path, "--cameras", path, "-o", f"{tmp_path}/out.####.exr", "--width", "9"]) == 2
-        return error_line(capsys)
+        return rejected(capsys, ["render", path, "--cameras", path, "-o", f"{tmp_path}/out.####.exr", "--width", "9"])
 
     stage = new_stage(tmp_path, "indices")
     with_model(stage, "/Forest/Tree")

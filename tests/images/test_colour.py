@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from calls import refuses
 from scenes import one
 
 from clsplat.config.pictures import ColourConfig, Encoding
@@ -118,8 +119,7 @@ def test_a_space_that_is_not_there() -> None:
         Colours(ColourConfig(colorspace="ACEScq"))
     with pytest.raises(InputError, match=r"^--model-colorspace zzz: .*; it has .+, .+, .+ and \d+ more"):
         Colours(ColourConfig(model_colorspace="zzz"))
-    with pytest.raises(InputError, match=r"^the model's colour space sRBG: .*sRGB"):
-        Colours(recorded="sRBG")
+    refuses(r"^the model's colour space sRBG: .*sRGB", Colours, recorded="sRBG")
 
 
 def test_a_configuration_that_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,8 +155,7 @@ def test_what_a_model_records(tmp_path: Path) -> None:
     assert recorded_space(path) == SRGB
     path.write_bytes(plain.replace(b"element vertex", b"obj_info clsplat colorspace ACEScg\nelement vertex", 1))
     assert recorded_space(path) == "ACEScg"
-    with pytest.raises(ValueError, match="expected one line"):
-        gaussians.save(path, comments=["a\nelement vertex 7"])
+    refuses("expected one line", gaussians.save, path, comments=["a\nelement vertex 7"], error=ValueError)
 
 
 def test_what_photos_are_in() -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-import pytest
+from calls import refuses
 from cg import write_flat, write_samples
 
-from clsplat.errors import InputError
 from clsplat.images.holdouts import Surfaces, check_holdout, read_holdout, surfaces_of
 
 DEPTH = np.array([[2.0, 0.0, np.inf], [3.0, 1e10, 5.0]])
@@ -82,8 +81,7 @@ def test_what_is_wrong(tmp_path: Path) -> None:
         (write_flat(tmp_path / "z.tif", {"Z": DEPTH}), "z.tif: is no EXR, expected a depth or deep EXR"),
     ]
     for path, message in cases:
-        with pytest.raises(InputError, match=f"^{tmp_path}/{message}"):
-            check_holdout(path, SIZE)
+        refuses(f"^{tmp_path}/{message}", check_holdout, path, SIZE)
     decoded = [
         (write_flat(tmp_path / "n.exr", {"Z": nan}), "n.exr: 1 values of Z are not a number, expected depths"),
         (write_flat(tmp_path / "g.exr", {"Z": negative}), "g.exr: 1 values of Z are negative, expected depths along"),
@@ -91,9 +89,7 @@ def test_what_is_wrong(tmp_path: Path) -> None:
     ]
     for path, message in decoded:
         check_holdout(path, SIZE)
-        with pytest.raises(InputError, match=f"^{tmp_path}/{message}"):
-            read_holdout(path, SIZE)
+        refuses(f"^{tmp_path}/{message}", read_holdout, path, SIZE)
     cut = write_samples(tmp_path / "cut.exr", SIZE, [[[1.0, 2.0]]] * 6)
     cut.write_bytes(cut.read_bytes()[:-8])
-    with pytest.raises(InputError, match=r"cut\.exr: does not decode: "):
-        read_holdout(cut, SIZE)
+    refuses(r"cut\.exr: does not decode: ", read_holdout, cut, SIZE)

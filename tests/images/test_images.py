@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from calls import refuses
 from other_pictures import HEIGHT, KINDS, WIDTH, other_picture
 from PIL import Image as Pillow
 from PIL import ImageOps
 
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError
 from clsplat.images import writing
 from clsplat.images.reading import alpha_of, channels_of, downscale, image_size, read_image
 from clsplat.images.writing import write_image
@@ -55,8 +56,7 @@ def test_exr_of_many_channels_gives_those_named_rgb(tmp_path: Path) -> None:
     write_raw(tmp_path / "a.exr", pixels, ("R", "G", "B", "Z", "N"))
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), [[[0, 1, 2]]])
     write_raw(tmp_path / "b.exr", pixels, ("u", "v", "w", "Z", "N"))
-    with pytest.raises(InputError, match=r"b\.exr: has the channels .*expected grey or RGB"):
-        read_image(tmp_path / "b.exr")
+    refuses(r"b\.exr: has the channels .*expected grey or RGB", read_image, tmp_path / "b.exr")
 
 
 def test_exr_data_window_is_placed_in_the_display_window(tmp_path: Path) -> None:
@@ -94,19 +94,14 @@ def test_undecodable_images_are_named_with_the_reason(tmp_path: Path) -> None:
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "empty.jpg").touch()
     for name in ("cut.jpg", "cut.png", "text.png", "empty.jpg"):
-        with pytest.raises(InputError, match=f"{name}: does not decode: ") as caught:
-            read_image(tmp_path / name)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match=r"cut\.png: does not decode: the PNG ends early"):
-        image_size(tmp_path / "cut.png")
-    with pytest.raises(InputError, match=r"gone\.png: no such image"):
-        read_image(tmp_path / "gone.png")
+        refuses(f"{name}: does not decode: ", read_image, tmp_path / name)
+    refuses(r"cut\.png: does not decode: the PNG ends early", image_size, tmp_path / "cut.png")
+    refuses(r"gone\.png: no such image", read_image, tmp_path / "gone.png")
 
 
 def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     write_raw(tmp_path / "a.exr", np.full((2, 2, 3), np.nan, np.float32), ("R", "G", "B"))
-    with pytest.raises(InputError, match=r"a\.exr: has 4 pixels that are not finite"):
-        read_image(tmp_path / "a.exr")
+    refuses(r"a\.exr: has 4 pixels that are not finite", read_image, tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -149,10 +144,8 @@ def test_a_failed_write_leaves_the_previous_file_and_nothing_else(
         write_image(path, np.ones((2, 2, 3), np.float32))
     assert path.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
-    with pytest.raises(InputError, match=r"expected \.png or \.exr"):
-        write_image(tmp_path / "a.gif", np.zeros((2, 2, 3), np.float32))
-    with pytest.raises(InputError, match="none: no such folder"):
-        write_image(tmp_path / "none" / "a.png", np.zeros((2, 2, 3), np.float32))
+    refuses(r"expected \.png or \.exr", write_image, tmp_path / "a.gif", np.zeros((2, 2, 3), np.float32))
+    refuses("none: no such folder", write_image, tmp_path / "none" / "a.png", np.zeros((2, 2, 3), np.float32))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full, a disk that is full, is not there")
@@ -229,9 +222,7 @@ def test_pictures_of_any_kind_under_any_name(kind: str, extension: str, tmp_path
 @pytest.mark.parametrize("kind", UNREAD)
 def test_pictures_that_cannot_be_read_are_named(kind: str, tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(other_picture(kind))
-    with pytest.raises(InputError, match=r"a\.png: does not decode: .*; expected an image") as caught:
-        read_image(tmp_path / "a.png")
-    assert "\n" not in str(caught.value)
+    refuses(r"a\.png: does not decode: .*; expected an image", read_image, tmp_path / "a.png")
 
 
 class Header:

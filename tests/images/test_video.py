@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import refuses
 from needs import require
 from numpy.typing import NDArray
 
 from clsplat.config.pictures import VideoConfig
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError
 from clsplat.images.video import check_video, frame_planes, prores_planes, video_record, video_writer
 
 require("av")
@@ -193,28 +194,21 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), video_writer(path) as video:
         video.add(frame_planes(made[0]))
         raise KeyboardInterrupt
-    with pytest.raises(InputError, match="the video has no frames"):
-        write_video(path, [])
-    with pytest.raises(ValueError, match=r"frame is 32x16, expected 32x32"):
-        write_video(path, [made[0], made[0][:16]])
+    refuses("the video has no frames", write_video, path, [])
+    refuses(r"frame is 32x16, expected 32x32", write_video, path, [made[0], made[0][:16]], error=ValueError)
     assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
     (tmp_path / "folder.mp4").mkdir()
-    with pytest.raises(ClsplatError, match=r"folder\.mp4: cannot be written"):
-        write_video(tmp_path / "folder.mp4", made)
+    refuses(r"folder\.mp4: cannot be written", write_video, tmp_path / "folder.mp4", made, error=ClsplatError)
 
 
 def test_what_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InputError, match=r"a\.avi: has the extension '\.avi', expected \.mp4 or \.mov"):
-        check_video(tmp_path / "a.avi")
-    with pytest.raises(InputError, match=r"no such folder to write a\.mp4 to"):
-        check_video(tmp_path / "none" / "a.mp4")
+    refuses(r"a\.avi: has the extension '\.avi', expected \.mp4 or \.mov", check_video, tmp_path / "a.avi")
+    refuses(r"no such folder to write a\.mp4 to", check_video, tmp_path / "none" / "a.mp4")
     for config, message in (
         (VideoConfig(fps=0), "--video.fps 0: expected 0.01"),
         (VideoConfig(crf=52), "--video.crf 52: expected 0 to 51"),
         (VideoConfig(preset="best"), "--video.preset best: expected one of ultrafast"),
     ):
-        with pytest.raises(InputError, match=message):
-            write_video(tmp_path / "a.mp4", [], config)
+        refuses(message, write_video, tmp_path / "a.mp4", [], config)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"a\.mp4: video needs PyAV, .*pip install 'clsplat\[video\]'"):
-        write_video(tmp_path / "a.mp4", [])
+    refuses(r"a\.mp4: video needs PyAV, .*pip install 'clsplat\[video\]'", write_video, tmp_path / "a.mp4", [])

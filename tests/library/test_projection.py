@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import refuses
 from compare import assert_close_gradient, relative_error
 from ewa_cases import MODELS, OUTPUTS, case
 
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.library.projection import Projection, fully_fused_projection
 from clsplat.reference import ewa as twin
 
@@ -181,15 +181,12 @@ def test_errors_name_the_argument(changes: dict[str, Any], told: str) -> None:
     viewmats, intrinsics = three_views()
     arrays = {"means": SUBJECT.means, "covars": None, "quaternions": SUBJECT.quaternions, "scales": SUBJECT.scales}
     given = {**arrays, "viewmats": viewmats, "intrinsics": intrinsics, "width": 100, "height": 70, **changes}
-    with pytest.raises(InputError, match=told):
-        fully_fused_projection(**given)
+    refuses(told, fully_fused_projection, **given)
 
 
 def test_errors_of_gradients(default_device: Device) -> None:
     projected = projection(default_device)
-    with pytest.raises(InputError, match=r"means2d: got shape \(400, 2\), expected \(3, 400, 2\)"):
-        projected.vjp(means2d=np.zeros((400, 2)))
+    refuses(r"means2d: got shape \(400, 2\), expected \(3, 400, 2\)", projected.vjp, means2d=np.zeros((400, 2)))
     shapes = (SUBJECT.means, None, SUBJECT.quaternions, SUBJECT.scales)
     plain = fully_fused_projection(*shapes, *three_views(), 100, 70, device=default_device)
-    with pytest.raises(InputError, match="compensations: got a gradient, expected None"):
-        plain.vjp(compensations=np.zeros((3, 400)))
+    refuses("compensations: got a gradient, expected None", plain.vjp, compensations=np.zeros((3, 400)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calls import refuses
 from compare import assert_close, assert_close_gradient, assert_same_bits
 from flat import Flat, cloud
 from numpy.typing import NDArray
@@ -176,13 +177,11 @@ def test_what_makes_no_sense_is_named(default_device: Device, changed: dict[str,
     given: dict[str, object] = {name: stacked(of, attribute) for name, attribute in names.items()}
     given |= {"image_width": WIDTH, "image_height": HEIGHT, "tile_size": 16}
     given |= {"isect_offsets": np.zeros((2, 3, 3), np.int32), "flatten_ids": np.zeros(0, np.int32)}
-    with pytest.raises(InputError, match=told):
-        rasterize_to_pixels(**{**given, **changed}, device=default_device)  # type: ignore[arg-type]  # wrong on purpose
+    refuses(told, rasterize_to_pixels, **{**given, **changed}, device=default_device)  # type: ignore[arg-type]  # wrong on purpose
 
 
 def test_ids_that_make_no_sense() -> None:
-    with pytest.raises(InputError, match="beyond the 1 images of 3 x 3"):
-        isect_offset_encode(np.array([1 << 36]), 1, 3, 3)
+    refuses("beyond the 1 images of 3 x 3", isect_offset_encode, np.array([1 << 36]), 1, 3, 3)
     with pytest.raises(InputError, match="image_ids"):
         isect_tiles(
             np.zeros((4, 2)), np.zeros((4, 2)), np.zeros(4), 16, 3, 3, image_ids=np.zeros(3, np.int32), n_images=1

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from calls import refuses
 from models import assert_equal, random_gaussians
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.models import edit
 from clsplat.reference.render import render as reference
@@ -125,8 +125,7 @@ def test_a_model_that_is_moved_far_keeps_its_digits() -> None:
     ],
 )
 def test_what_is_no_similarity_is_refused(matrix: np.ndarray, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        edit.transform(random_gaussians(3), matrix)
+    refuses(message, edit.transform, random_gaussians(3), matrix)
 
 
 def test_crops_are_in_the_world() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import Capture, printed, refuses, warned
 from models import assert_equal, random_gaussians
 from needs import SCENES, require
 from scipy.spatial.transform import Rotation
@@ -36,6 +37,13 @@ SIZE = 96
 def path_of(row: Format, folder: Path, stem: str = "model") -> Path:
     suffix = next(suffix for suffix in row.suffixes if suffix.startswith("."))
     return folder / (stem + suffix)
+
+
+def there_and_back(name: str, model: Gaussians, folder: Path) -> Gaussians:
+    """The model as it is read from a file of this format."""
+    path = path_of(WRITTEN[name], folder)
+    formats.save(path, model)
+    return formats.load(path)
 
 
 @cache
@@ -115,11 +123,9 @@ def test_a_model_comes_back_in_its_place(name: str, renderer: Renderer, tmp_path
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("name", WRITTEN)
 def test_every_degree_of_sh(name: str, degree: int, tmp_path: Path) -> None:
-    row, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
     model = edit.drop_sh(asymmetric(), degree)
-    formats.save(path, model)
-    read = formats.load(path)
-    assert read.sh_degree == min(degree, row.sh_degree)
+    read = there_and_back(name, model, tmp_path)
+    assert read.sh_degree == min(degree, WRITTEN[name].sh_degree)
     assert len(read) == len(model)
 
 
@@ -135,11 +141,9 @@ def test_the_same_model_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_single_gaussian_and_a_point(name: str, tmp_path: Path) -> None:
     """No extent to divide by."""
-    path = path_of(WRITTEN[name], tmp_path)
     one = edit.take(asymmetric(), np.arange(1))
     for model in (one, edit.merge([one, one])):
-        formats.save(path, model)
-        read = formats.load(path)
+        read = there_and_back(name, model, tmp_path)
         assert len(read) == len(model)
         np.testing.assert_allclose(read.means, model.means, atol=1e-3)
 
@@ -147,26 +151,30 @@ def test_a_single_gaussian_and_a_point(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", WRITTEN)
 def test_extremes_stay_finite(name: str, tmp_path: Path) -> None:
     """Opacities of 0 and 1, scales of nothing and of a world, colours beyond what a byte holds, no rotation at all."""
-    path = path_of(WRITTEN[name], tmp_path)
     model = random_gaussians(64, 1)
     model.opacity_logits[:4] = (-200, 200, -20, 20)
     model.log_scales[:4] = ((-60, -60, -60), (12, 12, 12), (-60, 0, 0), (5, -5, 0))
     model.sh[:2, 0] = ((40, 40, 40), (-40, -40, -40))
     model.quaternions[3] = 0
-    formats.save(path, model)
-    read = formats.load(path)
+    read = there_and_back(name, model, tmp_path)
     read.check()
-    for array in (read.means, read.quaternions, read.log_scales, read.opacity_logits, read.sh):
-        assert np.isfinite(array).all()
+    assert all(np.isfinite(array).all() for array in read.arrays().values())
+
+
+@pytest.mark.parametrize("field", ["means", "quaternions", "log_scales", "opacity_logits", "sh"])
+@pytest.mark.parametrize("name", WRITTEN)
+def test_nothing_is_written_that_no_reader_takes(name: str, field: str, tmp_path: Path) -> None:
+    path, model = path_of(WRITTEN[name], tmp_path), random_gaussians(9, 1)
+    getattr(model, field)[5] = np.nan
+    refuses(f"{path.name}: cannot be written: Gaussian 5 has an? .* not finite", formats.save, path, model)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_means_that_count_from_elsewhere_are_written_in_the_world(name: str, tmp_path: Path) -> None:
-    path = path_of(WRITTEN[name], tmp_path)
     model = edit.take(asymmetric(), np.arange(100))
     model.origin = np.array([1000.0, -2000.0, 500.0])
-    formats.save(path, model)
-    read = formats.load(path)
+    read = there_and_back(name, model, tmp_path)
     world = read.means + read.origin
     # Whatever order they are in; float32 at 2000 has steps of 1.2e-4, and quantised formats their own
     np.testing.assert_allclose(world.mean(axis=0), model.means.mean(axis=0) + model.origin, atol=2e-2)
@@ -176,11 +184,10 @@ def test_means_that_count_from_elsewhere_are_written_in_the_world(name: str, tmp
 @pytest.mark.parametrize("name", WRITTEN)
 def test_the_loss_is_small_in_every_attribute(name: str, tmp_path: Path) -> None:
     """The error of each attribute that `clsplat convert` prints: nothing in floats, a few steps of a byte else."""
-    row, path = WRITTEN[name], path_of(WRITTEN[name], tmp_path)
+    row = WRITTEN[name]
     whole = as_far_as_it_goes(row, asymmetric())
-    formats.save(path, whole)
     written = edit.take(whole, row.order(whole)) if row.order else whole
-    found = difference.errors(written, formats.load(path))
+    found = difference.errors(written, there_and_back(name, whole, tmp_path))
     # Floats: logs and logits of what is stored, and unit quaternions, are rounded once more. Else: positions to 10
     # bits, scales and opacities to 7 or 8, rotations to 8, colour to 8. SH of which every one is different are the
     # worst for a palette: the render has to do, this bound is of four of their standard deviations.
@@ -245,16 +252,13 @@ def test_a_spoilt_file_is_one_line_in_bounded_memory(name: str, way: str, tmp_pa
 
 
 def test_no_such_ending_and_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"x\.doc: does not end like a model file, .*\.ply"):
-        formats.save(tmp_path / "x.doc", asymmetric())
+    refuses(r"x\.doc: does not end like a model file, .*\.ply", formats.save, tmp_path / "x.doc", asymmetric())
     with pytest.raises(InputError, match=r"x\.ksplat: ksplat is read only, expected one of .*\.ply"):
         formats.save(tmp_path / "x.ksplat", asymmetric())
     for name in ("x.ply", "x.doc", "x.splat"):
-        with pytest.raises(InputError, match=f"{name}: no such file, expected a model file, .*ply"):
-            formats.load(tmp_path / name)
+        refuses(f"{name}: no such file, expected a model file, .*ply", formats.load, tmp_path / name)
     (tmp_path / "x.doc").write_bytes(b"words")
-    with pytest.raises(InputError, match=r"x\.doc: does not end like a model file"):
-        formats.load(tmp_path / "x.doc")
+    refuses(r"x\.doc: does not end like a model file", formats.load, tmp_path / "x.doc")
 
 
 def test_first_bytes_go_before_the_ending(tmp_path: Path) -> None:
@@ -294,9 +298,7 @@ def test_the_table_is_sound() -> None:
         assert "http" in (sys.modules[row.read.__module__].__doc__ or ""), f"{row.name} cites no specification"
 
 
-def test_a_format_is_one_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_format_is_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     """A row in the table is all that load, save, info and convert want to know a format."""
 
     def write(path: Path, gaussians: Gaussians) -> None:
@@ -319,14 +321,11 @@ def test_a_format_is_one_row(
     assert path.read_bytes().startswith(b"ours")
     assert_equal(Gaussians.load(path), model)
     assert ".ours" in formats.suffixes(writable=True)
-    assert main(["info", str(path)]) == 0
-    said = capsys.readouterr().out
+    said = printed(capsys, ["info", path]).out
     assert "format        ours, version 7\n" in said
     assert "loses         no more than NumPy\n" in said
     assert main(["convert", str(path), str(tmp_path / "b.ply")]) == 0
     assert main(["convert", str(tmp_path / "b.ply"), str(tmp_path / "c.ours")]) == 0
     assert_equal(formats.load(tmp_path / "c.ours"), model)
-    with pytest.warns(UserWarning, match=r"d\.ply: is ours by its content"):
-        assert_equal(formats.load(path.rename(tmp_path / "d.ply")), model)
-    with pytest.raises(InputError, match=r"expected one of .* \.ours "):
-        formats.save(tmp_path / "x.doc", model)
+    assert_equal(warned(r"d\.ply: is ours by its content", formats.load, path.rename(tmp_path / "d.ply")), model)
+    refuses(r"expected one of .* \.ours ", formats.save, tmp_path / "x.doc", model)

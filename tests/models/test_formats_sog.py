@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import re
-import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,10 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import no_warnings
+from calls import no_warnings, peak_of, refuses, warned
 from models import assert_equal, real_file
 from node import splat_transform
-from splats import assert_refused_or_sound, assert_within, damaged, lopsided, losses, opacity, read_plainly, with_origin
+from splats import (
+    assert_refused_or_sound,
+    assert_within,
+    lopsided,
+    losses,
+    opacity,
+    read_plainly,
+    refused_of,
+    with_origin,
+)
 from systems import links
 
 from clsplat.errors import InputError
@@ -63,9 +71,6 @@ def test_it_comes_back_with_the_stated_loss(tmp_path: Path, name: str, degree: i
         # a palette of 256 for 500 random vectors, the worst that there is: no better than their middle, but no worse
         error = np.square(back.sh[:, 1:] - model.sh[:, 1:]).mean()
         assert error < np.square(model.sh[:, 1:] - model.sh[:, 1:].mean(axis=0)).mean() * (0.8 if degree > 1 else 0.3)
-    first = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
-    sog.write(path, model)
-    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == first
 
 
 def test_a_folder_is_a_model(tmp_path: Path) -> None:
@@ -195,12 +200,9 @@ def test_writing_tells_how_far_it_is(tmp_path: Path) -> None:
 def test_damaged_files(tmp_path: Path) -> None:
     path = tmp_path / "model.sog"
     sog.write(path, lopsided(8, degree=1))
-    data = path.read_bytes()
-    refused = 0
-    for each in damaged(data, step=len(data) // 100):
-        path.write_bytes(each)
-        refused += assert_refused_or_sound(sog.read, path)
-    assert refused > 150  # every cut, and most changes: zip has sums
+    assert (
+        refused_of(sog.read, path, step=path.stat().st_size // 100) > 150
+    )  # every cut, and most changes: zip has sums
 
 
 def change(folder: Path, edit: Callable[[dict[str, Any]], object]) -> None:
@@ -252,8 +254,7 @@ def test_a_count_that_is_too_large_is_named_with_what_fits(tmp_path: Path) -> No
     path = meta_of(tmp_path, 20, degree=1)
     for count, shown in ((10**12, "1000000000000"), (1 << 32, "4294967296"), (0, "0"), (-3, "-3")):
         change(tmp_path, lambda meta, count=count: meta.update(count=count))
-        with pytest.raises(InputError, match=rf"meta\.json: has {shown} Gaussians, expected 1 to 4294967295$"):
-            sog.read(path)
+        refuses(rf"meta\.json: has {shown} Gaussians, expected 1 to 4294967295$", sog.read, path)
 
 
 @pytest.mark.parametrize("kind", ["empty", "text", "cut", "head", "changed", "PNG"])
@@ -283,8 +284,7 @@ def test_one_number_is_called_so(tmp_path: Path) -> None:
         ([1, 2], "mins of shN in meta.json has 2 numbers, expected 1"),
     ):
         change(tmp_path, lambda meta, given=given: meta["shN"].update(mins=given))
-        with pytest.raises(InputError, match=rf": {re.escape(said)}$"):
-            sog.read(tmp_path / "meta.json")
+        refuses(rf": {re.escape(said)}$", sog.read, tmp_path / "meta.json")
 
 
 @pytest.mark.brings("splat-transform", "SOG with null in codebooks", "a scale of 0, or left out")
@@ -299,8 +299,7 @@ def test_null_is_what_json_has_no_number_for(tmp_path: Path) -> None:
     flat = plain.log_scales == plain.log_scales[5, 2]
     users = flat.any(axis=1).sum()
     assert users < 30
-    with pytest.warns(UserWarning, match=f"has null in place of 1 of 256 numbers, which {users} of 300 Gaussians use"):
-        read = formats.load(path)
+    read = warned(f"has null in place of 1 of 256 numbers, which {users} of 300 Gaussians use", formats.load, path)
     wanted = np.where(flat, np.float32(np.log(packing.MIN_SCALE)), plain.log_scales)
     np.testing.assert_array_equal(read.log_scales, wanted)
     colour = int(np.abs(np.array(meta["sh0"]["codebook"]) - plain.sh[7, 0, 1]).argmin())
@@ -353,8 +352,7 @@ def test_no_numbers(tmp_path: Path, name: str) -> None:
     path, (edit, message) = tmp_path / "meta.json", NULLS[name]
     sog.write(path, lopsided(20, degree=1))
     change(tmp_path, edit)
-    with pytest.raises(InputError, match=message):
-        formats.load(path)
+    refuses(message, formats.load, path)
 
 
 @links
@@ -362,8 +360,7 @@ def test_a_picture_that_is_a_link_to_itself(tmp_path: Path) -> None:
     path = meta_of(tmp_path, 20, degree=0)
     (tmp_path / "quats.webp").unlink()
     (tmp_path / "quats.webp").symlink_to("quats.webp")
-    with pytest.raises(InputError, match=r"its picture quats\.webp is missing"):
-        sog.read(path)
+    refuses(r"its picture quats\.webp is missing", sog.read, path)
     assert size(path, format_of(path)) > 0
 
 
@@ -373,14 +370,10 @@ def test_an_archive_cannot_unpack_to_more_than_its_gaussians(tmp_path: Path) -> 
     with zipfile.ZipFile(path) as source, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as target:
         for name in source.namelist():
             target.writestr(name, bytes(64 << 20) if name == "quats.webp" else source.read(name))
-    tracemalloc.start()
-    with pytest.raises(InputError, match=r"bomb\.sog: quats\.webp has more than \d+ bytes unpacked"):
-        sog.read(bomb)
-    assert tracemalloc.get_traced_memory()[1] < 8 << 20
-    tracemalloc.stop()
+    said = r"bomb\.sog: quats\.webp has more than \d+ bytes unpacked"
+    assert peak_of(lambda: refuses(said, sog.read, bomb)) < 8 << 20
     path.write_bytes(b"PK\3\4 and nothing more")
-    with pytest.raises(InputError, match=r"model\.sog: is no \.sog archive"):
-        sog.read(path)
+    refuses(r"model\.sog: is no \.sog archive", sog.read, path)
 
 
 def test_null_at_the_head_of_a_codebook_is_a_scale_of_0(tmp_path: Path) -> None:
@@ -390,8 +383,7 @@ def test_null_at_the_head_of_a_codebook_is_a_scale_of_0(tmp_path: Path) -> None:
     with no_warnings():
         formats.load(tmp_path / "meta.json")
     change(tmp_path, lambda meta: meta["scales"]["codebook"].__setitem__(-1, None))
-    with pytest.warns(UserWarning, match="has null in place of 3 of 256 numbers, which"):
-        formats.load(tmp_path / "meta.json")
+    warned("has null in place of 3 of 256 numbers, which", formats.load, tmp_path / "meta.json")
 
 
 @pytest.mark.parametrize(
@@ -407,11 +399,9 @@ def test_null_at_the_head_of_a_codebook_is_a_scale_of_0(tmp_path: Path) -> None:
 def test_what_is_wrong_is_told_as_it_is(tmp_path: Path, keys: dict[str, Any], message: str) -> None:
     path = meta_of(tmp_path, 20, degree=0)
     change(tmp_path, lambda meta: meta.update(keys))
-    with pytest.raises(InputError, match=message):
-        sog.read(path)
+    refuses(message, sog.read, path)
     change(tmp_path, lambda meta: [meta.pop("count"), meta.update(version=2)])
-    with pytest.raises(InputError, match=r"meta\.json has no count, expected the number of Gaussians"):
-        sog.read(path)
+    refuses(r"meta\.json has no count, expected the number of Gaussians", sog.read, path)
 
 
 def test_null_in_place_of_the_coefficients_is_none(tmp_path: Path) -> None:
@@ -434,5 +424,4 @@ def test_names_of_another_case(tmp_path: Path, archived: bool) -> None:
         path = tmp_path / "model.sog"
     assert_equal(sog.read(path), wanted)
     change(tmp_path, lambda meta: meta["means"].update(files=["means.webp", "Means_U.WEBP"]))
-    with pytest.raises(InputError, match=r"its picture means\.webp is missing"):
-        sog.read(tmp_path / "meta.json")
+    refuses(r"its picture means\.webp is missing", sog.read, tmp_path / "meta.json")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import python
+from calls import python, refuses
 from needs import require
 from quick import quick
 from scipy.spatial.transform import Rotation
@@ -139,8 +139,7 @@ def test_layers_elsewhere_are_refused(tmp_path: Path) -> None:
     folder.mkdir()
     usd.write(tmp_path / "model.usda", lopsided(5))
     (folder / "shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@../model.usda@]\n)\n")
-    with pytest.raises(InputError, match=r"shot\.usda: refers to .*model\.usda"):
-        usd.read(folder / "shot.usda")
+    refuses(r"shot\.usda: refers to .*model\.usda", usd.read, folder / "shot.usda")
     usd.write(folder / "model.usda", lopsided(5))
     (folder / "shot.usda").write_text("#usda 1.0\n(\n    subLayers = [@model.usda@]\n)\n")
     assert len(usd.read(folder / "shot.usda")) == 5
@@ -172,8 +171,7 @@ def test_a_file_that_crashes_the_library(tmp_path: Path, monkeypatch: pytest.Mon
     (folder / "usd.py").write_text("import os\n\n\ndef read_here(path):\n    os.abort()\n")
     monkeypatch.syspath_prepend(tmp_path / "first")  # of the other process
     for read in (usd.read, usd.describe):
-        with pytest.raises(InputError, match=r"model\.usdc: USD's library crashes when it reads it; is it damaged"):
-            read(path)
+        refuses(r"model\.usdc: USD's library crashes when it reads it; is it damaged", read, path)
 
 
 def too_deep(path: Path) -> Path:
@@ -193,8 +191,7 @@ def test_text_that_refers_to_others_is_tried_first(
     path = tmp_path / "shot.usda"
     path.write_text("#usda 1.0\n(\n    subLayers = [@damaged.usda@]\n)\n")
     for read in (usd.read, lambda each: read_shot(each, size=(64, 48))):
-        with pytest.raises(InputError, match=r"shot\.usda: USD's library crashes when it reads it; is it damaged"):
-            read(path)
+        refuses(r"shot\.usda: USD's library crashes when it reads it; is it damaged", read, path)
 
 
 @pytest.mark.slow
@@ -220,16 +217,13 @@ def test_values_of_another_kind_are_named(tmp_path: Path) -> None:
             rf"{re.escape(kind)}\[\] {name} = \[.*?\]", f"int[] {name} = [1, 2, 3, 4, 5]", text, flags=re.DOTALL
         )
         path.write_text(wrong)
-        with pytest.raises(InputError, match=rf"{name} are int32 \(5,\), expected {expected}$"):
-            usd.read(path)
+        refuses(rf"{name} are int32 \(5,\), expected {expected}$", usd.read, path)
 
 
 def test_a_stage_without_gaussians(tmp_path: Path) -> None:
     (tmp_path / "model.usda").write_text('#usda 1.0\ndef Xform "World" {}\n')
-    with pytest.raises(InputError, match="has no ParticleField3DGaussianSplat"):
-        usd.read(tmp_path / "model.usda")
-    with pytest.raises(InputError, match="no such file"):
-        usd.read(tmp_path / "missing.usda")
+    refuses("has no ParticleField3DGaussianSplat", usd.read, tmp_path / "model.usda")
+    refuses("no such file", usd.read, tmp_path / "missing.usda")
 
 
 def test_without_usd_core_there_is_one_line(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import warned
 from models import random_gaussians, real_file
 
 from clsplat.errors import InputError
@@ -245,10 +246,7 @@ def test_records_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     spoilt[4112:4116] = struct.pack("<f", np.nan)  # the size of the first section's blocks
     path = tmp_path / "a.ksplat"
     path.write_bytes(spoilt)
-    with pytest.warns(
-        UserWarning, match=r"17 of 40 Gaussians have .*, the first is Gaussian 0 with a position; they are"
-    ):
-        read = formats.load(path)
+    read = warned(r"17 of 40 Gaussians have .*, the first is Gaussian 0 with a position; they are", formats.load, path)
     np.testing.assert_allclose(read.means, wanted.means[17:], atol=1e-5)  # as in the test of whole files
     path = tmp_path / "a.compressed.ply"
     both = compressed([(0, 0, 0, 0xFF00FF80), (2047 << 21, 0, 0, 0x00FF0080)], BOUNDS)
@@ -294,8 +292,7 @@ def test_a_ply_with_sh_of_degree_4_is_read_up_to_3(tmp_path: Path) -> None:
     more = b"".join(b"property float f_rest_%d\n" % i for i in range(45, 72))
     head = head.replace(b"property float f_rest_44\n", b"property float f_rest_44\n" + more)
     (tmp_path / "b.ply").write_bytes(head + mark + table.astype("<f4").tobytes())
-    with pytest.warns(UserWarning, match=r"b\.ply: has SH of degree 4; coefficients above degree 3"):
-        read = formats.load(tmp_path / "b.ply")
+    read = warned(r"b\.ply: has SH of degree 4; coefficients above degree 3", formats.load, tmp_path / "b.ply")
     np.testing.assert_array_equal(read.sh, model.sh)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import no_warnings, warnings_of
+from calls import no_warnings, only, refuses, warned, warnings_of
 from models import assert_equal, random_gaussians
 from needs import require
 from splats import lopsided, with_origin
@@ -77,8 +77,7 @@ def test_gaussians_are_left_out(tmp_path: Path, file: str, name: str, value: flo
     np.testing.assert_array_equal(read.means, np.delete(model.means, [4, 29], axis=0))
     getattr(model, name)[:] = np.nan
     written(path, model)
-    with pytest.raises(InputError, match=f"30 of 30 .* the first is Gaussian 0 with {what}; expected some that"):
-        formats.load(path)
+    refuses(f"30 of 30 .* the first is Gaussian 0 with {what}; expected some that", formats.load, path)
 
 
 @pytest.mark.brings("splat-transform", "scales of -inf, opacities of -inf and inf", "0, and 0 or 1")
@@ -178,12 +177,9 @@ def test_prims_of_a_stage(tmp_path: Path) -> None:
     shift.Set(Gf.Vec3d(0, 0, 0), 1)
     shift.Set(Gf.Vec3d(1, 0, 0), 5)
     stage.Save()
-    with pytest.warns(
-        UserWarning, match=f"{path}: {formats.usd.GAUSSIANS_PRIM_PATH}: 2 of 20 .* Gaussian 3 with a colour;"
-    ) as caught:
-        models = read_stage(path)
-    assert len(caught) == 1
-    assert models is not None
+    models = warned(
+        f"{path}: {formats.usd.GAUSSIANS_PRIM_PATH}: 2 of 20 .* Gaussian 3 with a colour;", read_stage, path
+    )
     np.testing.assert_array_equal(models.models[0].means, np.delete(model.means, [3, 4], axis=0))
 
 
@@ -199,8 +195,7 @@ def test_whole_numbers_of_the_gaussians_that_are_left(tmp_path: Path) -> None:
     ids[6] = 0.5  # what is left out need not be whole
     table = np.column_stack([table, ids])
     path.write_bytes(head + b"property float label\nend_header\n" + table.astype("<f4").tobytes())
-    with pytest.warns(UserWarning, match="2 of 10 Gaussians"):
-        assert len(formats.load(path)) == 8
+    assert len(warned("2 of 10 Gaussians", formats.load, path)) == 8
     assert ply.read_whole_numbers(path, "label").tolist() == [100, 200, 300, 400, 500, 700, 800, 900]
 
 
@@ -343,8 +338,7 @@ def test_a_kernel_that_is_not_known_is_drawn_as_an_ellipse(tmp_path: Path, kerne
     document["meshes"][0]["primitives"][0]["extensions"][gltf.GAUSSIAN_EXTENSION]["kernel"] = kernel
     path.write_text(json.dumps(document))
     read, texts = told(path)
-    (text,) = texts
-    assert text.startswith(
+    assert only(texts).startswith(
         f"primitive 0 of node 0 has the kernel {str(kernel)!r}, expected ellipse; it is drawn as one"
     )
     assert_equal(read, wanted)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture, train
+from calls import Capture, printed, train
 from pages import charts_of, figures_of, parse, rows_of
 from tiny import short
 
@@ -99,8 +99,7 @@ def test_settings_that_differ_and_no_others(runs: list[Path], tmp_path: Path, ca
 
 
 def test_json(runs: list[Path], capsys: Capture) -> None:
-    assert main(["compare", *map(str, runs), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = json.loads(printed(capsys, ["compare", *runs, "--json"]).out)
     assert [each["mean"] for each in said["runs"][:2]] == [evaluation(run)["mean"] for run in runs[:2]]
     assert said["runs"][2]["mean"] is None
     assert said["settings"]["--density.split-factor"] == [1.6, 2.0, 1.6]
@@ -116,8 +115,7 @@ def test_what_cannot_be_compared_is_said(runs: list[Path], tmp_path: Path, capsy
     (other / "config.toml").write_text(text)
     metrics = (other / "metrics.jsonl").read_text()
     (other / "metrics.jsonl").write_text(metrics.replace('"device": "', '"device": "another '))
-    assert main(["compare", str(runs[0]), str(other)]) == 0
-    said = capsys.readouterr().err
+    said = printed(capsys, ["compare", runs[0], other]).err
     for text in ("different scenes: another, scene", "same views", "--resolution differs", "different devices"):
         assert text in said
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import refuses
 from compare import assert_close
 from models import random_gaussians
 
@@ -57,15 +58,13 @@ def test_a_photograph_that_is_not_there(run: Run, photograph: str, message: str)
 )
 def test_a_damaged_record(run: Run, text: str) -> None:
     run.appearance_path.write_text(text, "utf-8")
-    with pytest.raises(InputError, match=r"appearance.json: .*expected a file that clsplat train --appearance writes"):
-        gains_of(run.path, "a.jpg")
+    refuses(r"appearance.json: .*expected a file that clsplat train --appearance writes", gains_of, run.path, "a.jpg")
 
 
 def test_a_run_without(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "plain", TrainConfig())
     for model in (run.path, tmp_path / "alone.ply"):
-        with pytest.raises(InputError, match=r"has learnt no appearances \(no appearance.json\), expected a run of"):
-            gains_of(model, "a.jpg")
+        refuses(r"has learnt no appearances \(no appearance.json\), expected a run of", gains_of, model, "a.jpg")
 
 
 def test_colours_of_an_exposed_model() -> None:

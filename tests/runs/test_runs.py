@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomli_w
-from calls import no_warnings
+from calls import Capture, no_warnings, refuses, warned
 from models import random_gaussians
 
 import clsplat
@@ -78,9 +78,7 @@ def test_whole_numbers_serve_as_floats_and_missing_keys_as_defaults(tmp_path: Pa
 
 
 @pytest.mark.parametrize("angle", [0.0, 2.5])
-def test_a_setting_of_an_earlier_version_still_loads(
-    angle: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_setting_of_an_earlier_version_still_loads(angle: float, tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "config.toml"
     path.write_text(f'clsplat = "1"\n[train]\niterations = 9\n[train.rasterizer]\nsh_angle = {angle}\n')
     verb = parse(["train", "S", "-o", str(tmp_path), "--resume"])
@@ -122,8 +120,7 @@ def test_switches_that_only_the_bench_has_are_passed_over(tmp_path: Path) -> Non
     named = ("extent = 'constant'", "row_skip = False", "gradient_skip = False")
     assert str(told[0].message).endswith(": " + ", ".join(f"train.rasterizer.{name}" for name in named))
     path.write_text(text.replace('extent = "opacity"', "extent = 3"))
-    with pytest.raises(InputError, match=r"train\.rasterizer\.extent is 3, expected one of opacity, 3sigma"):
-        read_config(path)
+    refuses(r"train\.rasterizer\.extent is 3, expected one of opacity, 3sigma", read_config, path)
 
 
 def test_settings_of_training_that_are_gone_are_passed_over(tmp_path: Path) -> None:
@@ -147,8 +144,7 @@ def test_settings_of_training_that_are_gone_are_passed_over(tmp_path: Path) -> N
 def test_a_run_is_not_written_over(tmp_path: Path) -> None:
     run = Run.create(tmp_path / "run", CONFIG)
     run.model_path.write_bytes(b"precious")
-    with pytest.raises(InputError, match="already a run, use --resume"):
-        Run.create(run.path, TrainConfig())
+    refuses("already a run, use --resume", Run.create, run.path, TrainConfig())
     assert run.model_path.read_bytes() == b"precious"
     assert Run.open(run.path).config == CONFIG
 
@@ -157,12 +153,9 @@ def test_other_folders_are_not_taken(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years")
     (tmp_path / "config.toml").write_text("[tool]\nof = 'another program'\n")
     for overwrite in (False, True):
-        with pytest.raises(InputError, match=r"holds other files \(config\.toml\) and is no run"):
-            Run.create(tmp_path, CONFIG, overwrite=overwrite)
-    with pytest.raises(InputError, match="no run to resume"):
-        Run.create(tmp_path, CONFIG, resume=True)
-    with pytest.raises(InputError, match="is a file"):
-        Run.create(tmp_path / "thesis.tex", CONFIG)
+        refuses(r"holds other files \(config\.toml\) and is no run", Run.create, tmp_path, CONFIG, overwrite=overwrite)
+    refuses("no run to resume", Run.create, tmp_path, CONFIG, resume=True)
+    refuses("is a file", Run.create, tmp_path / "thesis.tex", CONFIG)
     assert (tmp_path / "thesis.tex").read_text() == "years"
 
 
@@ -191,8 +184,7 @@ def test_resume_keeps_what_cannot_change(tmp_path: Path) -> None:
     assert Run.open(tmp_path).config.iterations == 20
     with pytest.raises(InputError, match="seed is 0, a resumed run cannot change it to 9"):
         Run.create(tmp_path, replace(CONFIG, seed=9), resume=True)
-    with pytest.raises(InputError, match="exclude each other"):
-        Run.create(tmp_path, CONFIG, resume=True, overwrite=True)
+    refuses("exclude each other", Run.create, tmp_path, CONFIG, resume=True, overwrite=True)
 
 
 def test_metrics_are_lines_and_a_cut_one_is_left_out(tmp_path: Path) -> None:
@@ -226,8 +218,7 @@ def test_what_the_model_was_trained_for(tmp_path: Path) -> None:
 
 def test_numbers_that_are_not_finite_stop_the_run(tmp_path: Path) -> None:
     run = Run.create(tmp_path, CONFIG)
-    with pytest.raises(ClsplatError, match="diverged at step 3"):
-        run.append_metrics({"step": 3, "loss": float("nan")})
+    refuses("diverged at step 3", run.append_metrics, {"step": 3, "loss": float("nan")}, error=ClsplatError)
     assert run.read_metrics() == []
 
 
@@ -243,7 +234,6 @@ def test_checkpoints_come_back_and_two_are_kept(tmp_path: Path) -> None:
         run.save_checkpoint(step, arrays(step), {"rng": {"big": 2**100}, "seconds": 0.1 + 0.2})
     assert [step for step, _ in run.checkpoints()] == [200, 3000]
     checkpoint = run.load_latest_checkpoint()
-    assert checkpoint is not None
     assert checkpoint.step == 3000
     assert checkpoint.state == {"rng": {"big": 2**100}, "seconds": 0.1 + 0.2}
     assert checkpoint.arrays.keys() == arrays(0).keys()
@@ -260,9 +250,7 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path: Path, damage: str) -> Non
     data = bytearray(path.read_bytes())
     data[data.index(arrays(2)["means"].tobytes()) + 7] ^= 16
     path.write_bytes({"cut": data[: len(data) // 2], "flip": data, "empty": b"", "text": b"text" * 99}[damage])
-    with pytest.warns(UserWarning, match=r"step-0000002\.npz: is a damaged checkpoint"):
-        checkpoint = run.load_latest_checkpoint()
-    assert checkpoint is not None
+    checkpoint = warned(r"step-0000002\.npz: is a damaged checkpoint", run.load_latest_checkpoint)
     assert checkpoint.step == 1
     run.save_checkpoint(1, arrays(1), {})
     assert [step for step, _ in run.checkpoints()] == [1]  # the damaged one was of a later step
@@ -287,8 +275,6 @@ def test_what_is_a_run(tmp_path: Path) -> None:
     assert not is_run(tmp_path)
     Run.create(tmp_path / "run", CONFIG)
     assert is_run(tmp_path / "run")
-    with pytest.raises(InputError, match="no such folder"):
-        Run.open(tmp_path / "none")
-    with pytest.raises(InputError, match="not a run"):
-        Run.open(tmp_path)
+    refuses("no such folder", Run.open, tmp_path / "none")
+    refuses("not a run", Run.open, tmp_path)
     assert f'clsplat = "{clsplat.__version__}"' in (tmp_path / "run" / "config.toml").read_text()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import warnings_of
+from calls import printed, warned, warnings_of
 from ring import FOCAL, HEIGHT, WIDTH, matrix_of, points, poses, write_cloud, write_colmap, write_transforms
 from scipy.spatial.transform import Rotation
 from tiny import write_scene
@@ -50,8 +50,7 @@ def test_parts_of_the_picture_are_read_as_such(keys: dict[str, Any], tmp_path: P
 
 def test_those_of_a_colmap_model_too(tmp_path: Path) -> None:
     write_colmap(tmp_path, camera=f"PINHOLE {WIDTH} {HEIGHT} {FOCAL / WIDTH} {FOCAL / HEIGHT} 0.5 0.5")
-    with pytest.warns(UserWarning, match="of camera 1 is given as fractions of the picture"):
-        camera = next(iter(read_cameras(tmp_path).values()))
+    camera = next(iter(warned("of camera 1 is given as fractions of the picture", read_cameras, tmp_path).values()))
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
 
 
@@ -185,8 +184,7 @@ def test_without_points_by_the_cameras_alone(kind: str, tmp_path: Path) -> None:
     found = [text for text in load_scene(tmp_path).warnings if "the poses have inverted" in text]
     assert len(found) == 1
     assert "face no common point, but 100 % face one place" in found[0]
-    with pytest.warns(UserWarning, match="the poses have inverted"):
-        read_poses(tmp_path / "transforms.json")
+    warned("the poses have inverted", read_poses, tmp_path / "transforms.json")
 
 
 @pytest.mark.parametrize("cloud", [points(), NO_POINTS])
@@ -297,8 +295,7 @@ def test_the_verbs_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         f"render {run}/model.ply --cameras {wrong} -o {tmp_path}/out/{{name}}.png".split(),
     ):
         capsys.readouterr()
-        assert main(words) == 0
-        told = capsys.readouterr().err
+        told = printed(capsys, words).err
         assert "is 0 0 in a picture" in told, words[0]
         assert "the poses have inverted" in told, words[0]
     assert json.loads((wrong / "transforms.json").read_text())["cx"] == 0

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import refuses, warned
 from depths import add_maps, add_tracks, depth_of, write_levels
 from models import real_file
 from tiny import HEIGHT, WIDTH, cameras, write_scene
@@ -35,7 +36,6 @@ def folder(tmp_path: Path) -> Path:
 def planes(scene: Scene, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Nearness and weight (H, W) of view `index` at its own size."""
     view = scene.views[index]
-    assert view.depth is not None
     pixels, nearness, weights = view.depth.at(view.camera, view.lens)
     found = np.zeros((2, view.camera.height * view.camera.width))
     found[0][pixels], found[1][pixels] = nearness, weights
@@ -84,8 +84,7 @@ def test_tracks_of_binary_files_are_those_of_text(folder: Path) -> None:
         name: rows.tolist() for name, rows in text.by_image.items()
     }
     (model / "points3D.bin").write_bytes(struct.pack("<Q", len(text.points)) + record[:-3])
-    with pytest.raises(InputError, match=r"points3D\.bin: truncated or corrupt"):
-        read_tracks(model)
+    refuses(r"points3D\.bin: truncated or corrupt", read_tracks, model)
 
 
 def test_tracks_of_a_real_model_are_pycolmap_s() -> None:
@@ -170,8 +169,6 @@ def test_relative_maps_are_brought_to_scale(folder: Path) -> None:
     scene = with_depths(load_scene(folder), RELATIVE)
     for view in scene.train_views:
         index = int(view.name[:2])
-        assert view.depth is not None
-        assert view.depth.fit is not None
         # float32 of the files
         assert view.depth.fit[0] == pytest.approx(0.05 + 0.001 * index, rel=1e-4)
         assert view.depth.fit[1] == pytest.approx(0.1, abs=1e-5)
@@ -179,8 +176,7 @@ def test_relative_maps_are_brought_to_scale(folder: Path) -> None:
     assert weights.all(), "known everywhere, and not at the points alone"
     for path in (folder / "depths").iterdir():
         np.save(path, np.zeros_like(np.load(path)))
-    with pytest.raises(InputError, match="no relative depth map agrees with the points"):
-        with_depths(load_scene(folder), RELATIVE)
+    refuses("no relative depth map agrees with the points", with_depths, load_scene(folder), RELATIVE)
 
 
 def test_a_scene_of_nerfstudio_names_its_maps(tmp_path: Path) -> None:
@@ -205,51 +201,40 @@ def test_a_scene_of_nerfstudio_names_its_maps(tmp_path: Path) -> None:
 
 def test_what_is_refused(folder: Path) -> None:
     scene = load_scene(folder)
-    with pytest.raises(InputError, match=r"has no depth maps for --depth maps; expected depths/IMAGE\.png"):
-        with_depths(scene, MAPS)
-    with pytest.raises(InputError, match="no point has a track"):
-        with_depths(scene, POINTS)
+    refuses(r"has no depth maps for --depth maps; expected depths/IMAGE\.png", with_depths, scene, MAPS)
+    refuses("no point has a track", with_depths, scene, POINTS)
     add_maps(folder)
     maps = folder / "depths"
     (maps / "99.png").write_bytes((maps / "00.png").read_bytes())
-    with pytest.raises(InputError, match=r"1 depth map\(s\) fit no photograph \(99\.png\)"):
-        with_depths(scene, MAPS)
+    refuses(r"1 depth map\(s\) fit no photograph \(99\.png\)", with_depths, scene, MAPS)
     (maps / "99.png").unlink()
     (maps / "00_depth.png").write_bytes((maps / "00.png").read_bytes())
-    with pytest.raises(InputError, match=r"is a second depth map of 00\.png, beside 00\.png"):
-        with_depths(scene, MAPS)
+    refuses(r"is a second depth map of 00\.png, beside 00\.png", with_depths, scene, MAPS)
     (maps / "00_depth.png").unlink()
     write_levels(maps / "03.png", np.ones((HEIGHT, WIDTH // 2), np.uint16))
-    with pytest.raises(InputError, match=r"03\.png: the depth map has 24x40 pixels, expected the aspect ratio"):
-        with_depths(scene, MAPS)
+    refuses(r"03\.png: the depth map has 24x40 pixels, expected the aspect ratio", with_depths, scene, MAPS)
     (maps / "03.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"03\.png"):
-        with_depths(scene, MAPS)
+    refuses(r"03\.png", with_depths, scene, MAPS)
     (maps / "03.png").unlink()
     with pytest.warns(UserWarning, match=r"no depths are known for 1 photograph\(s\) \(03\.png\)"):
         assert with_depths(scene, MAPS).views[3].depth is None
-    with pytest.raises(InputError, match="--depth-maps relative"):
-        with_depths(scene, RELATIVE)
-    with pytest.raises(InputError, match="no depth maps are used, expected --depth maps too"):
-        TrainConfig(depth_maps="relative").check()
+    refuses("--depth-maps relative", with_depths, scene, RELATIVE)
+    refuses("no depth maps are used, expected --depth maps too", TrainConfig(depth_maps="relative").check)
 
 
 def test_maps_in_which_nothing_is_known(folder: Path) -> None:
     add_maps(folder)
     for name, level in (("03", 0), ("04", 65535)):
         write_levels(folder / "depths" / f"{name}.png", np.full((HEIGHT, WIDTH), level, np.uint16))
-    with pytest.warns(UserWarning, match=r"no depths are known for 2 photograph\(s\) \(03\.png, 04\.png\)"):
-        with_depths(load_scene(folder), MAPS)
+    warned(r"no depths are known for 2 photograph\(s\) \(03\.png, 04\.png\)", with_depths, load_scene(folder), MAPS)
 
 
 @pytest.mark.parametrize("array", [np.zeros((2, 3, 4)), np.array(["a"]), np.zeros((0, 5))])
 def test_arrays_that_are_no_maps(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "map.npy", array)
-    with pytest.raises(InputError, match=r"map\.npy"):
-        map_header(tmp_path / "map.npy")
+    refuses(r"map\.npy", map_header, tmp_path / "map.npy")
     (tmp_path / "map.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(InputError, match="cannot be read as NPY"):
-        read_map(tmp_path / "map.npy")
+    refuses("cannot be read as NPY", read_map, tmp_path / "map.npy")
 
 
 def test_depths_are_part_of_what_a_run_knows_of_its_scene(folder: Path) -> None:

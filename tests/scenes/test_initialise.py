@@ -3,8 +3,8 @@
 
 import numpy as np
 import pytest
+from calls import refuses
 
-from clsplat.errors import InputError
 from clsplat.scenes.start.initialise import MIN_SQUARED_DISTANCE, from_points, mean_squared_distance, random_points
 from clsplat.spherical_harmonics import SH_C0
 
@@ -49,12 +49,9 @@ def test_what_a_gaussian_starts_as() -> None:
 
 
 def test_bad_points() -> None:
-    with pytest.raises(InputError, match="no points"):
-        from_points(np.zeros((0, 3)), np.zeros((0, 3)))
-    with pytest.raises(InputError, match="point 1 is not finite"):
-        from_points([[0, 0, 0], [0, np.nan, 0]], np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="expected"):
-        from_points(np.zeros((4, 3)), np.zeros((3, 3)))
+    refuses("no points", from_points, np.zeros((0, 3)), np.zeros((0, 3)))
+    refuses("point 1 is not finite", from_points, [[0, 0, 0], [0, np.nan, 0]], np.zeros((2, 3)))
+    refuses("expected", from_points, np.zeros((4, 3)), np.zeros((3, 3)), error=ValueError)
 
 
 def test_random_points_fill_the_box_and_repeat() -> None:

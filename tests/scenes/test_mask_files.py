@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import only, refuses, warned
 from PIL import Image as Pillow
 from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 
 from clsplat.config.masks import MaskUse
-from clsplat.errors import InputError
 from clsplat.images.reading import companions, find_images
 from clsplat.images.writing import write_image
 from clsplat.scenes.analysis.photo_findings import findings
@@ -74,15 +74,13 @@ def test_a_mask_that_does_not_fit(name: str, size: tuple[int, int], told: str, t
     scene = write_scene(tmp_path / "scene")
     (scene / "masks").mkdir()
     write_image(scene / "masks" / name, mask_of(*size))
-    with pytest.raises(InputError, match=told):
-        load_scene(scene, masks=IGNORE)
+    refuses(told, load_scene, scene, masks=IGNORE)
     assert load_scene(scene).views[0].mask is None
 
 
 def test_no_masks_at_all_and_some_missing(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "scene")
-    with pytest.raises(InputError, match="has no masks for --masks ignore; expected masks/"):
-        load_scene(scene, masks=IGNORE)
+    refuses("has no masks for --masks ignore; expected masks/", load_scene, scene, masks=IGNORE)
     (scene / "masks").mkdir()
     write_image(scene / "masks" / "03.png", mask_of())
     read = load_scene(scene, masks=IGNORE)
@@ -93,8 +91,7 @@ def test_no_masks_at_all_and_some_missing(tmp_path: Path) -> None:
 def test_two_masks_of_one_photograph(tmp_path: Path) -> None:
     for name in ("a.png", "a.jpg.png"):
         write_image(tmp_path / name, mask_of())
-    with pytest.raises(InputError, match=r"is a second mask of a\.jpg, beside"):
-        find_masks(tmp_path, ["a.jpg"])
+    refuses(r"is a second mask of a\.jpg, beside", find_masks, tmp_path, ["a.jpg"])
 
 
 def test_an_alpha_channel_to_ignore(tmp_path: Path) -> None:
@@ -113,8 +110,7 @@ def test_mask_path_of_a_frame(tmp_path: Path) -> None:
     assert read.views[1].load_masked()[:, :, 4].mean() == 0.5
     assert not any("ignored" in text for text in read.warnings)
     (tmp_path / "shapes" / "m1.png").unlink()
-    with pytest.raises(InputError, match=r"m1\.png: no such image file"):
-        load_scene(tmp_path, masks=IGNORE)
+    refuses(r"m1\.png: no such image file", load_scene, tmp_path, masks=IGNORE)
 
 
 def test_one_mask_for_all_frames(tmp_path: Path) -> None:
@@ -171,36 +167,28 @@ def masks_at(scene: Path, *places: str) -> None:
         write_image(scene / place, mask_of(30, 20))
 
 
+MASKS = {
+    "IMG_1.jpg": (
+        *("masks/IMG_1.jpg.mask.png", "mask/IMG_1.jpg_mask.png", ".mask/IMG_1.jpg.mask.png", "images/.mask/IMG_1.png"),
+        *(".masks/IMG_1.jpg.png", "Masks/IMG_1.png", "images/IMG_1.mask.png", "images/IMG_1_mask.png"),
+        *("images/IMG_1.jpg.mask.png", "images/IMG_1.jpg.png", "masks/IMG_1-mask.png", "images/IMG_1-mask.png"),
+    ),
+    "IMG_1.JPG": ("masks/IMG_1.jpg.PNG", "masks/img_1.jpg.mask.png", "masks/mask-IMG_1.png"),
+    "IMG_1.png": ("masks/IMG_1.jpg.mask.png",),
+    "a/IMG_1.jpg": (
+        *("masks/IMG_1.png", "images/a/.mask/IMG_1.jpg.mask.png", "images/a/masks/IMG_1.png"),
+        "images/a/IMG_1.jpg-mask.png",
+    ),
+    "a/b/IMG_1.jpg": ("masks/IMG_1.jpg.mask.png",),
+    "a/IMG_1.JPG": ("images/a/img_1_MASK.PNG",),
+}
+"""Masks by their photograph."""
+
+
 @pytest.mark.brings(
     "RealityScan, Brush, LichtFeld", "masks as `IMG.jpg.mask.png`, in `.mask/`, flat, beside the picture", "masks"
 )
-@pytest.mark.parametrize(
-    ("photo", "mask"),
-    [
-        ("IMG_1.jpg", "masks/IMG_1.jpg.mask.png"),
-        ("IMG_1.jpg", "mask/IMG_1.jpg_mask.png"),
-        ("IMG_1.jpg", ".mask/IMG_1.jpg.mask.png"),
-        ("IMG_1.jpg", "images/.mask/IMG_1.png"),
-        ("IMG_1.jpg", ".masks/IMG_1.jpg.png"),
-        ("IMG_1.jpg", "Masks/IMG_1.png"),
-        ("IMG_1.JPG", "masks/IMG_1.jpg.PNG"),
-        ("IMG_1.JPG", "masks/img_1.jpg.mask.png"),
-        ("IMG_1.png", "masks/IMG_1.jpg.mask.png"),
-        ("a/IMG_1.jpg", "masks/IMG_1.png"),
-        ("a/b/IMG_1.jpg", "masks/IMG_1.jpg.mask.png"),
-        ("a/IMG_1.jpg", "images/a/.mask/IMG_1.jpg.mask.png"),
-        ("a/IMG_1.jpg", "images/a/masks/IMG_1.png"),
-        ("IMG_1.jpg", "images/IMG_1.mask.png"),
-        ("IMG_1.jpg", "images/IMG_1_mask.png"),
-        ("IMG_1.jpg", "images/IMG_1.jpg.mask.png"),
-        ("IMG_1.jpg", "images/IMG_1.jpg.png"),
-        ("a/IMG_1.JPG", "images/a/img_1_MASK.PNG"),
-        ("IMG_1.jpg", "masks/IMG_1-mask.png"),
-        ("IMG_1.jpg", "images/IMG_1-mask.png"),
-        ("IMG_1.JPG", "masks/mask-IMG_1.png"),
-        ("a/IMG_1.jpg", "images/a/IMG_1.jpg-mask.png"),
-    ],
-)
+@pytest.mark.parametrize(("photo", "mask"), [(photo, mask) for photo, masks in MASKS.items() for mask in masks])
 def test_masks_of_other_programs(photo: str, mask: str, tmp_path: Path) -> None:
     """For scenes and for structure from motion, which takes none of them for a photograph."""
     images = photographs(tmp_path / "images", photo, "other/IMG_2.jpg")
@@ -242,16 +230,14 @@ def test_white_may_be_what_moves(tmp_path: Path) -> None:
         write_image(scene / "dynamic_masks" / f"{index:02d}.png", mask_of())
     read = load_scene(scene, masks=IGNORE)
     assert [view.load_masked()[:, :, 4].mean() for view in read.views] == [0.5] * VIEWS
-    (told,) = [text for text in read.warnings if "dynamic_masks" in text]
     assert (
         "white pixels are the ones that count, as in all masks; if white marks moving objects there, add --invert-masks"
-        in told
+        in only([text for text in read.warnings if "dynamic_masks" in text])
     )
     inverted = load_scene(scene, masks=MaskUse("ignore", invert=True))
     assert not [text for text in inverted.warnings if "dynamic_masks" in text]
     paths = sorted((scene / "images").iterdir())
-    with pytest.warns(UserWarning, match="white pixels are the ones that count"):
-        reconstruct._masks(scene / "images", paths, IGNORE)
+    warned("white pixels are the ones that count", reconstruct._masks, scene / "images", paths, IGNORE)
 
 
 @pytest.mark.brings("renderers, video tools", "masks/mask_0007.png for image_0007.png", "by their numbers")
@@ -270,8 +256,7 @@ def test_two_series_go_together_by_their_numbers(photo: str, mask: str, tmp_path
     wanted = {photo.format(number): tmp_path / "masks" / mask.format(number) for number in range(1, 3)}
     assert masks_beside(images) == wanted
     masks_at(tmp_path, f"masks/{mask.format(7)}")
-    with pytest.raises(InputError, match=r"masks: 1 mask\(s\) fit no photograph"):
-        masks_beside(images)
+    refuses(r"masks: 1 mask\(s\) fit no photograph", masks_beside, images)
 
 
 @pytest.mark.parametrize(
@@ -289,8 +274,7 @@ def test_two_series_go_together_by_their_numbers(photo: str, mask: str, tmp_path
 def test_numbers_that_are_of_no_series(photos: tuple[str, ...], masks: tuple[str, ...], tmp_path: Path) -> None:
     images = photographs(tmp_path / "images", *photos)
     masks_at(tmp_path, *(f"masks/{name}" for name in masks))
-    with pytest.raises(InputError, match=r"mask\(s\) fit no photograph"):
-        masks_beside(images)
+    refuses(r"mask\(s\) fit no photograph", masks_beside, images)
 
 
 @pytest.mark.brings("matting and label tools", "IMG_silhouette.png, IMG_fg.png, labels/, into `sfm`", "no photographs")
@@ -340,8 +324,7 @@ def test_masks_that_may_be_of_several_photographs_are_of_none(
 ) -> None:
     images = photographs(tmp_path / "images", *photos)
     masks_at(tmp_path, mask)
-    with pytest.raises(InputError, match=r"masks: 1 mask\(s\) fit no photograph"):
-        masks_beside(images)
+    refuses(r"masks: 1 mask\(s\) fit no photograph", masks_beside, images)
     assert masks_beside(images, strict=False) == {}
 
 
@@ -351,8 +334,7 @@ def test_exact_names_go_before_loose_ones(tmp_path: Path) -> None:
     wanted = {"a/1.jpg": "a/1.png", "b/1.jpg": "b/1.jpg.mask.png", "b/2.jpg": "2.png"}
     assert masks_beside(images) == {name: tmp_path / "masks" / mask for name, mask in wanted.items()}
     masks_at(tmp_path, "masks/B/2.png")
-    with pytest.raises(InputError, match=r"is a second mask of b/2\.jpg, beside"):
-        masks_beside(images)
+    refuses(r"is a second mask of b/2\.jpg, beside", masks_beside, images)
 
 
 def test_pictures_beside_the_photographs_that_are_no_masks(tmp_path: Path) -> None:

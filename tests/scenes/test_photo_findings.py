@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture
+from calls import Capture, only
 from scipy import ndimage
 from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 
@@ -229,8 +229,7 @@ def test_a_white_table_below_is_no_sky() -> None:
 def test_blur() -> None:
     scene = made()
     changed(scene, 7, sharpness=0.3)
-    (found,) = findings(scene)
-    assert found == Finding("blur", "1 photographs are more blurred than the others (07.png)")
+    assert only(findings(scene)) == Finding("blur", "1 photographs are more blurred than the others (07.png)")
 
 
 def test_sharpness_is_of_the_blur_alone() -> None:
@@ -246,8 +245,7 @@ def test_copies() -> None:
     scene = made()
     noise = np.random.default_rng(3).normal(0, 0.5 / 255, (DOWN, ACROSS, 3))
     changed(scene, 9, pixels=(scene.glances["04.png"].pixels + noise).astype(np.float32))
-    (found,) = findings(scene)
-    assert found.text == "1 photographs are duplicates (09.png is 04.png)"
+    assert only(findings(scene)).text == "1 photographs are duplicates (09.png is 04.png)"
 
 
 def test_alpha_and_fisheyes() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import no_warnings
+from calls import no_warnings, warned
 from models import random_gaussians
 from needs import missing
 from ring import points, write_cloud, write_colmap, write_transforms
@@ -125,8 +125,7 @@ def test_points_that_are_no_numbers_are_left_out(kind: str, tmp_path: Path) -> N
 
 def test_those_of_text_too_and_points_of_places_alone(tmp_path: Path) -> None:
     folder = write_points(tmp_path, ["1 1 2 3", "2 nan 5 6", "3 7 8 9"])
-    with pytest.warns(UserWarning, match="1 of 3 points have NaN values and are left out"):
-        model = read_model(folder)
+    model = warned("1 of 3 points have NaN values and are left out", read_model, folder)
     np.testing.assert_array_equal(model.points, [[1, 2, 3], [7, 8, 9]])
     assert (model.colors == model.colors[0]).all()
 

@@ -10,7 +10,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pycolmap
 import pytest
-from calls import warnings_of
+from calls import refuses, warnings_of
+from demo_photographs import photographs
 from PIL import Image as Pillow
 from systems import can_link
 
@@ -60,10 +61,7 @@ def read_image(path):
 @pytest.fixture(scope="module")
 def pictures():
     """A dozen neighbouring views of the demo's ring, (height, width, 3) uint8, and their true cameras."""
-    surfaces = ray_caster.still_life()
-    ray_caster.bake(surfaces, seed=0)
-    cameras = ray_caster.cameras(40, WIDTH, HEIGHT, seed=0)[:COUNT]
-    return [np.rint(ray_caster.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras], cameras
+    return photographs(range(COUNT), WIDTH, HEIGHT)
 
 
 @pytest.fixture(scope="module")
@@ -241,24 +239,21 @@ def test_what_counts_as_transparent(dtype):
 
 
 def test_bad_folders(tmp_path, photos):
-    with pytest.raises(InputError, match=r"missing: no such folder"):
-        sfm.reconstruct(tmp_path / "missing", tmp_path / "out")
+    refuses(r"missing: no such folder", sfm.reconstruct, tmp_path / "missing", tmp_path / "out")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty/a.webp").write_bytes(b"")
     with pytest.raises(InputError, match=r"empty: no photos found, only 1 of an unsupported kind such as a\.webp"):
         sfm.reconstruct(tmp_path / "empty", tmp_path / "out")
     (tmp_path / "few").mkdir()
     shutil.copy(photos / "view_00.jpg", tmp_path / "few")
-    with pytest.raises(InputError, match=r"few: only 1 photo\(s\) found, expected at least 3"):
-        sfm.reconstruct(tmp_path / "few", tmp_path / "out")
+    refuses(r"few: only 1 photo\(s\) found, expected at least 3", sfm.reconstruct, tmp_path / "few", tmp_path / "out")
     for output, settings, told in [
         (tmp_path, {}, "is neither empty nor a result of sfm"),
         (tmp_path / "few/view_00.jpg", {}, "is a file"),
         (tmp_path / "out", {"matching": "nearest"}, "expected auto, exhaustive or sequential"),
         (tmp_path / "out", {"camera_model": "LENS"}, "camera model 'LENS'"),
     ]:
-        with pytest.raises(InputError, match=told):
-            sfm.reconstruct(photos, output, sfm.SfmSettings(**settings))
+        refuses(told, sfm.reconstruct, photos, output, sfm.SfmSettings(**settings))
     assert not (tmp_path / "out").exists()
 
 
@@ -268,8 +263,7 @@ def test_photo_that_does_not_decode_is_named(photos, tmp_path, damage):
     whole = (folder / "view_05.jpg").read_bytes()
     broken = {"garbage": b"hello" * 100, "truncated": whole[: len(whole) // 2], "empty": b""}[damage]
     (folder / "view_05.jpg").write_bytes(broken)
-    with pytest.raises(InputError, match=r"view_05\.jpg: (cannot be decoded|does not decode)"):
-        sfm.reconstruct(folder, tmp_path / "out")
+    refuses(r"view_05\.jpg: (cannot be decoded|does not decode)", sfm.reconstruct, folder, tmp_path / "out")
     assert leftovers(tmp_path) == ["photos"]
 
 
@@ -367,8 +361,7 @@ def test_interrupt_leaves_nothing(photos, tmp_path, stage):
 
 def test_failing_worker_is_an_error_with_its_last_words(photos, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "executable", "/bin/false")
-    with pytest.raises(ClsplatError, match="structure from motion failed"):
-        sfm.reconstruct(photos, tmp_path / "out")
+    refuses("structure from motion failed", sfm.reconstruct, photos, tmp_path / "out", error=ClsplatError)
     assert leftovers(tmp_path) == []
 
 
@@ -398,18 +391,27 @@ def test_cameras_of_their_own_and_sequential_matching(photos, tmp_path):
     assert len(pycolmap.Reconstruction(output / "sparse/0").cameras) == COUNT
 
 
-def test_features_under_masks_are_left_out_and_masks_are_undistorted(photos, tmp_path):
-    folder = tmp_path / "capture"
+def with_masks(photos, folder, name, top):
+    """images/ and masks/ with files of this name, whose upper quarter has this value, the rest the other."""
     shutil.copytree(photos, folder / "images")
-    (folder / "masks").mkdir()
-    mask = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    mask[: HEIGHT // 4] = 0
+    mask = np.full((HEIGHT, WIDTH, 3), 255 - top, np.uint8)
+    mask[: HEIGHT // 4] = top
     for path in (folder / "images").iterdir():
-        write_png(folder / "masks" / f"{path.name}.png", mask)
-    out = sfm.reconstruct(folder / "images", tmp_path / "out", masks=MaskUse("ignore"))
-    model = pycolmap.Reconstruction(out / "sparse" / "0")
+        write_png(folder / "masks" / name.format(path), mask)
+    return folder
+
+
+def assert_no_feature_under_the_mask(folder):
+    """But for what undistortion moves."""
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
     seen = [point.xy[1] for image in model.images.values() for point in image.points2D if point.has_point3D()]
-    assert min(seen) > HEIGHT // 4 - 6, "no feature is under the mask, but for what undistortion moves"
+    assert min(seen) > HEIGHT // 4 - 6
+
+
+def test_features_under_masks_are_left_out_and_masks_are_undistorted(photos, tmp_path):
+    folder = with_masks(photos, tmp_path / "capture", "{0.name}.png", 0)
+    out = sfm.reconstruct(folder / "images", tmp_path / "out", masks=MaskUse("ignore"))
+    assert_no_feature_under_the_mask(out)
     view = load_scene(out, masks=MaskUse("ignore")).views[0]
     pixels = view.load_masked()
     assert not pixels[: HEIGHT // 4 - 6].any()
@@ -417,24 +419,15 @@ def test_features_under_masks_are_left_out_and_masks_are_undistorted(photos, tmp
 
 
 def test_masks_that_are_asked_for_and_not_there(photos, tmp_path):
-    with pytest.raises(InputError, match="has no masks, expected masks/"):
-        sfm.reconstruct(photos, tmp_path / "out", masks=MaskUse("ignore"))
+    refuses("has no masks, expected masks/", sfm.reconstruct, photos, tmp_path / "out", masks=MaskUse("ignore"))
 
 
 @pytest.mark.slow
 def test_photos_with_masks_are_trained_by_their_folder(photos, tmp_path, monkeypatch):
     """images/ and masks/ in one folder without cameras: the masks reach sfm, are inverted once, and count after it."""
-    folder = tmp_path / "capture"
-    shutil.copytree(photos, folder / "images")
-    (folder / "masks").mkdir()
-    mask = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    mask[: HEIGHT // 4] = 255
-    for path in (folder / "images").iterdir():
-        write_png(folder / "masks" / f"{path.stem}.png", mask)
+    folder = with_masks(photos, tmp_path / "capture", "{0.stem}.png", 255)
     scene = load_scene(folder, masks=MaskUse("transparent", invert=True))
-    model = pycolmap.Reconstruction(tmp_path / "capture_colmap" / "sparse" / "0")
-    seen = [point.xy[1] for image in model.images.values() for point in image.points2D if point.has_point3D()]
-    assert min(seen) > HEIGHT // 4 - 6
+    assert_no_feature_under_the_mask(tmp_path / "capture_colmap")
     alpha = scene.views[0].load()[:, :, 3]
     assert not alpha[: HEIGHT // 4 - 6].any()
     assert alpha[HEIGHT // 4 + 6 :].all()

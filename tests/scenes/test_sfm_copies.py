@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from calls import warnings_of
+from demo_photographs import photographs
 from numpy.typing import NDArray
 from PIL import Image as Pillow
 from scipy.ndimage import map_coordinates
 
 from clsplat.config.masks import MaskUse
-from clsplat.demo import ray_caster
 from clsplat.errors import InputError
 from clsplat.scenes.sfm import copies, photos
 from clsplat.scenes.sfm import reconstruct as sfm
@@ -28,17 +28,17 @@ Picture = NDArray[np.uint8]
 @pytest.fixture(scope="module")
 def pictures() -> list[Picture]:
     """Neighbouring views, (180, 240, 3)."""
-    surfaces = ray_caster.still_life()
-    ray_caster.bake(surfaces, seed=0)
-    cameras = ray_caster.cameras(40, WIDTH, HEIGHT, seed=0)[:COUNT]
-    return [np.rint(ray_caster.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras]
+    return photographs(range(COUNT), WIDTH, HEIGHT)[0]
+
+
+def resized(picture: Picture, side: int) -> Picture:
+    height, width = picture.shape[:2]
+    return np.asarray(Pillow.fromarray(picture).resize((side, side * height // width), Pillow.Resampling.LANCZOS))
 
 
 def write(path: Path, picture: Picture, side: int = WIDTH, **how: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    image = Pillow.fromarray(picture)
-    if side != WIDTH:
-        image = image.resize((side, side * image.height // image.width), Pillow.Resampling.LANCZOS)
+    image = Pillow.fromarray(picture if side == WIDTH else resized(picture, side))
     image.save(path, **{**({"quality": 92} if path.suffix.lower() == ".jpg" else {}), **how})
 
 
@@ -101,45 +101,50 @@ def test_smaller_copies_in_folders_beside(
     assert told in message
 
 
+CHANGES: dict[str, Callable[[Picture], Picture]] = {
+    "corrected": undone,
+    "smaller": lambda picture: resized(picture, 120),
+    "smaller than what is compared": lambda picture: resized(picture, 60),
+    "same": lambda picture: picture,
+}
+"""Copies by what is told of them, which begins so."""
+
+
 @pytest.mark.brings("Polycam, 3DGS", "`corrected_images` or `input` beside `images`, into `sfm`", "one of them")
+@pytest.mark.brings("COLMAP, OpenSfM", "`dense/0/images`, `undistorted/images` beside `images`, into `sfm`", "one")
 @pytest.mark.parametrize(
-    ("kept", "other"),
-    [("images", "corrected_images"), ("input", "images"), ("images", "undistorted"), ("Input", "undistorted_images")],
+    ("kept", "other", "change"),
+    [
+        # before and after their lens was undone: by their names, as the pictures differ
+        ("keyframes/images/{0}.jpg", "keyframes/corrected_images/{0}.jpg", "corrected"),
+        ("keyframes/input/{0}.jpg", "keyframes/images/{0}.jpg", "corrected"),
+        ("keyframes/images/{0}.jpg", "keyframes/undistorted/{0}.jpg", "corrected"),
+        ("keyframes/Input/{0}.jpg", "keyframes/undistorted_images/{0}.jpg", "corrected"),
+        # some folders deeper
+        ("images/{0}.jpg", "undistorted/images/{0}.jpg", "corrected"),
+        ("images/{0}.jpg", "opensfm/undistorted/images/{0}.jpg.jpg", "corrected"),
+        ("images/{0}.jpg", "dense/images/{0}.jpg", "corrected"),
+        ("images/{0}.jpg", "dense/0/images/{0}.jpg", "corrected"),
+        ("images/left/{0}.jpg", "dense/0/images/left/{0}.jpg", "corrected"),
+        ("{0}.jpg", "undistorted/{0}.png", "corrected"),
+        ("left/{0}.jpg", "undistorted/left/{0}.jpg", "corrected"),
+        # the larger one is kept, though its name says that it is the copy
+        ("images/{0}.jpg", "input/{0}.jpg", "smaller"),
+        # the same names and pictures in any folder, beside the photographs' folder or in it
+        ("photos/{0}.jpg", "for the web/{0}.jpg", "smaller"),
+        ("{0}.jpg", "backup/{0}.jpg", "same"),
+        ("all/{0}.jpg", "all/deep/{0}.jpg", "smaller than what is compared"),
+    ],
 )
-def test_pictures_before_and_after_their_lens_was_undone(
-    kept: str, other: str, pictures: list[Picture], tmp_path: Path, used: Any
+def test_copies_are_left_out(
+    kept: str, other: str, change: str, pictures: list[Picture], tmp_path: Path, used: Any
 ) -> None:
-    """By their names, as the pictures differ."""
     for index, picture in enumerate(pictures):
-        write(tmp_path / "in" / "keyframes" / kept / f"{index}.jpg", picture)
-        write(tmp_path / "in" / "keyframes" / other / f"{index}.jpg", undone(picture))
+        write(tmp_path / "in" / kept.format(index), picture)
+        write(tmp_path / "in" / other.format(index), CHANGES[change](picture), optimize=True)
     found, (message,) = used(tmp_path / "in")
-    assert found == names(f"keyframes/{kept}/")
-    assert f"keyframes/{other}/0.jpg is keyframes/{kept}/0.jpg, corrected" in message
-
-
-def test_the_larger_one_is_kept_whichever_came_first(pictures: list[Picture], tmp_path: Path, used: Any) -> None:
-    for index, picture in enumerate(pictures):
-        write(tmp_path / "in" / "input" / f"{index}.jpg", picture, 120)
-        write(tmp_path / "in" / "images" / f"{index}.jpg", picture)
-    found, (message,) = used(tmp_path / "in")
-    assert found == names("images/")
-    assert "input/0.jpg is images/0.jpg, smaller" in message
-
-
-@pytest.mark.parametrize(("folder", "side"), [("for the web", 120), ("backup", WIDTH), ("all/deep", 60)])
-def test_the_same_names_and_pictures_in_any_folder(
-    folder: str, side: int, pictures: list[Picture], tmp_path: Path, used: Any
-) -> None:
-    """Beside the photographs' folder, or in it."""
-    top = {"for the web": "photos/", "backup": "", "all/deep": "all/"}[folder]
-    for index, picture in enumerate(pictures):
-        write(tmp_path / "in" / f"{top}{index}.jpg", picture)
-        write(tmp_path / "in" / folder / f"{index}.jpg", picture, side, optimize=True)
-    found, (message,) = used(tmp_path / "in")
-    assert found == names(top)
-    why = "smaller" if side < WIDTH else "same"
-    assert f"{folder}/0.jpg is {top}0.jpg, {why}" in message
+    assert found == [kept.format(index) for index in range(COUNT)]
+    assert f"{other.format(0)} is {kept.format(0)}, {change.split(maxsplit=1)[0]}" in message
 
 
 @pytest.mark.brings("phones, raw converters", "IMG.jpg and IMG.png, into `sfm`", "one of them")
@@ -191,10 +196,7 @@ def test_several_cameras_stay(folders: tuple[str, str], pictures: list[Picture],
 @pytest.fixture(scope="module")
 def elsewhere() -> list[Picture]:
     """Views from the other side, (180, 240, 3)."""
-    surfaces = ray_caster.still_life()
-    ray_caster.bake(surfaces, seed=0)
-    cameras = ray_caster.cameras(40, WIDTH, HEIGHT, seed=0)[20 : 20 + COUNT]
-    return [np.rint(ray_caster.render(surfaces, camera) * 255).astype(np.uint8) for camera in cameras]
+    return photographs(range(20, 20 + COUNT), WIDTH, HEIGHT)[0]
 
 
 @pytest.mark.parametrize("side", [WIDTH, 120])
@@ -230,28 +232,6 @@ def test_smaller_copies_of_a_copy(cut: int, extension: str, pictures: list[Pictu
     found, (message,) = used(tmp_path / "in")
     assert found == names("input/")
     assert f"{3 * COUNT} photographs are copies and left out (images/0.{extension} is input/0.jpg, " in message
-
-
-@pytest.mark.brings("COLMAP, OpenSfM", "`dense/0/images`, `undistorted/images` beside `images`, into `sfm`", "one")
-@pytest.mark.parametrize(
-    ("kept", "other"),
-    [
-        ("images/{0}.jpg", "undistorted/images/{0}.jpg"),
-        ("images/{0}.jpg", "opensfm/undistorted/images/{0}.jpg.jpg"),
-        ("images/{0}.jpg", "dense/images/{0}.jpg"),
-        ("images/{0}.jpg", "dense/0/images/{0}.jpg"),
-        ("images/left/{0}.jpg", "dense/0/images/left/{0}.jpg"),
-        ("{0}.jpg", "undistorted/{0}.png"),
-        ("left/{0}.jpg", "undistorted/left/{0}.jpg"),
-    ],
-)
-def test_copies_some_folders_deeper(kept: str, other: str, pictures: list[Picture], tmp_path: Path, used: Any) -> None:
-    for index, picture in enumerate(pictures):
-        write(tmp_path / "in" / kept.format(index), picture)
-        write(tmp_path / "in" / other.format(index), undone(picture))
-    found, (message,) = used(tmp_path / "in")
-    assert found == [kept.format(index) for index in range(COUNT)]
-    assert f"{other.format(0)} is {kept.format(0)}, corrected" in message
 
 
 def test_what_shows_nothing_goes_with_its_folder(pictures: list[Picture], tmp_path: Path, used: Any) -> None:
@@ -319,6 +299,6 @@ def test_masks_are_those_of_what_is_kept(pictures: list[Picture], tmp_path: Path
         write(tmp_path / "in" / "images" / f"{index}.jpg", picture)
         write(tmp_path / "in" / "images_2" / f"{index}.jpg", picture, 120)
         write(tmp_path / "in" / "masks" / f"{index}.jpg.mask.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
-    with pytest.warns(UserWarning, match="4 photo"):
+    with pytest.warns(UserWarning, match="4 photographs are copies"):
         sfm.reconstruct(tmp_path / "in", tmp_path / "scene", masks=MaskUse("ignore"))
     assert staged == [(f"{index}.jpg.mask.png", f"{index}.jpg.png") for index in range(COUNT)]

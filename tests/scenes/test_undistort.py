@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from calls import python
 from systems import posix
 
 from clsplat.camera import Camera
@@ -135,5 +133,5 @@ signal.signal(signal.SIGTERM, lambda *_: print("taken"))
 import clsplat.scenes.dataset
 os.kill(os.getpid(), signal.SIGTERM)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = python("-c", code)
     assert (done.returncode, done.stdout, done.stderr) == (0, "taken\n", "")

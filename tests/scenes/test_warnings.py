@@ -7,8 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
-from calls import no_warnings
+from calls import Capture, no_warnings, warned
 from models import random_gaussians
 
 from clsplat.cli.main import main
@@ -28,7 +27,7 @@ more
 """
 
 
-def test_a_warning_of_a_reader_reaches_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_warning_of_a_reader_reaches_the_command_line(tmp_path: Path, capsys: Capture) -> None:
     """Which passes over the warnings of other packages."""
     path = tmp_path / "model.ply"
     random_gaussians(4).save(path)
@@ -38,8 +37,7 @@ def test_a_warning_of_a_reader_reaches_the_command_line(tmp_path: Path, capsys: 
 
 
 def test_a_warning_is_one_line() -> None:
-    with pytest.warns(UserWarning, match=r"^a\\nb\\x1b$"):
-        warn("a\nb\x1b")
+    warned(r"^a\\nb\\x1b$", warn, "a\nb\x1b")
 
 
 def test_a_scene_gathers_what_its_readers_warn_of(tmp_path: Path) -> None:

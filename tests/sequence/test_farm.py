@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from calls import Capture, error_line, left_behind
 from needs import openjd_path, require
+from rendered import camera_file, contents
 from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
@@ -41,11 +42,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """A model and cameras that move, as arguments of render: COUNT frames."""
     folder = tmp_path_factory.mktemp("shot")
     hidden_model().save(folder / "model.ply")
-    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": 1, "position": [-1, 0, -4], **key}, {"frame": COUNT, "position": [1, 0, -4], **key}]
-    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-    (folder / "cameras.json").write_text(json.dumps(document))
-    return [str(folder / "model.ply"), "--cameras", str(folder / "cameras.json")]
+    return [str(folder / "model.ply"), "--cameras", str(camera_file(folder / "cameras.json", {1: -1, COUNT: 1}))]
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +56,6 @@ def whole(shot: list[str], tmp_path_factory: pytest.TempPathFactory) -> dict[str
 def render(shot: list[str], folder: Path, *more: str) -> int:
     flags = ["--channels", "rgb,alpha,depth", "--exr", "half"]
     return main(["render", *shot, "-o", str(folder / "a.####.exr"), *flags, *more])
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 class Killer(threading.Thread):
@@ -120,7 +113,6 @@ def test_ctrl_c_of_a_terminal(shot: list[str], tmp_path: Path) -> None:
     line = [sys.executable, "-m", "clsplat", "render", *shot, "-o", str(tmp_path / "a.####.exr"), "--workers", "2"]
     line += ["--progress", "json", "--width", "1600"]  # large enough that there are frames left
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    assert process.stdout is not None
     process.stdout.readline()
     os.killpg(process.pid, signal.SIGINT)  # to the workers as well
     _, err = process.communicate(timeout=60)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 from calls import Capture, error_line
 from cg import write_flat
 from needs import require
+from rendered import camera_file, pixels_of
 from tiny import HEIGHT, WIDTH, hidden_model
 
 from clsplat.arrays import Float32
@@ -37,10 +37,7 @@ BOTH_WAYS = ("motion", "backward")
 
 def cameras(folder: Path, *places: float, first: int = 1) -> Path:
     """A shot of a camera at these x, frame by frame."""
-    keys = [{"frame": first + index, "position": [x, 0, -4], **KEY} for index, x in enumerate(places)]
-    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-    (folder / "cameras.json").write_text(json.dumps(document))
-    return folder / "cameras.json"
+    return camera_file(folder / "cameras.json", dict(enumerate(places, first)))
 
 
 def layout(folder: Path, **of_it: Any) -> Path:
@@ -56,7 +53,7 @@ def render(folder: Path, model: Path, shot: Path, flags: str) -> int:
 
 
 def pixels(folder: Path, frame: int) -> Float32:
-    return np.asarray(oiio.ImageBuf(str(folder / f"{frame:04d}.exr")).get_pixels(oiio.FLOAT))
+    return pixels_of(folder / f"{frame:04d}.exr")
 
 
 def assert_goes_along(model: Path, shot: Shot, sampling: SamplingConfig) -> None:
@@ -122,7 +119,6 @@ def test_where_keys_go_on_they_count(tmp_path: Path) -> None:
     for further, wanted in (([], 0.0), ([{"frame": 4, "translate": [2, 0, 0]}], 1.0)):
         cast = load_cast(layout(tmp_path, keys=keys + further))
         placed = cast.seen(tasks, options.pictures, options.channels)[1].placed
-        assert placed is not None
         assert placed[1][0].transform[0, 3] == wanted
 
 

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import left_behind
+from calls import left_behind, only, refuses
+from rendered import contents
 from scenes import tilted_camera
 
 from clsplat.camera import Camera
@@ -63,10 +64,6 @@ def rendered(task: Task) -> RenderedFrame:
     return RenderedFrame(planes_of(task), 0.5)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-
-
 def assert_same_pose(a: Camera, b: Camera) -> None:
     np.testing.assert_allclose(a.rotation, b.rotation, atol=1e-12)
     np.testing.assert_allclose(a.translation, b.translation, atol=1e-12)
@@ -103,7 +100,6 @@ def test_backward_motion_goes_to_the_frame_number_before() -> None:
     late = SamplingConfig(shutter_open=0.0, shutter_close=0.5)
     (task,) = make_tasks(shot.only("1"), shot, "{frame}.exr", lambda camera: camera, ("rgb", "backward"), late)
     before = sequence_task.camera_before(task, PictureConfig(sampling=late))
-    assert before is not None
     # a circle's cameras between frames are interpolated: within a thousandth of a frame's way
     np.testing.assert_allclose(before.rotation, turned(-0.075).rotation, atol=1e-4)
 
@@ -117,11 +113,9 @@ def test_tasks_know_the_whole_shot(tmp_path: Path) -> None:
 
     (task,) = make_tasks(whole.only("3"), whole, pattern, half, ("rgb", "motion"))
     assert (task.number, task.path, task.camera.width) == (3, tmp_path / "3.exr", 20)
-    assert task.after is not None
     assert (task.after.width, task.after.fx) == (20, 17.5)
     assert_same_pose(task.after, turned(0.3))
-    (still,) = make_tasks(whole.only("3"), whole, pattern, half, ("rgb",))
-    assert still.after is None
+    assert only(make_tasks(whole.only("3"), whole, pattern, half, ("rgb",))).after is None
     panorama = replace(turned(0), projection="equirectangular")
     mixed = Shot((*whole.frames, Frame(6, panorama, "0006")))
     with pytest.raises(InputError, match="--channels motion: frame 6 is equirectangular"):
@@ -146,7 +140,6 @@ def test_a_stretch_is_the_shot_there() -> None:
     of = stretches(even, lambda camera: camera, -2.5, 2.5)
     for number, angle in ((1, -0.15), (12, 1.25)):  # before its first and after its last frame it goes on
         stretch = of(number)
-        assert stretch is not None
         time_ = -1.5 if number == 1 else 1.5
         np.testing.assert_allclose(stretch.at(time_).rotation, turned(angle).rotation, atol=1e-6)
     assert stretches(Shot(even.frames[:1]), lambda camera: camera, -1, 1)(1) is None
@@ -198,8 +191,6 @@ def test_shade_takes_each_channel_from_its_place(tmp_path: Path) -> None:
     assert (made["backward"] == [4, -5]).all()
     wanted, how = renderer.asked[0]
     assert set(wanted) == {"depth", "normal", "position", "motion", "backward"}
-    assert task.after is not None
-    assert task.earlier is not None
     assert how["before"].translation is task.earlier.translation
     assert (how["after"].width, how["after"].translation is task.after.translation) == (task.after.width, True)
     renderer.asked.clear()
@@ -349,18 +340,15 @@ def test_stale_temporaries_of_the_shot_alone_go(tmp_path: Path) -> None:
 def test_folders_are_looked_at_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_bytes(b"")
     (tmp_path / "a.0002.exr").mkdir()
-    with pytest.raises(InputError, match=r"file: is a file, expected a folder"):
-        finished_frames.check_folders(tasks_in(tmp_path / "file" / "shot"))
+    refuses(r"file: is a file, expected a folder", finished_frames.check_folders, tasks_in(tmp_path / "file" / "shot"))
     with pytest.raises(InputError, match=r"a\.0002\.exr: is a folder, expected the name of a file"):
         finished_frames.check_folders(tasks_in(tmp_path))
     finished_frames.check_folders(tasks_in(tmp_path / "new" / "shot"))
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
-    with pytest.raises(InputError, match="is not writable"):
-        finished_frames.check_folders(tasks_in(tmp_path / "new" / "shot"))
+    refuses("is not writable", finished_frames.check_folders, tasks_in(tmp_path / "new" / "shot"))
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr(Path, "mkdir", lambda *_, **__: (_ for _ in ()).throw(OSError(30, "Read-only file system")))
-    with pytest.raises(InputError, match="cannot be made: the disk is read-only"):
-        finished_frames.make_folders(tasks_in(tmp_path / "new" / "shot"))
+    refuses("cannot be made: the disk is read-only", finished_frames.make_folders, tasks_in(tmp_path / "new" / "shot"))
 
 
 def test_the_digest_goes_by_what_a_colour_configuration_says(tmp_path: Path) -> None:

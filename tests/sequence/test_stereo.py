@@ -13,10 +13,11 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import scenes
-from calls import Capture, error_line
+from calls import Capture, error_line, fails, printed, ran, refuses, rejected
 from cg import write_flat, write_samples
 from headers import exr_attributes
 from needs import require
+from rendered import camera_file, pixels_of
 
 from clsplat.camera import Camera
 from clsplat.cli.main import main
@@ -78,10 +79,8 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         np.ones((1, 1, 3)),
     )
     gaussians.save(folder / "model.ply")
-    keys = [{"frame": 1, "position": [0, 0, -4], **KEY}, {"frame": 2, "position": [0.01, 0, -4], **KEY}]
-    document = {"clsplat_cameras": 1, "width": 96, "height": 64, "keys": keys}
-    (folder / "cameras.json").write_text(json.dumps(document))
-    return [str(folder / "model.ply"), "--cameras", str(folder / "cameras.json")]
+    cameras = camera_file(folder / "cameras.json", {1: 0, 2: 0.01}, size=(96, 64), fov_x=40)
+    return [str(folder / "model.ply"), "--cameras", str(cameras)]
 
 
 def render(shot: list[str], pattern: Path, flags: str = "") -> int:
@@ -93,10 +92,6 @@ def centroid(pixels: np.ndarray) -> np.ndarray:
     weight = pixels[:, :, 0].astype(np.float64)
     y, x = np.indices(weight.shape) + 0.5
     return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
-
-
-def pixels_of(path: Path, part: int = 0) -> np.ndarray:
-    return np.asarray(oiio.ImageBuf(str(path), part, 0).get_pixels(oiio.FLOAT))
 
 
 def test_disparity_of_cameras() -> None:
@@ -152,15 +147,13 @@ def test_one_file_has_both_views(shot: list[str], tmp_path: Path, parts: str) ->
 
 
 def test_records_tell_the_eyes_apart(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
-    assert render(shot, tmp_path / "{eye}.##.png", "--stereo 0.1 --json") == 0
-    records = json.loads(capsys.readouterr().out)
+    records = json.loads(ran(capsys, render, shot, tmp_path / "{eye}.##.png", "--stereo 0.1 --json").out)
     assert [(record["frame"], record["eye"]) for record in records] == [
         *((1, "left"), (1, "right"), (2, "left"), (2, "right"))
     ]
     assert render(shot, tmp_path / "{eye}.##.png", "--stereo 0.1 --skip-existing --dry-run --json") == 0
     assert all(frame["skipped"] for frame in json.loads(capsys.readouterr().out)["frames"])
-    assert render(shot, tmp_path / "{eye}.##.png", "--stereo 0.1 --skip-existing --dry-run") == 0
-    plan = capsys.readouterr().out
+    plan = ran(capsys, render, shot, tmp_path / "{eye}.##.png", "--stereo 0.1 --skip-existing --dry-run").out
     assert "frames    4: 1-2;" in plan
     assert "skipped   4: 1-2" in plan
     assert render(shot, tmp_path / "one.##.png", "--stereo 0.1 --eye right --frames 2") == 0
@@ -188,15 +181,13 @@ def test_errors_are_one_line(
 ) -> None:
     if pattern.endswith(".mp4"):
         require("av")
-    assert render(shot, tmp_path / pattern, flags) == 2
-    assert message in error_line(capsys)
+    assert message in fails(capsys, render, shot, tmp_path / pattern, flags)
     assert not list(tmp_path.iterdir())
 
 
 def test_other_projections_are_refused() -> None:
     camera: Any = replace(scenes.tilted_camera(60, 40), projection="orthographic")
-    with pytest.raises(InputError, match="--stereo: a frame is orthographic, expected perspective"):
-        seen_by(camera, "left", 0.1)
+    refuses("--stereo: a frame is orthographic, expected perspective", seen_by, camera, "left", 0.1)
 
 
 def test_names_and_settings() -> None:
@@ -204,8 +195,7 @@ def test_names_and_settings() -> None:
     assert for_eye("%v.exr", "") == "%v.exr"
     assert StereoConfig("0.1", eye="right").eyes == ("right",)
     assert StereoConfig().eyes == ()
-    with pytest.raises(InputError, match="the cameras of --stereo stage have their own"):
-        StereoConfig("stage", convergence=2.0).check()
+    refuses("the cameras of --stereo stage have their own", StereoConfig("stage", convergence=2.0).check)
 
 
 def test_a_pair_of_a_stage(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
@@ -218,8 +208,7 @@ def test_a_pair_of_a_stage(shot: list[str], tmp_path: Path, capsys: Capture) -> 
     with pytest.raises(InputError, match="--usd-camera single: belongs to no pair, expected --usd-camera with one of"):
         pair_of_stage(stage, "single")
     call = ["render", shot[0], "--cameras", str(stage), "--width", "64", "--progress", "none"]
-    assert main([*call, "-o", f"{tmp_path}/%V.##.exr", "--stereo", "stage"]) == 0
-    assert "stereoRole" not in capsys.readouterr().err
+    assert "stereoRole" not in printed(capsys, [*call, "-o", f"{tmp_path}/%V.##.exr", "--stereo", "stage"]).err
     cameras = {eye: f"/rig/{name}" for eye, name in (("left", "one"), ("right", "two"))}
     for eye, name in cameras.items():
         assert main([*call, "-o", f"{tmp_path}/{eye}.alone.##.exr", "--usd-camera", name]) == 0
@@ -261,8 +250,7 @@ def test_eyes_that_are_not_alike(
         stage = stage.replace("endTimeCode = 2", 'endTimeCode = 2\n    renderSettingsPrimPath = "/Render"')
     (tmp_path / "shot.usda").write_text(stage + settings)
     call = ["render", shot[0], "--cameras", str(tmp_path / "shot.usda"), "--stereo", "stage", *flags.split()]
-    assert main([*call, "-o", str(tmp_path / "a.##.exr"), "--dry-run"]) == 2
-    assert message in error_line(capsys)
+    assert message in rejected(capsys, [*call, "-o", tmp_path / "a.##.exr", "--dry-run"])
     if "--region" not in flags:
         assert main([*call, "-o", str(tmp_path / "{eye}.##.exr"), "--dry-run"]) == 0
 
@@ -275,8 +263,7 @@ def test_each_eye_has_a_holdout(shot: list[str], tmp_path: Path, capsys: Capture
         folder.mkdir()
         flags = f"--stereo 0.1 --frames 1 --alpha --holdout {folder}/z.{{eye}}.exr"
         write_flat(folder / "z.left.exr", {"Z": whole})
-        assert render(shot, folder / names, flags) == 2
-        assert f"{folder}/z.right.exr: no such holdout" in error_line(capsys)
+        assert f"{folder}/z.right.exr: no such holdout" in fails(capsys, render, shot, folder / names, flags)
         write_flat(folder / "z.right.exr", {"Z": whole[:, 1:]})
         assert render(shot, folder / names, flags) == 2
         assert "z.right.exr: holds a frame of 95x64, expected 96x64" in error_line(capsys)
@@ -312,8 +299,7 @@ def test_a_pair_in_strips_is_no_file_of_one_eye(tmp_path: Path) -> None:
     left, right = (Task(1, "1", camera, tmp_path / "a.exr", eye=eye, holdout=tmp_path / "z.exr") for eye in EYES)
     frames, pair = InStrips(Renderer(), scenes.one()[0], options), replace(left, right=right)
     frames.check([pair])
-    with pytest.raises(InputError, match="a picture of 64x40 is written in strips here, expected a file for each eye"):
-        frames(pair)
+    refuses("a picture of 64x40 is written in strips here, expected a file for each eye", frames, pair)
     assert not (tmp_path / "a.exr").exists()
 
 

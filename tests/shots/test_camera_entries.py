@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from calls import refuses
 
 from clsplat.camera import focal_length
 from clsplat.errors import InputError
@@ -52,17 +53,14 @@ def test_sizes_that_cannot_be(write: Any, width: Any, problem: str, tmp_path: Pa
 @pytest.mark.parametrize("write", [own, nerfstudio])
 def test_angles_that_cannot_be(write: Any, tmp_path: Path) -> None:
     path = write(tmp_path / "a.json", 640, 1e-320)
-    with pytest.raises(InputError, match=r"key 0: 'fov(_y)?': angle of view is .* focal length over 1e\+12"):
-        read_shot(path)
+    refuses(r"key 0: 'fov(_y)?': angle of view is .* focal length over 1e\+12", read_shot, path)
 
 
 def test_an_entry_begins_every_error_with_its_place() -> None:
     entry = Keys(Path("a.json"), "key 3", {"p": [1, 2, "x"], "n": 10**5000}, {"q": [1, 2, 3]})
     assert entry.vector("q", 3).tolist() == [1, 2, 3]
-    with pytest.raises(InputError, match=r"^a\.json: key 3: 'p' is \[1, 2, 'x'\], expected a list of 3 numbers$"):
-        entry.vector("p", 3)
-    with pytest.raises(InputError, match=r"^a\.json: key 3: 'n' is an endless number, expected a list of 2 numbers$"):
-        entry.vector("n", 2)
+    refuses(r"^a\.json: key 3: 'p' is \[1, 2, 'x'\], expected a list of 3 numbers$", entry.vector, "p", 3)
+    refuses(r"^a\.json: key 3: 'n' is an endless number, expected a list of 2 numbers$", entry.vector, "n", 2)
 
 
 @pytest.mark.parametrize("given", [None, {}, "x", [], [1], [{}, None]])
@@ -72,8 +70,6 @@ def test_no_list_of_objects(given: Any) -> None:
 
 def test_whole_frames() -> None:
     assert whole_frames("a", "frame", 1.5, 4.0) == [2, 3, 4]
-    with pytest.raises(InputError, match=r"^a: has no whole frame from 1\.2 to 1\.8, expected at least one$"):
-        whole_frames("a", "frame", 1.2, 1.8)
+    refuses(r"^a: has no whole frame from 1\.2 to 1\.8, expected at least one$", whole_frames, "a", "frame", 1.2, 1.8)
     for begin, end in ((0.0, 1e5), (0.0, float("inf")), (float("inf"), 0.0), (float("nan"), 1.0)):
-        with pytest.raises(InputError, match=r"^a: has the frames .* expected at most 100,000$"):
-            whole_frames("a", "frame", begin, end)
+        refuses(r"^a: has the frames .* expected at most 100,000$", whole_frames, "a", "frame", begin, end)

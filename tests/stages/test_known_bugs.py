@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What has gone wrong in other programs of this kind, a test each that the suite would not have by another name.
 
-docs/numerics.md lists them all, with the tests elsewhere; docs/never-a-nan.md those of values that are not finite.
+docs/numerics.md has the tests elsewhere; docs/never-a-nan.md those of values that are not finite.
 """
 
 from __future__ import annotations

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tracemalloc
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ import pytest
 
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
+from clsplat.errors import InputError
 from clsplat.files.atomic import temporary_name
 
 Capture = pytest.CaptureFixture[str]
@@ -31,12 +33,26 @@ def warnings_of(work: Callable[[], object]) -> list[str]:
     return [str(warning.message) for warning in caught if warning.category in {UserWarning, RuntimeWarning}]
 
 
+def warned(match: str, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """The result of a call that gives one warning; fails unless the warning matches."""
+    with pytest.warns(UserWarning, match=match) as caught:
+        found = call(*arguments, **options)
+    assert len(caught) == 1, [str(each.message) for each in caught]
+    return found
+
+
 @contextmanager
 def no_warnings() -> Iterator[None]:
     """Any warning is an error here."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
+
+
+def only(items: Iterable[Any]) -> Any:
+    """The one item that there is."""
+    (item,) = items
+    return item
 
 
 def peak_of(work: Callable[[], object]) -> int:
@@ -75,6 +91,46 @@ def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
     return python("-m", "clsplat", *arguments, timeout=120)
+
+
+def refuses(
+    match: str, call: Callable[..., object], *arguments: Any, error: type[Exception] = InputError, **options: Any
+) -> str:
+    """The message of the error that the call raises, of an InputError one line; fails unless it matches."""
+    with pytest.raises(error, match=match) as caught:
+        call(*arguments, **options)
+    message = str(caught.value)
+    del caught  # else the frames of the call, and the files that they have open, live until garbage is collected
+    assert error is not InputError or "\n" not in message
+    return message
+
+
+def complaint(path: object, call: Callable[..., object], *arguments: Any, **options: Any) -> str:
+    """The words behind the file's name in the InputError that the call raises."""
+    start = f"{path}: "
+    return refuses(f"^{re.escape(start)}", call, *arguments, **options).removeprefix(start)
+
+
+def ran(capsys: Capture, call: Callable[..., int], *arguments: Any, status: int = 0, **options: Any) -> Any:
+    """Output and errors of a call, which ends with this status."""
+    assert call(*arguments, **options) == status, arguments
+    return capsys.readouterr()
+
+
+def fails(capsys: Capture, call: Callable[..., int], *arguments: Any, status: int = 2, **options: Any) -> str:
+    """The one line of error of a call, which ends with this status."""
+    assert call(*arguments, **options) == status, arguments
+    return error_line(capsys)
+
+
+def printed(capsys: Capture, words: Iterable[object], *, call: Callable[[list[str]], int] = main, **how: Any) -> Any:
+    """Output and errors of a call of the command line; how: its status."""
+    return ran(capsys, call, [*map(str, words)], **how)
+
+
+def rejected(capsys: Capture, words: Iterable[object], *, call: Callable[[list[str]], int] = main, **how: Any) -> str:
+    """The one line of error of a call of the command line; how: its status."""
+    return fails(capsys, call, [*map(str, words)], **how)
 
 
 def error_line(capsys: Capture) -> str:

@@ -54,3 +54,9 @@ def cloud(count: int, *, width: int = 3, degree: int | None = None, cams: int = 
 def rounded(arguments: dict[str, Any]) -> dict[str, Any]:
     """The same with each tensor's numbers rounded to float32's, in float64."""
     return {name: value.float().double() if isinstance(value, Tensor) else value for name, value in arguments.items()}
+
+
+def given(count: int = 8, **changes: Any) -> dict[str, Any]:
+    """`cloud` in float32, with these changes."""
+    made = {name: value.float() if isinstance(value, Tensor) else value for name, value in cloud(count).items()}
+    return {**made, **changes}

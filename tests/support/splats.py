@@ -110,6 +110,15 @@ def damaged(data: bytes, *, step: int) -> Iterable[bytes]:
         yield data[:at] + bytes([data[at] ^ int(rng.integers(1, 256))]) + data[at + 1 :]
 
 
+def refused_of(read: Callable[[Path], Gaussians], path: Path, *, step: int) -> int:
+    """How many of the file's damages are refused; what is read of the others is sound."""
+    refused = 0
+    for data in damaged(path.read_bytes(), step=step):
+        path.write_bytes(data)
+        refused += assert_refused_or_sound(read, path)
+    return refused
+
+
 def assert_refused_or_sound(read: Callable[[Path], Gaussians], path: Path) -> bool:
     """Whether the file was refused: by one line that names it; else what was read is whole and finite."""
     with warnings.catch_warnings():

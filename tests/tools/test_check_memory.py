@@ -8,6 +8,7 @@ from pathlib import Path
 
 import check_memory
 import pytest
+from calls import printed
 from check_memory import CHECKS, Finding, Result, findings, kernels, places, report, report_planted
 from memory_workload import by_elements
 
@@ -75,14 +76,12 @@ def test_a_kernel_that_never_ran_is_told(monkeypatch: pytest.MonkeyPatch, capsys
     monkeypatch.setattr(check_memory, "library", lambda: Path("driver"))
     monkeypatch.setattr(check_memory, "run", lambda shape, check, *_: Result(f"{shape} {check}", 0, ran, "", 0.0))
     monkeypatch.setattr(check_memory, "report_planted", lambda *_: True)
-    assert check_memory.main(["--shapes", "8x1"]) == 1
-    assert "never ran: scan_chunks" in capsys.readouterr().out
+    assert "never ran: scan_chunks" in printed(capsys, ["--shapes", "8x1"], status=1, call=check_memory.main).out
 
 
 def test_without_oclgrind(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(check_memory, "library", lambda: None)
-    assert check_memory.main([]) == 2
-    assert "apt install oclgrind" in capsys.readouterr().err
+    assert "apt install oclgrind" in printed(capsys, [], status=2, call=check_memory.main).err
 
 
 def test_vectors_are_made_of_elements() -> None:

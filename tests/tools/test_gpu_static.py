@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import gpu_page
 import gpu_rules
 import gpu_static
 import pytest
+from calls import Capture, refuses
 from gpu_assembly import Block, Instruction, Loop, gcn_kind, parse_gcn, parse_sass, sass_kind
 from gpu_compilers import Built, NoCompilerError, Source, ask_package, read_amd, read_nvidia
 from gpu_devices import Gpu, occupancy, waves_at_a_time
@@ -148,41 +150,24 @@ def test_loops_of_amd() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("kind_of", "kind", "names"),
     [
-        ("FFMA", "fp32"),
-        ("FSETP.GEU.AND", "fp32"),
-        ("IMAD.MOV.U32", "integer"),
-        ("I2FP.F32.S32", "other"),
-        ("LDL.64", "shared"),
-        ("ATOMS.MAX", "shared"),
-        ("STG.E.128", "global"),
-        ("LDGSTS.E", "other"),
-        ("BAR.SYNC.DEFER_BLOCKING", "control"),
-        ("ULDC.64", "other"),
-        ("VOTE.ANY", "other"),
-        ("UISETP.NE.AND", "integer"),
+        (sass_kind, "fp32", "FFMA FSETP.GEU.AND"),
+        (sass_kind, "integer", "IMAD.MOV.U32 UISETP.NE.AND"),
+        (sass_kind, "other", "I2FP.F32.S32 LDGSTS.E ULDC.64 VOTE.ANY"),
+        (sass_kind, "shared", "LDL.64 ATOMS.MAX"),
+        (sass_kind, "global", "STG.E.128"),
+        (sass_kind, "control", "BAR.SYNC.DEFER_BLOCKING"),
+        (gcn_kind, "fp32", "v_dual_fmac_f32 v_cmp_lt_f32_e32"),
+        (gcn_kind, "integer", "v_cndmask_b32_e32"),
+        (gcn_kind, "shared", "ds_load_b128 scratch_store_b32"),
+        (gcn_kind, "control", "s_delay_alu"),
+        (gcn_kind, "scalar", "s_and_b32"),
+        (gcn_kind, "other", "v_cvt_f32_i32_e32"),
     ],
 )
-def test_kinds_of_sass(name: str, kind: str) -> None:
-    assert sass_kind(name) == kind
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("v_dual_fmac_f32", "fp32"),
-        ("v_cmp_lt_f32_e32", "fp32"),
-        ("v_cndmask_b32_e32", "integer"),
-        ("ds_load_b128", "shared"),
-        ("scratch_store_b32", "shared"),
-        ("s_delay_alu", "control"),
-        ("s_and_b32", "scalar"),
-        ("v_cvt_f32_i32_e32", "other"),
-    ],
-)
-def test_kinds_of_amd(name: str, kind: str) -> None:
-    assert gcn_kind(name) == kind
+def test_kinds_of_instructions(kind_of: Callable[[str], str], kind: str, names: str) -> None:
+    assert {name: kind_of(name) for name in names.split()} == dict.fromkeys(names.split(), kind)
 
 
 def test_what_ptxas_says() -> None:
@@ -206,7 +191,7 @@ def test_a_binary_that_says_nothing() -> None:
         read_intel(Source("ranges", ("-DITEMS=64",)), "tgllp", b"\x7fELF")
 
 
-def test_without_ocloc(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_ocloc(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setattr(gpu_intel, "ocloc", lambda: None)
     monkeypatch.setattr(gpu_static, "ask_package", lambda *_: [[{"stem": "ranges", "options": ["-DITEMS=64"]}]])
     assert gpu_static.main(["--intel"]) == 2
@@ -234,8 +219,7 @@ def test_a_loop_that_no_rule_knows_is_told() -> None:
         UnknownLoopError, match=r"blend for sm_89 .*gpu_rules.* the loop of `while \(outer\);` \(6 instr"
     ):
         cost_of(kernel, LINES, rules, Run(64))
-    with pytest.raises(UnknownLoopError, match="walk: no kernel of BY_PAIR or BY_ITEM"):
-        rules_of("walk")
+    refuses("walk: no kernel of BY_PAIR or BY_ITEM", rules_of, "walk", error=UnknownLoopError)
 
 
 def test_an_unrolled_loop_runs_less_often() -> None:
@@ -397,11 +381,10 @@ def test_a_page_of_older_kernels_is_told() -> None:
     assert gpu_page.stale_tables(page, {"compilers": "clang 1", "kernels": "| 7 |"}) == []
     assert gpu_page.stale_tables(page, {"compilers": "clang 1", "kernels": "| 8 |"}) == ["kernels"]
     assert gpu_page.stale_tables(page, {"compilers": "clang 2", "kernels": "| 8 |"}) == []  # other compilers
-    with pytest.raises(ClsplatError, match="has no place for the table pairs"):
-        gpu_page.stale_tables(page, {"pairs": ""})
+    refuses("has no place for the table pairs", gpu_page.stale_tables, page, {"pairs": ""}, error=ClsplatError)
 
 
-def test_without_clang(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_clang(monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setattr(gpu_compilers.shutil, "which", lambda _: None)
     monkeypatch.setattr(gpu_static, "ask_package", lambda *_: [[]])
     assert gpu_static.main(["--check"]) == 2
@@ -413,8 +396,7 @@ def test_another_clang(monkeypatch: pytest.MonkeyPatch) -> None:
     done = subprocess.CompletedProcess([], 0, "clang version 15.0.6\n", "")
     monkeypatch.setattr(gpu_compilers, "_run", lambda _: done)
     told = "no clang 19 found; /bin/clang is another version: apt install clang-19"
-    with pytest.raises(NoCompilerError, match=told):
-        gpu_compilers.clang()
+    refuses(told, gpu_compilers.clang, error=NoCompilerError)
 
 
 def test_without_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -422,12 +404,11 @@ def test_without_an_index(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> No
     monkeypatch.setattr(gpu_compilers, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(gpu_compilers, "_run", lambda _: subprocess.CompletedProcess([], 1, "", "ERROR: no index\n"))
     told = r"no ptxas found: .*pip download nvidia-cuda-nvcc==\S+ failed: ERROR: no i"
-    with pytest.raises(NoCompilerError, match=told):
-        gpu_compilers.nvidia("ptxas")
+    refuses(told, gpu_compilers.nvidia, "ptxas", error=NoCompilerError)
 
 
 @pytest.mark.parametrize("arguments", [["--shapes", "8x1"], ["--targets", "sm_20"]])
-def test_what_is_not_known_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_not_known_is_told(arguments: list[str], capsys: Capture) -> None:
     assert gpu_static.main(arguments) != 0
     assert capsys.readouterr().err.startswith(f"gpu_static: error: {arguments[0]} {arguments[1]}: expected one of")
 
@@ -469,8 +450,7 @@ def test_tables_have_a_place_in_the_page() -> None:
     names = ("kernels", "pairs", "frames", "stages", "goals", "steps", "devices", "intel")
     filled = gpu_page.fill_in(page, {name: f"table of {name}" for name in names})
     assert all(f"<!-- {name} -->\ntable of {name}\n<!-- end -->" in filled for name in names)
-    with pytest.raises(ClsplatError, match="has no place for the table costs"):
-        gpu_page.fill_in(page, {"costs": ""})
+    refuses("has no place for the table costs", gpu_page.fill_in, page, {"costs": ""}, error=ClsplatError)
 
 
 def predictions() -> dict[tuple[str, str, str], dict[str, Stage]]:
@@ -488,8 +468,7 @@ def test_a_step_by_parts() -> None:
     (loss,) = [line for line in lines if line.startswith("| loss |")]
     assert loss.startswith("| loss | 4 | 2.00 | 1.00 | 3.00 | 3.00 |")  # target is of it
     assert lines[-1].startswith("| all | 10 | 5.00 | 2.50 | 7.50 | 7.50 |")
-    with pytest.raises(ClsplatError, match="stages turn: of no part in PARTS"):
-        gpu_page.parts_of({"turn": Stage()})
+    refuses("stages turn: of no part in PARTS", gpu_page.parts_of, {"turn": Stage()}, error=ClsplatError)
 
 
 def test_what_is_wanted() -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from calls import Capture, ran, refuses
 
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="tools/ci/machines.py is for systems with process groups")
@@ -90,17 +91,14 @@ def test_what_cannot_be_had_is_not_run_and_says_why(changes: dict[str, object], 
 def test_a_home_is_read_only_without_mounts_too(tmp_path: Path) -> None:
     row = rows(mounts=())["read-only-home"]
     row.prepare(tmp_path)
-    with pytest.raises(OSError, match="Not a directory"):
-        Path(environment_of(row, tmp_path)["HOME"]).mkdir(parents=True)
+    refuses("Not a directory", Path(environment_of(row, tmp_path)["HOME"]).mkdir, parents=True, error=OSError)
 
 
-def test_one_that_fails_fails_the_run_and_the_others_are_run(capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_that_fails_fails_the_run_and_the_others_are_run(capsys: Capture) -> None:
     good = Machine("good", "passes", (python("print('fine')"),))
     bad = Machine("bad", "fails", (python("import sys; sys.exit('the trouble')"), python("print('never')")))
-    assert run_all([good]) == 0
-    assert "1 passed, 0 failed, 0 not run" in capsys.readouterr().out
-    assert run_all([bad, good], jobs=2) == 1
-    printed = capsys.readouterr().out
+    assert "1 passed, 0 failed, 0 not run" in ran(capsys, run_all, [good]).out
+    printed = ran(capsys, run_all, [bad, good], jobs=2, status=1).out
     assert "bad: FAILED: it: exit status 1, expected 0\n    the trouble\n" in printed
     assert "1 passed, 1 failed, 0 not run" in printed
     assert "never" not in printed
@@ -184,7 +182,7 @@ def test_the_table_is_markdown_where_asked_for() -> None:
     assert lines[2].endswith(" | passed |")
 
 
-def test_a_machine_that_there_is_not_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_machine_that_there_is_not_is_refused(capsys: Capture) -> None:
     with pytest.raises(SystemExit) as end:
         machines.main(["--only", "pypi-pocl,zx81"])
     assert end.value.code == 2

@@ -7,6 +7,7 @@ import json
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import bench_growth
 import bench_library
@@ -14,10 +15,9 @@ import bench_sort
 import compare_peer
 import numpy as np
 import pytest
+from calls import Capture, printed
 from measuring import sizes
 from tiny import HEIGHT, WIDTH, write_scene
-
-Capture = pytest.CaptureFixture[str]
 
 
 def one_error(capsys: Capture, tool: str) -> str:
@@ -28,6 +28,11 @@ def one_error(capsys: Capture, tool: str) -> str:
     return last
 
 
+def measured(capsys: Capture, tool: ModuleType, *words: object) -> dict[str, Any]:
+    """The tool's answer to --json."""
+    return json.loads(printed(capsys, [*words, "--json"], call=tool.main).out)
+
+
 def test_sizes() -> None:
     assert sizes(10_000, 300_000) == [10_000, 30_000, 100_000, 300_000]
     assert sizes(10_000, 29_999) == [10_000]
@@ -36,8 +41,7 @@ def test_sizes() -> None:
 @pytest.mark.needs("matplotlib")
 def test_sort(tmp_path: Path, capsys: Capture) -> None:
     plot = tmp_path / "sort.svg"
-    assert bench_sort.main(["--max", "3e4", "--repeat", "1", "--json", "--plot", str(plot)]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = measured(capsys, bench_sort, "--max", "3e4", "--repeat", "1", "--plot", plot)
     assert [(row["sort"], row["n"]) for row in result["rows"]] == [
         (name, n) for n in (10_000, 30_000) for name in ("keys", "pairs")
     ]
@@ -50,8 +54,7 @@ def test_sort(tmp_path: Path, capsys: Capture) -> None:
 
 
 def test_library(capsys: Capture) -> None:
-    assert bench_library.main(["--gaussians", "300", "--size", "40x30", "--repeat", "1", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = measured(capsys, bench_library, "--gaussians", "300", "--size", "40x30", "--repeat", "1")
     rows = {row["call"]: row for row in result["rows"]}
     bases = {"rasterize, differentiable=False": "Renderer.render", "rasterize": "Rasterizer.forward"}
     for call, base in {**bases, "rasterize, vjp": "Rasterizer.backward"}.items():
@@ -87,9 +90,8 @@ def test_growth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
         monkeypatch.setattr(bench_growth, name, value)
     monkeypatch.setattr(bench_growth, "MEGAPIXELS", (0.003, 0.006, 0.012, 1.0))
     plot = tmp_path / "growth.svg"
-    flags = ["--max-gaussians", "1e3", "--max-megapixels", "0.02", "--repeat", "1", "--plot", str(plot)]
-    assert bench_growth.main([*flags, "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    flags = ["--max-gaussians", "1e3", "--max-megapixels", "0.02", "--repeat", "1", "--plot", plot]
+    result = measured(capsys, bench_growth, *flags)
     gaussians, pixels = result["gaussians"], result["pixels"]
     drawn = [[(row["gaussians"], row["width"], row["height"]) for row in part["rows"]] for part in (gaussians, pixels)]
     assert drawn == [[(100, 80, 60), (300, 80, 60), (1000, 80, 60)], [(500, 63, 47), (500, 89, 67), (500, 126, 94)]]
@@ -144,8 +146,7 @@ def peer_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_peer_with_a_known_limit(peer_scene: Path, capsys: Capture) -> None:
-    assert compare_peer.main([str(peer_scene), "--limit-gpairs", "2.545", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = json.loads(printed(capsys, [peer_scene, "--limit-gpairs", "2.545", "--json"], call=compare_peer.main).out)
     (row,) = result["rows"]
     assert (row["scene"], row["width"], row["height"], row["gaussians"]) == ("tiny", WIDTH, HEIGHT, 40)
     assert row["limits"] == {"given": 2.545}
@@ -159,12 +160,10 @@ def test_peer_with_a_program(peer_scene: Path, tmp_path: Path, capsys: Capture) 
     program = tmp_path / "limit.py"
     program.write_text("import sys; print(f'2 threads 8 lanes: {sys.argv[1]} Gpairs/s')")
     line = [str(peer_scene), "--limit", f"{sys.executable} {program} 1000.5"]
-    assert compare_peer.main([*line, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["rows"]
+    (row,) = json.loads(printed(capsys, [*line, "--json"], call=compare_peer.main).out)["rows"]
     assert row["limit"] == row["limits"]["program"] == 1000.5
     # a program that is slower than what the device has just shown does not make the peer slower
-    assert compare_peer.main([str(peer_scene), "--limit", f"{sys.executable} {program} 0.0001"]) == 0
-    out = capsys.readouterr().out
+    out = printed(capsys, [peer_scene, "--limit", f"{sys.executable} {program} 0.0001"], call=compare_peer.main).out
     assert "program 0.00, kernel " in out
     assert " 0.00  " not in out
 

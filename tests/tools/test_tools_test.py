@@ -43,9 +43,7 @@ PATIENCE = 120
 def tool() -> ModuleType:
     """The script as a module."""
     spec = spec_from_loader("tools_test", SourceFileLoader("tools_test", str(ROOT / "tools" / "test")))
-    assert spec is not None
     module = module_from_spec(spec)
-    assert spec.loader is not None
     spec.loader.exec_module(module)
     return module
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import refuses
 from models import assert_equal, random_gaussians
 from systems import links
 from tiny import cameras
@@ -64,7 +65,6 @@ def pose(x: float = 0.0, size: tuple[int, int] = (640, 360)) -> Pose:
 def test_a_browsers_camera_is_ours() -> None:
     origin = np.array([1e6, -2e6, 30.0])
     found = read_pose(2 * TURN, (1.0, 2.0, 3.0), math.radians(60), (800, 600), origin)
-    assert found is not None
     camera = found.camera()
     assert (camera.width, camera.height, camera.cx, camera.cy) == (800, 600, 400, 300)
     assert camera.fx == camera.fy == pytest.approx(300 / math.tan(math.radians(30)))
@@ -98,7 +98,6 @@ def test_what_no_camera_has_is_left_out(change: dict[str, Any]) -> None:
 
 def test_quaternions_go_there_and_back() -> None:
     found = read_pose(-TURN, (0, 0, 0), 1.0, (8, 8), ZERO)
-    assert found is not None
     np.testing.assert_allclose(quaternion_of(found.rotation), TURN, atol=1e-12)
 
 
@@ -421,23 +420,20 @@ def test_keys_are_taken_back() -> None:
     assert [key.position[0] for key in keys] == [0.0]
     keys.clear()
     del keys[-1:]
-    with pytest.raises(InputError, match="no key frames"):
-        path_document(keys, (32, 20))
+    refuses("no key frames", path_document, keys, (32, 20))
 
 
 @pytest.mark.parametrize(
     ("size", "numbers"), [((0, 20), {}), ((1 << 20, 20), {}), ((32, 20), {"apart": math.nan}), ((32, 20), {"fps": 0.0})]
 )
 def test_numbers_that_make_no_path(size: tuple[int, int], numbers: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="expected"):
-        path_document(recorded(0.0), size, **numbers)
+    refuses("expected", path_document, recorded(0.0), size, **numbers)
 
 
 def test_too_many_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     keys = recorded(0.0)
     keys *= MAX_KEY_FRAMES
-    with pytest.raises(InputError, match="10,000"):
-        add_key(keys, pose())
+    refuses("10,000", add_key, keys, pose())
 
 
 @links

@@ -47,27 +47,17 @@ def size(text: str) -> tuple[int, int]:
 def arrays_of(subject: Subject) -> dict[str, Any]:
     """The arguments of `rasterize`."""
     gaussians, camera = subject.gaussians, subject.camera
+    pose = np.eye(4, dtype=np.float32)
+    pose[:3, :3], pose[:3, 3] = camera.rotation, camera.translation
     return {
         "means": gaussians.means,
         "quaternions": gaussians.quaternions,
         "scales": np.exp(gaussians.log_scales),
         "opacities": 1 / (1 + np.exp(-gaussians.opacity_logits)),
         "colors": gaussians.sh,
-        "viewmats": view_of(camera),
-        "intrinsics": lens_of(camera),
+        "viewmats": pose[None],
+        "intrinsics": np.array([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], np.float32),
     }
-
-
-def view_of(camera: Camera) -> Any:
-    """View matrix (1, 4, 4) float32."""
-    pose = np.eye(4, dtype=np.float32)
-    pose[:3, :3], pose[:3, 3] = camera.rotation, camera.translation
-    return pose[None]
-
-
-def lens_of(camera: Camera) -> Any:
-    """Intrinsics (1, 3, 3) float32."""
-    return np.array([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], np.float32)
 
 
 def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
@@ -81,22 +71,19 @@ def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]
     def forward() -> Callable[[], object]:
         return lambda: renderer.render(subject.gaussians, camera)
 
-    def backward() -> Callable[[], object]:
-        frame = rasterizer.forward(gaussians, camera, black, backward=True)
+    def finished(work: Callable[[], Any]) -> Any:
+        found = work()
         device.finish()
+        return found
 
-        def work() -> None:
-            rasterizer.backward(gaussians, frame, planes, gradients)
-            device.finish()
+    draw = partial(rasterizer.forward, gaussians, camera, black, backward=True)
 
-        return work
+    def backward() -> Callable[[], object]:
+        frame = finished(draw)
+        return lambda: finished(lambda: rasterizer.backward(gaussians, frame, planes, gradients))
 
     def frame() -> Callable[[], object]:
-        def work() -> None:
-            rasterizer.forward(gaussians, camera, black, backward=True)
-            device.finish()
-
-        return work
+        return lambda: finished(draw)
 
     return ("Renderer.render", forward), ("Rasterizer.forward", frame), ("Rasterizer.backward", backward)
 

@@ -22,7 +22,6 @@ limit.
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
 import shlex
@@ -33,7 +32,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from measuring import Result, machine, require, show, tool
+from measuring import Result, machine, plain_parser, require, show, tool
 
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device, open_device
@@ -154,9 +153,7 @@ def table(result: Result) -> list[str]:
 @tool("compare_peer")
 def main(arguments: Sequence[str]) -> int:
     """Run the measurement and print its results."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = plain_parser(__doc__)
     parser.add_argument("scenes", metavar="SCENE", nargs="+", type=Path)
     limit = parser.add_mutually_exclusive_group(required=True)
     limit.add_argument("--limit", metavar="PROGRAM")

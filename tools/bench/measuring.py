@@ -20,11 +20,15 @@ from clsplat.errors import ClsplatError, InputError
 Result = dict[str, Any]
 
 
+def plain_parser(description: str | None, **options: Any) -> argparse.ArgumentParser:
+    """Parser whose help keeps the line breaks of the description."""
+    lines = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(description=description, formatter_class=lines, allow_abbrev=False, **options)
+
+
 def options_parser(description: str | None, repeat: int = 5, *, plot: bool = True) -> argparse.ArgumentParser:
-    """Parser with the common options of the measuring tools. The help keeps the line breaks of the description."""
-    parser = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    """Parser with the common options of the measuring tools."""
+    parser = plain_parser(description)
     parser.add_argument("--repeat", metavar="N", type=int, default=repeat)
     parser.add_argument("--device")
     parser.add_argument("--json", action="store_true")

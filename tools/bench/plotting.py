@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plots of the tools: training, growth and errors. Legible at a width of 800 pixels, like the plots of `bench`."""
+"""Plots of the tools: growth, errors, parts of a step. Legible at a width of 800 pixels, like the plots of `bench`."""
 
 from __future__ import annotations
 
@@ -41,20 +41,6 @@ class Panel:
     fitted: Mapping[str, Points] = field(default_factory=dict)
 
 
-def plot_training(path: Path, runs: Mapping[str, Points], title: str, time: str = "seconds of training") -> None:
-    """Plot each run, keyed by name: (seconds of training, held-out PSNR in dB). time: label for the seconds."""
-    figure = _figure(5.2, title)
-    axes = figure.subplots()
-    for number, (name, points) in enumerate(runs.items()):
-        axes.plot(*zip(*sorted(points), strict=True), **_style(number), markersize=6, label=name)
-    axes.set_xlabel(time, fontsize=FONT_SIZE_POINTS)
-    axes.set_ylabel("PSNR of the held-out views, dB", fontsize=FONT_SIZE_POINTS)
-    axes.tick_params(labelsize=FONT_SIZE_POINTS)
-    axes.grid(alpha=0.3)
-    _legend_below(figure, axes, columns=4 if max(map(len, runs)) < 20 else 2)
-    save_figure(figure, path)
-
-
 def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
     """Plot how times grow with sizes, in panels side by side."""
     figure = _figure(4.4, title)
@@ -69,9 +55,8 @@ def plot_growth(path: Path, panels: Sequence[Panel], title: str) -> None:
         axes.set_ylabel(panel.y, fontsize=FONT_SIZE_POINTS)
         axes.grid(alpha=0.3)
         if not alike:
-            axes.legend(
-                fontsize=FONT_SIZE_POINTS, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.2
-            )
+            place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+            axes.legend(fontsize=FONT_SIZE_POINTS, frameon=False, **place)
     if alike:
         _legend_below(figure, figure.axes[0], columns=4)
     save_figure(figure, path)
@@ -109,14 +94,8 @@ def plot_stacks(path: Path, bars: Mapping[str, Mapping[str, float]], title: str,
     ends = [0.0] * len(names)
     for number, part in enumerate(next(iter(bars.values()))):
         widths = [bars[name][part] for name in names]
-        axes.barh(
-            names,
-            widths,
-            left=ends,
-            color=OKABE_ITO_COLOURS[number % len(OKABE_ITO_COLOURS)],
-            edgecolor="white",
-            label=part,
-        )
+        colour = OKABE_ITO_COLOURS[number % len(OKABE_ITO_COLOURS)]
+        axes.barh(names, widths, left=ends, color=colour, edgecolor="white", label=part)
         ends = [end + width for end, width in zip(ends, widths, strict=True)]
     for place, end in enumerate(ends):
         axes.text(end, place, f" {end:.1f}", va="center", fontsize=FONT_SIZE_POINTS)

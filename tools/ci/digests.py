@@ -332,9 +332,7 @@ def table(rows: list[Row]) -> str:
             cells: tuple[str, ...] = (row.shape, f"not run: {reason}", "", "", "")
         else:
             apart = "" if row.gradient == good[0].gradient else f", {row.difference:.0e} off"
-            model = "not trained"
-            if row.model is not None:
-                model = f"`{row.model}`, {row.psnr:.3f} dB"
+            model = "not trained" if row.model is None else f"`{row.model}`, {row.psnr:.3f} dB"
             cells = (row.shape, f"`{row.frame}`", f"`{row.channels}`", f"`{row.gradient}`{apart}", model)
         drivers.setdefault(cells, []).append(row.driver)
     header = ("shape", "drivers", "frame", "all channels", "gradient", "trained model")

@@ -21,6 +21,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsplat_tests import commit_of
+
 STEPS = 10
 BEFORE = """
 import importlib.abc, importlib.machinery, importlib.util, math, sys, types
@@ -175,17 +177,12 @@ def _runs(program: Program, folder: Path) -> bool:
         command = [sys.executable, "-c", code + program.lines]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=temporary)
     losses = [float(found) for found in re.findall(r"[Ll]oss:? ([\d.e+-]+)", done.stdout)]
-    commit = _commit(folder)
+    commit = commit_of(folder)
     if done.returncode or len(losses) != STEPS or not all(map(math.isfinite, losses)):
         print(f"{program.folder}, commit {commit}: {(done.stderr.strip() or 'no losses').splitlines()[-1]}")
         return False
     print(f"{program.folder}, commit {commit}: {len(losses)} steps, loss {losses[0]:.6f} to {losses[-1]:.6f}")
     return losses[-1] < losses[0] or not program.falls
-
-
-def _commit(folder: Path) -> str:
-    done = subprocess.run(["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "?"
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def main(arguments: list[str]) -> int:
         parser.error(f"{folder}: has no tests/{missing[0]}, expected gsplat's sources")
     sys.path.insert(0, str(folder))
     version = re.search(r'"(.+)"', (folder / "gsplat" / "version.py").read_text("utf-8"))
-    print(f"gsplat {version[1] if version else '?'}, commit {asked.commit or _commit(folder)}")
+    print(f"gsplat {version[1] if version else '?'}, commit {asked.commit or commit_of(folder)}")
     _install()
     report = Report(asked.seed)
     with tempfile.TemporaryDirectory() as temporary:
@@ -103,7 +103,7 @@ def main(arguments: list[str]) -> int:
     return 1 if total["failed"] or not total["passed"] or status not in {0, 1} else 0
 
 
-def _commit(folder: Path) -> str:
+def commit_of(folder: Path) -> str:
     """The commit of a checkout; ? if the folder is not a checkout."""
     done = subprocess.run(
         ["git", "-C", str(folder), "rev-parse", "--show-toplevel", "HEAD"], capture_output=True, text=True, check=False

@@ -31,6 +31,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from opencl_drivers import BESIDE, SYSTEM_VENDORS
 from processor import has_avx512, processor
@@ -310,18 +311,25 @@ def machines(found: Found) -> list[Machine]:
     no_rusticl = "" if found.rusticl else "CLSPLAT_RUSTICL names no library"
     debian, intel, rusticl = ((("debian", found.debian),), (("intel", found.intel),), (("rusticl", found.rusticl),))
     no_avx512 = "" if found.avx512 else "this processor has no AVX-512"
-    home_alone = Machine("", "", (short_test(), elsewhere), pypi=True, missing=no_pypi)
+
+    def at_home(name: str, purpose: str, *steps: Step, **changes: Any) -> Machine:
+        """A machine with what pip brings, for another user or in another place. steps: those before the smoke tests."""
+        tests = (short_test(), *steps, elsewhere)
+        return Machine(name, purpose, tests, pypi=True, **{"missing": no_pypi, **changes})
+
+    made = ten_steps("{folder}/made")
     every = tuple(
         (name, path) for name, path in (*debian, *intel, *rusticl) if path
     )  # other rows report what is missing here
     return [
         Machine("pypi-pocl", "what pip brings, alone", usual, pypi=True, missing=no_pypi),
-        replace(
-            home_alone,
-            name="pypi-pocl-1-thread",
-            purpose="the same, with one thread",
-            steps=usual,
+        Machine(
+            "pypi-pocl-1-thread",
+            "the same, with one thread",
+            usual,
+            pypi=True,
             variables=(("POCL_MAX_PTHREAD_COUNT", "1"),),
+            missing=no_pypi,
         ),
         emulated(found, no_pypi),
         Machine("debian-pocl", "the distribution's PoCL", usual, debian, missing=no_debian),
@@ -358,36 +366,35 @@ def machines(found: Found) -> list[Machine]:
             missing=no_pypi or ("" if every else "there is one driver only"),
         ),
         Machine("none", "no driver: the message says what to install", no_driver()),
-        replace(
-            home_alone,
-            name="not-root",
-            purpose="a user who may write at home alone",
+        at_home(
+            "not-root",
+            "a user who may write at home alone",
             wrap=found.stranger,
             prepare=_give_away,
             missing=no_pypi or _no_stranger(found),
         ),
-        read_only_home(found, home_alone),
-        replace(
-            home_alone,
-            name="odd-paths",
-            purpose="spaces and letters beyond ASCII in home, TMPDIR and the scene's path",
-            steps=(short_test(), *ten_steps("{folder}/a hôme/スプラット"), elsewhere),
+        read_only_home(found, at_home("read-only-home", "nothing can be written at home")),
+        at_home(
+            "odd-paths",
+            "spaces and letters beyond ASCII in home, TMPDIR and the scene's path",
+            *ten_steps("{folder}/a hôme/スプラット"),
             home="a hôme",
             temporary="a hôme/tmp é",
         ),
-        full_temporary(found, home_alone),
-        replace(
-            home_alone,
-            name="lang-c",
-            purpose="LANG=C, and a scene with letters beyond ASCII in its path",
-            steps=(short_test(), *ten_steps("{folder}/made/é"), elsewhere),
+        full_temporary(
+            found,
+            at_home("full-tmp", "no space left in TMPDIR: training beside it, and one line for training on it", *made),
+        ),
+        at_home(
+            "lang-c",
+            "LANG=C, and a scene with letters beyond ASCII in its path",
+            *ten_steps("{folder}/made/é"),
             variables=(("LANG", "C"),),
         ),
-        replace(
-            home_alone,
-            name="ascii",
-            purpose="LC_ALL=C with Python kept from making UTF-8 of it",
-            steps=(short_test(), *ten_steps("{folder}/made"), elsewhere),
+        at_home(
+            "ascii",
+            "LC_ALL=C with Python kept from making UTF-8 of it",
+            *made,
             variables=(("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0")),
         ),
     ]
@@ -437,9 +444,8 @@ def no_driver() -> tuple[Step, ...]:
     )
 
 
-def read_only_home(found: Found, alone: Machine) -> Machine:
+def read_only_home(found: Found, machine: Machine) -> Machine:
     """A home on a read-only mount, which root cannot write either; without mounts, a home that cannot be created."""
-    machine = replace(alone, name="read-only-home", purpose="nothing can be written at home")
     if found.mounts:
         script = 'mount --bind "$1" "$1" && mount -o remount,ro,bind "$1" && shift && exec "$@"'
         return replace(machine, wrap=(*found.mounts, "sh", "-c", script, "sh", "{folder}/home"))
@@ -458,8 +464,6 @@ def full_temporary(found: Found, alone: Machine) -> Machine:
     on_it = Step("on it", command, TRAIN_LIMIT, status=1, says="the disk is full")
     return replace(
         alone,
-        name="full-tmp",
-        purpose="no space left in TMPDIR: training beside it, and one line for training on it",
         wrap=(*found.mounts, "sh", "-c", script, "sh", "{folder}/tmp"),
         steps=(short_test(), scene, train, on_it),
         missing=alone.missing or ("" if found.mounts else "mounts are not allowed here"),

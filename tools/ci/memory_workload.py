@@ -37,7 +37,7 @@ from clsplat.gaussians import PARAMETER_GROUPS, Gaussians
 from clsplat.images.holdouts import surfaces_of
 from clsplat.layouts.columns import POSE_ROWS, READBACK, WIDEST_SLOTS
 from clsplat.optimisation.density_rules import MarkRules
-from clsplat.rendering.rasterizer import Rasterizer
+from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
 from clsplat.rendering.renderer import Renderer
 from clsplat.scenes.dataset import Lens
 from clsplat.scenes.scene import Scene
@@ -93,6 +93,13 @@ def cloud(count: int, view: Camera, seed: int = 0, degree: int = 3) -> Gaussians
     )
 
 
+def image_gradient(device: Device, frame: ForwardPass) -> DeviceArray:
+    """Random planes by an image of 33 x 17, zero in its padding."""
+    planes = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
+    planes[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
+    return upload(device, planes)
+
+
 def frames(device: Device) -> None:
     """Forward and backward: as trained, with every exact switch off, in bands, and the counting build."""
     view = camera(33, 17)
@@ -108,15 +115,10 @@ def frames(device: Device) -> None:
         frame = rasterizer.forward(held, view, background, nearness=True)
         if small and len(frame.bands) < 2:
             raise SystemExit("the frame in bands has one band only")
-        gradient = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
-        gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
         gradients = allocate_gaussians(device, held.count, held.coefficients, zero=True)
-        screen = rasterizer.backward(held, frame, upload(device, gradient), gradients, fields=WIDEST_SLOTS)
-        read = [
-            *(gradients[group].get() for group in PARAMETER_GROUPS),
-            screen.gradients.get(),
-            frame.blended.image.get(),
-        ]
+        screen = rasterizer.backward(held, frame, image_gradient(device, frame), gradients, fields=WIDEST_SLOTS)
+        arrays = [*(gradients[group] for group in PARAMETER_GROUPS), screen.gradients, frame.blended.image]
+        read = [array.get() for array in arrays]
         shown = frame.projected.tile_counts.get() > 0
         if not all(np.isfinite(values[shown] if len(values) == len(shown) else values).all() for values in read):
             raise SystemExit("a gradient is not finite")
@@ -140,9 +142,7 @@ def subgroups(device: Device) -> None:
     view = camera(33, 17)
     rasterizer, held = Rasterizer(opened), upload_gaussians(opened, cloud(40, view))
     frame = rasterizer.forward(held, view, upload(opened, np.zeros(3, np.float32)), nearness=True)
-    gradient = np.zeros((4, *frame.blended.image.shape[1:]), np.float32)
-    gradient[:, :17, :33] = np.random.default_rng(1).normal(size=(4, 17, 33))
-    slots = rasterizer.pair_gradients(frame, upload(opened, gradient), fields=WIDEST_SLOTS)
+    slots = rasterizer.pair_gradients(frame, image_gradient(opened, frame), fields=WIDEST_SLOTS)
     if not (np.isfinite(out.get()).all() and np.isfinite(slots.values.get()).all()):
         raise SystemExit("a sum by sub-groups is not finite")
 
@@ -214,16 +214,8 @@ def training(device: Device) -> None:
     """Steps in which everything happens: SH bands are added, Gaussians cloned, split and pruned, opacities reset. Some
     by capacity, of which one has too little."""
     density = replace(PAPER.density, absolute_gradients=True, min_contribution=1e-3, prune_every=3, max_gaussians=60)
-    wide = replace(
-        PAPER,
-        iterations=4,
-        warmup=(),
-        sh_degree=1,
-        sh_degree_every=1,
-        background="random",
-        optimiser=OptimiserConfig(sparse=True),
-        density=density,
-    )
+    wide = replace(PAPER, iterations=4, warmup=(), sh_degree=1, sh_degree_every=1, background="random")
+    wide = replace(wide, optimiser=OptimiserConfig(sparse=True), density=density)
     for config, channels, view in ((PAPER, 3, VIEW), (wide, 4, LOW), (AHEAD, 3, LOW)):
         _train(device, config, channels, view)
 
@@ -243,14 +235,8 @@ def methods(device: Device) -> None:
     _train(device, replace(short, appearance="grid"), 3, LOW)
     _train(device, replace(short, masks="transparent"), 5, LOW)
     # One view is not held; sums of more than POSE_ROWS Gaussians take two kernels.
-    _train(
-        device,
-        replace(short, refine_poses=True, refine_lenses=True, iterations=3),
-        3,
-        LOW,
-        views=3,
-        count=POSE_ROWS + 1,
-    )
+    refined = replace(short, refine_poses=True, refine_lenses=True, iterations=3)
+    _train(device, refined, 3, LOW, views=3, count=POSE_ROWS + 1)
     _train(device, replace(short, depth="points"), 3, LOW)
     long = replace(PAPER.density, growth="budget", max_gaussians=60, long_axis=True)
     _train(device, replace(short, thinning=0.3, density=long), 3, LOW)

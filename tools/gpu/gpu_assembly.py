@@ -100,13 +100,18 @@ def _successors(blocks: list[Block]) -> list[list[int]]:
     return after
 
 
-def _dominators(after: list[list[int]]) -> list[set[int]]:
-    """For each block its dominators: the blocks on every path from the first block. Unreachable blocks have only
-    themselves."""
+def _predecessors(after: list[list[int]]) -> list[list[int]]:
     before: list[list[int]] = [[] for _ in after]
     for block, following in enumerate(after):
         for each in following:
             before[each].append(block)
+    return before
+
+
+def _dominators(after: list[list[int]]) -> list[set[int]]:
+    """For each block its dominators: the blocks on every path from the first block. Unreachable blocks have only
+    themselves."""
+    before = _predecessors(after)
     reached, waiting = {0}, [0]
     while waiting:
         fresh = [each for each in after[waiting.pop()] if each not in reached]
@@ -127,14 +132,11 @@ def _dominators(after: list[list[int]]) -> list[set[int]]:
 
 def _natural(after: list[list[int]], head: int, latch: int) -> set[int]:
     """The blocks of a loop: those that reach the latch without passing the head."""
-    before: dict[int, list[int]] = {}
-    for block, following in enumerate(after):
-        for each in following:
-            before.setdefault(each, []).append(block)
+    before = _predecessors(after)
     body, waiting = {head, latch}, [latch]
     while waiting:
         block = waiting.pop()
-        fresh = [each for each in before.get(block, []) if each not in body] if block != head else []
+        fresh = [each for each in before[block] if each not in body] if block != head else []
         body.update(fresh)
         waiting += fresh
     return body

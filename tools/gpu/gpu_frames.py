@@ -12,7 +12,6 @@ row with `picture` is only rendered, not trained.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
-from measuring import require, tool
+from measuring import plain_parser, require, tool
 
 from clsplat.bench.workload import Subject, load_subject
 from clsplat.device.buffers import upload
@@ -64,9 +63,7 @@ def count(name: str, subject: Subject) -> dict[str, Any]:
 @tool("gpu_frames")
 def main(arguments: Sequence[str]) -> int:
     """Count the frames and write their rows."""
-    parser = argparse.ArgumentParser(
-        prog="gpu_frames", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = plain_parser(__doc__, prog="gpu_frames")
     parser.add_argument("subjects", metavar="NAME=PATH", nargs="+")
     frames = {row["name"]: row for row in json.loads(FRAMES.read_text())["frames"]}
     for text in parser.parse_args(arguments).subjects:

@@ -20,7 +20,6 @@ a goal is missed, the page is out of date, a loop or rule lacks the other, or a 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -44,7 +43,7 @@ from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, 
 from gpu_model import Stage, predict
 from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
 from gpu_rules import BY_PAIR, WALK, Rule, Run
-from measuring import require, tool
+from measuring import plain_parser, require, tool
 
 from clsplat.progress import aligned
 
@@ -166,22 +165,11 @@ def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
 
 def table(rows: Sequence[Row]) -> list[str]:
     """Text table of the rows. The last column has the defines that do not come from the shape."""
-    head = (
-        "kernel",
-        "shape",
-        "target",
-        "registers",
-        "spills",
-        "stack",
-        "shared",
-        "occupancy",
-        "instructions",
-        "a pair",
-    )
-    lines: list[tuple[str, ...]] = [head]
+    names = ("registers", "spills", "stack", "shared")
+    lines: list[tuple[str, ...]] = [("kernel", "shape", "target", *names, "occupancy", "instructions", "a pair")]
     for row in rows:
         told = row.told()
-        numbers = [str(told[name]) for name in ("registers", "spills", "stack", "shared")]
+        numbers = [str(told[name]) for name in names]
         pair = "unknown" if row.unknown else "-" if row.a_pair is None else f"{row.a_pair:.0f}"
         last = (f"{told['occupancy']:.0%}", str(told["instructions"]), pair)
         lines.append((row.built.kernel, told["shape"], row.built.target, *numbers, *last))
@@ -238,9 +226,7 @@ def broken(rows: Sequence[Row]) -> list[str]:
 @tool("gpu_static")
 def main(arguments: Sequence[str]) -> int:
     """Compile, count and print."""
-    parser = argparse.ArgumentParser(
-        prog="gpu_static", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = plain_parser(__doc__, prog="gpu_static")
     parser.add_argument("--shapes", default="1x64", help=f"of the kernels, such as {','.join(SHAPES)}")
     parser.add_argument("--targets", default=",".join(CHECKED[1]), help=f"of {','.join(TARGETS)}, or `all`")
     parser.add_argument("--stems", default="", help="kernel files; all where not given")

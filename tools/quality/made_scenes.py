@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from ring import write_cloud
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
@@ -149,21 +150,10 @@ def write_transforms(folder: Path, capture: Capture, counts: tuple[int, int], se
     every, shades = np.concatenate(points), np.concatenate(colors)
     for name, count in zip(("sparse", "dense"), counts, strict=True):
         chosen = np.sort(np.random.default_rng(seed).permutation(len(every))[:count])
-        write_ply(folder / f"{name}.ply", every[chosen], shades[chosen])
+        write_cloud(folder / f"{name}.ply", every[chosen], np.rint(255 * shades[chosen]))
     document = {"ply_file_path": "sparse.ply", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document), "utf-8")
     return folder
-
-
-def write_ply(path: Path, points: Float64, colors: Float32) -> None:
-    """Write points (N, 3) with their colours in [0, 1]."""
-    rows = np.zeros(len(points), [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in "rgb"])
-    for axis in range(3):
-        rows["xyz"[axis]], rows["rgb"[axis]] = points[:, axis], np.rint(255 * colors[:, axis])
-    properties = [f"property float {name}" for name in "xyz"]
-    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *properties, "end_header"]
-    path.write_bytes(("\n".join(header) + "\n").encode() + rows.tobytes())
 
 
 def fisheye_of(pinhole: Camera, side: int) -> Camera:

@@ -9,7 +9,7 @@ import random
 import struct
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -179,23 +179,10 @@ def make_transforms(folder: Path) -> None:
     for name in PICTURES:
         _picture(folder / "images" / name)
     make_cloud(folder, "ascii")
-    document = {
-        "fl_x": 11.5,
-        "fl_y": 11.0,
-        "cx": 6.0,
-        "cy": 4.5,
-        "w": 12,
-        "h": 9,
-        "k1": 0.01,
-        "p1": 0.001,
-        "aabb_scale": 4,
-        "camera_model": "OPENCV",
-        "ply_file_path": "cloud.ply",
-        "scale": 0.33,
-        "offset": [0.5, 0.5, 0.5],
-        "frames": _frames(tuple(f"images/{name}" for name in PICTURES)),
-        "test_filenames": ["images/a.png"],
-    }
+    lens = {"fl_x": 11.5, "fl_y": 11.0, "cx": 6.0, "cy": 4.5, "w": 12, "h": 9, "k1": 0.01, "p1": 0.001}
+    ours = {"aabb_scale": 4, "camera_model": "OPENCV", "ply_file_path": "cloud.ply", "scale": 0.33}
+    frames = _frames(tuple(f"images/{name}" for name in PICTURES))
+    document = {**lens, **ours, "offset": [0.5, 0.5, 0.5], "frames": frames, "test_filenames": ["images/a.png"]}
     (folder / "transforms.json").write_text(json.dumps(document, indent=1))
 
 
@@ -211,41 +198,30 @@ def make_blender(folder: Path) -> None:
 def make_camera_keys(folder: Path) -> None:
     """A clsplat camera file of three keys, with all that a key can have."""
     turn = [0.70710678, -0.70710678, 0, 0]
-    document = {
+    keys: list[dict[str, Any]] = [
+        {"frame": 1001, "position": [0, -4, 1], "world_from_cam": turn, "fov_x": 40},
+        {"frame": 1009, "position": [2, -4, 1], "world_from_cam": turn, "fov_x": 55, "roll": 5},
+        {"seconds": 0.5, "position": [3, -3, 1], "world_from_cam": [0.65, -0.65, 0.27, -0.27], "fx": 30},
+    ]
+    keys[-1]["shift"] = [0.05, 0]
+    document: dict[str, Any] = {
         "clsplat_cameras": 1,
         "width": 32,
         "height": 18,
         "fps": 24,
         "first_frame": 1001,
         "near": 0.01,
-        "far": 100,
-        "keys": [
-            {"frame": 1001, "position": [0, -4, 1], "world_from_cam": turn, "fov_x": 40},
-            {"frame": 1009, "position": [2, -4, 1], "world_from_cam": turn, "fov_x": 55, "roll": 5},
-            {
-                "seconds": 0.5,
-                "position": [3, -3, 1],
-                "world_from_cam": [0.65, -0.65, 0.27, -0.27],
-                "fx": 30,
-                "shift": [0.05, 0],
-            },
-        ],
     }
+    document |= {"far": 100, "keys": keys}
     (folder / "cameras.json").write_text(json.dumps(document, indent=1))
 
 
 def make_camera_path(folder: Path) -> None:
     """nerfstudio's camera_path.json, four frames."""
     poses = [[1, 0, 0, 0.1 * i, 0, 1, 0, 0.2, 0, 0, 1, 2.0 + i, 0, 0, 0, 1] for i in range(4)]
-    document = {
-        "camera_type": "perspective",
-        "render_width": 32,
-        "render_height": 18,
-        "fps": 24,
-        "seconds": 4,
-        "keyframes": [],
-        "camera_path": [{"camera_to_world": pose, "fov": 50, "aspect": 1.7} for pose in poses],
-    }
+    frames = [{"camera_to_world": pose, "fov": 50, "aspect": 1.7} for pose in poses]
+    document: dict[str, Any] = {"camera_type": "perspective", "render_width": 32, "render_height": 18, "fps": 24}
+    document |= {"seconds": 4, "keyframes": [], "camera_path": frames}
     (folder / "camera_path.json").write_text(json.dumps(document, indent=1))
 
 
@@ -413,6 +389,8 @@ BINARY, TEXT = (*BYTES, *PLACES), (*BYTES, *LINES, *PLACES)
 DOCUMENT, ARCHIVE = (*BYTES, *LINES, "json", *PLACES), (*BYTES, "archive", *PLACES)
 SPARSE = tuple(f"sparse/0/{stem}" for stem in ("cameras", "images", "points3D"))
 BINARY_FILES, TEXT_FILES = tuple(f"{name}.bin" for name in SPARSE), tuple(f"{name}.txt" for name in SPARSE)
+CHECKPOINTS = tuple(f"run/checkpoints/step-000000{n}.npz" for n in (2, 1))
+SOG_FILES = ("means_l.webp", "quats.webp", "sh0.webp", "shN_centroids.webp")
 USD = ("usda", "usdc") if find_spec("pxr") else ()
 
 
@@ -436,6 +414,12 @@ def _one_file(
 def _saved(name: str, kinds: tuple[str, ...]) -> Reader:
     """A reader of a model file that clsplat writes."""
     return _one_file(f"model-{name}", name, partial(make_model, name=name), read_model, kinds, 2)
+
+
+def _with_others(name: str, file: str, *others: str) -> Reader:
+    """A reader of a document that clsplat writes with other files beside it."""
+    one = _one_file(name, file, partial(make_model, name=file), read_model, DOCUMENT, 3)
+    return replace(one, files=(file, *others))
 
 
 _ALL = (
@@ -475,14 +459,7 @@ _ALL = (
     ),
     Reader("config", make_run, read_run, ("run/config.toml",), TEXT, 3),
     Reader("records", make_run, read_run, ("run/metrics.jsonl", "run/eval.json"), DOCUMENT, 3),
-    Reader(
-        "checkpoint",
-        make_run,
-        read_checkpoint,
-        tuple(f"run/checkpoints/step-000000{n}.npz" for n in (2, 1)),
-        ARCHIVE,
-        3,
-    ),
+    Reader("checkpoint", make_run, read_checkpoint, CHECKPOINTS, ARCHIVE, 3),
     _one_file("bundle", "trouble-step-0000007.npz", make_bundle, repro_bundle.read_bundle, ARCHIVE, 2),
     Reader("photos", make_photos, read_photos, ("photos/a.png", "photos/picture.jpg"), BINARY, 1),
     Reader("record", make_record, read_record, ("sfm.json",), DOCUMENT, 1),
@@ -492,22 +469,8 @@ _ALL = (
     ),
     *(_saved(f"model.{each}", TEXT) for each in USD),
     _one_file("model-spz-2", "model.spz", partial(make_model, name="model.spz", version=2), read_model, BINARY, 2),
-    Reader(
-        "gltf",
-        partial(make_model, name="model.gltf"),
-        lambda folder: read_model(folder / "model.gltf"),
-        ("model.gltf", "model.bin"),
-        DOCUMENT,
-        3,
-    ),
-    Reader(
-        "sog-folder",
-        partial(make_model, name="meta.json"),
-        lambda folder: read_model(folder / "meta.json"),
-        ("meta.json", "means_l.webp", "quats.webp", "sh0.webp", "shN_centroids.webp"),
-        DOCUMENT,
-        3,
-    ),
+    _with_others("gltf", "model.gltf", "model.bin"),
+    _with_others("sog-folder", "meta.json", *SOG_FILES),
     _one_file("ksplat", "model.ksplat", make_ksplat, read_model, BINARY, 2),
     *(
         _one_file(f"zip-{name}", "model.zip", partial(make_zip, name=name), read_model, ARCHIVE, 1)

@@ -25,7 +25,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from stress_kills import write_scene
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
+
+from tiny import write_scene
 
 LONG, SHORT = 100_000, 20
 DEADLINE = 300.0

@@ -26,40 +26,14 @@ MOST_BYTES = 1 << 24
 NUMBERS = (
     *("0", "-1", "-0", "1", "2", "255", "256", "65536", "4294967295", "2147483648", "-2147483649", "1000000000"),
     *("18446744073709551615", "9223372036854775808", "9" * 400, "9" * 5000, "1e308", "1e999", "-1e999", "1e-320"),
-    *(
-        "nan",
-        "NaN",
-        "inf",
-        "-Infinity",
-        "0x10",
-        "1_000",
-        "\u0663",
-        "\uff11",
-        "1.5",
-        "1.",
-        ".5",
-        "+3",
-        "1e",
-        "",
-        "-",
-        "true",
-    ),
+    *("nan", "NaN", "inf", "-Infinity", "0x10", "1_000", "\u0663", "\uff11"),
+    *("1.5", "1.", ".5", "+3", "1e", "", "-", "true"),
 )
 WORDS = (
     *("../../etc/passwd", "/etc/passwd", "images/../../../x.png", "..", ".", "./a.png", "a.png", "images//a.png", "~"),
     *("C:\\\\Windows\\\\x.png", "..\\\\..\\\\x.png", "//host/share/x.png", "/dev/zero", "/dev/stdin", "/proc/self/mem"),
-    *(
-        "a\u0000b.png",
-        "\u202egnp.a",
-        "\ufeff",
-        "\U0001f4a9.png",
-        "e\u0301.png",
-        "caf\u00e9.png",
-        "x" * 300,
-        "y/" * 3000,
-        " ",
-        "",
-    ),
+    *("a\u0000b.png", "\u202egnp.a", "\ufeff", "\U0001f4a9.png", "e\u0301.png", "caf\u00e9.png"),
+    *("x" * 300, "y/" * 3000, " ", ""),
     *("PINHOLE", "OPENCV", "EQUIRECTANGULAR", "FULL_OPENCV", "null", "[]", "{}", "list", "property list uchar int x"),
     *("element vertex 99999999999", "end_header", "\\ud800", "\\u0000", "%s%n", "{name}", "a\nb", "a\rb", "\x1b[31m"),
 )
@@ -168,28 +142,25 @@ def _lines(data: bytes, rng: random.Random) -> bytes:
 def _text(data: bytes, rng: random.Random) -> bytes:
     """A text after an editor or a bad transfer, or made deeply nested or very long."""
     at = rng.randrange(len(data) + 1)
-    kind = rng.randrange(11)
-    if kind == 0:
-        return b"\xef\xbb\xbf" + data
-    if kind == 1:
-        return data.replace(b"\n", b"\r\n")
-    if kind == 2:
-        return data.replace(b"\n", b"\r")
-    if kind == 3:
-        return data.decode("latin-1").encode("utf-16")
-    if kind == 4:
-        return data[:at] + b"\xff\xfe\xc3" + data[at:]
-    if kind == 5:
-        return data[:at] + rng.choice((b"[", b"{", b'{"a":', b"(")) * rng.choice((100, 3000, 100_000)) + data[at:]
-    if kind == 6:
-        return data[:at] + rng.choice((b"x", b" ", b"9", b"\t", b"0", b"#", b"a.")) * 1_000_000 + data[at:]
-    if kind == 7:
-        return data[:at] + rng.choice(WORDS).encode() + data[at:]
-    if kind == 8:
-        return b"[" * 50_000 + b"]" * 50_000
-    if kind == 9:
-        return data.replace(b" ", rng.choice((b"\0", b"\x0b", b"\xc2\xa0", b"")))
-    return b"x = " + rng.choice((b"[" * 5000 + b"]" * 5000, b"9" * 10_000, b"{a=" * 1000 + b"1" + b"}" * 1000))
+    nested = b"[" * 5000 + b"]" * 5000, b"9" * 10_000, b"{a=" * 1000 + b"1" + b"}" * 1000
+
+    def between(part: bytes) -> bytes:
+        return data[:at] + part + data[at:]
+
+    edits: tuple[Callable[[], bytes], ...] = (
+        lambda: b"\xef\xbb\xbf" + data,
+        lambda: data.replace(b"\n", b"\r\n"),
+        lambda: data.replace(b"\n", b"\r"),
+        lambda: data.decode("latin-1").encode("utf-16"),
+        lambda: between(b"\xff\xfe\xc3"),
+        lambda: between(rng.choice((b"[", b"{", b'{"a":', b"(")) * rng.choice((100, 3000, 100_000))),
+        lambda: between(rng.choice((b"x", b" ", b"9", b"\t", b"0", b"#", b"a.")) * 1_000_000),
+        lambda: between(rng.choice(WORDS).encode()),
+        lambda: b"[" * 50_000 + b"]" * 50_000,
+        lambda: data.replace(b" ", rng.choice((b"\0", b"\x0b", b"\xc2\xa0", b""))),
+        lambda: b"x = " + rng.choice(nested),
+    )
+    return rng.choice(edits)()
 
 
 def _json(data: bytes, rng: random.Random) -> bytes:
@@ -202,9 +173,7 @@ def _json(data: bytes, rng: random.Random) -> bytes:
     nodes: list[tuple[Any, Any]] = []
 
     def walk(node: Any) -> None:
-        pairs = (
-            list(node.items()) if isinstance(node, dict) else list(enumerate(node)) if isinstance(node, list) else []
-        )
+        pairs = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
         for key, value in pairs:
             nodes.append((node, key))
             walk(value)
@@ -258,40 +227,22 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
         shape = rng.choice(((10**12,), (2**62, 4), (-1,), (0, 5), (3, 10**9), (), (1,) * 40, (10**400,)))
         content = _npy_claim(f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape!r}, }}", b"\0" * 48)
     elif kind == 1:
-        buffer = io.BytesIO()
-        np.save(buffer, np.array([_Mark(), {}], object), allow_pickle=True)
-        content = buffer.getvalue()
+        content = _npy(np.array([_Mark(), {}], object), allow_pickle=True)
     elif kind == 2:
-        descr = rng.choice(
-            ("'|O'", "'<f9'", "'<V99999999'", "[('a', '<f4')]", "'<U1000000000'", "None", "'<c16'", "'<M8[s]'")
-        )
-        content = _npy_claim(f"{{'descr': {descr}, 'fortran_order': False, 'shape': (4, 3), }}", b"\0" * 48)
+        kinds = ("'|O'", "'<f9'", "'<V99999999'", "[('a', '<f4')]", "'<U1000000000'", "None", "'<c16'", "'<M8[s]'")
+        content = _npy_claim(f"{{'descr': {rng.choice(kinds)}, 'fortran_order': False, 'shape': (4, 3), }}", b"\0" * 48)
     elif kind == 3:
-        name = rng.choice(
-            ("../../x.npy", "/etc/passwd", "parameters/means.npy", "state.json.npy", "x" * 70_000, "", "a")
-        )
+        names = ("../../x.npy", "/etc/passwd", "parameters/means.npy", "state.json.npy", "x" * 70_000, "", "a")
+        name = rng.choice(names)
     elif kind == 4:
         compression = zipfile.ZIP_DEFLATED
-        zeros = np.zeros(rng.choice((10, 15_000_000)), np.float32)
-        buffer = io.BytesIO()
-        np.save(buffer, zeros)
-        content = buffer.getvalue()
+        content = _npy(np.zeros(rng.choice((10, 15_000_000)), np.float32))
     elif kind == 5:
         name = "state.json.npy"
-        text = rng.choice(
-            (b"", b"{", b"[" * 100_000, b"null", b"[]", b'{"step": 1e999, "state": {}}', b'{"step": "x"}')
-        )
-        other = rng.choice(
-            (
-                text,
-                b'{"step": NaN, "state": 3}',
-                b'{"step": ' + b"9" * 6000 + b', "state": {}}',
-                b'{"step": -5, "state": []}',
-            )
-        )
-        buffer = io.BytesIO()
-        np.save(buffer, np.frombuffer(other, np.uint8))
-        content = buffer.getvalue()
+        texts = (b"", b"{", b"[" * 100_000, b"null", b"[]", b'{"step": 1e999, "state": {}}', b'{"step": "x"}')
+        long = b'{"step": ' + b"9" * 6000 + b', "state": {}}'
+        other = rng.choice((rng.choice(texts), b'{"step": NaN, "state": 3}', long, b'{"step": -5, "state": []}'))
+        content = _npy(np.frombuffer(other, np.uint8))
         members = [member for member in members if member[0] != name]
         at = 0
     elif kind == 6:
@@ -310,6 +261,12 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
         warnings.simplefilter("ignore")  # names that come twice
         for each, body in members:
             archive.writestr(each[:65_000] or "empty", body)
+    return buffer.getvalue()
+
+
+def _npy(array: Any, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, **options)
     return buffer.getvalue()
 
 

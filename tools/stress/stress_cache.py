@@ -27,7 +27,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from clsplat.bench.workload import synthetic
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 DEADLINE = 1200.0
@@ -48,21 +50,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     print(json.dumps(result, indent=2))
     return 0 if result["right"] == result["left_alone"] and result["one_more"] == "right" else 1
-
-
-def write_model(path: Path) -> Path:
-    """A cloud of 300 Gaussians of many colours."""
-    from clsplat import Gaussians
-
-    random_state, count = np.random.default_rng(0), 300
-    Gaussians(
-        means=random_state.normal(size=(count, 3)).astype(np.float32),
-        quaternions=random_state.normal(size=(count, 4)).astype(np.float32),
-        log_scales=np.full((count, 3), -2.5, np.float32),
-        opacity_logits=np.full(count, 2.0, np.float32),
-        sh=random_state.normal(size=(count, 1, 3)).astype(np.float32),
-    ).save(path)
-    return path
 
 
 def environment(cache: Path) -> dict[str, str]:
@@ -107,7 +94,8 @@ class Started:
 
 def stress(folder: Path, processes: int, interrupted: int, device: str | None, chance: random.Random) -> dict[str, Any]:
     """Start them all, interrupt some, and wait for the rest; how they ended."""
-    model = write_model(folder / "model.ply")
+    model = folder / "model.ply"
+    synthetic(300, 64, 64).gaussians.save(model)
     alone, start = environment(folder / "alone"), time.monotonic()
     first = Started(model, folder / "alone.png", alone, device)
     if (end := first.end(None, start + DEADLINE)) != "right":

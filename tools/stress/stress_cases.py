@@ -97,22 +97,25 @@ def scales(rng: np.random.Generator, count: int) -> Cases:
     return _done(made, size[:, 0])
 
 
+def _elongated(made: Cloud, rng: np.random.Generator, low: float, high: float) -> tuple[Float64, Float64]:
+    """Make needles and discs, with longest axes of 10^low to 10^high pixels; returns these, and longest / shortest."""
+    count = len(made.depths)
+    longest, ratio = 10 ** rng.uniform(low, high, count), 10 ** rng.uniform(0, 8, count)
+    middle = np.where(rng.random(count) < 0.5, longest, longest / ratio)
+    made.axes = rng.permuted(np.stack([longest, middle, longest / ratio], axis=1), axis=1)
+    return longest, ratio
+
+
 def anisotropy(rng: np.random.Generator, count: int) -> Cases:
     """Needles and discs, the longest axis as long as the image at most."""
     made = cloud(rng, count)
-    longest, ratio = 10 ** rng.uniform(0, 2.8, count), 10 ** rng.uniform(0, 8, count)
-    middle = np.where(rng.random(count) < 0.5, longest, longest / ratio)
-    made.axes = rng.permuted(np.stack([longest, middle, longest / ratio], axis=1), axis=1)
-    return _done(made, ratio)
+    return _done(made, _elongated(made, rng, 0, 2.8)[1])
 
 
 def giants(rng: np.random.Generator, count: int) -> Cases:
     """Needles and discs far longer than the image."""
     made = cloud(rng, count)
-    longest, ratio = 10 ** rng.uniform(2.8, 6, count), 10 ** rng.uniform(0, 8, count)
-    middle = np.where(rng.random(count) < 0.5, longest, longest / ratio)
-    made.axes = rng.permuted(np.stack([longest, middle, longest / ratio], axis=1), axis=1)
-    return _done(made, longest)
+    return _done(made, _elongated(made, rng, 2.8, 6)[0])
 
 
 def edge_on(rng: np.random.Generator, count: int) -> Cases:

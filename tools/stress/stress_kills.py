@@ -4,10 +4,10 @@
 
     python tools/stress/stress_kills.py [--kills 100] [--seed 0] [--device DEVICE] [--json]
 
-The scene is a small one made on the spot: 40 points, 8 pictures of 48x40. Training writes a checkpoint every second
-step, so that many kills come while one is being written. A process is killed after a random time, anywhere from its
-start (imports, building of kernels, reading the checkpoint) to its end. One that gets to its end is compared with an
-undisturbed training: model.ply byte for byte, and the steps in metrics.jsonl. Exit status 1 if one of them
+The scene is the small one of the tests: 40 points, 8 pictures of 48x40 and two held out. Training writes a checkpoint
+every second step, so that many kills come while one is being written. A process is killed after a random time, anywhere
+from its start (imports, building of kernels, reading the checkpoint) to its end. One that gets to its end is compared
+with an undisturbed training: model.ply byte for byte, and the steps in metrics.jsonl. Exit status 1 if one of them
 differs, or a process ends in any other way than by being killed or being done.
 """
 
@@ -26,7 +26,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
+
+from tiny import write_scene
 
 ITERATIONS, CHECKPOINT_EVERY = 240, 2
 SETTINGS = (
@@ -35,7 +38,6 @@ SETTINGS = (
     *("--density.start", "30", "--density.every", "20", "--density.stop", "200", "--density.max-gaussians", "300"),
     *("--density.gradient-threshold", "1e-3", "--density.opacity-reset-every", "90"),
 )
-VIEWS, WIDTH, HEIGHT, FOCAL, POINTS = 10, 48, 40, 50.0, 40
 WHILE_WRITING = 0.4
 """Share of the kills that wait for the next checkpoint to be under way, which is a small part of the time."""
 DEADLINE = 300.0
@@ -52,35 +54,6 @@ class Figures:
     before: int = 0
     compared: int = 0
     seconds: float = 0.0
-
-
-def write_scene(folder: Path) -> Path:
-    """Pictures of coloured blobs, drawn as discs, in a COLMAP folder of text files."""
-    from clsplat.camera import Camera
-    from clsplat.images.writing import write_image
-    from clsplat.scenes.dataset import Lens
-    from clsplat.scenes.readers.colmap_writer import write_model
-
-    rng = np.random.default_rng(3)
-    points = rng.uniform(-0.8, 0.8, (POINTS, 3))
-    colours = rng.uniform(0.1, 1.0, (POINTS, 3)).astype(np.float32)
-    numbers = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
-    (folder / "images").mkdir(parents=True)
-    images = []
-    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    for index, angle in enumerate(np.linspace(-0.8, 0.8, VIEWS)):
-        c, s = np.cos(angle), np.sin(angle)
-        rotation = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
-        camera = Camera(WIDTH, HEIGHT, *numbers, rotation, np.array([0.0, 0.0, 4.0]))
-        seen = points @ rotation.T + camera.translation
-        image = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-        for i in np.argsort(-seen[:, 2]):
-            u, v = FOCAL * seen[i, :2] / seen[i, 2] + (WIDTH / 2, HEIGHT / 2)
-            image[(x - u) ** 2 + (y - v) ** 2 < 9] = colours[i]
-        images.append((f"{index:02d}.png", Lens("PINHOLE", WIDTH, HEIGHT, numbers), camera))
-        write_image(folder / "images" / images[-1][0], image)
-    write_model(folder / "sparse" / "0", images, points, colours)
-    return folder
 
 
 def half_written(run: Path) -> set[str]:

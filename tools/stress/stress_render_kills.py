@@ -36,8 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for folder in (whole, killed):
         if folder.exists():
             parser.error(f"{folder} is there already")
+    all_of_it, rest = (command(arguments.render, folder, arguments.extension) for folder in (whole, killed))
     start = time.monotonic()
-    subprocess.run(command(arguments.render, whole, arguments.extension), check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(all_of_it, check=True, stdout=subprocess.DEVNULL)
     seconds = time.monotonic() - start
     wanted = read(whole)
     ends = sorted(path.stat().st_mtime for path in whole.iterdir())
@@ -48,11 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         more = chance.randint(0, len(wanted) // (arguments.kills + 1))
         # a little more than the time of a frame, so that a kill may come at any point of it
         delay = chance.uniform(0, 1.5 * pace)
-        kills.append(kill(command(arguments.render, killed, arguments.extension), killed, more, delay))
+        kills.append(kill(rest, killed, more, delay))
         troubles += [name for name, data in read(killed).items() if name[0] != "." and wanted.get(name) != data]
-    finished = subprocess.run(
-        command(arguments.render, killed, arguments.extension), check=False, stdout=subprocess.DEVNULL
-    )
+    finished = subprocess.run(rest, check=False, stdout=subprocess.DEVNULL)
     same = read(killed) == wanted and finished.returncode == 0
     result = {
         "frames": len(wanted),
