@@ -44,7 +44,7 @@ class Witness(StepProbe):
         self.stages.append("before_rows")
         if rows.gradients is not None:
             self.gradients = {group: rows.gradients[group].get() for group in PARAMETER_GROUPS}
-        self.means, self.first = rows.parameters["means"].get(), rows.first["means"].get()
+        self.means, self.first = rows.parameters["means"].get(), rows.model[1]["means"].get()
 
     def after_rows(self, rows: StepRows) -> None:
         self.stages.append("after_rows")

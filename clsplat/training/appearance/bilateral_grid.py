@@ -55,25 +55,18 @@ class ViewGrid(ViewPart):
         """The photograph's grid, in the form that `on` takes."""
         return self.grids.grids.get_rows(self.view, self.view + 1)
 
-    def compare(
-        self,
-        work: Workspace,
-        image: DeviceArray,
-        target: DeviceArray,  # noqa: ARG002
-        width: int,
-        height: int,
-    ) -> DeviceArray:
+    def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
         """The image with the photograph's grid applied."""
-        return apply_grid(self.device, work, self.grids, self.view, image, width, height)
+        return apply_grid(self.device, work, self.grids, self.view, image, *size)
 
     def gradient(
-        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
+        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
         """Convert `gradient`, in place, to the gradient with respect to the image. Return the gradient of the grid.
 
         `update` uses the result; its kernels are tried here in the sandbox, before anything changes.
         """
-        of_view, size = (self.grids, self.view, image, gradient), (width, height)
+        of_view = (self.grids, self.view, image, gradient)
         by_grid = grid_gradient(self.device, work, *of_view, *size, VARIATION_WEIGHT, self.place)
         if self.visit == 1:
             with only_tried(self.device):

@@ -80,28 +80,16 @@ class ViewGains(ViewPart):
         """The photograph's gains, in the form that `on` takes."""
         return self.gains.gains.get_rows(self.view, self.view + 1)
 
-    def compare(
-        self,
-        work: Workspace,  # noqa: ARG002
-        image: DeviceArray,
-        target: DeviceArray,
-        width: int,  # noqa: ARG002
-        height: int,  # noqa: ARG002
-    ) -> DeviceArray:
+    def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
         """Divide the photograph in `target` by its gains. Returns the unchanged image."""
         remove_gains(self.device, self.gains, self.view, target)
         return image
 
     def gradient(
-        self,
-        work: Workspace,
-        image: DeviceArray,
-        gradient: DeviceArray,
-        width: int,  # noqa: ARG002
-        height: int,
+        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
         """Sums for `update`, whose kernels are tried here in the sandbox, before anything changes."""
-        columns = gain_gradient(self.device, work, image, gradient, height, self.place)
+        columns = gain_gradient(self.device, work, image, gradient, size[1], self.place)
         if self.step == 1:
             with only_tried(self.device):
                 self.update(columns, columns)

@@ -68,23 +68,16 @@ class ViewColours(ViewPart):
         gains, logs = (array.get_rows(row, row + 1) for array in (self.colours.gains, self.colours.logs))
         return np.concatenate([gains[:, :3], logs[:, 3:], self.vignettes.logs.get_rows(lens, lens + 1)], axis=1)
 
-    def compare(
-        self,
-        work: Workspace,  # noqa: ARG002
-        image: DeviceArray,
-        target: DeviceArray,
-        width: int,
-        height: int,
-    ) -> DeviceArray:
+    def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
         """Remove gains, mixes and vignette from the photograph in `target`. Returns the unchanged image."""
-        develop(self.device, self.colours, self.vignettes, self.taken, target, width, height)
+        develop(self.device, self.colours, self.vignettes, self.taken, target, *size)
         return image
 
     def gradient(
-        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, width: int, height: int
+        self, work: Workspace, image: DeviceArray, gradient: DeviceArray, size: tuple[int, int]
     ) -> DeviceArray:
         """Sums for `update`, whose kernels are tried here in the sandbox, before anything changes."""
-        columns = camera_gradient(self.device, work, self.taken, image, gradient, width, height, self.place)
+        columns = camera_gradient(self.device, work, self.taken, image, gradient, *size, self.place)
         if self.step == 1:
             with only_tried(self.device):
                 self.update(columns, columns)

@@ -104,7 +104,7 @@ class GradientStep:
             result = result.fetched()
         probe.loss(result)
         size = (camera.width, camera.height)
-        own = [part.gradient(work, frame.blended.image, result.gradient, *size) for part in inputs.parts]
+        own = [part.gradient(work, frame.blended.image, result.gradient, size) for part in inputs.parts]
         slots = self.replayed(
             model[0],
             (frame.listed, frame.background, result.gradient, self.fields),
@@ -124,7 +124,7 @@ class GradientStep:
         planes = target(self.device, work, photograph, frame.background, frame.blended, alpha=alpha)
         image = frame.blended.image
         for part in inputs.parts:
-            image = part.compare(work, image, planes, *size)
+            image = part.compare(work, image, planes, size)
 
         def compared() -> Loss:
             return loss(

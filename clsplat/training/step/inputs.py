@@ -81,14 +81,9 @@ class StepRows(ViewRows):
         """Parameters of the rows."""
         return self.model[0]
 
-    @property
-    def first(self) -> DeviceGaussians:
-        """Adam's first moments."""
-        return self.model[1]
-
 
 class ViewPart:
-    """A component's part (`training.step.component`) in one view of a step. By default no method does anything."""
+    """A component's part in one view of a step. By default no method does anything."""
 
     wants_gradients = False
     """True if `add_rows` reads the rows' gradients."""
@@ -101,14 +96,7 @@ class ViewPart:
         """Values that `on` takes."""
         return np.zeros(0, np.float32)
 
-    def compare(
-        self,
-        work: Workspace,  # noqa: ARG002
-        image: DeviceArray,
-        target: DeviceArray,  # noqa: ARG002
-        width: int,  # noqa: ARG002
-        height: int,  # noqa: ARG002
-    ) -> DeviceArray:
+    def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
         """Give the image the photograph's colours, or give the photograph in `target` the image's colours, in place.
 
         Returns the image to compare.
@@ -120,8 +108,7 @@ class ViewPart:
         work: Workspace,  # noqa: ARG002
         image: DeviceArray,  # noqa: ARG002
         gradient: DeviceArray,  # noqa: ARG002
-        width: int,  # noqa: ARG002
-        height: int,  # noqa: ARG002
+        size: tuple[int, int],  # noqa: ARG002
     ) -> DeviceArray | None:
         """Convert dL/d(compared image) to dL/d(image), in place. Returns the gradient for the part's own parameters."""
         return None
