@@ -196,6 +196,8 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
     assert [default(each, "host") for each in (PageOptions, Address)] == ["127.0.0.1"] * 2
     held_out = inspect.signature(load_scene).parameters["test_every"].default
     assert [default(each, "test_every") for each in (TrainConfig, ConvertVerb)] == [held_out] * 2 == [8] * 2
+    most = inspect.signature(load_scene).parameters["test_most"].default
+    assert default(TrainConfig, "test_most") == most == 200
     names = {"exr": "depth", "parts": "parts", "compression": "compression", "quality": "quality"}
     for flag, name in names.items():
         assert default(RenderVerb, flag) == default(Encoding, name), flag

@@ -27,7 +27,7 @@ MAX_SAMPLED_VIEWS = 200
 """Maximum number of photographs whose points are looked at, spread evenly over the training photographs."""
 MAX_SAMPLED_POINTS = 100_000
 """Maximum number of a scene's points that are projected, if it is not known which photographs show them."""
-POINTS_PER_OCCLUSION_CELL = 16
+POINTS_PER_DEPTH_CELL = 16
 """Mean number of projected points in a cell of a picture. Only the nearest point of a cell counts as shown."""
 
 
@@ -75,6 +75,6 @@ def _nearest(points: Float64, view: View, near: float) -> Float64:
     camera = view.camera.before(near)
     rows, columns, inside = pixels_of(points, camera, view.lens)
     depths = camera.depths_of(points[inside])
-    cell = max(float(np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(len(depths), 1))), 1.0)
+    cell = max(float(np.sqrt(POINTS_PER_DEPTH_CELL * camera.width * camera.height / max(len(depths), 1))), 1.0)
     nearest: Float64 = depths[depths == nearest_around(rows, columns, depths, cell)]
     return nearest
