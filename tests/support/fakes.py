@@ -85,6 +85,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         start: StartPoints = TrainConfig().start_points
         depth_use: DepthUse = NO_DEPTH
         unit: float = 1.0
+        extent = 1.0
         unit_differs = False
 
         @property
