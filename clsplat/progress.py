@@ -20,6 +20,8 @@ Progress = Callable[[str, float | None], None]
 """A progress callback. It takes the text of a stage and the fraction that is done, or None if that is unknown."""
 PLAIN_LINE_SECONDS = 10.0
 """Seconds between plain lines."""
+LIVE_TEXT_SECONDS = 1.0
+"""Seconds between changes of a live bar's text: a forecast takes several milliseconds, which is a GPU's step."""
 METRIC_SMOOTHING_WEIGHT = 0.1
 """Weight of the newest report in the displayed PSNR and loss, which are smoothed because views differ."""
 RATE_WINDOW_SECONDS = 20.0
@@ -115,7 +117,10 @@ class TrainProgress(_Bar):
         self.loss += METRIC_SMOOTHING_WEIGHT * (report.loss - self.loss)
         self.psnr += METRIC_SMOOTHING_WEIGHT * (report.psnr - self.psnr)
         if self.live is not None:
-            self.live.update(self.task, completed=report.step, description=f"{self._numbers()}{self._left()}")
+            self.live.update(self.task, completed=report.step)
+            if time.monotonic() - self.printed_at >= LIVE_TEXT_SECONDS or report.step == self.total:
+                self.live.update(self.task, description=f"{self._numbers()}{self._left()}")
+                self.printed_at = time.monotonic()
         elif time.monotonic() - self.printed_at >= PLAIN_LINE_SECONDS and self.rate() > 0:
             self._print_line()
 

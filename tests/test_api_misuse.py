@@ -95,6 +95,7 @@ def test_arguments_of_another_kind_are_named(arguments: dict[str, Any], message:
         ({"resolution": 40.5}, "resolution 40.5: expected a whole number below"),
         ({"resolution": -1}, "resolution -1: expected 0 or more"),
         ({"test_every": -1}, "test_every -1: expected 0 or more"),
+        ({"test_most": -1}, "test_most -1: expected 0 or more"),
     ],
     ids=str,
 )

@@ -80,6 +80,7 @@ def load_subject(path: Path, size: tuple[int, int] | None = None, progress: Prog
             run.scene,
             resolution=config.resolution,
             test_every=config.test_every,
+            test_most=config.test_most,
             lenses=config.lenses,
             missing=config.missing,
             masks=masks,

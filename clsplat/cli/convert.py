@@ -16,7 +16,7 @@ from tyro.conf import Positional, arg
 from clsplat.cli.options import DeviceOptions, Flag, RunOrModel, ScenePath, Verb
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.checks import Rule, check_rules
-from clsplat.config.cli_defaults import TEST_EVERY
+from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.masks import NO_MASKS
 from clsplat.errors import InputError, warn
 from clsplat.files.atomic import check_new
@@ -397,7 +397,7 @@ def _measured(
     run = run_of(verb.source)
     own = run is not None and run.scene is not None and run.scene.resolve() == verb.scene.resolve()
     masks = run.config.mask_use if run is not None and own else NO_MASKS
-    scene = load_scene(services, verb.scene, verb.resolution, verb.test_every, masks, missing="skip")
+    scene = load_scene(services, verb.scene, verb.resolution, (verb.test_every, TEST_MOST), masks, missing="skip")
     renderer = services.renderer(services.require(device, FORWARD_STAGES))
     background = background_colour(verb.background)
 

@@ -41,6 +41,9 @@ class EvalVerb(Verb):
     """Folder with the scene. If not given: the scene on which the run was trained."""
     test_every: OptionalInt = None
     """Every n-th view in the order of names is held out and measured. If not given: the run's setting, else 8."""
+    test_most: OptionalInt = None
+    """Maximum number of views that are held out like this, spread evenly; 0 for no maximum. If not given: the run's
+    setting, else 200."""
     resolution: OptionalInt = None
     """Longest image side in pixels; 0 keeps the images' size up to 1600. If not given: the run's setting, else 0."""
     missing: Annotated[Missing | None, arg(metavar="few|skip|error")] = None
@@ -130,8 +133,9 @@ def _held_out(verb: EvalVerb, services: Services, source: Path, trained: Run | N
     config = trained.config if trained else TrainConfig()
     resolution = config.resolution if verb.resolution is None else verb.resolution
     test_every = config.test_every if verb.test_every is None else verb.test_every
+    test_most = config.test_most if verb.test_most is None else verb.test_most
     missing = verb.missing or config.missing
-    scene = load_scene(services, source, resolution, test_every, config.mask_use, config.lenses, missing)
+    scene = load_scene(services, source, resolution, (test_every, test_most), config.mask_use, config.lenses, missing)
     views = through_refined([view for view in scene.views if view.split == "test"], trained)
     if not views:
         raise InputError(f"{source}: no view is held out with --test-every {test_every}")

@@ -54,16 +54,20 @@ def load_scene(
     services: Services,
     path: Path,
     resolution: int,
-    test_every: int,
+    test_views: tuple[int, int],
     masks: MaskUse = NO_MASKS,
     lenses: Lenses = "undistort",
     missing: Missing = "few",
 ) -> Scene:
-    """Load the scene and print its warnings."""
+    """Load the scene and print its warnings.
+
+    test_views: test_every and test_most.
+    """
     scene = services.load_scene(
         path,
         resolution=resolution,
-        test_every=test_every,
+        test_every=test_views[0],
+        test_most=test_views[1],
         masks=masks,
         lenses=lenses,
         missing=missing,

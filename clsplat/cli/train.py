@@ -17,7 +17,7 @@ from clsplat.cli.eval import print_summary, tell_of_lpips
 from clsplat.cli.options import Flag, Output, PageOptions, SeveralDevices, Verb, with_given
 from clsplat.cli.session import Services, load_scene
 from clsplat.config.masks import NO_MASKS
-from clsplat.config.presets import Preset, Schedule, bundled
+from clsplat.config.presets import Preset, Schedule, bundled, by_passes, steps_made_for
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError, warn
 from clsplat.files.documents import open_input
@@ -65,6 +65,10 @@ class TrainVerb(Verb):
     """Bundle of learning rates and of the steps for scheduled actions. paper is made for 30,000 steps, short for
     about 7000. high-rates is for about 7000 steps too, with higher rates than short. It pays off below about 60 steps
     per photograph. Flags override it. If not given: paper, but short with --preset fast."""
+    passes: Annotated[int | None, arg(metavar="N")] = None
+    """Passes through the training photographs. Sets --iterations to N times their number, and stretches or shortens the
+    schedule in the same way: densification, SH degrees, opacity resets, warm-up sizes, learning rates and cooldown.
+    Flags for these override it."""
     config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     given: Annotated[frozenset[str], Suppress] = field(default=frozenset(), compare=False)
     """Names of the settings given on the command line."""
@@ -80,14 +84,22 @@ class TrainVerb(Verb):
         return replace(verb, config=config, given=frozenset(given))
 
     def _with_settings(self, given: Collection[str]) -> TrainVerb:
+        if self.passes is not None:
+            by_passes(self.config, self.passes, photographs=1)  # an invalid number is reported before the scene is read
+            if "iterations" in given:
+                raise InputError(
+                    f"--passes {self.passes} and --iterations {self.config.iterations} exclude each other: both set "
+                    "the number of steps"
+                )
         if not self.resume and (self.preset, self.schedule) == ("default", None):
             return self
         if not self.resume:
-            settings = bundled(self.preset, self.schedule, self.config.iterations)
-            return replace(self, config=with_given(settings, self.config, given))
+            steps = self.config.iterations if self.passes is None else steps_made_for(self.preset, self.schedule)
+            return replace(self, config=with_given(bundled(self.preset, self.schedule, steps), self.config, given))
         from clsplat.runs.run import Run, check_output
 
-        for flag, value, usual in (("preset", self.preset, "default"), ("schedule", self.schedule, None)):
+        bundles = (("preset", self.preset, "default"), ("schedule", self.schedule, None), ("passes", self.passes, None))
+        for flag, value, usual in bundles:
             if value != usual:
                 raise InputError(f"--{flag} {value} and --resume exclude each other: a resumed run keeps its settings")
         check_output(self.output, resume=True, overwrite=self.overwrite)
@@ -152,7 +164,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     if verb.resume and verb.auto:
         raise InputError("--auto and --resume exclude each other: a resumed run keeps its settings")
     devices = verb.device.open_all(services)
-    scene, config = _looked_at(verb, services, source)
+    scene, config = _looked_at(verb, services, source, earlier)
     if earlier is not None:
         check_steps_left(earlier, config, "--iterations")
     if len(scene.points) == 1:  # a Gaussian's initial size is derived from its neighbours
@@ -201,10 +213,11 @@ def _stages(config: TrainConfig) -> tuple[str, ...]:
 
 def _tell_of(scene: Scene, devices: Sequence[Device]) -> None:
     """Print the numbers of pictures and points, the devices, and the reason if LPIPS will be missing."""
+    unit = f", lengths relative to {scene.length_unit:.4g} (extent {scene.extent:.4g})" if scene.unit_differs else ""
     on = "; ".join(f"{device.name}, {device.driver.split('  ')[0].strip()}" for device in devices)
     print(
         f"{scene.name}: {len(scene.train_views)} training pictures, {len(scene.test_views)} held out, "
-        f"{len(scene.points):,} points; on {on} (the first steps may take longer, while kernels are built)",
+        f"{len(scene.points):,} points{unit}; on {on} (the first steps may take longer, while kernels are built)",
         file=sys.stderr,
     )
     if scene.test_views:
@@ -251,19 +264,24 @@ def _train_run(
         raise
 
 
-def _looked_at(verb: TrainVerb, services: Services, source: Path) -> tuple[Scene, TrainConfig]:
+def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run | None) -> tuple[Scene, TrainConfig]:
     """Load and check the scene, and print the findings about it. Returns the scene and the settings for it.
 
+    earlier: the run to continue.
     With --auto the settings are adapted to the findings.
     """
     from clsplat.scenes.analysis.recommendations import answered, paragraph
 
     config = verb.config
-    scene = _scene(services, source, config)
-    if verb.resume:
+    scene = _scene(services, source, config, earlier)
+    if earlier is not None:
         return scene, config
+    photographs = len(scene.train_views)
+    if verb.passes is not None:
+        config = by_passes(config, verb.passes, photographs, verb.given)
+        config.check()
     findings = services.findings(scene, config.mask_use, config.iterations)
-    answers, better = answered(findings, config, verb.given)
+    answers, better = answered(findings, config, verb.given, photographs)
     print(paragraph(answers, len(scene.views), auto=verb.auto), file=sys.stderr)
     if not verb.auto:
         return scene, config
@@ -272,17 +290,20 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path) -> tuple[Scene
     return scene, better
 
 
-def _scene(services: Services, source: Path, config: TrainConfig) -> Scene:
-    """Load the training scene with its initial points. Raises InputError if training on it would fail."""
+def _scene(services: Services, source: Path, config: TrainConfig, earlier: Run | None = None) -> Scene:
+    """Load the training scene with its initial points. Raises InputError if training on it would fail.
+
+    earlier: the run to continue.
+    """
     from clsplat.training.preparation import prepared
 
     if config.points:  # checked early, since structure from motion may follow and take long
         with open_input(Path(config.points), "a cloud of points"):
             pass
     scene = load_scene(
-        services, source, config.resolution, config.test_every, config.mask_use, config.lenses, config.missing
+        services, source, config.resolution, config.test_views, config.mask_use, config.lenses, config.missing
     )
-    scene = prepared(scene, config)
+    scene = prepared(scene, config, earlier)
     _check_scene(scene)
     return scene
 

@@ -143,6 +143,7 @@ def _scene(services: Services, path: Path | None, config: TrainConfig, *, given:
             path,
             resolution=config.resolution,
             test_every=config.test_every,
+            test_most=config.test_most,
             masks=config.mask_use,
             lenses=config.lenses,
             missing=config.missing,

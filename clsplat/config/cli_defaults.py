@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 TEST_EVERY = 8
+TEST_MOST = 200
 VIEWER_HOST, VIEWER_PORT = "127.0.0.1", 8080
 """Address and port of the viewer's server."""
 DEMO_ITERATIONS = 2000

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
+from operator import attrgetter
 from typing import Literal
 
+from clsplat.config.checks import misfit
 from clsplat.config.rasterizer import RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import InputError
@@ -67,6 +70,53 @@ def scheduled(schedule: Schedule, iterations: int) -> TrainConfig:
         ),
         density=replace(config.density, noise_rate=2e5),
     )
+
+
+STEPS_MADE_FOR: dict[Schedule, int] = {"paper": 30_000, "short": 7000, "high-rates": 7000}
+"""Training steps that each schedule is made for."""
+STEP_SETTINGS = (
+    "iterations",
+    "sh_degree_every",
+    "warmup",
+    "optimiser.means_rate_steps",
+    "optimiser.cooldown",
+    "density.every",
+    "density.start",
+    "density.stop",
+    "density.opacity_reset_every",
+    "density.prune_every",
+)
+"""Settings of the schedule that count steps. `--passes` scales them."""
+
+
+def steps_made_for(preset: Preset, schedule: Schedule | None) -> int:
+    """Training steps for which the settings of a preset and a schedule are made."""
+    return STEPS_MADE_FOR[schedule or ("short" if preset == "fast" else "paper")]
+
+
+def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collection[str] = ()) -> TrainConfig:
+    """The same schedule, stretched or shortened to `passes` passes through the training photographs.
+
+    Settings that count steps are scaled like `iterations`: those of densification, SH degrees, opacity resets, warm-up
+    sizes, learning rates and cooldown. A densification then sees the same part of the photographs, however many there
+    are. Steps stay in order, and those that are not 0 stay at least 1.
+    given: names of settings that must not change.
+    Raises InputError if `passes` is less than 1.
+    """
+    if expected := misfit(int, passes) or ("" if passes >= 1 else "at least 1"):
+        raise InputError(f"--passes {passes}: expected {expected}")
+    factor = passes * photographs / config.iterations
+
+    def scaled(steps: int) -> int:
+        return max(round(factor * steps), 1) if steps else 0
+
+    for name in STEP_SETTINGS:
+        if name in given:
+            continue
+        steps = attrgetter(name)(config)
+        value = tuple(sorted({scaled(step) for step in steps})) if isinstance(steps, tuple) else scaled(steps)
+        config = config.changed(name, value)
+    return config
 
 
 def bundled(preset: Preset, schedule: Schedule | None, iterations: int) -> TrainConfig:

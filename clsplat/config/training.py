@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from math import inf
-from typing import Literal
+from typing import Any, Literal
 
 from clsplat.config.checks import Rule, check_kinds, check_rules, check_steps
-from clsplat.config.cli_defaults import TEST_EVERY
+from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.depth import DepthSource, DepthUse, MapKind
 from clsplat.config.masks import AlphaMeaning, MaskMeaning, MaskUse
 from clsplat.config.points import DEFAULT_MAX_FILE_POINTS, PointsUse, StartPoints
@@ -32,9 +32,9 @@ class OptimiserConfig:
     """Learning rates and Adam's constants, with a rate per parameter group."""
 
     means_rate: float = 1.6e-4
-    """Learning rate of the Gaussians' centres (means) at the first step, relative to the scene's extent."""
+    """Learning rate of the Gaussians' centres (means) at the first step, relative to the scene's length unit."""
     means_rate_end: float = 1.6e-6
-    """Learning rate of the means after means-rate-steps, relative to the extent. Until then the rate falls
+    """Learning rate of the means after means-rate-steps, relative to the length unit. Until then the rate falls
     exponentially."""
     means_rate_steps: int = 30_000
     """Steps over which the learning rate of the means falls."""
@@ -99,13 +99,13 @@ class DensityConfig:
     """Sum the absolute values of the per-pixel gradients instead (AbsGS). gradient-threshold should then be about
     8e-4."""
     dense_fraction: float = 0.01
-    """Largest scale of a Gaussian that is cloned, relative to the scene's extent; larger ones are split."""
+    """Largest scale of a Gaussian that is cloned, relative to the scene's length unit; larger ones are split."""
     split_factor: float = 1.6
     """Factor by which each half of a split Gaussian is smaller than the original."""
     min_opacity: float = 0.005
     """Prune Gaussians whose opacity is less than this, 0 to 1."""
     max_world_fraction: float = 0.1
-    """Prune Gaussians larger than this fraction of the scene's extent, after the first opacity reset."""
+    """Prune Gaussians larger than this fraction of the scene's length unit, after the first opacity reset."""
     max_screen_radius: float = 0.0
     """Prune Gaussians that covered a larger radius than this on the screen, in pixels, after the first opacity reset; 0
     prunes none."""
@@ -131,12 +131,12 @@ class DensityConfig:
     at the mean, as published. Applies only if more Gaussians have to move than have a gradient."""
     noise_rate: float = 5e5
     """With growth mcmc: noise added to the means in each step, in multiples of their learning rate, for Gaussians of
-    scale 1 in a scene of extent 1. 0 adds none. The cooldown has no noise."""
+    scale 1 in a scene of length unit 1. 0 adds none. The cooldown has no noise."""
     opacity_weight: float = 0.01
     """With growth mcmc: weight in the loss of the opacities' sum over the Gaussians that the step's view shows, divided
     by the number of all Gaussians."""
     scale_weight: float = 0.01
-    """With growth mcmc: like opacity-weight, but for scales relative to the scene's extent."""
+    """With growth mcmc: like opacity-weight, but for scales relative to the scene's length unit."""
     min_contribution: float = 0.0
     """Prune Gaussians that contribute less than this to every training view of an epoch (a pass through all of them). A
     contribution is alpha times transmittance, summed over the picture, in pixels. 0 prunes none."""
@@ -212,7 +212,7 @@ class TrainConfig:
     to 0.9. It rises from 0 at the first step. The other Gaussians are more opaque in that step. 0.2 is as published; 0
     leaves none out."""
     penalty: float = 0.0
-    """Weight in the loss of the mean opacity and of the mean scale relative to the scene's extent. Summed over the
+    """Weight in the loss of the mean opacity and of the mean scale relative to the scene's length unit. Summed over the
     Gaussians that the step's view shows. 0.02 helps against fog if there are few photographs. --density.growth mcmc has
     weights of its own instead."""
     antialiased: bool = False
@@ -243,6 +243,8 @@ class TrainConfig:
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
+    test_most: int = TEST_MOST
+    """Maximum number of views that test-every holds out, spread evenly over them; 0 for no maximum."""
     missing: Missing = "few"
     """Handling of pictures that the scene lists but that are missing. few: up to a tenth of them are left out, with a
     warning, and more are an error. skip: any number is left out. error: none may be missing. The held-out views stay
@@ -271,7 +273,7 @@ class TrainConfig:
     maps: depth maps in depths/ next to images/, or depth_file_path of transforms.json. none: no depths."""
     depth_weight: float = 0.01
     """Weight of the depth loss at the first step. The loss is the mean difference of inverse depths, in units of one
-    over the scene's extent. The weight falls to a hundredth at the last step."""
+    over the scene's length unit. The weight falls to a hundredth at the last step."""
     depth_maps: MapKind = "metric"
     """metric: depth maps hold distances along the camera's axis, for fisheyes and panoramas distances from the camera,
     0 if unknown. relative: numbers that grow with nearness, scaled to the scene's points."""
@@ -300,7 +302,7 @@ class TrainConfig:
     COLMAP model; eval.json gets the PSNR of held-out views after aligning them with the model. Not with batches."""
     pose_reach: float = 5.0
     """Approximate limit of a refined pose's rotation over a training, in degrees. The limit of its movement is as many
-    57ths of the scene's extent."""
+    57ths of the scene's length unit."""
     refine_lenses: bool = False
     """Refine focal lengths and principal points with the model. Photographs with the same lens share them. refined/
     in the run gets them. For photographs without distortion; not with batches."""
@@ -338,6 +340,7 @@ class TrainConfig:
                     "seed",
                     "resolution",
                     "test_every",
+                    "test_most",
                     "checkpoint_every",
                     "stages_every",
                     "sky",
@@ -385,6 +388,11 @@ class TrainConfig:
         if self.depth != "maps" and self.depth_maps != "metric":
             raise InputError(f"--depth-maps {self.depth_maps}: no depth maps are used, expected --depth maps too")
 
+    def changed(self, name: str, value: Any) -> TrainConfig:
+        """Copy with one setting changed. A name such as "density.stop" starts with its group."""
+        group, dot, setting = name.partition(".")
+        return replace(self, **{group: replace(getattr(self, group), **{setting: value}) if dot else value})
+
     @property
     def refines(self) -> bool:
         """True if cameras are refined."""
@@ -398,6 +406,11 @@ class TrainConfig:
     def mask_use(self) -> MaskUse:
         """Use of the scene's masks and alpha channels."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
+
+    @property
+    def test_views(self) -> tuple[int, int]:
+        """test_every and test_most, which choose the held-out views."""
+        return self.test_every, self.test_most
 
     @property
     def depth_use(self) -> DepthUse:

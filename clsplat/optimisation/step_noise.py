@@ -48,31 +48,31 @@ NO_EXPLORATION = Exploration()
 """Neither penalties nor noise."""
 
 
-def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, extent: float) -> Exploration:
+def exploration_of(config: TrainConfig, step: int, means_rate: float, count: int, length_unit: float) -> Exploration:
     """Penalties and noise of step number `step`, of `count` Gaussians.
 
-    There is noise only with growth mcmc and before the cooldown. It is scaled as if the scene's extent were 1.
-    means_rate, extent: world units.
+    There is noise only with growth mcmc and before the cooldown. It is scaled as if the scene's length unit were 1.
+    means_rate, length_unit: world units.
     """
     density = config.density
     if density.growth != "mcmc":
         penalty = config.penalty
-        return _penalties(penalty, penalty, count, extent) if penalty > 0 else NO_EXPLORATION
+        return _penalties(penalty, penalty, count, length_unit) if penalty > 0 else NO_EXPLORATION
     cools = step > config.iterations - config.optimiser.cooldown
     return replace(
-        _penalties(density.opacity_weight, density.scale_weight, count, extent),
-        amount=0.0 if cools else density.noise_rate * means_rate / extent**2,
+        _penalties(density.opacity_weight, density.scale_weight, count, length_unit),
+        amount=0.0 if cools else density.noise_rate * means_rate / length_unit**2,
         dead=density.min_opacity,
         key=step_key(config.seed, step),
     )
 
 
-def _penalties(opacity: float, scale: float, count: int, extent: float) -> Exploration:
+def _penalties(opacity: float, scale: float, count: int, length_unit: float) -> Exploration:
     """Weights of the sums over the Gaussians in view, from weights of the means over all `count`.
 
-    Scales are relative to the scene's extent (docs/gradients.md, (91)).
+    Scales are relative to the scene's length unit (docs/gradients.md, (91)).
     """
-    return Exploration(opacity=opacity / count, scale=scale / (3 * count * extent))
+    return Exploration(opacity=opacity / count, scale=scale / (3 * count * length_unit))
 
 
 def step_key(seed: int, step: int) -> tuple[int, int]:

@@ -84,6 +84,7 @@ def scene_of(run: Run) -> Scene | str:
             source,
             resolution=run.config.resolution,
             test_every=run.config.test_every,
+            test_most=run.config.test_most,
             masks=masks,
             lenses=run.config.lenses,
             missing=run.config.missing,

@@ -7,6 +7,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +46,7 @@ def record_of(scene: Scene, resolution: int) -> dict[str, Any]:
         "origin": scene.origin.tolist(),
         "points": {"count": len(scene.points), "blake2b": points.hexdigest()},
         "views": {view.name: _view(view, digests[view.name]) for view in scene.views},
+        **({"length_unit": scene.length_unit} if scene.unit_differs else {}),
     }
 
 
@@ -65,7 +67,7 @@ def _view(view: View, digest: str | None) -> dict[str, Any]:
 
 def digest_of(record: dict[str, Any]) -> str:
     """First 128 bits of the SHA-256 of a scene, in hexadecimal, independent of the version that wrote the record."""
-    scene = {key: value for key, value in record.items() if key not in ("clsplat", "earlier")}
+    scene = {key: value for key, value in record.items() if key not in ("clsplat", "earlier", "length_unit")}
     return hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()[:32]
 
 
@@ -95,6 +97,7 @@ def read(run: Run) -> dict[str, Any] | None:
         assert isinstance(points["count"], int)
         assert len(record["origin"]) == 3
         assert isinstance(record["resolution"], int)
+        assert 0 < float(record.get("length_unit", 1)) < inf
         assert isinstance(record.get("earlier", []), list)
         assert all(isinstance(digest, str) for digest in record.get("earlier", []))
         for view in views.values():
@@ -105,6 +108,14 @@ def read(run: Run) -> dict[str, Any] | None:
         why = str(error) or "its form is wrong"
         raise InputError(f"{path}: is damaged ({why}), expected {_EXPECTED_SCENE_RECORD}; {advice}") from None
     return dict(record)
+
+
+def length_unit_of(run: Run, scene: Scene) -> float:
+    """Length unit of the run's training. Runs of earlier versions, and scenes that record none, have the extent.
+
+    Raises InputError like `read`.
+    """
+    return float((read(run) or {}).get("length_unit", scene.extent))
 
 
 def own_cameras(run: Run | None) -> list[Camera]:

@@ -49,6 +49,9 @@ RETIRED_SETTINGS |= {
     "train.frequency_steps": 0,
 }
 """Settings of earlier versions, each with the value that switched it off."""
+_ADDED_SETTINGS: dict[str, tuple[str, Any]] = {"train.test_most": ("test_every", 0)}
+"""Settings that runs of earlier versions lack. Each has a setting that these runs have, and the value that stands for
+what these versions did."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}
 """Retired values of current settings. The default replaces them."""
 
@@ -102,7 +105,8 @@ def _from_table(cls: type[T], table: Any, path: Path, where: str, passed_over: l
         raise InputError(f"{path}: {where} is {table!r}, expected a table")
     types = get_type_hints(cls)
     names = [f.name for f in fields(cls)]  # type: ignore[arg-type]  # every caller passes a dataclass
-    values = {}
+    added = {key: _ADDED_SETTINGS.get(f"{where}.{key}", ("", None)) for key in names}
+    values = {key: value for key, (beside, value) in added.items() if beside in table}
     for key, value in table.items():
         name = f"{where}.{key}"
         if name in RETIRED_SETTINGS or (isinstance(value, str) and (name, value) in _RETIRED_VALUES):

@@ -13,7 +13,7 @@ import numpy as np
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.checks import misfit
-from clsplat.config.cli_defaults import TEST_EVERY
+from clsplat.config.cli_defaults import TEST_EVERY, TEST_MOST
 from clsplat.config.masks import NO_MASKS, MaskUse
 from clsplat.config.training import Lenses, Missing
 from clsplat.errors import InputError, examples, plain, warn
@@ -47,6 +47,7 @@ def load_scene(
     *,
     resolution: int = 0,
     test_every: int = TEST_EVERY,
+    test_most: int = TEST_MOST,
     images: str | Path | None = None,
     lenses: Lenses = "undistort",
     work_dir: Path | None = None,
@@ -59,6 +60,7 @@ def load_scene(
     path: a folder in a layout that `detect` knows, or a transforms.json.
     resolution: longest side of the views in pixels, never larger than the pictures. 0 keeps their size up to 1600.
     test_every: every n-th view in the order of names is held out, 0 for none. A split in the data set takes precedence.
+    test_most: maximum number of views that `test_every` holds out, spread evenly over them, 0 for no maximum.
     images: another folder with the pictures, relative to `path`, such as "images_4". By default, images_2, images_4 or
         images_8 of a COLMAP scene is used instead of larger pictures if its pictures have exactly the requested size.
         Such a folder of any size is used if there are no other pictures.
@@ -82,7 +84,7 @@ def load_scene(
     (`outliers`) and implausible cameras (`camera_checks`) are reported too.
     """
     path = Path(path)
-    for name, number in (("resolution", resolution), ("test_every", test_every)):
+    for name, number in (("resolution", resolution), ("test_every", test_every), ("test_most", test_most)):
         if (expected := misfit(int, number)) or number < 0:
             raise InputError(f"{name} {number}: expected {expected or '0 or more'}")
     kind = detect(path)
@@ -93,7 +95,7 @@ def load_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         files = _read(path, kind, images, missing, masks, work_dir, progress)
-        views = _views(files, path, resolution, test_every, lenses)
+        views = _views(files, path, resolution, (test_every, test_most), lenses)
         scene = _scene(files, path, kind, views)
         near_views = [view for view in views if view.name not in scene.stray_cameras]  # outliers are reported already
         for doubt in camera_checks([(view.name, view.camera, view.lens) for view in near_views], scene.points):
@@ -139,22 +141,32 @@ def _read(
     return _SceneFiles(data, folder, smaller if masks == NO_MASKS else (), masks)
 
 
-def _views(files: _SceneFiles, path: Path, resolution: int, test_every: int, lenses: Lenses) -> list[View]:
-    """Views of the data set, sorted by name, with the split and the masks. Warns of copies and of uneven scaling."""
+def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[int, int], lenses: Lenses) -> list[View]:
+    """Views of the data set, sorted by name, with the split and the masks. Warns of copies and of uneven scaling.
+
+    test_views: test_every and test_most.
+    """
     data = files.data
     posed = sorted(data.images, key=lambda image: image.name)
     of_pictures = masks_of(files.masks, posed, path, strict=not data.missing)
     own_split = any(image.split for image in posed)
-    every = {name: index for index, name in enumerate(sorted([*(image.rank for image in posed), *data.missing]))}
+    held_out_names = frozenset(_held_out(sorted([*(image.rank for image in posed), *data.missing]), *test_views))
     views = []
     for image in posed:
-        by_name = test_every > 0 and every[image.rank] % test_every == 0
-        held_out = image.split == "test" if own_split else by_name
+        held_out = image.split == "test" if own_split else image.rank in held_out_names
         view = _view(image, "test" if held_out else "train", resolution, files.smaller, lenses)
         views.append(replace(view, mask=of_pictures.get(image.name), depth_file=image.depth))
     _warn_of_copies(views)
     _warn_of_uneven(posed, views)
     return views
+
+
+def _held_out(names: Sequence[str], every: int, most: int) -> Sequence[str]:
+    """Every n-th of the sorted names, at most `most` of them, spread evenly. None for `every` 0, all for `most` 0."""
+    chosen = names[::every] if every > 0 else []
+    if not 0 < most < len(chosen):
+        return chosen
+    return [chosen[index * len(chosen) // most] for index in range(most)]
 
 
 def _scene(files: _SceneFiles, path: Path, kind: Kind, views: list[View]) -> Scene:

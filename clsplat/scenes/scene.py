@@ -143,6 +143,7 @@ class Scene:
     depth_use: choice of known depths (`scenes.depth_sources`).
     clouds: point files next to the scene that are not used.
     missing: names of listed pictures that do not exist.
+    unit: the length unit, if it is not the extent (`scenes.analysis.length_unit`).
     """
 
     name: str
@@ -157,6 +158,7 @@ class Scene:
     depth_use: DepthUse = NO_DEPTH
     clouds: tuple[Path, ...] = ()
     missing: tuple[str, ...] = ()
+    unit: float | None = None
 
     @cached_property
     def train_views(self) -> list[View]:
@@ -250,7 +252,7 @@ class Scene:
 
     @cached_property
     def extent(self) -> float:
-        """The authors' cameras_extent in world units, which scales the learning rates.
+        """The authors' cameras_extent in world units.
 
         It is 1.1 times the distance of the farthest training camera from the cameras' mean, without outliers. If all
         cameras are in one place, it is the median distance of the points from there, or 1 without points.
@@ -260,10 +262,20 @@ class Scene:
             return 1.1 * spread
         return (float(np.median(np.linalg.norm(self.points - middle, axis=1))) if len(self.points) else 0.0) or 1.0
 
-    @cached_property
+    @property
+    def length_unit(self) -> float:
+        """Length in world units that learning rates and sizes of Gaussians are relative to: `unit`, or the extent."""
+        return self.extent if self.unit is None else self.unit
+
+    @property
+    def unit_differs(self) -> bool:
+        """True if the length unit is not the extent."""
+        return self.length_unit != self.extent
+
+    @property
     def near(self) -> float:
         """Near plane, in world units, of a model of this scene (docs/decisions/0019)."""
-        return min(DEFAULT_NEAR_PLANE, self.extent / MIN_NEAR_PLANES_PER_EXTENT)
+        return min(DEFAULT_NEAR_PLANE, self.length_unit / MIN_NEAR_PLANES_PER_EXTENT)
 
 
 def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:

@@ -78,6 +78,8 @@ class Forecast:
         self.last: tuple[int, int, float] | None = None
         self.spans: list[Span] = []
         """Steps between two reports."""
+        self.amounts: list[tuple[float, ...]] = []
+        """Amounts of these spans."""
         self.added: list[tuple[int, int]] = []
         """Step of each densification, and the number of Gaussians that it added."""
 
@@ -93,6 +95,7 @@ class Forecast:
         self.added += [(each, (count - previous) // len(due)) for each in due]
         reads = self._reads(before, step)
         self.spans.append(Span(self.sizes.factor(step), count, step - before, reads, max(seconds - at, 0.0)))
+        self.amounts.append(self._amounts(self.spans[-1]))
         self.last = (step, count, seconds)
 
     def left(self) -> float | None:
@@ -102,7 +105,7 @@ class Forecast:
         step, count, _ = self.last
         ahead = self._ahead(step, count)
         cost, pace = self._cost()
-        return pace * float(sum(span.steps * (cost @ self._amounts(span)) for span in ahead))
+        return pace * float(sum(span.steps * (cost @ np.array(self._amounts(span))) for span in ahead))
 
     def _reads(self, before: int, step: int) -> float:
         """Number of photographs that the steps after `before` up to `step` read: those not yet seen in this size.
@@ -154,14 +157,14 @@ class Forecast:
         added = PRIOR_GROWTH_WEIGHT * before + sum(each for _, each in taken)
         return added / (PRIOR_GROWTH_WEIGHT + sum(_course(self.config.density, step, peak) for step, _ in taken)), peak
 
-    def _amounts(self, span: Span) -> Float64:
+    def _amounts(self, span: Span) -> tuple[float, ...]:
         """Factors (4,) of the costs in a step: 1, pixels, Gaussians, photographs read."""
-        return np.array([1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps])
+        return 1.0, self.pixels / span.factor**2, span.gaussians, span.reads / span.steps
 
     def _cost(self) -> tuple[Float64, float]:
         """Seconds of a step by its parts (4,), and the factor by which recent steps took longer."""
         spans = self.spans[1:] or self.spans  # the first span includes building kernels
-        parts = np.array([self._amounts(span) for span in spans])
+        parts = np.array(self.amounts[-len(spans) :])
         steps, seconds = np.array([(span.steps, span.seconds) for span in spans]).T
         rates = seconds / np.maximum(steps * (parts @ PRIOR_COSTS), 1e-12)
         usual_spans = rates <= OUTLIER_FACTOR * np.median(rates)

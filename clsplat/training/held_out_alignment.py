@@ -42,7 +42,7 @@ def aligned(trainer: Trainer, view: View, look: Look) -> Camera:
     if (factors := look(view.name, white)) is not white:
         photograph = np.concatenate([photograph[:, :, :3] / factors, photograph[:, :, 3:]], axis=2, dtype=np.float32)
     kept, background = kept_pixels(photograph), np.array(background_colour(config.background), np.float32)
-    room, scale = view_gradients(rasterizer.work, model), np.repeat([1.0, trainer.scene.extent], 3)
+    room, scale = view_gradients(rasterizer.work, model), np.repeat([1.0, trainer.scene.length_unit], 3)
     first, second = np.zeros(6), np.zeros((6, 6))
     camera = best = view.camera
     least = np.inf

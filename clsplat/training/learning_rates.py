@@ -7,10 +7,10 @@ from clsplat.config.training import TrainConfig
 from clsplat.gaussians import PARAMETER_GROUPS
 
 
-def rates_at(config: TrainConfig, step: int, extent: float, factor: float) -> dict[str, float]:
+def rates_at(config: TrainConfig, step: int, length_unit: float, factor: float) -> dict[str, float]:
     """Learning rate of each group at a step.
 
-    The means' rate falls exponentially, and is relative to the scene's extent. All rates fall in the cooldown.
+    The means' rate falls exponentially, and is relative to the scene's length unit. All rates fall in the cooldown.
     factor: factor on all rates, which falls with each return to a checkpoint.
     """
     optimiser = config.optimiser
@@ -19,5 +19,5 @@ def rates_at(config: TrainConfig, step: int, extent: float, factor: float) -> di
     fraction = min(step / optimiser.means_rate_steps, 1.0)
     means_rate = optimiser.means_rate ** (1 - fraction) * optimiser.means_rate_end**fraction
     rates = {name: getattr(optimiser, group.rate) for name, group in PARAMETER_GROUPS.items()}
-    rates["means"] = means_rate * extent
+    rates["means"] = means_rate * length_unit
     return {group: rate * cooled * factor for group, rate in rates.items()}

@@ -14,6 +14,7 @@ from clsplat.images.alpha import background_colour
 from clsplat.runs import scene_record
 from clsplat.runs.run import Run, check_resumed
 from clsplat.scenes.analysis import sanity_checks
+from clsplat.scenes.analysis.length_unit import length_unit_of
 from clsplat.scenes.depth_sources import with_depths
 from clsplat.scenes.scene import Scene
 from clsplat.scenes.start.initialise import is_colourless, photographed
@@ -21,11 +22,15 @@ from clsplat.scenes.start.point_cloud import with_points
 from clsplat.training.cameras.refinement import Cameras
 
 
-def prepared(scene: Scene, config: TrainConfig) -> Scene:
-    """Scene with its start points and known depths; `scene` itself if it has them already.
+def prepared(scene: Scene, config: TrainConfig, resumed: Run | None = None) -> Scene:
+    """Scene with its length unit, start points and known depths; `scene` itself if it has them already.
 
+    resumed: the run that continues, which keeps its length unit.
     Raises InputError for points, depths or cameras to refine with which training would fail.
     """
+    unit = scene_record.length_unit_of(resumed, scene) if resumed else scene.unit or length_unit_of(scene)
+    if unit != scene.unit:
+        scene = replace(scene, unit=unit)
     scene = with_depths(with_points(scene, config.start_points), config.depth_use)
     scene.require_training_views()
     if config.refines:
@@ -44,7 +49,7 @@ def begin(scene: Scene, config: TrainConfig, run: Run | None, *, resume: bool) -
 
     Raises InputError if the run has already been trained, or trained on another scene.
     """
-    scene = prepared(scene, config)
+    scene = prepared(scene, config, run if resume else None)
     if run is not None:
         if not resume and (run.checkpoints() or run.read_metrics()):
             raise InputError(

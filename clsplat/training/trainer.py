@@ -100,7 +100,7 @@ class Trainer:
         self.photographs = ImageCache(self.views, device)
         self.renderer = Renderer(device, self.rasterizer)
         self.validation_views = ValidationViews(scene, device, config)
-        self.depths = DepthTargets(config, self.views, scene.extent, scene.near, self._pixels)
+        self.depths = DepthTargets(config, self.views, scene.length_unit, scene.near, self._pixels)
         self.batch = Batch(self.rasterizer, self.photographs, config, further) if config.batch > 1 else None
         self.sizes = by_doubling(config.warmup)
         self.background: NDArray[np.float32] = np.zeros(3, np.float32)
@@ -261,7 +261,9 @@ class Trainer:
             self.step,
             rates,
             slot_fields(self.strategy.needs(self.step), nearness=bool(self.config.depth_use)),
-            explore=exploration_of(self.config, self.step, rates["means"], self.parameters.count, self.scene.extent),
+            explore=exploration_of(
+                self.config, self.step, rates["means"], self.parameters.count, self.scene.length_unit
+            ),
         )
 
     def _run(
@@ -399,7 +401,7 @@ class Trainer:
 
     def rates(self) -> dict[str, float]:
         """Learning rate of each group at this step."""
-        return rates_at(self.config, self.step, self.scene.extent, self.monitor.retries.rate_factor)
+        return rates_at(self.config, self.step, self.scene.length_unit, self.monitor.retries.rate_factor)
 
     def _next_view(self) -> int:
         if not self.queue:
@@ -444,7 +446,9 @@ class Trainer:
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
-        return ModelState(model.count, step, self.scene.extent, model.arrays, statistics, self.rng, self.model.marker())
+        return ModelState(
+            model.count, step, self.scene.length_unit, model.arrays, statistics, self.rng, self.model.marker()
+        )
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out a plan of density control, or of a repair, for the rows of all arrays."""

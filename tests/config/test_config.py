@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import get_args
 
@@ -11,7 +12,15 @@ import pytest
 from tiny import write_scene
 
 from clsplat.cli.main import main
-from clsplat.config.presets import RASTERIZER_PRESETS, Schedule, bundled, scheduled
+from clsplat.config.presets import (
+    RASTERIZER_PRESETS,
+    STEP_SETTINGS,
+    Schedule,
+    bundled,
+    by_passes,
+    scheduled,
+    steps_made_for,
+)
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.errors import InputError
 from clsplat.runs.run import Run
@@ -187,7 +196,58 @@ def test_a_setting_that_two_places_have_has_one_default() -> None:
     assert [default(each, "host") for each in (PageOptions, Address)] == ["127.0.0.1"] * 2
     held_out = inspect.signature(load_scene).parameters["test_every"].default
     assert [default(each, "test_every") for each in (TrainConfig, ConvertVerb)] == [held_out] * 2 == [8] * 2
+    most = inspect.signature(load_scene).parameters["test_most"].default
+    assert default(TrainConfig, "test_most") == most == 200
     names = {"exr": "depth", "parts": "parts", "compression": "compression", "quality": "quality"}
     for flag, name in names.items():
         assert default(RenderVerb, flag) == default(Encoding, name), flag
     assert bits_of("a.png", default(RenderVerb, "bits"), ["rgb"]) == default(Encoding, "bits")
+
+
+@pytest.mark.parametrize("schedule", get_args(Schedule))
+@pytest.mark.parametrize(("passes", "photographs"), [(30, 1000), (30, 2000), (10, 40), (1, 1)])
+def test_passes_stretch_a_schedule(schedule: Schedule, passes: int, photographs: int) -> None:
+    made_for = steps_made_for("default", schedule)
+    before = scheduled(schedule, made_for)
+    config = by_passes(before, passes, photographs)
+    config.check()
+    assert config.iterations == passes * photographs
+    factor = passes * photographs / made_for
+    for name in STEP_SETTINGS:
+        old, new = attrgetter(name)(before), attrgetter(name)(config)
+        if isinstance(old, tuple):
+            assert all(abs(b - factor * a) <= 1 for a, b in zip(old, new, strict=False)), name
+        else:
+            assert abs(new - factor * old) <= 1, name
+            assert (new == 0) == (old == 0), name
+    assert by_passes(config, passes, photographs) == config
+    back = config
+    for name in STEP_SETTINGS:
+        back = back.changed(name, attrgetter(name)(before))
+    assert back == before, "nothing else changes"
+
+
+def test_passes_leave_settings_that_are_given() -> None:
+    config = TrainConfig().changed("density.stop", 900)
+    assert by_passes(config, 60, 1000, {"density.stop"}).density.stop == 900
+    with pytest.raises(InputError, match="--passes 0: expected at least 1"):
+        by_passes(config, 0, 10)
+
+
+@pytest.mark.slow
+def test_passes_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
+    scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"  # eight training photographs
+    words = ["train", str(scene), "-o", str(run), "--passes"]
+    for number, more, said in (
+        ("0", (), "--passes 0: expected at least 1"),
+        ("2", ("--iterations", "9"), "--passes 2 and --iterations 9 exclude each other"),
+    ):
+        assert main([*words, number, *more]) == 2
+        assert said in capsys.readouterr().err
+        assert not run.exists()
+    assert main([*words, "2", "--schedule", "short", "--density.start", "3"]) == 0
+    wanted = by_passes(scheduled("short", 7000), 2, 8).changed("density.start", 3)
+    assert Run.open(run).config == wanted
+    assert wanted.iterations == 16
+    assert main(["train", "-o", str(run), "--resume", "--passes", "3"]) == 2
+    assert "--passes 3 and --resume exclude each other" in capsys.readouterr().err

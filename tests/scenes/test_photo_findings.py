@@ -16,7 +16,7 @@ from tiny import HEIGHT, VIEWS, WIDTH, write_scene
 from clsplat.camera import Camera
 from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
-from clsplat.config.presets import bundled, scheduled
+from clsplat.config.presets import bundled, by_passes, scheduled
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
@@ -335,6 +335,23 @@ def test_few_views_are_trained_for_fewer_steps() -> None:
     assert answered(few, mcmc)[1] == replace(mcmc, thinning=0.2), "which has penalties of its own"
     (answer,), config = answered(few, TrainConfig(), {"thinning"})
     assert (answer.words, config) == ("a (you set --thinning)", TrainConfig())
+
+
+def test_many_photographs_are_trained_by_passes() -> None:
+    """At the default number of steps, from 1001 photographs on; not where steps are given."""
+    assert [each.kind for each in findings(made(40), iterations=30_000)] == []
+    many = made(1010)
+    assert findings(many) == [], "the number of steps is unknown"
+    (found,) = findings(many, iterations=30_000)
+    assert found.kind == "few passes"
+    assert found.text == "30,000 steps pass 29.7 times through the 1,010 training photographs"
+    (answer,), config = answered([found], TrainConfig(), photographs=1010)
+    assert answer.words == f"{found.text} (--passes 30)"
+    assert config == by_passes(TrainConfig(), 30, 1010)
+    (answer,), config = answered([found], TrainConfig(), {"density.stop"}, photographs=1010)
+    assert (config.iterations, config.density.stop) == (30_300, TrainConfig().density.stop)
+    (answer,), config = answered([found], TrainConfig(), {"iterations"}, photographs=1010)
+    assert (answer.words, config) == (f"{found.text} (you set --iterations)", TrainConfig())
 
 
 def test_few_steps_are_trained_with_high_rates() -> None:

@@ -69,6 +69,12 @@ def test_split(tmp_path: Path) -> None:
     make_colmap(tmp_path)
     assert len(load_scene(tmp_path, test_every=0).test_views) == 0
     assert [view.name for view in load_scene(tmp_path, test_every=3).test_views] == ["1.png", "4.png", "7.png"]
+    every_second = [view.name for view in load_scene(tmp_path, test_every=2, test_most=0).test_views]
+    assert len(every_second) == 5
+    assert [view.name for view in load_scene(tmp_path, test_every=2, test_most=5).test_views] == every_second
+    few = [view.name for view in load_scene(tmp_path, test_every=2, test_most=3).test_views]
+    assert few == [every_second[index] for index in (0, 1, 3)]
+    assert [view.name for view in load_scene(tmp_path, test_every=1, test_most=2).test_views] == ["1.png", "5.png"]
 
 
 def test_resolution(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import io
 import json
 from contextlib import redirect_stderr
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -172,6 +173,22 @@ def test_the_time_left_is_the_forecasts(now: list[float], left: float | None, wo
             progress(Report(step, seconds=now[0]))
     assert stream.getvalue().splitlines()[0].endswith(f"2.0 steps/s  {words}")
     assert forecast.seen == list(range(1, 21))
+
+
+def test_a_live_bar_asks_for_the_time_left_once_a_second(now: list[float]) -> None:
+    """A GPU reports a hundred times a second, and a forecast takes as long as some of its steps."""
+    progress, forecast, shown = TrainProgress(1000), Fixed(754.0), []
+    progress.forecast = forecast
+    progress.live = SimpleNamespace(update=lambda _, **changes: shown.append(changes))  # type: ignore[assignment]
+    progress.task = 0  # type: ignore[assignment]
+    for step in range(10, 1001, 10):
+        now[0] += 0.05
+        progress(Report(step, seconds=now[0]))
+    texts = [each["description"] for each in shown if "description" in each]
+    assert len(texts) == 5, "one a second; the fifth is the end's"
+    assert texts[-1].startswith("step 1000/1000")
+    assert texts[-1].endswith("12:34 left")
+    assert [each["completed"] for each in shown if "completed" in each] == list(range(10, 1001, 10))
 
 
 def test_the_first_line_has_a_rate(now: list[float]) -> None:

@@ -84,6 +84,9 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         points: tuple[float, ...] = ()
         start: StartPoints = TrainConfig().start_points
         depth_use: DepthUse = NO_DEPTH
+        unit: float = 1.0
+        extent = 1.0
+        unit_differs = False
 
         @property
         def train_views(self) -> list[FakeView]:
@@ -130,6 +133,7 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         *,
         resolution: int,
         test_every: int,
+        test_most: int,
         masks: MaskUse,
         lenses: str,
         missing: str,

@@ -23,6 +23,7 @@ from clsplat.scenes.thumbnail import REC601_LUMA
 
 Kind = Literal[
     "few steps",
+    "few passes",
     "exposure",
     "scales",
     "masks",
@@ -77,6 +78,9 @@ FEW_STEPS_PER_VIEW = 60
 (docs/decisions/0031-high-rates.md)."""
 SHORT_TRAINING_STEPS = range(1000, 10_001)
 """Numbers of training steps for which high learning rates are recommended. Trainings of 2000 to 7000 were measured."""
+RECOMMENDED_PASSES = 30
+"""Passes through the training photographs that a training needs to learn what each of them shows. With fewer, the
+schedule is stretched; the paper's 30,000 steps are 30 passes through 1000 photographs."""
 BLUR_SHARPNESS_RATIO = 0.72
 """Sharpness, relative to the scene's median, below which a photograph counts as blurred.
 
@@ -126,6 +130,7 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
         _few(scene),
         _some(scene, iterations),
         _few_steps(scene, iterations),
+        _few_passes(scene, iterations),
         _exposure(looked),
         _scales(looked),
         _masks(scene, use),
@@ -253,6 +258,14 @@ def _few_steps(scene: Scene, iterations: int) -> Finding | None:
     each = iterations / count
     text = f"{iterations:,} steps are {each:.1f} per training photograph ({count:,}): higher learning rates are better"
     return Finding("few steps", text)
+
+
+def _few_passes(scene: Scene, iterations: int) -> Finding | None:
+    count = len(scene.train_views)
+    if iterations < SHORT_TRAINING_STEPS.stop or iterations >= RECOMMENDED_PASSES * count:
+        return None
+    text = f"{iterations:,} steps pass {iterations / count:.1f} times through the {count:,} training photographs"
+    return Finding("few passes", text, ({"passes": RECOMMENDED_PASSES},))
 
 
 def _sky(looked: VisiblePoints) -> Finding | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-from clsplat.config.presets import scheduled
+from clsplat.config.presets import by_passes, scheduled
 from clsplat.config.training import TrainConfig
 from clsplat.errors import InputError
 from clsplat.scenes.analysis.photo_findings import Finding, Kind
@@ -37,6 +37,8 @@ SETTINGS_BY_FINDING: Mapping[Kind, Sequence[Mapping[str, Any]]] = {
 }
 """Alternative settings for each kind of finding, best first. The first one compatible with the other settings is used.
 """
+PASSES_SETTING = "passes"
+"""Key of the number of passes in the settings of an answer. It scales the schedule (`config.presets.by_passes`)."""
 SCHEDULED_SETTINGS = ("sh_degree_every", "optimiser", "density.stop", "density.noise_rate")
 """Settings that a schedule changes, except for the number of steps."""
 ADVICE_BY_FINDING: Mapping[Kind, str] = {
@@ -87,11 +89,12 @@ def flags(settings: Mapping[str, Any]) -> str:
 
 
 def answered(
-    found: Sequence[Finding], config: TrainConfig, given: Collection[str] = ()
+    found: Sequence[Finding], config: TrainConfig, given: Collection[str] = (), photographs: int = 0
 ) -> tuple[list[Answer], TrainConfig]:
     """Choose settings for each finding. Returns the answers, and the configuration with all their settings.
 
     given: names of settings that must not change.
+    photographs: number of training photographs, for settings that count passes through them.
     """
     answers = []
     for finding in found:
@@ -101,7 +104,7 @@ def answered(
         taken: Mapping[str, Any] = {}
         for option in free:
             try:
-                config = with_settings(config, option)
+                config = with_settings(config, option, given, photographs)
             except InputError:
                 continue
             taken = option
@@ -118,12 +121,16 @@ def _options(finding: Finding) -> Sequence[Mapping[str, Any]]:
 def _touched(option: Mapping[str, Any], given: Collection[str]) -> str:
     """First setting of `given`, in the order of names, that `option` or its schedule would change; "" for none."""
     names = {*option, *((*SCHEDULED_SETTINGS, "density.start") if SCHEDULE_SETTING in option else ())}
+    names |= {"iterations"} if PASSES_SETTING in option else set()
     return min((name for name in given if name in names or name.partition(".")[0] in names), default="")
 
 
-def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConfig:
+def with_settings(
+    config: TrainConfig, settings: Mapping[str, Any], given: Collection[str] = (), photographs: int = 0
+) -> TrainConfig:
     """Apply the settings of an answer to a configuration.
 
+    given, photographs: as for `answered`.
     Raises InputError if they are incompatible, or if a schedule would override settings that differ from the paper's.
     """
     changes = dict(settings)
@@ -133,16 +140,12 @@ def with_settings(config: TrainConfig, settings: Mapping[str, Any]) -> TrainConf
         if values(config) != values(paper):
             raise InputError(f"--schedule {name}: the run has settings that differ from the paper's schedule")
         changes = dict(zip(SCHEDULED_SETTINGS, values(scheduled(name, config.iterations)), strict=True)) | changes
+    if (passes := changes.pop(PASSES_SETTING, None)) is not None:
+        config = by_passes(config, passes, photographs, given)
     for each, value in changes.items():
-        config = changed(config, each, value)
+        config = config.changed(each, value)
     config.check()
     return config
-
-
-def changed(config: TrainConfig, name: str, value: Any) -> TrainConfig:
-    """Copy of the configuration with one setting changed. A name such as "density.stop" starts with its group."""
-    group, dot, field = name.partition(".")
-    return replace(config, **{group: replace(getattr(config, group), **{field: value}) if dot else value})
 
 
 def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:

@@ -27,10 +27,10 @@ INITIAL_OPACITY = 0.1
 MIN_SQUARED_DISTANCE = 1e-7
 """Lower bound of the mean squared distance, in world units squared. It gives coincident points a size.
 
-This is the 3DGS authors' bound, for scenes whose extent is within ORDINARY_EXTENTS. In other scenes it is scaled by the
-squared ratio of the extent to the nearer end of that range.
+This is the 3DGS authors' bound, for scenes whose length unit is within ORDINARY_UNITS. In other scenes it is scaled by
+the squared ratio of the unit to the nearer end of that range.
 """
-ORDINARY_EXTENTS = (1.0, 100.0)
+ORDINARY_UNITS = (1.0, 100.0)
 MIN_START_COLOUR = 1 / 512
 """Smallest initial value of a colour channel: half a step of an 8-bit image.
 
@@ -64,7 +64,7 @@ def from_scene(scene: Scene, random_count: int, rng: np.random.Generator) -> Gau
     colors: NDArray[Any] = scene.point_colors
     if len(points) == 0:
         points, colors = random_points(random_count, *scene.bounds, rng)
-    return from_points(points, colors, origin=scene.origin, extent=scene.extent, near=scene.near)
+    return from_points(points, colors, origin=scene.origin, length_unit=scene.length_unit, near=scene.near)
 
 
 def from_points(
@@ -72,7 +72,7 @@ def from_points(
     colors: ArrayLike,
     *,
     origin: Float64 | None = None,
-    extent: float = 1.0,
+    length_unit: float = 1.0,
     near: float = DEFAULT_NEAR_PLANE,
 ) -> Gaussians:
     """One Gaussian per point.
@@ -80,7 +80,7 @@ def from_points(
     points: (N, 3), in world units.
     colors: (N, 3) in [0, 1].
     origin: (3,), origin of the means in the world, by default the world's origin.
-    extent: the scene's extent in world units.
+    length_unit: the scene's length unit in world units.
     near: the model's near plane.
 
     The standard deviation is the root of the mean squared distance to the three nearest other points, or to all if
@@ -98,7 +98,7 @@ def from_points(
         raise InputError(f"point {int(np.argmin(np.isfinite(xyz).all(axis=1)))} is not finite")
 
     origin = np.zeros(3) if origin is None else origin
-    log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), squared_floor(extent)))
+    log_scales = 0.5 * np.log(np.maximum(mean_squared_distance(xyz), squared_floor(length_unit)))
     quaternions = np.zeros((count, 4), np.float32)
     quaternions[:, 0] = 1
     sh = ((np.maximum(rgb, MIN_START_COLOUR) - 0.5) / SH_C0).astype(np.float32)[:, None]
@@ -113,10 +113,10 @@ def from_points(
     )
 
 
-def squared_floor(extent: float) -> float:
+def squared_floor(length_unit: float) -> float:
     """Lower bound, in world units squared, of the mean squared distance of a scene's points."""
-    low, high = ORDINARY_EXTENTS
-    return MIN_SQUARED_DISTANCE * (extent / min(max(extent, low), high)) ** 2
+    low, high = ORDINARY_UNITS
+    return MIN_SQUARED_DISTANCE * (length_unit / min(max(length_unit, low), high)) ** 2
 
 
 def mean_squared_distance(points: Float64) -> Float64:

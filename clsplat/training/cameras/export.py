@@ -14,8 +14,8 @@ from clsplat.training.cameras.intrinsics import RefinedLenses
 from clsplat.training.cameras.poses import Poses
 from clsplat.training.cameras.validation_gate import Drift
 
-POSE_WARNING_DEGREES, POSE_WARNING_EXTENTS = 5.0, 0.1
-"""Rotation in degrees, and movement relative to the scene's extent, above which a refined pose causes a warning."""
+POSE_WARNING_DEGREES, POSE_WARNING_UNITS = 5.0, 0.1
+"""Rotation in degrees, and movement relative to the length unit, above which a refined pose causes a warning."""
 LENS_WARNING_FOCAL_LENGTHS = 0.1
 """Change of a lens, in focal lengths, above which it causes a warning."""
 
@@ -33,7 +33,7 @@ def keep_cameras(run: Run, scene: Scene, poses: Poses, lenses: RefinedLenses, al
     images = [(view.name, lenses.refined(view.lens), cameras[view.name]) for view in scene.views]
     write_model(run.refined_path, images, points, scene.point_colors)
     degrees, shifts = poses.motions()
-    far = (degrees > POSE_WARNING_DEGREES) | (shifts > POSE_WARNING_EXTENTS * scene.extent)
+    far = (degrees > POSE_WARNING_DEGREES) | (shifts > POSE_WARNING_UNITS * scene.length_unit)
     if far.any():
         names = [view.name for view, one in zip(scene.train_views, far, strict=True) if one]
         warnings.warn(

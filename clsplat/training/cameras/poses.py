@@ -106,9 +106,9 @@ class Poses:
     and the view farthest from it. Outlier cameras are not chosen.
     """
 
-    def __init__(self, config: TrainConfig, views: Sequence[View], extent: float) -> None:
+    def __init__(self, config: TrainConfig, views: Sequence[View], length_unit: float) -> None:
         self.on, self.cameras = config.refine_poses, [view.camera for view in views]
-        self._config, self._scale = config, np.repeat([1.0, extent], 3)
+        self._config, self._scale = config, np.repeat([1.0, length_unit], 3)
         self._given = list(self.cameras)
         self.held: tuple[int, ...] = ()
         if not self.on:
@@ -136,7 +136,7 @@ class Poses:
 
     def move(self, view: int, step: int, gradient: Float64) -> None:
         """Take Adam's step for a view's pose. A gradient that is not finite causes no step."""
-        by = gradient * self._scale  # translations relative to the extent
+        by = gradient * self._scale  # translations relative to the length unit
         if not np.isfinite(by).all():
             return
         self._visits[view] += 1

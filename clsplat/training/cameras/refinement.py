@@ -100,8 +100,8 @@ class Cameras(Component):
     """
 
     def __init__(self, config: TrainConfig, scene: Scene, work: Workspace | None = None, held_out: int = 0) -> None:
-        views, extent = scene.train_views, scene.extent
-        self.poses, self.lenses = Poses(config, views, extent), RefinedLenses(config, views)
+        views, length_unit = scene.train_views, scene.length_unit
+        self.poses, self.lenses = Poses(config, views, length_unit), RefinedLenses(config, views)
         self.gate = CameraGate(config, held_out)
         self._config, self._scene, self._views, self._work = config, scene, views, work
 
@@ -144,7 +144,7 @@ class Cameras(Component):
     def drift(self) -> Drift | None:
         """Drift of the refined poses from the given ones; None if poses are not refined."""
         given = [view.camera for view in self._views]
-        return drift(given, self.poses.cameras, self._scene.extent) if self.poses.on else None
+        return drift(given, self.poses.cameras, self._scene.length_unit) if self.poses.on else None
 
     def refined_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays of a checkpoint, by name, without the gate's."""

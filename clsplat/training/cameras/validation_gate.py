@@ -76,16 +76,16 @@ class Drift:
         return moved
 
 
-def drift(given: Sequence[Camera], refined: Sequence[Camera], extent: float) -> Drift:
+def drift(given: Sequence[Camera], refined: Sequence[Camera], length_unit: float) -> Drift:
     """Similarity transform that best maps the n given poses to the n refined poses.
 
-    A camera's residual is the root of (angle^2 + (distance/extent)^2), with the angle in radians. Squared residuals
-    have Huber weights with the median residual as the bound, so that a few outliers have little influence. The rotation
-    fits positions and axes together (Kabsch 1976), as cameras may lie on a line or in one point. The scale is Umeyama's
-    (1991), from the positions.
+    A camera's residual is the root of (angle^2 + (distance/length_unit)^2), with the angle in radians. Squared
+    residuals have Huber weights with the median residual as the bound, so that a few outliers have little influence.
+    The rotation fits positions and axes together (Kabsch 1976), as cameras may lie on a line or in one point. The scale
+    is Umeyama's (1991), from the positions.
     """
     old, new = (np.array([camera.rotation for camera in cameras]) for cameras in (given, refined))
-    at, to = (np.array([camera.position for camera in cameras]) / extent for cameras in (given, refined))
+    at, to = (np.array([camera.position for camera in cameras]) / length_unit for cameras in (given, refined))
     turns, weights = new.transpose(0, 2, 1) @ old, np.ones(len(old))
     for _ in range(DRIFT_ITERATIONS):
         parts = weights / weights.sum()
@@ -100,7 +100,7 @@ def drift(given: Sequence[Camera], refined: Sequence[Camera], extent: float) -> 
         residuals = np.sqrt(angles + np.square(b - scale * turned).sum(axis=1))
         bound = max(float(np.median(residuals)), MIN_DRIFT_RESIDUAL)
         weights = bound / np.maximum(residuals, bound)
-    return Drift(scale, rotation, extent * (to_middle - scale * rotation @ from_middle))
+    return Drift(scale, rotation, length_unit * (to_middle - scale * rotation @ from_middle))
 
 
 class CameraGate:

@@ -89,7 +89,7 @@ def plan(config: DensityConfig, model: ModelState) -> RowPlan:
     Retained Gaussians come first, in order. Clones and halves are fresh.
     """
     # Each rule compares like NumPy: a float32 array with a Python number, in float32.
-    too_large, dense = config.max_world_fraction * model.extent, config.dense_fraction * model.extent
+    too_large, dense = config.max_world_fraction * model.length_unit, config.dense_fraction * model.length_unit
     shrinks = 1 / LONG_AXIS_HALF_RATIO if config.long_axis else config.split_factor
     rules = replace(
         _pruning(config, model),

@@ -21,7 +21,7 @@ from clsplat.training.step.component import Component
 from clsplat.training.step.inputs import ViewInputs
 
 MAX_TARGET_NEARNESS = 1e6
-"""Exclusive upper limit of inverse depth times the scene's extent. Depths nearer than that come from damaged maps."""
+"""Exclusive upper limit of inverse depth times the length unit. Depths nearer than that come from damaged maps."""
 
 
 def weight_at(config: TrainConfig, step: int) -> float:
@@ -40,11 +40,17 @@ class DepthTargets(Component):
         self,
         config: TrainConfig,
         views: list[View],
-        extent: float,
+        length_unit: float,
         near: float = DEFAULT_NEAR_PLANE,
         pixels: Callable[[int], NDArray[Any]] | None = None,
     ) -> None:
-        self._config, self._views, self._extent, self._near, self._pixels = config, views, extent, near, pixels
+        self._config, self._views, self._length_unit, self._near, self._pixels = (
+            config,
+            views,
+            length_unit,
+            near,
+            pixels,
+        )
         self._held: dict[int, tuple[tuple[int, int], tuple[NDArray[np.int64], Float32, Float32]]] = {}
 
     @property
@@ -76,7 +82,7 @@ class DepthTargets(Component):
         planes[0][at] = nearness if of_distances is None else nearness * of_distances[at]
         planes[1][at] = weights
         total = float(weights.sum(dtype=np.float64))
-        factor = weight_at(self._config, step) * self._extent / total if total > 0 else 0.0
+        factor = weight_at(self._config, step) * self._length_unit / total if total > 0 else 0.0
         return DepthTerm(planes, factor)
 
     def _known(
@@ -87,7 +93,7 @@ class DepthTargets(Component):
             of, nothing = self._views[view], np.empty(0, np.float32)
             found = None if of.depth is None else of.depth.at(of.camera.resized(*size).before(self._near), of.lens)
             pixels, nearness, weights = found or (np.empty(0, np.int64), nothing, nothing)
-            counts = nearness * self._extent < MAX_TARGET_NEARNESS
+            counts = nearness * self._length_unit < MAX_TARGET_NEARNESS
             if photograph is not None and photograph.shape[2] == 5:
                 counts &= photograph[:, :, 4].ravel()[pixels] > 0
             held = self._held[view] = size, (pixels[counts], nearness[counts], weights[counts])

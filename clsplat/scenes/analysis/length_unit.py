@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The length in which training counts learning rates and sizes, from what the photographs look at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from clsplat.arrays import Float64
+from clsplat.scenes.dataset import nearest_around, pixels_of
+from clsplat.scenes.photo_names import match
+from clsplat.scenes.readers import colmap
+from clsplat.scenes.scene import Scene, View
+
+DEPTH_TO_UNIT = 1.1
+"""The unit, as a multiple of the median depth. The extent is the same multiple of the cameras' distance from their
+middle, so that both agree where cameras surround a small object."""
+MAX_UNIT_PER_EXTENT = 0.25
+"""The unit is used only if it is less than this fraction of the extent.
+
+For a scene that cameras surround, depths are about as large as the extent. Such a scene keeps the authors' unit.
+"""
+NEAR_PER_EXTENT = 1e-6
+"""Depth of the nearest points that count, as a fraction of the extent."""
+MAX_SAMPLED_VIEWS = 200
+"""Maximum number of photographs whose points are looked at, spread evenly over the training photographs."""
+MAX_SAMPLED_POINTS = 100_000
+"""Maximum number of a scene's points that are projected, if it is not known which photographs show them."""
+POINTS_PER_DEPTH_CELL = 16
+"""Mean number of projected points in a cell of a picture. Only the nearest point of a cell counts as shown."""
+
+
+def length_unit_of(scene: Scene) -> float:
+    """Length in world units: the extent, or 1.1 times the median depth where that is under a quarter of it.
+
+    The depth is the median over the training photographs of the median depth of the points that they show. These are
+    the points of a COLMAP model's tracks. Without tracks, each cell of a picture shows its nearest point.
+    """
+    medians = [float(np.median(depths)) for depths in _depths(scene) if len(depths)]
+    unit = DEPTH_TO_UNIT * float(np.median(medians)) if medians else np.inf
+    return unit if 0 < unit < MAX_UNIT_PER_EXTENT * scene.extent else scene.extent
+
+
+def _depths(scene: Scene) -> Iterator[Float64]:
+    """Depths (k,) of the points that each of the sampled photographs shows."""
+    views = scene.train_views
+    views = views[:: max(-(-len(views) // MAX_SAMPLED_VIEWS), 1)]
+    tracked = _tracked(scene, views)
+    points = scene.points[:: max(-(-len(scene.points) // MAX_SAMPLED_POINTS), 1)]
+    for view in views:
+        if tracked:
+            depths = view.camera.depths_of(tracked.get(view.name, np.empty((0, 3))))
+            yield depths[depths > 0]
+        elif len(points):
+            yield _nearest(points, view, NEAR_PER_EXTENT * scene.extent)
+
+
+def _tracked(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
+    """Points (k, 3) of the tracks of each view, by its name; empty without a COLMAP model or without tracks."""
+    model = None if scene.source is None else colmap.find_model(scene.source)
+    if model is None or not len(scene.points):
+        return {}
+    tracks = colmap.read_tracks(model)
+    tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
+    names = match([view.name for view in views], tracked).names
+    return {name: tracks.points[tracked[theirs]] for name, theirs in names.items()}
+
+
+def _nearest(points: Float64, view: View, near: float) -> Float64:
+    """Depth of the nearest of the points (N, 3) in each occupied cell of the view's picture.
+
+    near: depth from which points count, if the camera has no near plane of its own.
+    """
+    camera = view.camera.before(near)
+    rows, columns, inside = pixels_of(points, camera, view.lens)
+    depths = camera.depths_of(points[inside])
+    cell = max(float(np.sqrt(POINTS_PER_DEPTH_CELL * camera.width * camera.height / max(len(depths), 1))), 1.0)
+    nearest: Float64 = depths[depths == nearest_around(rows, columns, depths, cell)]
+    return nearest

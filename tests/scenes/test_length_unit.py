@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The length that rates and sizes are relative to: what photographs look at, not how far apart they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny import DISTANCE, short, write_scene
+
+from clsplat.api import train
+from clsplat.device.context import Device
+from clsplat.runs import scene_record
+from clsplat.runs.run import Run
+from clsplat.scenes.analysis.length_unit import DEPTH_TO_UNIT, length_unit_of
+from clsplat.scenes.loading import load_scene
+from clsplat.scenes.readers.colmap import Tracks
+from clsplat.scenes.scene import Scene
+from clsplat.training.preparation import prepared
+from clsplat.training.trainer import Trainer
+
+STREET = 40.0
+"""Length of a street of cameras, in distances of what they look at."""
+
+
+def street(folder: Path, *, factor: float = 1.0) -> Scene:
+    """Copies of the tiny scene in a row, each with its own photographs and points."""
+    one = load_scene(write_scene(folder), test_every=0)
+    views, points = [], []
+    for index, offset in enumerate(np.linspace(0, STREET * DISTANCE, 5)):
+        place = np.array([offset, 0, 0])
+        for view in one.views:
+            camera = view.camera
+            moved = replace(camera, translation=factor * (camera.translation - camera.rotation @ place))
+            views.append(replace(view, name=f"{index}/{view.name}", camera=moved))
+        points.append(factor * (one.points + place))
+    colours = np.tile(one.point_colors, (5, 1))
+    return Scene("street", views, np.concatenate(points), colours, one.bounds)  # without a source: no tracks
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+def test_the_unit_of_a_street_is_the_depth_of_its_photographs(factor: float, tmp_path: Path) -> None:
+    scene = street(tmp_path / "scene", factor=factor)
+    unit = length_unit_of(scene)
+    assert scene.extent > 10 * DISTANCE * factor
+    # the nearest point of a cell is up to the radius of 1 before the middle
+    assert DEPTH_TO_UNIT * (DISTANCE - 1) * factor < unit < DEPTH_TO_UNIT * (DISTANCE + 1) * factor
+
+
+def test_a_scene_that_cameras_surround_keeps_the_extent(tmp_path: Path) -> None:
+    scene = load_scene(write_scene(tmp_path / "scene"))
+    assert length_unit_of(scene) == scene.extent == scene.length_unit
+    assert prepared(scene, short()).length_unit == scene.extent
+
+
+def test_a_scene_without_points_keeps_the_extent(tmp_path: Path) -> None:
+    scene = street(tmp_path / "scene")
+    assert length_unit_of(replace(scene, points=np.empty((0, 3)), point_colors=np.empty((0, 3)))) == scene.extent
+
+
+def test_tracks_tell_what_a_photograph_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points behind a wall are in the frame, but not in the photograph."""
+    scene = replace(street(tmp_path / "scene"), source=tmp_path / "scene")
+    view = scene.train_views[0]
+    shown = view.camera.position + np.array([[1.0], [2.0], [3.0]]) * view.camera.rotation[2]
+    tracks = Tracks(shown, np.zeros(3), {view.name: np.arange(3)})
+    monkeypatch.setattr("clsplat.scenes.readers.colmap.read_tracks", lambda _: tracks)
+    assert length_unit_of(scene) == pytest.approx(DEPTH_TO_UNIT * 2)
+
+
+def test_rates_and_sizes_count_in_the_unit(tmp_path: Path, default_device: Device) -> None:
+    scene = prepared(street(tmp_path / "scene"), short())
+    trainer = Trainer(scene, short(), default_device)
+    plain = Trainer(replace(scene, unit=None), short(), default_device)
+    ratio = scene.length_unit / scene.extent
+    assert ratio < 0.25
+    assert trainer.rates()["means"] == pytest.approx(ratio * plain.rates()["means"])
+    assert trainer._state().length_unit == scene.length_unit
+    assert trainer.near == scene.near
+
+
+def test_a_run_keeps_its_unit(tmp_path: Path, default_device: Device) -> None:
+    scene, config = street(tmp_path / "scene"), short(iterations=2)
+    run = Run.create(tmp_path / "run", config, scene=tmp_path / "scene")
+    train(scene, config, device=default_device, run=run)
+    unit = prepared(scene, config).length_unit
+    assert (scene_record.read(run) or {})["length_unit"] == unit
+    assert prepared(scene, config, run).length_unit == unit
+
+
+def test_a_run_of_an_earlier_version_keeps_the_extent(tmp_path: Path, default_device: Device) -> None:
+    scene, config = street(tmp_path / "scene"), short(iterations=2)
+    run = Run.create(tmp_path / "run", config, scene=tmp_path / "scene")
+    scene_record.write(run, scene)  # before its unit is known, as those versions did
+    assert "length_unit" not in (scene_record.read(run) or {})
+    assert prepared(scene, config, run).length_unit == scene.extent
+    train(scene, config, device=default_device, run=run, resume=True)
+    assert "length_unit" not in (scene_record.read(run) or {})
