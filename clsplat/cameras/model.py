@@ -206,7 +206,7 @@ class CameraModel:
         seen = (z > view.near) & ((ratios > low) & (ratios < high)).all(axis=1)
         return np.where(seen, z / max(view.fx, view.fy), np.inf)
 
-    # Methods for models without RAYS, which draw Gaussians on an image plane.
+    # Methods for models that draw Gaussians on an image plane: those without the define RAYS.
 
     def divisors(self, z: Float64) -> Float64:
         """Numbers (N,) by which x and y are divided in the projection, for points of depth z (N,)."""

@@ -48,7 +48,7 @@ class RasterizerConfig:
         check_rules(self, "--rasterizer.", rules)
 
     def switches(self) -> BenchSwitches:
-        """All settings that the rasterizer reads. Switches that this configuration lacks are on."""
+        """This configuration with the switches of measurements added, which are on."""
         return BenchSwitches(**vars(self))
 
 

@@ -8,8 +8,8 @@ The scene is diffuse, apart from a mild highlight on the two balls.
 Its light (sun with soft shadows, sky) is therefore baked into one texture per object.
 A photo needs only the nearest hit and a texture look-up for each ray.
 
-In the world, z is up and units are metres. It is a paved floor inside a round wall that hides the sky from all photos.
-The sky would have no initial points, and training might put Gaussians for it in front of another camera.
+In the world, z is up and units are metres. The scene is a paved floor inside a round wall. The wall hides the sky, for
+which there would be no initial points: training might place its Gaussians in front of another camera.
 """
 
 from __future__ import annotations

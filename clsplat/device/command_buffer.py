@@ -88,7 +88,7 @@ class CommandBuffer:
         self._described.append(("a fill", *description))
 
     def add_read(self, read: Callable[[], Any], *description: object) -> None:
-        """Append a copy to the host."""
+        """Record a copy from the device to the host."""
         self.entries.append((None, read))
         self.reads.append(read)
         self._described.append(("a copy to the host", *description))

@@ -98,7 +98,7 @@ def check_codec(path: str, config: VideoConfig, channels: Collection[str]) -> No
             value = getattr(config, name)
             raise InputError(f"--video.{name} {value}: is for H.264, expected the name of an .mp4, not {path}")
     if "alpha" in channels and config.prores != "4444":
-        raise InputError(f"{path}: ProRes {config.prores} cannot hold alpha, expected --video.prores 4444 with it")
+        raise InputError(f"{path}: ProRes {config.prores} cannot hold alpha, expected --video.prores 4444")
 
 
 def check_size(path: Path, width: int, height: int) -> None:

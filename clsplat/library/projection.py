@@ -331,7 +331,7 @@ def check_given(covars: object, quaternions: object, scales: object) -> None:
     """Raise InputError unless there are either covars, or quaternions and scales. It names the argument."""
     if covars is None and (quaternions is None or scales is None):
         missing = "quaternions" if quaternions is None else "scales"
-        raise InputError(f"{missing} is None, expected an array, as covars is None too")
+        raise InputError(f"{missing} is None, expected an array unless covars is given")
     if covars is not None and (quaternions is not None or scales is not None):
         raise InputError("covars: expected either covars, or quaternions and scales, not both")
 

@@ -34,7 +34,7 @@ class PassWorkspace(Workspace):
     def array(
         self, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32, *, kept: bool = False
     ) -> DeviceArray:
-        """An array by its name, as in any workspace."""
+        """An array by its name. Those of BACKWARD_ARRAY_NAMES are this workspace's own; others are the scratch's."""
         if name in BACKWARD_ARRAY_NAMES:
             return super().array(name, shape, dtype, kept=kept)
         return self._scratch.array(name, shape, dtype, kept=kept)

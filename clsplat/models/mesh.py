@@ -103,7 +103,9 @@ def _of_obj(path: Path) -> Float64:
             except ValueError:
                 ragged = True
             if ragged:
-                raise InputError(f"{path}: line {number} is {line[:40]!r}, expected numbers after its letter")
+                raise InputError(
+                    f"{path}: line {number} is {str(line[:40])[1:]}, expected numbers after the letter v or f"
+                )
             _check_counts(path, len(points), max(count, len(polygons)))
     return _fans(path, np.array(points, np.float64).reshape(-1, 3), polygons)
 

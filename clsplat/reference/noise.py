@@ -52,6 +52,6 @@ def penalty(explore: Exploration, log_scales: Float64, opacity_logits: Float64) 
 
 
 def penalty_grad(explore: Exploration, log_scales: Float64, opacity_logits: Float64) -> tuple[Float64, Float64]:
-    """Eq. (91): gradients of log scales (n, 3) and opacity logits (n,)."""
+    """Gradients of the penalties by log scales (n, 3) and opacity logits (n,): eq. (91)."""
     opacities = 1 / (1 + np.exp(-opacity_logits))
     return explore.scale * np.exp(log_scales), explore.opacity * opacities * (1 - opacities)

@@ -106,7 +106,7 @@ class ProjectedTwin(Seen):
         return found
 
     def footprint(self, gaussian: int, width: int, height: int) -> Footprint | None:
-        """Eqs. (9), (14) on the box in which alpha can reach 1/255."""
+        """Footprint of a Gaussian: the box in which its alpha can reach 1/255, by Eqs. (9) and (14)."""
         opacity = self.opacities[gaussian]
         reach = 2 * np.log(opacity / ALPHA_MIN) + BOX_SLACK
         half = np.sqrt(reach * self.covariances[gaussian, [0, 2]])

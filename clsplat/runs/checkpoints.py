@@ -119,7 +119,7 @@ def read_checkpoint(path: Path, expected: int | None = None) -> Checkpoint:
             if digest_of(array) != digests[name]:
                 raise ValueError(f"{name} has changed since it was written: its sha256 differs")
     if expected is not None and step != expected:
-        raise ValueError(f"it is of step {step}")
+        raise ValueError(f"it contains step {step}, but its name says step {expected}")
     return Checkpoint(step, arrays, state)
 
 

@@ -118,8 +118,10 @@ def owned(
 
 
 def _series(names: Iterable[str]) -> dict[int, str]:
-    """Name for each number at the end of a name, before extensions. Empty unless there are several names, which differ
-    only in this number."""
+    """Names by the number at their end, without extensions.
+
+    Empty unless there are at least two names, and they differ only in this number.
+    """
     texts, numbers = set(), {}
     names = sorted(names)
     for name in names:

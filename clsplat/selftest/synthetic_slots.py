@@ -31,7 +31,7 @@ def slot_sums(bench: CaseBench, slots: Array) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class MadeUpSlots:
-    """Slots, and their sums (n, 9) by Gaussian in float64."""
+    """Synthetic gradients, one slot for each pair, and their float64 sums (n, 9) for each Gaussian."""
 
     slots: Slots
     sums: Float64

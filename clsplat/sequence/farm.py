@@ -146,7 +146,7 @@ def render_on_farm(
         results = _results(client, placed, job, video)
         for record in encoded(placed, results, video):
             on_done(replace(record, path=names[record.key]))
-    # A worker killed while writing has left a temporary file; no worker writes any more.
+    # A worker that was killed while writing may have left a temporary file. No worker writes now.
     remove_temporaries(tasks)
 
 

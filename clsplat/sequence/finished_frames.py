@@ -100,8 +100,8 @@ def frames_there(tasks: Sequence[Task], options: RenderOptions, video: VideoConf
     states = dict(zip(tasks, _at_once(tasks, lambda task: _state(task, options)), strict=True))
     if untold := [task.path for task, state in states.items() if state == "untold"]:
         warn(
-            f"--skip-existing: {len(untold)} of the frames that are there do not say how they were made, such as "
-            f"{untold[0]}: they are kept, whatever their cameras, precision and other settings are"
+            f"--skip-existing: {len(untold)} existing frames have no record of their settings, such as {untold[0]}; "
+            "they are kept unchecked"
         )
     if changed := [task.path for task, state in states.items() if state == "changed"]:
         warn(

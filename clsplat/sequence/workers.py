@@ -168,7 +168,7 @@ def run_tasks(
             devices.submit(render, renderer).add_done_callback(tell_failure)
         for record in encoded(tasks, (finished.get().result() for _ in tasks), video):
             if video is not None:
-                room.release()  # frames are handed out in order, so that the next one always has room
+                room.release()  # frames begin in order, so that the frame the video waits for has had room
             on_done(record)
     except KeyboardInterrupt:
         abandon()  # a thread may wait for a driver that hangs

@@ -45,7 +45,7 @@ class Moments:
             if camera.projection != cameras[0].projection:
                 raise InputError(
                     f"an open shutter: the camera is {cameras[0].projection} {rising[0]:g} frames from the frame and "
-                    f"{camera.projection} {time:g} frames from it, expected one camera"
+                    f"{camera.projection} {time:g} frames from it, expected one projection"
                 )
         return cls(cameras[0], rising, np.array([_values(camera) for camera in cameras]))
 
@@ -173,7 +173,8 @@ def stretches(
         kinds = [f"{shown.width}x{shown.height} {shown.projection}" for shown in (before, camera)]
         if kinds[0] != kinds[1]:
             raise InputError(
-                f"an open shutter: frame {earlier} is {kinds[0]} and frame {number} {kinds[1]}, expected one camera"
+                f"an open shutter: frame {earlier} is {kinds[0]} and frame {number} {kinds[1]}, expected one size and "
+                "projection"
             )
     first, second = frames[0][1], resize(camera_after(shot, 0))
     for _ in range(ceil(max(-opens, 0)) + NEIGHBOUR_FRAMES):

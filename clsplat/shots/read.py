@@ -138,7 +138,9 @@ def photographed(path: Path, size: tuple[int | None, int | None] = (None, None))
     elif path.suffix.lower() == ".json" and "frames" in _parsed(path):
         images = transforms.read_images(path, _both(size))
     if images is None:
-        raise InputError(f"{path}: has no lenses of photographs, expected a COLMAP model's folder or a transforms.json")
+        raise InputError(
+            f"{path}: describes no photographs with lenses, expected a COLMAP model's folder or a transforms.json"
+        )
     if wrong := [image.name for image in images if image.lens.is_panorama]:
         raise InputError(f"{path}: {examples(wrong)} are panoramas, which cannot be warped from a pinhole picture")
     cameras_of(images)  # warns about implausible cameras

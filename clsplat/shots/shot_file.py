@@ -249,7 +249,7 @@ def _volumes(reader: Keys) -> Iterator[Volume]:
         name = _text(volume, "name")
         kinds = [kind for kind in VOLUME_KINDS if kind in entry]
         if len(kinds) != 1:
-            raise InputError(f"{volume.where}: expected a 'box', a 'sphere' or a 'mesh', and one of them only")
+            raise InputError(f"{volume.where}: expected exactly one of 'box', 'sphere' and 'mesh'")
         (kind,) = kinds
         if kind == "mesh":
             yield Volume(name, mesh=read_mesh(reader.path.parent / _text(volume, "mesh")))

@@ -37,7 +37,9 @@ def _widest_digit(device: Device, n: int) -> int:
 def scratch_bytes(device: Device, n: int) -> int:
     """Upper bound of the scratch bytes for sorts and scans of up to `n` elements, except for the named arrays."""
     groups = max(chunking(device, n, device.shape.sort_items)[0], device.shape.chunks)
-    return 4 * (1 << _widest_digit(device, n)) * (groups + 1) + 8 * groups  # histograms, totals; sums of scans
+    return (
+        4 * (1 << _widest_digit(device, n)) * (groups + 1) + 8 * groups
+    )  # histograms and totals, then the scans' sums
 
 
 def radix_sort(

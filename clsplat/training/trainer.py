@@ -366,9 +366,10 @@ class Trainer:
         self.mark = _Mark(self.step - begun, self.rng.bit_generator.state, list(self.queue), self.controlled)
 
     def step_back(self) -> bool:
-        """After an error, restore the state before the current step, or after its density control.
+        """After an error, return to the last point at which a checkpoint was possible.
 
-        Returns False if that is impossible.
+        That is before the current step or, once its density control is done, after that. Returns False if the state
+        there is lost.
         """
         mark = self.mark
         if mark is None:

@@ -132,7 +132,9 @@ def wide_enough(fov: float, aspect: float, width: int, height: int) -> float:
 
 
 def start_of(cameras: Sequence[Camera], points: Float64) -> Start:
-    """Start at the first camera that is no outlier. It orbits a point at the depth of the cameras' common focus.
+    """The viewer's start: the pose of the first camera that is no outlier.
+
+    The view orbits a point at the depth of the cameras' common focus.
 
     Without cameras, the start is in front of the points (N, 3), with y down, looking along z as in a COLMAP scene.
     All vectors are in world coordinates.

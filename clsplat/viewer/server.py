@@ -126,7 +126,7 @@ class Server:
             async def moved(camera: Any) -> None:
                 nonlocal fov, before
                 size = (camera.image_width, camera.image_height)
-                # if the page is resized, adapt the start's field of view; keep that of a camera that the user clicked
+                # a resize refits the start's field of view, but not that of a camera that the user clicked
                 if size != before and min(size) > 0 and math.isclose(camera.fov, fov, rel_tol=1e-6):
                     fov = camera.fov = start.fov_on(*size)
                 before = size

@@ -211,7 +211,7 @@ def test_counts(default_device: Device, count: int) -> None:
         ("viewmats", np.eye(4)[:3], r"viewmats: got shape \(3, 4\), expected \(C, 4, 4\)"),
         ("backgrounds", np.zeros(4), r"backgrounds: got shape \(4,\), expected \(2, 3\)"),
         ("means", None, "means is None, expected an array"),
-        ("scales", None, "scales is None, expected an array, as covars is None too"),
+        ("scales", None, "scales is None, expected an array unless covars is given"),
         ("covars", np.zeros((65, 6)), "covars: expected either covars, or quaternions and scales"),
         ("colors", np.zeros((65, 0)), "colors has 0 channels, expected 1 or more"),
         ("render_mode", "depth", "render_mode is 'depth', expected one of RGB, D"),

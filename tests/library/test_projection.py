@@ -162,7 +162,7 @@ def test_no_gaussians_and_no_cameras(default_device: Device) -> None:
         ({"means": np.full((400, 3), np.nan)}, r"means: \[0, 0\] is nan, expected finite numbers"),
         ({"means": np.full((400, 3), 1e300)}, r"means: \[0, 0\] is 1e\+300, expected finite numbers"),
         ({"means": [["a"] * 3] * 400}, "means: got <U1, expected an array of real numbers"),
-        ({"quaternions": None}, "quaternions is None, expected an array, as covars is None too"),
+        ({"quaternions": None}, "quaternions is None, expected an array unless covars is given"),
         ({"scales": np.zeros((7, 3))}, r"scales: got shape \(7, 3\), expected \(400, 3\)"),
         ({"covars": np.zeros((400, 6))}, "covars: expected either covars, or quaternions and scales"),
         ({"viewmats": np.eye(4)}, r"intrinsics: got shape \(3, 3, 3\), expected \(1, 3, 3\) or \(3, 3\)"),

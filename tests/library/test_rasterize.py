@@ -314,7 +314,7 @@ def test_absolute_gradients(default_device: Device) -> None:
         ({"means": np.zeros((12, 2))}, "means: got shape (12, 2), expected (N, 3)"),
         ({"means": np.full((12, 3), np.nan)}, "means: [0, 0] is nan, expected finite numbers within float32"),
         ({"quaternions": np.zeros((11, 4))}, "quaternions: got shape (11, 4), expected (12, 4)"),
-        ({"quaternions": None}, "quaternions is None, expected an array, as covars is None too"),
+        ({"quaternions": None}, "quaternions is None, expected an array unless covars is given"),
         ({"covars": np.zeros((12, 6))}, "covars: expected either covars, or quaternions and scales"),
         ({"scales": "wide"}, "scales: got <U4, expected an array of real numbers"),
         ({"opacities": np.full(12, np.inf)}, "opacities: [0] is inf, expected finite numbers within float32"),

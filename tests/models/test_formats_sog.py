@@ -280,7 +280,7 @@ def test_one_number_is_called_so(tmp_path: Path) -> None:
     sog.write(tmp_path / "meta.json", lopsided(100, degree=2))
     as_version_1(tmp_path)
     for given, said in (
-        (["x"], "mins of shN in meta.json has other values than numbers, expected a number"),
+        (["x"], "mins of shN in meta.json is no list of numbers, expected a finite number"),
         ([1, 2], "mins of shN in meta.json has 2 numbers, expected 1"),
     ):
         change(tmp_path, lambda meta, given=given: meta["shN"].update(mins=given))
@@ -338,7 +338,7 @@ NULLS: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "missing": (lambda meta: meta["scales"].pop("codebook"), r"scales in meta\.json has no codebook"),
     "words": (
         lambda meta: meta["shN"].update(codebook=["x", None]),
-        r"codebook of shN in meta\.json has other values than numbers, expected 1 to 256",
+        r"codebook of shN in meta\.json is no list of numbers, expected 1 to 256 finite numbers",
     ),
     "too many": (
         lambda meta: meta["means"].update(maxs=[1.0] * 4),

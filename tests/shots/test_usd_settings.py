@@ -165,8 +165,8 @@ def test_what_is_not_applied_is_one_warning(tmp_path: Path) -> None:
         ("", "float pixelAspectRatio = 0", "/Render: pixelAspectRatio is 0.0, expected a number above 0"),
         ("", "float pixelAspectRatio = nan", "/Render: pixelAspectRatio is nan, expected a number above 0"),
         ("", 'token aspectRatioConformPolicy = "fit"', "/Render: aspectRatioConformPolicy is fit, expected one of exp"),
-        ("", "float4 dataWindowNDC = (1, 0, 0, 1)", "/Render: dataWindowNDC is (1, 0, 0, 1), expected left below"),
-        ("", "float4 dataWindowNDC = (0, 0, inf, 1)", "/Render: dataWindowNDC is (0, 0, inf, 1), expected left b"),
+        ("", "float4 dataWindowNDC = (1, 0, 0, 1)", "/Render: dataWindowNDC is (1, 0, 0, 1), expected left <"),
+        ("", "float4 dataWindowNDC = (0, 0, inf, 1)", "/Render: dataWindowNDC is (0, 0, inf, 1), expected left <"),
     ],
 )
 def test_values_that_cannot_be(tmp_path: Path, camera: str, settings: str, message: str) -> None:

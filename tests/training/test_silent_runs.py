@@ -108,7 +108,10 @@ def test_a_checkpoint_of_more_coefficients_is_named(scene_folder: Path, run: Pat
 def test_a_checkpoint_under_another_name_is_passed_over(run: Path) -> None:
     latest = run / "checkpoints" / "step-0000003.npz"
     latest.rename(latest.with_name("step-0000900.npz"))
-    with pytest.warns(UserWarning, match="it is of step 3"), pytest.raises(InputError, match="no intact checkpoint"):
+    with (
+        pytest.warns(UserWarning, match="it contains step 3, but its name says step"),
+        pytest.raises(InputError, match="no intact checkpoint"),
+    ):
         Run.open(run).load_latest_checkpoint()
 
 

@@ -6,8 +6,8 @@ python tools/ci/gsplat_programs.py --programs DIR        # has a checkout of eac
 
 Each program's own model, loss and loop run; the few lines below give it Gaussians and cameras. In its sources `cuda` is
 replaced by `cpu`. Modules that it imports but does not call here (file readers, viewers, other CUDA rasterizers) may be
-missing; GsplatLoc calls kornia and small_gicp. Prints the commit, and the first and last loss. The exit status is 1 if a
-program fails or its loss does not fall.
+missing; GsplatLoc calls kornia and small_gicp. Prints the commit, and the first and last loss. The exit status is 1 if
+a program fails or its loss does not fall.
 """
 
 from __future__ import annotations

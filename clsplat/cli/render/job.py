@@ -194,6 +194,6 @@ def check_warps(tasks: Sequence[Task], pictures: PictureConfig) -> None:
         number, part = max(empty.items(), key=lambda item: item[1])
         advice = "" if pictures.warp.stmap else "; --lenses native renders fisheyes without a straight picture"
         warn(
-            f"{flag}: {100 * part:.0f} % of frame {number} have no place in the straight picture, or one more than a "
-            f"frame beyond its edges; they stay black and transparent{advice}"
+            f"{flag}: {100 * part:.0f} % of frame {number} stays black and transparent: its pixels lie more than a "
+            f"frame's size beyond the straight picture, or have no place in it{advice}"
         )

@@ -114,7 +114,7 @@ class PlyHeader:
         return self.elements[: self.elements.index(self.vertex)]
 
     def start(self, index: int) -> int:
-        """Byte offset in a binary file of the element at this index, or of the end after the last one."""
+        """Byte offset of an element in a binary file; the offset of the end for the index after the last one."""
         return self.size + sum(element.count * element.row_bytes for element in self.elements[:index])
 
     def row_type(self, element: Element) -> np.dtype[Any]:

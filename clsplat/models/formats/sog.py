@@ -229,8 +229,8 @@ class _Meta:
         null = -np.inf if section == "scales" else np.nan
         array = numbers([null if empty else number for empty, number in zip(nulls, value, strict=True)])
         if array.shape != (len(value),) or not np.isfinite(array[~np.array(nulls)]).all():
-            expected = "a number" if count == "1" else f"{count} of them"
-            raise InputError(f"{where} has other values than numbers, expected {expected}")
+            expected = "a finite number" if count == "1" else f"{count} finite numbers"
+            raise InputError(f"{where} is no list of numbers, expected {expected}")
         return array
 
     def picture(self, section: str, index: int, channels: int, *, least: int | None = None) -> Bytes:

@@ -138,7 +138,9 @@ def with_settings(
     if (name := changes.pop(SCHEDULE_SETTING, None)) is not None:
         paper, values = scheduled("paper", config.iterations), attrgetter(*SCHEDULED_SETTINGS)
         if values(config) != values(paper):
-            raise InputError(f"--schedule {name}: the run has settings that differ from the paper's schedule")
+            raise InputError(
+                f"--schedule {name}: would override settings that are not the paper's, expected one or the other"
+            )
         changes = dict(zip(SCHEDULED_SETTINGS, values(scheduled(name, config.iterations)), strict=True)) | changes
     if (passes := changes.pop(PASSES_SETTING, None)) is not None:
         config = by_passes(config, passes, photographs, given)

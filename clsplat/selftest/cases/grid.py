@@ -70,7 +70,11 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
     seen, terms = reference.apply(image, own), reference.apply(np.abs(image), np.abs(own))
     by_image, by_grid = reference.gradient(image, own, by_seen)
     by_grid += given.weight * reference.variation_gradient(own)
-    step = (got["by grid"].astype(np.float64), given.visit, given.rate)  # so that no error counts twice
+    step = (
+        got["by grid"].astype(np.float64),
+        given.visit,
+        given.rate,
+    )  # the kernel's gradient, whose error is checked too
     got |= {f"{name} of another": got[name][0] for name in ("first", "second")}
     held[at], first[at], second[at] = reference.step(own, first[at], second[at], *step)
     level = image @ reference.LUMINANCE_WEIGHTS * (GRID_SHAPE[0] - 1)

@@ -98,7 +98,7 @@ def _channels(bench: CaseBench) -> StageOutcome:
     wanted = reference_channels.channels(splats, bench.frozen.gaussians, camera, _after(camera))
     means, whole = (cropped(planes, camera) for planes in outcome.arrays)
     sure = clear & (wanted.doubt > MIN_TRANSMITTANCE_MARGIN)
-    # a sum that cancels, as normals may at low opacity, has no accurate digits
+    # at low opacity normals may cancel in the sum, and no digit of it is accurate
     solid = sure & (frame.transmittance < 0.5)
     parts = {
         name: (means[solid, at : at + FEATURE_WIDTHS[name]], getattr(wanted, name).reshape(*solid.shape, -1)[solid])

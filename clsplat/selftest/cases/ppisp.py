@@ -65,7 +65,7 @@ def _random(rng: Generator, size: tuple[int, int]) -> Inputs:
 
 
 def _frozen(bench: CaseBench) -> list[Inputs]:
-    """One of three photographs, through the second of two lenses."""
+    """The frozen inputs: photograph 1 of three, taken with lens 1 of two."""
     learnt = Inputs(
         taken=PhotoLens(photograph=1, lens=1, centre=(0.4375, 0.5625)),
         entries=evenly(46, (3, COLOUR_ENTRIES), -0.125, 0.125).astype(np.float32),

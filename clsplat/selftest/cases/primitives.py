@@ -44,7 +44,7 @@ def _twin_of_probe(given: Inputs, _: Arrays) -> dict[str, Wanted]:
         "exp": Wanted(exact["exp"], 2.4e-7, exact["exp"]),  # 2 ulp: one of the polynomial, one of the reduction
         "log2": Wanted(exact["log2"], 2.4e-7, np.maximum(np.abs(exact["log2"]), 1)),  # it goes through 0
         "sigmoid": Wanted(exact["sigmoid"], 3.6e-7, exact["sigmoid"]),  # 3 ulp
-        "exp2": Wanted(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 of the polynomial, the rest of rounding
+        "exp2": Wanted(exact["exp2"], 2.1e-7, exact["exp2"]),  # 0.8e-7 from the polynomial, the rest from rounding
     }
 
 

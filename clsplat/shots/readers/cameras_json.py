@@ -62,7 +62,7 @@ def _is_camera(entry: object) -> bool:
 
 
 def _called(entry: dict[str, Any]) -> str:
-    """The name of an entry in parentheses, to follow its number in an error message; '' without a name."""
+    """An entry's name as " (NAME)", to put after its number in an error message; "" if it has none."""
     name = entry.get("img_name")
     return f" ({name[:80]})" if isinstance(name, str) and name.strip() else ""
 

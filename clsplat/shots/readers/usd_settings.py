@@ -124,7 +124,7 @@ def _stage_settings(stage: Any) -> Any:
 
 
 def _unnamed(stage: Any) -> tuple[str, ...]:
-    """Names of render settings that the stage's metadata do not name, at most three, for a warning."""
+    """At most three render settings that the stage's metadata do not point to, for a warning."""
     from pxr import UsdRender
 
     paths = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
@@ -185,7 +185,5 @@ def _window(path: Path, prims: list[Any]) -> tuple[float, float, float, float]:
     attribute = _authored(prims, "dataWindowNDC")
     left, bottom, right, top = (float(edge) for edge in attribute.Get())
     if not (-math.inf < left < right < math.inf and -math.inf < bottom < top < math.inf):
-        raise _wrong(
-            path, attribute, f"({left:g}, {bottom:g}, {right:g}, {top:g})", "left below right and bottom below top"
-        )
+        raise _wrong(path, attribute, f"({left:g}, {bottom:g}, {right:g}, {top:g})", "left < right and bottom < top")
     return left, bottom, right, top

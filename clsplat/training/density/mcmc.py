@@ -148,7 +148,7 @@ def draw(weights: Float64, count: int, rng: np.random.Generator) -> NDArray[np.i
     """Indices (count,) drawn with replacement, with probabilities proportional to the weights."""
     sums = np.cumsum(weights)
     found: NDArray[np.int64] = np.searchsorted(sums, rng.random(count) * sums[-1], side="right")
-    last = int(np.flatnonzero(weights)[-1])  # selected by a random number that was rounded up to the sum of the weights
+    last = int(np.flatnonzero(weights)[-1])  # a random number rounded up to the total would select the index after it
     found[found > last] = last
     return found
 
