@@ -41,6 +41,7 @@ from clsplat.training.held_out_alignment import aligned
 from clsplat.training.preparation import late_settings
 from clsplat.training.repro_bundle import write_bundle
 from clsplat.training.stability.health import MAX_CHECKPOINT_RETURNS, TROUBLE_WINDOW_STEPS
+from clsplat.training.supervision.decoding import PhotographError
 from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
@@ -142,8 +143,8 @@ class TrainingSession:
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """After a failed or interrupted trial of a kernel, write a checkpoint of the state at the start of the step, if
-        that is intact.
+        """After a failed or interrupted trial of a kernel, or a photograph that cannot be read, write a checkpoint of
+        the state at the start of the step, if that is intact.
 
         Returns the end of a sentence that reports it, or "".
         """
@@ -343,8 +344,11 @@ class TrainingSession:
         self.tell_plan()
         try:
             self.make_steps(between)
-        except (DriverError, TrialInterrupted) as error:  # a checkpoint saves the work so far
+        except (DriverError, TrialInterrupted, PhotographError) as error:  # a checkpoint saves the work so far
             written = self.rescue()
+            if isinstance(error, PhotographError) and run is not None:
+                go_on = f"; go on with: clsplat train -o {run.path} --resume"
+                raise PhotographError(f"{error}{written or go_on}") from None
             if written and isinstance(error, DriverError):
                 raise DriverError(f"{error}{written}") from error
             raise
