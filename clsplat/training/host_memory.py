@@ -15,6 +15,7 @@ from clsplat.gaussians import floats_of
 from clsplat.rendering.memory_needs import MODELS
 from clsplat.runs.run import Run
 from clsplat.stages.density import gaussian_bytes
+from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER
 from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
 from clsplat.training.supervision.decoding import Decoder
 from clsplat.training.supervision.host_photographs import HostPhotographs
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
     from clsplat.scenes.scene import Scene
 
 NO_CACHE = "none"
+
+
+def model_bytes(config: TrainConfig) -> int:
+    """Bytes of a Gaussian's parameters, moments and statistics, and with a batch of its gradients and their sums."""
+    arrays = MODELS if config.batch == 1 else OWNER_ARRAYS_PER_PARAMETER
+    return arrays * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=False)
 
 
 @dataclass(frozen=True)
@@ -63,8 +70,7 @@ class HostMemory:
         """Raise InputError if the limit is too small for the first step. Writes nothing."""
         if self.limit is not None:
             count = len(scene.points) or config.random_points
-            model = MODELS * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=False)
-            taken = count * model if device.shares_memory else 0
+            taken = count * model_bytes(config) if device.shares_memory else 0
             self.share(self._photographs(scene, config), count, taken, begins=True)
 
     def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
