@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.device import cl
 from clsplat.device.drivers.worker_process import TrialInterrupted
-from clsplat.errors import CapacityError, ClsplatError, DriverError
+from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.depths import keep_depths
 from clsplat.evaluation.held_out import EvaluatedModel, Evaluation, evaluate
 from clsplat.gaussians import Gaussians
@@ -41,7 +41,6 @@ from clsplat.training.held_out_alignment import aligned
 from clsplat.training.preparation import late_settings
 from clsplat.training.repro_bundle import write_bundle
 from clsplat.training.stability.health import MAX_CHECKPOINT_RETURNS, TROUBLE_WINDOW_STEPS
-from clsplat.training.supervision.decoding import PhotographError
 from clsplat.training.trainer import Trainer
 
 REPORT_EVERY = 10
@@ -337,18 +336,27 @@ class TrainingSession:
             self.save()
 
     def train(self, between: Between | None) -> Gaussians:
-        """Run the remaining steps, and write the model and its evaluation."""
+        """Run the remaining steps, and write the model and its evaluation.
+
+        Raises InputError, after a checkpoint, for a photograph that cannot be read.
+        """
+        try:
+            return self._train(between)
+        except InputError as error:
+            if self.run is None:
+                raise
+            go_on = f"; go on with: clsplat train -o {self.run.path} --resume"
+            raise InputError(f"{error}{self.rescue() or go_on}") from None
+
+    def _train(self, between: Between | None) -> Gaussians:
         trainer, run = self.trainer, self.run
         self.first_step = trainer.step
         _tell_idle_settings(trainer)
         self.tell_plan()
         try:
             self.make_steps(between)
-        except (DriverError, TrialInterrupted, PhotographError) as error:  # a checkpoint saves the work so far
+        except (DriverError, TrialInterrupted) as error:  # a checkpoint saves the work so far
             written = self.rescue()
-            if isinstance(error, PhotographError) and run is not None:
-                go_on = f"; go on with: clsplat train -o {run.path} --resume"
-                raise PhotographError(f"{error}{written or go_on}") from None
             if written and isinstance(error, DriverError):
                 raise DriverError(f"{error}{written}") from error
             raise

@@ -420,11 +420,13 @@ def test_photographs_of_large_scenes_are_decoded_later(
 
 
 @pytest.mark.usefixtures("many")
+@pytest.mark.parametrize("name", ["04.png", "08.png"])
 def test_a_damaged_photograph_of_a_large_scene(
-    own: Path, tmp_path: Path, default_device: Device, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    own: Path, tmp_path: Path, default_device: Device, capsys: Capture, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
+    """It is not in the sample, and the sanity checks do not look at it. The second is held out, and evaluated."""
     monkeypatch.setattr(host_photographs, "reading_threads", lambda: 1)
-    path = own / "images" / "04.png"  # not in the sample, nor one that the sanity checks look at
+    path = own / "images" / name
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2] + bytes(200) + data[len(data) // 2 + 200 :])
     line = ["train", str(own), "-o", str(tmp_path / "run"), "--iterations", "9", "--no-report", "--warmup", ""]
