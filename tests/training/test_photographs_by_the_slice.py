@@ -7,6 +7,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ from clsplat.cli.main import main
 from clsplat.config.masks import MaskUse
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
+from clsplat.device.memory_account import Memory
+from clsplat.device.profile import Calls
 from clsplat.errors import InputError
 from clsplat.images.writing import write_image
 from clsplat.runs.run import Run
@@ -287,6 +290,19 @@ def test_training_is_the_same(
         with pytest.warns(UserWarning, match="the photograph is decoded again") as told:
             assert model_bytes(scene, CONFIG, default_device, tmp_path / "again", **options) == unbounded
         assert len([each for each in told if "is decoded again" in str(each.message)]) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", ["ample", "little"])
+def test_a_device_with_memory_of_its_own_is_the_same(
+    scene: Scene, default_device: Device, tmp_path: Path, unbounded: bytes, memory: str
+) -> None:
+    """With all photographs on the device, and with some sent in each step."""
+    apart = copy(default_device)
+    apart.shares_memory, apart.under_way, apart.calls = False, [], Calls()
+    apart.memory = Memory(None if memory == "ample" else 600 * 1024)
+    limit = limit_of(scene, CONFIG, apart)
+    assert model_bytes(scene, CONFIG, apart, tmp_path / "run", max_host_mem=limit) == unbounded
 
 
 @pytest.mark.slow
