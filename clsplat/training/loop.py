@@ -142,8 +142,9 @@ class TrainingSession:
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """After a failed or interrupted trial of a kernel, or a photograph that cannot be read, write a checkpoint of
-        the state at the start of the step, if that is intact.
+        """Write a checkpoint of the state at the start of the step, if that is intact.
+
+        It is for failed or interrupted trials of kernels, and for photographs that cannot be read.
 
         Returns the end of a sentence that reports it, or "".
         """
