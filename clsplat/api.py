@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
+from pathlib import Path
 
 from clsplat.config.checks import parse_bytes
 from clsplat.config.training import TrainConfig
@@ -16,6 +17,7 @@ from clsplat.report.page import write_last
 from clsplat.runs.locks import locked
 from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
+from clsplat.training.host_memory import HostMemory
 from clsplat.training.loop import Between, StepReport, TrainingSession
 from clsplat.training.preparation import begin, checked
 from clsplat.training.trainer import Trainer
@@ -39,6 +41,8 @@ def train(
     *,
     device: Device | str | Sequence[Device] | None = None,
     max_device_mem: str | int | None = None,
+    max_host_mem: str | int | None = None,
+    cache: str | Path | None = None,
     run: Run | None = None,
     resume: bool = False,
     on_step: Callable[[StepReport], None] | None = None,
@@ -58,6 +62,12 @@ def train(
         the views of a step (`TrainConfig.batch`).
     max_device_mem : str or int, optional
         Largest amount of memory to use on each device: a number of bytes, or text such as "256MiB".
+    max_host_mem : str or int, optional
+        Largest amount of main memory to use for photographs and Gaussians together, like `max_device_mem`. Photographs
+        beyond it are read from `cache`, or decoded again.
+    cache : str or Path, optional
+        Folder for decoded photographs, which stays and may be shared by trainings, or "none". None means the run's
+        folder until the training has finished if `max_host_mem` is given, else no cache.
     run : Run, optional
         A folder for metrics, checkpoints, held-out renders and the model. With None nothing is written.
     resume : bool
@@ -93,12 +103,14 @@ def train(
     with nullcontext() if run is None else locked(run.path, "train"):
         first, *further = _opened(device, parse_bytes(max_device_mem))
         config = config.on_devices(1 + len(further), explicit=resume)
-        trainer = Trainer(begin(scene, config, run, resume=resume), config, first, further=further)
+        memory = HostMemory.chosen(max_host_mem, cache, run)
+        trainer = Trainer(begin(scene, config, run, resume=resume), config, first, further=further, memory=memory)
         with closing(trainer):
             session = TrainingSession(trainer, run, on_step, on_plan)
             if resume:
                 session.resume()
             model = session.train(between)
+        memory.end(run)
         if run is not None and config.report:
             write_last(run, scene, model)
     return model

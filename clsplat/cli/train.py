@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, Suppress, arg
 
 from clsplat.cli.eval import print_summary, tell_of_lpips
-from clsplat.cli.options import Flag, Output, PageOptions, SeveralDevices, Verb, with_given
+from clsplat.cli.options import Flag, Memory, Output, PageOptions, SeveralDevices, Verb, with_given
 from clsplat.cli.session import Services, load_scene
+from clsplat.config.checks import parse_bytes
 from clsplat.config.masks import NO_MASKS
 from clsplat.config.presets import Preset, Schedule, bundled, by_passes, steps_made_for
 from clsplat.config.training import TrainConfig
@@ -53,6 +54,12 @@ class TrainVerb(Verb):
     view: Flag = False
     """Show the growing model on a page in the browser, where training can be paused too (see clsplat view)."""
     page: Annotated[PageOptions, arg(name="")] = field(default_factory=PageOptions)
+    max_host_mem: Memory = None
+    """Limit of main memory for photographs and Gaussians together, such as 4GiB. Photographs beyond it are read from
+    the cache (--cache), or decoded again. The result is the same. If not given: all photographs stay in memory."""
+    cache: Annotated[str | None, arg(metavar="DIR|none")] = None
+    """Folder for decoded photographs, which stays, and which several trainings may share. none: no cache. If not given:
+    with --max-host-mem cache/ in the run's folder until the training has finished, else none."""
     auto: Flag = False
     """Adapt settings to findings on the scene, such as --appearance exposure if the photographs' exposures differ.
     Settings given as flags stay. The findings are printed even without --auto."""
@@ -144,9 +151,11 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     from clsplat.runs import scene_record
     from clsplat.runs.locks import locked
     from clsplat.runs.run import Run, check_resumed
+    from clsplat.training.host_memory import HostMemory
     from clsplat.training.preparation import check_steps_left
 
     verb.device.check()
+    parse_bytes(verb.max_host_mem, "--max-host-mem")
     verb.config.check()
     _check_used(verb.config, verb.given)
     page = None
@@ -174,13 +183,14 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     )
     stages = _stages(config)
     devices = [services.require(device, stages) for device in devices]
+    HostMemory.chosen(verb.max_host_mem, verb.cache, None).check(scene, config, devices[0])
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
     if changed:
         scene_record.write(run, scene)
     _tell_of(scene, devices)
-    _train_run(services, scene, run, devices, page)
+    _train_run(verb, services, scene, run, devices, page)
     result = json.loads(run.eval_path.read_text("utf-8")) if run.eval_path.exists() else None
     if verb.json:
         print(json.dumps(result, indent=2))
@@ -225,6 +235,7 @@ def _tell_of(scene: Scene, devices: Sequence[Device]) -> None:
 
 
 def _train_run(
+    verb: TrainVerb,
     services: Services,
     scene: Scene,
     run: Run,
@@ -251,6 +262,8 @@ def _train_run(
                 scene,
                 run.config,
                 device=devices,
+                max_host_mem=verb.max_host_mem,
+                cache=verb.cache,
                 run=run,
                 resume=run.resuming,
                 on_plan=print_plan,
@@ -282,7 +295,7 @@ def _looked_at(verb: TrainVerb, services: Services, source: Path, earlier: Run |
         config.check()
     findings = services.findings(scene, config.mask_use, config.iterations)
     answers, better = answered(findings, config, verb.given, photographs)
-    print(paragraph(answers, len(scene.views), auto=verb.auto), file=sys.stderr)
+    print(paragraph(answers, len(scene.views), auto=verb.auto, sampled=len(scene.sampled_views)), file=sys.stderr)
     if not verb.auto:
         return scene, config
     if (better.mask_use, better.lenses) != (config.mask_use, config.lenses):

@@ -71,8 +71,9 @@ def check_steps(flag: str, steps: tuple[int, ...]) -> None:
         raise InputError(f"{flag} {','.join(map(str, steps))}: expected steps of at least 1, in ascending order")
 
 
-def parse_bytes(text: str | int | None) -> int | None:
-    """Bytes of "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number. Raises InputError."""
+def parse_bytes(text: str | int | None, flag: str = "--max-device-mem") -> int | None:
+    """Bytes of "256MiB", "2GiB", "1.5G" (the same as GiB), "500MB" (decimal) or a number. Raises InputError that names
+    the flag."""
     if text is None:
         return None
     match = _BYTE_SIZE_PATTERN.fullmatch(str(text))
@@ -82,7 +83,7 @@ def parse_bytes(text: str | int | None) -> int | None:
         base, power = 1000 if (ending or "").lower() == "b" else 1024, ["", *"kmgt"].index(prefix.lower())
         size = int(float(number) * base**power)
     if size < 1:
-        raise InputError(f"--max-device-mem {text}: expected a size such as 256MiB, 1.5G or a number of bytes")
+        raise InputError(f"{flag} {text}: expected a size such as 256MiB, 1.5G or a number of bytes")
     return size
 
 

@@ -25,6 +25,10 @@ Missing = Literal["few", "skip", "error"]
 Perspective = Literal["auto", "plane", "rays"]
 Growth = Literal["paper", "budget", "mcmc"]
 AppearanceKind = Literal["none", "exposure", "ppisp", "grid"]
+Photos = Literal["auto", "exact", "8bit"]
+
+MANY_PHOTOGRAPHS = 300
+"""Number of training photographs from which they are kept with 8 bits, and decoded while training runs."""
 
 
 @dataclass(frozen=True)
@@ -240,6 +244,10 @@ class TrainConfig:
     with '' at the full size."""
     resolution: int = 0
     """Longest image side in pixels, in training and evaluation; 0 keeps the images' size up to 1600."""
+    photos: Photos = "auto"
+    """Precision of the photographs' pixels at the training resolution. exact: as resized. 8bit: rounded to levels of
+    1/255, which takes a quarter of the memory. Photographs with values outside 0 to 1 (HDR) stay exact. auto: exact for
+    fewer than 300 training photographs, else 8bit."""
     test_every: int = TEST_EVERY
     """Every n-th view by name is held out, including the first; 0 holds out none. A data set's own split takes
     precedence."""
@@ -406,6 +414,10 @@ class TrainConfig:
     def mask_use(self) -> MaskUse:
         """Use of the scene's masks and alpha channels."""
         return MaskUse(self.masks, self.alpha, self.invert_masks)
+
+    def rounds_photos(self, photographs: int) -> bool:
+        """True if pixels are rounded to 8 bits, in a scene of so many training photographs."""
+        return self.photos == "8bit" or (self.photos == "auto" and photographs >= MANY_PHOTOGRAPHS)
 
     @property
     def test_views(self) -> tuple[int, int]:

@@ -51,6 +51,7 @@ class Run:
         self.refined_path = path / "refined"
         self.checkpoints_path = path / "checkpoints"
         self.test_path = path / "test"
+        self.cache_path = path / "cache"
 
     @classmethod
     def create(
@@ -276,6 +277,7 @@ def owned_files(path: Path) -> list[Path]:
         "test/**/*.png",
         "depth/**/*.png",
         "refined/*.txt",
+        "cache/*.pixels",
         "**/.*" + TEMPORARY_SUFFIX,
     )
     # config.toml last: an interrupted removal still leaves a run, which --overwrite can remove.

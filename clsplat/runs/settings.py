@@ -49,7 +49,10 @@ RETIRED_SETTINGS |= {
     "train.frequency_steps": 0,
 }
 """Settings of earlier versions, each with the value that switched it off."""
-_ADDED_SETTINGS: dict[str, tuple[str, Any]] = {"train.test_most": ("test_every", 0)}
+_ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
+    "train.test_most": ("test_every", 0),
+    "train.photos": ("iterations", "exact"),
+}
 """Settings that runs of earlier versions lack. Each has a setting that these runs have, and the value that stands for
 what these versions did."""
 _RETIRED_VALUES = {("train.rasterizer.extent", "constant")}

@@ -155,7 +155,7 @@ def _views(files: _SceneFiles, path: Path, resolution: int, test_views: tuple[in
     for image in posed:
         held_out = image.split == "test" if own_split else image.rank in held_out_names
         view = _view(image, "test" if held_out else "train", resolution, files.smaller, lenses)
-        views.append(replace(view, mask=of_pictures.get(image.name), depth_file=image.depth))
+        views.append(replace(view, mask=of_pictures.get(image.name), depth_file=image.depth).stamped())
     _warn_of_copies(views)
     _warn_of_uneven(posed, views)
     return views

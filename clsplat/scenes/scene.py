@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -18,7 +18,8 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import DEFAULT_NEAR_PLANE, MIN_NEAR_PLANES_PER_EXTENT, Camera
 from clsplat.config.depth import NO_DEPTH, DepthUse
 from clsplat.config.points import SCENE_POINTS_ONLY, StartPoints
-from clsplat.errors import InputError
+from clsplat.config.training import MANY_PHOTOGRAPHS
+from clsplat.errors import InputError, reason_of
 from clsplat.files.documents import short_digest
 from clsplat.images.reading import downscale, read_image
 from clsplat.scenes.dataset import Lens, pixels_of, undistort
@@ -28,6 +29,8 @@ from clsplat.scenes.supervision.masks import MASK_THRESHOLD, Mask
 from clsplat.scenes.thumbnail import Thumbnail, glance_at
 
 Split = Literal["train", "test"]
+FileStamp = tuple[int, int]
+"""Size of a file in bytes, and its modification time in nanoseconds."""
 T = TypeVar("T")
 
 FAR_ORIGIN_RATIO = 64.0
@@ -44,6 +47,8 @@ a standard deviation of 0.29. The picture of an outlier shows no points, or has 
 """
 MIN_FAR_GROUP_NEIGHBOURS = 2
 """Minimum number of other cameras near a distant camera that form a group with it. Wrong poses are scattered."""
+MAX_SAMPLED_PHOTOGRAPHS = 200
+"""Maximum number of photographs that findings are based on, in scenes whose photographs are decoded later."""
 SAME_PLACE_TOLERANCE = 1e-12
 """Distance between cameras, relative to their largest coordinate, up to which they count as in the same place."""
 
@@ -61,6 +66,8 @@ class View:
     mask: mask of the pixels that count, None if all count.
     depth_file: the depth map that the data set names, if any.
     depth: known depths for training.
+    stamps: size in bytes and modification time in nanoseconds of each of `files` when the scene was loaded; () if they
+        were not noted.
     """
 
     name: str
@@ -72,6 +79,28 @@ class View:
     mask: Mask | None = None
     depth_file: Path | None = None
     depth: KnownDepth | None = None
+    stamps: tuple[FileStamp, ...] = ()
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that the pixels come from: the photograph, and its mask if it has one."""
+        return (self.path,) if self.mask is None or self.mask.path is None else (self.path, self.mask.path)
+
+    def stamped(self) -> View:
+        """The view with its files' sizes and modification times, as they are now. Raises OSError."""
+        return replace(self, stamps=tuple(_stamp(path) for path in self.files))
+
+    def check_unchanged(self) -> None:
+        """Raise InputError if a file has been removed or replaced since the scene was loaded."""
+        for path, stamp in zip(self.files, self.stamps, strict=False):
+            try:
+                now = _stamp(path)
+            except OSError as error:
+                raise InputError(
+                    f"{path}: could be read when the scene was loaded, now not: {reason_of(error)}"
+                ) from None
+            if now != stamp:
+                raise InputError(f"{path}: has been changed or replaced since the scene was loaded")
 
     def load(self, width: int | None = None, height: int | None = None) -> Float32:
         """Read the undistorted pixels at the camera's size: float32 (H, W, 3), or (H, W, 4) with straight alpha.
@@ -88,13 +117,26 @@ class View:
 
         A pixel counts if at least half of its area counts. Its colour is the mean over the part that counts.
         """
-        width, height = width or self.camera.width, height or self.camera.height
-        image = self._read()
-        if self.mask is None:
-            return self._fitted(image, width, height)
-        image, counts = self.mask.applied(image, orient=self.upright)
-        if counts is None:
-            return self._fitted(image, width, height)
+        return self.load_sizes([(width or self.camera.width, height or self.camera.height)])[0]
+
+    def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[Float32]:
+        """Read like `load_masked` at several sizes, (width, height), and decode the file once.
+
+        reduce: make each size from the picture at the camera's size, which is quicker than from the file. The result
+        differs by rounding. Pictures of which pixels are left out are always made from the file.
+        """
+        image, counts = self._read(), None
+        if self.mask is not None:
+            image, counts = self.mask.applied(image, orient=self.upright)
+        if counts is not None:
+            return [self._masked(image, counts, width, height) for width, height in sizes]
+        if reduce:
+            full = self._fitted(image, self.camera.width, self.camera.height)
+            return [downscale(full, width, height) for width, height in sizes]
+        return [self._fitted(image, width, height) for width, height in sizes]
+
+    def _masked(self, image: Float32, counts: Float32, width: int, height: int) -> Float32:
+        """Picture of five channels, from a picture (H, W, 3 or 4) and its mask (H, W, 1)."""
         parts = [np.where(counts > 0, image[:, :, :3], np.float32(0)), counts]
         if image.shape[2] == 4:  # alpha is averaged over the part that counts, like a colour
             there = np.where(counts > 0, image[:, :, 3:], np.float32(0))
@@ -177,30 +219,48 @@ class Scene:
             raise InputError(f"{self.name}: all {count} views are held out; use --test-every 0 to hold out none")
         return self.train_views
 
+    @property
+    def decoded_first(self) -> bool:
+        """True if every picture is decoded before training. With MANY_PHOTOGRAPHS training views or more, a picture is
+        decoded when a step first needs it."""
+        return len(self.train_views) < MANY_PHOTOGRAPHS
+
+    @cached_property
+    def sampled_views(self) -> list[View]:
+        """Views that findings are based on: all, or an even sample of the training views if they are decoded later."""
+        if self.decoded_first:
+            return self.views
+        count = min(MAX_SAMPLED_PHOTOGRAPHS, len(self.train_views))
+        return [self.train_views[index * len(self.train_views) // count] for index in range(count)]
+
     def check_pictures(self) -> None:
         """Decode every picture once, so that a truncated one is reported before training. Sets `digests` and
-        `glances`.
+        `glances`. If pictures are decoded later (`decoded_first`), it only sets `digests`.
 
         Raises InputError for the first picture in the order of names that does not decode.
         """
-        found = self._of_each(lambda view: (_digest(view), view.check()))
+        if not self.decoded_first:
+            self.__dict__["digests"] = self._of_each(_digest, self.views)
+            return
+        found = self._of_each(lambda view: (_digest(view), view.check()), self.views)
         self.__dict__["digests"] = {name: digest for name, (digest, _) in found.items()}
         self.__dict__["glances"] = {name: glance for name, (_, glance) in found.items()}
 
     @cached_property
     def glances(self) -> dict[str, Thumbnail]:
-        """Thumbnail of each view's picture. The keys are the views' names. Raises InputError like `check_pictures`."""
-        return self._of_each(View.check)
+        """Thumbnail of each sampled view's picture. The keys are the views' names. Raises InputError like
+        `check_pictures`."""
+        return self._of_each(View.check, self.sampled_views)
 
     @cached_property
     def digests(self) -> dict[str, str | None]:
         """Digest of each view's file, mask and known depths. The keys are the views' names."""
-        return self._of_each(_digest)
+        return self._of_each(_digest, self.views)
 
-    def _of_each(self, work: Callable[[View], T]) -> dict[str, T]:
+    def _of_each(self, work: Callable[[View], T], views: Sequence[View]) -> dict[str, T]:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
-                return {view.name: result for view, result in zip(self.views, pool.map(work, self.views), strict=True)}
+                return {view.name: result for view, result in zip(views, pool.map(work, views), strict=True)}
             finally:
                 pool.shutdown(cancel_futures=True)
 
@@ -294,6 +354,11 @@ def _shows_much(view: View, points: Float64, views: Sequence[View]) -> bool:
     usual = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
     near = np.linalg.norm(centres - view.camera.position, axis=1) < usual
     return int(near.sum()) > MIN_FAR_GROUP_NEIGHBOURS
+
+
+def _stamp(path: Path) -> FileStamp:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def _has_alpha(image: Float32) -> bool:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clsplat.camera import Camera
 from clsplat.device import cl
 from clsplat.device.drivers.worker_process import TrialInterrupted
-from clsplat.errors import CapacityError, ClsplatError, DriverError
+from clsplat.errors import CapacityError, ClsplatError, DriverError, InputError
 from clsplat.evaluation.depths import keep_depths
 from clsplat.evaluation.held_out import EvaluatedModel, Evaluation, evaluate
 from clsplat.gaussians import Gaussians
@@ -142,8 +142,9 @@ class TrainingSession:
                 self.saved = self.trainer.step
 
     def rescue(self) -> str:
-        """After a failed or interrupted trial of a kernel, write a checkpoint of the state at the start of the step, if
-        that is intact.
+        """Write a checkpoint of the state at the start of the step, if that is intact.
+
+        It is for failed or interrupted trials of kernels, and for photographs that cannot be read.
 
         Returns the end of a sentence that reports it, or "".
         """
@@ -336,7 +337,19 @@ class TrainingSession:
             self.save()
 
     def train(self, between: Between | None) -> Gaussians:
-        """Run the remaining steps, and write the model and its evaluation."""
+        """Run the remaining steps, and write the model and its evaluation.
+
+        Raises InputError, after a checkpoint, for a photograph that cannot be read.
+        """
+        try:
+            return self._train(between)
+        except InputError as error:
+            if self.run is None:
+                raise
+            go_on = f"; go on with: clsplat train -o {self.run.path} --resume"
+            raise InputError(f"{error}{self.rescue() or go_on}") from None
+
+    def _train(self, between: Between | None) -> Gaussians:
         trainer, run = self.trainer, self.run
         self.first_step = trainer.step
         _tell_idle_settings(trainer)

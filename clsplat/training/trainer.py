@@ -15,6 +15,7 @@ from clsplat.camera import Camera
 from clsplat.config.masks import NO_MASKS
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
+from clsplat.errors import warn
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import background_colour
 from clsplat.optimisation.density_rules import FRESH
@@ -26,7 +27,7 @@ from clsplat.rendering.renderer import Renderer, RenderResult
 from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint, unusable
 from clsplat.scenes.start.initialise import from_scene
-from clsplat.stages.density import DensityStatistics
+from clsplat.stages.density import DensityStatistics, gaussian_bytes
 from clsplat.stages.device_gaussians import (
     AnyGaussians,
     DeviceGaussians,
@@ -41,6 +42,7 @@ from clsplat.training.cameras.refinement import Cameras
 from clsplat.training.cameras.validation import ValidationViews, validate
 from clsplat.training.density import ModelState, RowPlan, Strategy
 from clsplat.training.density.choice import strategy_of
+from clsplat.training.host_memory import UNLIMITED, HostMemory
 from clsplat.training.learning_rates import rates_at
 from clsplat.training.mip_filter import MipFilter
 from clsplat.training.stability.health import RetryBudget
@@ -51,6 +53,7 @@ from clsplat.training.step.inputs import ViewInputs
 from clsplat.training.step.monitor import StepMonitor
 from clsplat.training.step.speculative_steps import SpeculativeSteps
 from clsplat.training.supervision.depth_targets import DepthTargets
+from clsplat.training.supervision.host_photographs import reading_threads
 from clsplat.training.supervision.image_cache import ImageCache
 from clsplat.training.supervision.resolution import by_doubling
 from clsplat.training.trained_model import TrainedModel
@@ -83,6 +86,7 @@ class Trainer:
     pending: steps that have been launched but may have to be repeated.
     mark: state that `step_back` restores; None once the arrays no longer have that state.
     further: devices in addition to the model's.
+    memory: limit of main memory, and the cache of photographs.
     """
 
     def __init__(
@@ -93,11 +97,13 @@ class Trainer:
         initial: Gaussians | None = None,
         strategy: Callable[[TrainConfig], Strategy] = strategy_of,
         further: Sequence[Device] = (),
+        memory: HostMemory = UNLIMITED,
     ) -> None:
         self.scene, self.config, self.device, self._new_strategy = scene, config, device, strategy
         self.views = scene.require_training_views()
         self.rasterizer = Rasterizer(device, config.rasterizer, antialiased=config.antialiased)
-        self.photographs = ImageCache(self.views, device)
+        self.memory, self._begins, self._tight = memory, True, False
+        self.photographs = ImageCache(self.views, device, memory.photographs(scene, config))
         self.renderer = Renderer(device, self.rasterizer)
         self.validation_views = ValidationViews(scene, device, config)
         self.depths = DepthTargets(config, self.views, scene.length_unit, scene.near, self._pixels)
@@ -165,6 +171,15 @@ class Trainer:
         made = plan(self.device, models or (MODELS if batch is None else OWNER_ARRAYS_PER_PARAMETER))
         self.rasterizer.follow(made)
         self.photographs.follow(made.photographs)
+        on_host = self.device.shares_memory or made.streamed
+        model = made.need.model + gaussian_bytes(contributions=needs.contributions)
+        enough = self.memory.share(self.photographs.host, count, count * model if on_host else 0, begins=self._begins)
+        if not enough and not self._tight:
+            self._tight = True
+            warn(
+                f"{count:,} Gaussians leave photographs less than they need of --max-host-mem, which is exceeded from "
+                "here on; --density.max-gaussians limits their number"
+            )
         if batch is not None:
             batch.follow([plan(replica.device, REPLICA_ARRAYS_PER_PARAMETER) for replica in batch.replicas])
         return made
@@ -207,6 +222,7 @@ class Trainer:
         Kerbl et al. 2023, algorithm 1, but density control comes first instead of last. So a model is rendered, saved
         or finished before its Gaussians are split or made transparent, and not right after.
         """
+        self._begins = False
         if self.mark is None or self._looks_at_steps:
             self._note()
         self.mend()
@@ -221,6 +237,7 @@ class Trainer:
         self._raise_sh_degree()
         self._prepare_components(views)
         inputs, step, factor = self._inputs(views), self._gradient_step(), self.sizes.factor(self.step)
+        self.photographs.host.read_ahead(self._next_photographs())
         result: Loss | Losses
         if self.batch is None:
             run = partial(self._run, step, inputs[0], reads_loss)
@@ -236,6 +253,11 @@ class Trainer:
         if self._looks_at_steps:
             self._rearrange(self.strategy.after_gradient(self._state()))
         return result
+
+    def _next_photographs(self) -> list[tuple[int, float]]:
+        """Views of the next steps and their factors, in the order of their use, until the end of the epoch."""
+        batch, ahead = self.config.batch, self.queue[: -1 - reading_threads() - self.config.batch : -1]
+        return [(view, self.sizes.factor(self.step + (1 + place // batch) * batch)) for place, view in enumerate(ahead)]
 
     def _prepare_components(self, views: int) -> None:
         """Let the components do the work that is due before a step of `views` views."""
@@ -472,7 +494,8 @@ class Trainer:
         self._rearrange(self.strategy.at_end(self._state()))
 
     def close(self) -> None:
-        """End the threads of a batch."""
+        """End the threads of a batch, and those that read photographs."""
+        self.photographs.host.close()
         if self.batch is not None:
             self.batch.close()
 

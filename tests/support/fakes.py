@@ -93,6 +93,10 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
             return [view for view in self.views if view.split == "train"]
 
         @property
+        def sampled_views(self) -> list[FakeView]:
+            return self.views
+
+        @property
         def test_views(self) -> list[FakeView]:
             return [view for view in self.views if view.split == "test"]
 
@@ -151,6 +155,8 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> Pipeline:
         config: TrainConfig,
         *,
         device: FakeDevice,
+        max_host_mem: str | None,
+        cache: str | None,
         run: Run,
         resume: bool,
         on_step: Any,

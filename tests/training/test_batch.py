@@ -282,7 +282,7 @@ def test_a_view_without_a_finite_loss_is_named(scene: Scene, default_device: Dev
         bad = order[-2]  # the second view of the next step
         photograph = trainer.photographs.load(bad, 1.0).astype(np.float32)
         photograph[3, 4] = np.nan
-        trainer.photographs._held[bad, 1.0] = photograph
+        trainer.photographs.host.replace(bad, 1.0, photograph)
         if devices[1:]:
             assert trainer.batch is not None
             trainer.batch.replicas[0].photographs._on_device.clear()

@@ -143,6 +143,16 @@ def findings(scene: Scene, use: MaskUse = NO_MASKS, iterations: int = 0) -> list
     return [each for each in found if each is not None]
 
 
+def _looked_at(scene: Scene) -> list[View]:
+    """Training views that have thumbnails."""
+    return [view for view in scene.sampled_views if view.split == "train"]
+
+
+def _counted(scene: Scene, count: int) -> str:
+    """A number of photographs as text, with the size of the sample if not all were inspected."""
+    return f"{count:,}" if scene.decoded_first else f"{count:,} of {len(scene.sampled_views):,} sampled"
+
+
 def _exposure(looked: VisiblePoints) -> Finding | None:
     gains = looked.gains
     if len(gains) < 3:
@@ -208,7 +218,7 @@ def _strange_masks(scene: Scene, reason: str) -> Finding | None:
 def _alpha(scene: Scene, use: MaskUse) -> Finding | None:
     if use.alpha != "blend":
         return None
-    shares = np.array([scene.glances[view.name].transparent for view in scene.train_views])
+    shares = np.array([scene.glances[view.name].transparent for view in _looked_at(scene)])
     if (shares >= TRANSPARENT_PIXEL_FRACTION).mean() < 0.5:
         return None
     part = f"{100 * shares.mean():.0f} %"
@@ -270,13 +280,12 @@ def _few_passes(scene: Scene, iterations: int) -> Finding | None:
 
 def _sky(looked: VisiblePoints) -> Finding | None:
     scene = looked.scene
-    parts = [_sky_part(looked, view) for view in scene.train_views if view.name in looked.places]
+    parts = [_sky_part(looked, view) for view in _looked_at(scene) if view.name in looked.places]
     with_sky = [part for part in parts if part >= MIN_SKY_PIXEL_FRACTION]
     if len(with_sky) < max(3, MIN_SKY_VIEW_FRACTION * len(parts)) or not len(scene.points):
         return None
-    return Finding(
-        "sky", f"{len(with_sky):,} photographs have a sky without points, {100 * np.mean(with_sky):.0f} % of their area"
-    )
+    many, area = _counted(scene, len(with_sky)), 100 * np.mean(with_sky)
+    return Finding("sky", f"{many} photographs have a sky without points, {area:.0f} % of their area")
 
 
 def _sky_part(looked: VisiblePoints, view: View) -> float:
@@ -319,7 +328,7 @@ def _elevation(view: View, part: NDArray[np.bool_], up: Float64) -> float:
 
 
 def _blur(scene: Scene) -> Finding | None:
-    names = [view.name for view in scene.train_views]
+    names = [view.name for view in _looked_at(scene)]
     logs = np.log([max(scene.glances[name].sharpness, 1e-6) for name in names])
     if len(names) < 5:
         return None
@@ -328,13 +337,15 @@ def _blur(scene: Scene) -> Finding | None:
     blurred = [name for name, value in zip(names, logs, strict=True) if value < limit]
     if not blurred:
         return None
-    return Finding("blur", f"{len(blurred):,} photographs are more blurred than the others ({examples(blurred)})")
+    return Finding(
+        "blur", f"{_counted(scene, len(blurred))} photographs are more blurred than the others ({examples(blurred)})"
+    )
 
 
 def _duplicates(scene: Scene) -> Finding | None:
     """Find photographs with nearly identical thumbnails."""
     by_size: dict[tuple[int, ...], list[str]] = {}
-    for view in scene.views:
+    for view in scene.sampled_views:
         by_size.setdefault(scene.glances[view.name].pixels.shape, []).append(view.name)
     copies = []
     for names in by_size.values():
@@ -350,4 +361,4 @@ def _duplicates(scene: Scene) -> Finding | None:
                 copies.append(f"{names[other]} is {names[one]}")
     if not copies:
         return None
-    return Finding("duplicates", f"{len(copies):,} photographs are duplicates ({examples(copies)})")
+    return Finding("duplicates", f"{_counted(scene, len(copies))} photographs are duplicates ({examples(copies)})")

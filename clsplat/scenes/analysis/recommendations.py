@@ -150,15 +150,17 @@ def with_settings(
     return config
 
 
-def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool) -> str:
+def paragraph(answers: Sequence[Answer], looked: int, *, auto: bool, sampled: int | None = None) -> str:
     """Report of the findings and the settings for them.
 
     looked: number of photographs.
     auto: True if the settings are applied.
+    sampled: number of photographs that were inspected, if not all.
     """
+    inspected = f"{looked:,}" if sampled in (None, looked) else f"{sampled:,} of {looked:,}"
     if not answers:
-        return f"inspected {looked:,} photographs: no setting needs to change"
+        return f"inspected {inspected} photographs: no setting needs to change"
     text = "; ".join(answer.words for answer in answers)
     settings = " ".join(filter(None, (flags(answer.settings) for answer in answers)))
     end = f". --auto {'takes' if auto else 'would take'} {settings}" if settings else ""
-    return f"inspected {looked:,} photographs: {text}{end}"
+    return f"inspected {inspected} photographs: {text}{end}"

@@ -47,11 +47,12 @@ class VisiblePoints:
 
     @cached_property
     def places(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Float64]]:
-        """For each view's name: indices of the visible points, their rows and columns in the thumbnail, and depths.
+        """For each sampled view's name: indices of the visible points, their rows and columns in the thumbnail, and
+        depths.
 
         Panoramas and fisheyes are left out.
         """
-        flat = [view for view in self.scene.train_views if view.lens.native is None]
+        flat = [view for view in self.scene.sampled_views if view.split == "train" and view.lens.native is None]
         return {view.name: self._place(view) for view in flat}
 
     @cached_property

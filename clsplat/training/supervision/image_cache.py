@@ -12,6 +12,8 @@ from clsplat.device.buffers import DeviceArray, allocate, shared
 from clsplat.device.context import Device
 from clsplat.device.upload_ring import UPLOAD_RING_SLOTS, UploadRing
 from clsplat.errors import CapacityError
+from clsplat.training.supervision.decoding import Decoder, PhotographError
+from clsplat.training.supervision.host_photographs import HostPhotographs
 
 if TYPE_CHECKING:
     from clsplat.scenes.scene import View
@@ -23,17 +25,18 @@ def kept_pixels(image: NDArray[Any]) -> int | None:
 
 
 class ImageCache:
-    """Pixels of the training views at one resolution. Each view is decoded once, and stored as uint8 if that is exact.
+    """Pixels of the training views at one resolution, on the device as far as there is room.
 
-    Only device memory is bounded. The host keeps every view that a step has used at this resolution.
+    Only device memory is bounded here; `host` bounds the host's.
 
+    host: the photographs on the host. By default all that a step has used stay there, as exact as they were resized.
     allowed: maximum number of bytes on the device.
     """
 
-    def __init__(self, views: list[View], device: Device) -> None:
+    def __init__(self, views: list[View], device: Device, host: HostPhotographs | None = None) -> None:
         self._views, self._device = views, device
+        self.host = host or HostPhotographs(Decoder(views))
         self._factor = 0.0
-        self._held: dict[tuple[int, float], NDArray[Any]] = {}
         self._on_device: dict[int, DeviceArray] = {}
         self._kept: dict[tuple[int, float], int | None] = {}
         self._taken = self.allowed = 0
@@ -41,9 +44,7 @@ class ImageCache:
 
     def for_device(self, device: Device) -> ImageCache:
         """The same photographs for another device, sharing the host's pixels."""
-        other = ImageCache(self._views, device)
-        other._held = self._held
-        return other
+        return ImageCache(self._views, device, self.host)
 
     def follow(self, allowed: int) -> None:
         """Set the maximum number of bytes on the device."""
@@ -55,25 +56,10 @@ class ImageCache:
         """View `index` at 1/factor of its size; do not write to it.
 
         The shape is (H, W, 3), or 4 channels with straight alpha, or 5 with a mask that is 0 for pixels that do not
-        count.
+        count. Raises PhotographError.
         """
-        if factor != self._factor:
-            self._factor = factor
-            for key in [key for key in self._held if key[1] != factor]:
-                del self._held[key]
-            self._leave_device()
-        if (index, factor) not in self._held:
-            camera = self._views[index].camera
-            image: NDArray[np.float32] = self._views[index].load_masked(
-                max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
-            )
-            levels = np.rint(image * 255)
-            exact = (
-                np.array_equal(levels * np.float32(1 / 255), image)  # as in target.cl
-                and 0 <= levels.min() <= levels.max() <= 255
-            )
-            self._held[index, factor] = levels.astype(np.uint8) if exact else np.ascontiguousarray(image, np.float32)
-        return self._held[index, factor]
+        self._enter(factor)
+        return self.host.get(index, factor)
 
     def kept(self, index: int, factor: float) -> int | None:
         """Number of pixels that count in the image that `load` returns; None without a mask."""
@@ -87,31 +73,40 @@ class ImageCache:
         An image is uploaded once and stays, unless `ahead` has already sent it to the upload ring. A device that shares
         the host's memory reads the host's array.
         """
+        self._enter(factor)
+        if index in self._on_device:
+            return self._on_device[index]
         image = self.load(index, factor)
-        if index not in self._on_device:
-            if self._device.shares_memory:
-                self._on_device[index] = shared(self._device, image)
-            elif self._uploads is not None and (sent := self._uploads.take((index, factor))) is not None:
-                return sent
-            elif self._taken + image.nbytes <= self.allowed:
-                try:
-                    array = allocate(self._device, image.shape, image.dtype)
-                except CapacityError:  # another program may have taken memory that the plan counted on
-                    self.allowed = self._taken
-                    return image
-                array.send(image)
+        if self._device.shares_memory:
+            array = shared(self._device, image)
+            if not self.host.bounded:  # else the host may drop the image
                 self._on_device[index] = array
-                self._taken += image.nbytes
-        return self._on_device.get(index, image)
+            return array
+        if self._uploads is not None and (sent := self._uploads.take((index, factor))) is not None:
+            return sent
+        if self._taken + image.nbytes > self.allowed:
+            return image
+        try:
+            array = allocate(self._device, image.shape, image.dtype)
+        except CapacityError:  # another program may have taken memory that the plan counted on
+            self.allowed = self._taken
+            return image
+        array.send(image)
+        self._on_device[index] = array
+        self._taken += image.nbytes
+        return array
 
     def ahead(self, index: int, factor: float) -> None:
         """Begin to send an image to the upload ring, for the next `bring`, if the device has no room to keep it.
 
         Call it after launching a step: the upload then runs while the device computes.
         """
-        if self._device.shares_memory or index in self._on_device:
+        if self._device.shares_memory or (index in self._on_device and factor == self._factor):
             return
-        image = self.load(index, factor)
+        try:
+            image = self.load(index, factor)
+        except PhotographError:  # `bring` raises it again, before the step that needs the photograph
+            return
         if self._taken + image.nbytes <= self.allowed:
             return
         if self._uploads is None and UPLOAD_RING_SLOTS * image.nbytes <= self.allowed:
@@ -125,6 +120,12 @@ class ImageCache:
             self._taken += self._uploads.taken
         if self._uploads is not None:
             self._uploads.begin((index, factor), image)
+
+    def _enter(self, factor: float) -> None:
+        """Leave the device if the size changes."""
+        if factor != self._factor:
+            self._factor = factor
+            self._leave_device()
 
     def _leave_device(self) -> None:
         self._on_device.clear()

@@ -17,6 +17,11 @@ class Sizes:
 
     until: tuple[tuple[int, float], ...]
 
+    @property
+    def factors(self) -> tuple[float, ...]:
+        """All divisors, in the order of the steps."""
+        return (*(factor for _, factor in self.until), 1.0)
+
     def factor(self, step: int) -> float:
         """Divisor of the photographs' width and height at `step`, from 1."""
         return next((factor for last, factor in self.until if step <= last), 1.0)

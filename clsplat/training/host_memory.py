@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The limit of main memory for photographs and Gaussians, and the cache of decoded photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from clsplat.config.checks import parse_bytes
+from clsplat.config.training import TrainConfig
+from clsplat.device.context import Device
+from clsplat.errors import InputError, amount
+from clsplat.gaussians import floats_of
+from clsplat.rendering.memory_needs import MODELS
+from clsplat.runs.run import Run
+from clsplat.stages.density import gaussian_bytes
+from clsplat.training.batch import OWNER_ARRAYS_PER_PARAMETER
+from clsplat.training.supervision.decoded_store import DecodedStore, remove_decoded
+from clsplat.training.supervision.decoding import Decoder
+from clsplat.training.supervision.host_photographs import HostPhotographs
+from clsplat.training.supervision.resolution import by_doubling
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import Scene
+
+NO_CACHE = "none"
+
+
+def model_bytes(config: TrainConfig) -> int:
+    """Bytes of a Gaussian's parameters, moments and statistics, and with a batch of its gradients and their sums."""
+    arrays = MODELS if config.batch == 1 else OWNER_ARRAYS_PER_PARAMETER
+    return arrays * 4 * floats_of((config.sh_degree + 1) ** 2) + gaussian_bytes(contributions=False)
+
+
+@dataclass(frozen=True)
+class HostMemory:
+    """Main memory of a training.
+
+    limit: maximum number of bytes for photographs and Gaussians; None for no limit.
+    cache: folder of the cache of decoded photographs; None for no cache.
+    """
+
+    limit: int | None = None
+    cache: Path | None = None
+
+    @classmethod
+    def chosen(cls, max_host_mem: str | int | None, cache: str | Path | None, run: Run | None) -> HostMemory:
+        """Main memory by the arguments of `clsplat.train`. Raises InputError.
+
+        cache: a folder, "none", or None for the run's folder if there is a limit.
+        """
+        limit = parse_bytes(max_host_mem, "--max-host-mem")
+        if cache is not None and str(cache) != NO_CACHE and (not str(cache) or Path(cache).is_file()):
+            raise InputError(f"--cache {cache}: expected a folder, or none")
+        if cache is None:
+            return cls(limit, run.cache_path if run is not None and limit is not None else None)
+        return cls(limit, None if str(cache) == NO_CACHE else Path(cache))
+
+    def photographs(self, scene: Scene, config: TrainConfig) -> HostPhotographs:
+        """Training photographs of a scene."""
+        store = DecodedStore(self.cache) if self.cache is not None else None
+        return self._photographs(scene, config, store)
+
+    def _photographs(self, scene: Scene, config: TrainConfig, store: DecodedStore | None = None) -> HostPhotographs:
+        views, factors = scene.require_training_views(), by_doubling(config.warmup).factors
+        return HostPhotographs(Decoder(views, config.rounds_photos(len(views)), factors, store), config.batch)
+
+    def check(self, scene: Scene, config: TrainConfig, device: Device) -> None:
+        """Raise InputError if the limit is too small for the first step. Writes nothing."""
+        if self.limit is not None:
+            count = len(scene.points) or config.random_points
+            taken = count * model_bytes(config) if device.shares_memory else 0
+            self.share(self._photographs(scene, config), count, taken, begins=True)
+
+    def share(self, photographs: HostPhotographs, count: int, taken: int, *, begins: bool) -> bool:
+        """Give the photographs the memory that the Gaussians leave. Returns False if that is too little.
+
+        count: number of Gaussians.
+        taken: bytes of the Gaussians on the host.
+        begins: True to raise InputError instead, with the smallest limit that is enough.
+        """
+        if self.limit is None:
+            return True
+        enough = self.limit - taken >= photographs.least
+        if begins and not enough:
+            least = -(-(taken + photographs.least) // 2**20)
+            raise InputError(
+                f"--max-host-mem {amount(self.limit)} is too little: the photographs need at least "
+                f"{amount(photographs.least)}, and {count:,} Gaussians take {amount(taken)} of main memory; expected "
+                f"at least {least}MiB"
+            )
+        photographs.follow(self.limit - taken)
+        return enough
+
+    def end(self, run: Run | None) -> None:
+        """Remove the cache in the folder of a run that has finished, unless it was named as the cache's folder."""
+        if run is not None and run.cache_path.is_dir() and (self.cache is None or self.cache == run.cache_path):
+            remove_decoded(run.cache_path)
+
+
+UNLIMITED = HostMemory()

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of decoded photographs: a file for each photograph and size, read back to the same pixels.
+
+A file has a header and the pixels. The header has the shape, the type, a key and a checksum of header and pixels. The
+key is a digest of everything that the pixels depend on, and also names the file. Files are read and not mapped, as a
+file that is cut short while it is mapped would end the process (docs/decisions/0045-photographs-by-the-slice.md).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from clsplat.errors import WriteError, amount, reason_of
+from clsplat.files.atomic import TEMPORARY_NAME, atomic_name, is_abandoned, remove
+from clsplat.files.mounts import network_type
+from clsplat.version import package_version
+
+FORMAT_VERSION = 1
+SUFFIX = ".pixels"
+KEY_BYTES = 32
+NETWORK_SAMPLE_BYTES = 16 << 20
+"""Bytes that are read or written before the rate of a network disk is reported."""
+_MAGIC = b"clsplat\x00"
+_HEADER = struct.Struct(f"<8sIIIII{KEY_BYTES}s")
+_CHECKSUM = struct.Struct("<I")
+_TYPES: tuple[type[np.generic], ...] = (np.uint8, np.float32)
+_HEADER_BYTES = _HEADER.size + _CHECKSUM.size
+
+
+def key_of(parts: Sequence[object]) -> bytes:
+    """Digest of what the pixels depend on: `parts`, and the versions of this package, its format and its decoder."""
+    versions = [FORMAT_VERSION, package_version(), oiio.VERSION_STRING]
+    text = json.dumps([versions, *parts], default=repr)
+    return hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=KEY_BYTES).digest()
+
+
+class DecodedStore:
+    """A folder of decoded photographs, which several threads and processes may use at a time.
+
+    A damaged file counts as missing. If a file cannot be written, no further files are. Each kind of trouble is told
+    once, by `notes`.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.writable = True
+        self._lock = threading.Lock()
+        self._notes: list[str] = []
+        self._told_damage = False
+        self._network = ""
+        self._moved, self._seconds = 0, 0.0
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._network = network_type(folder)
+            self._remove_abandoned()
+        except OSError as error:
+            self._give_up(reason_of(error))
+
+    def path(self, key: bytes) -> Path:
+        """File of the pixels with this key."""
+        return self.folder / f"{key.hex()}{SUFFIX}"
+
+    def read(self, key: bytes) -> NDArray[Any] | None:
+        """Pixels (H, W, C) with this key; None if there are none, or if they are damaged."""
+        path, start = self.path(key), time.perf_counter()
+        try:
+            pixels = _read(path, key)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            self._damaged(path, reason_of(error) if isinstance(error, OSError) else str(error))
+            return None
+        self._count(pixels.nbytes, time.perf_counter() - start)
+        return pixels
+
+    def write(self, key: bytes, pixels: NDArray[Any]) -> None:
+        """Write pixels (H, W, C), uint8 or float32. A failure is noted, and ends the writing."""
+        if not self.writable:
+            return
+        path, start = self.path(key), time.perf_counter()
+        pixels = np.ascontiguousarray(pixels)
+        header = _HEADER.pack(_MAGIC, FORMAT_VERSION, _TYPES.index(pixels.dtype.type), *pixels.shape, key)
+        try:
+            # not flushed to the disk, which takes long: a file that a power cut damages fails its checksum
+            with atomic_name(path, _HEADER_BYTES + pixels.nbytes) as temporary, open(temporary, "xb") as file:
+                file.write(header + _CHECKSUM.pack(_checksum(header, pixels)))
+                file.write(pixels.data)
+        except OSError as error:
+            self._give_up(str(error.strerror) if isinstance(error, WriteError) else reason_of(error))
+            return
+        self._count(pixels.nbytes, time.perf_counter() - start)
+
+    def notes(self) -> list[str]:
+        """Lines for the user that have not been returned yet."""
+        if not self._notes:
+            return []
+        with self._lock:
+            notes, self._notes = self._notes, []
+        return notes
+
+    def _remove_abandoned(self) -> None:
+        """Remove the temporary files of processes that have ended."""
+        for path in self.folder.iterdir():
+            match = TEMPORARY_NAME.fullmatch(path.name)
+            if match is not None and match[1].endswith(SUFFIX):
+                with suppress(OSError):
+                    if is_abandoned(path, match[2]):
+                        remove(path)
+
+    def _give_up(self, reason: str) -> None:
+        with self._lock:
+            if self.writable:
+                self.writable = False
+                self._notes.append(
+                    f"{self.folder}: no decoded photographs can be written there ({reason}): those that are not in it "
+                    "are decoded each time"
+                )
+
+    def _damaged(self, path: Path, reason: str) -> None:
+        with self._lock:
+            if not self._told_damage:
+                self._told_damage = True
+                self._notes.append(
+                    f"{path}: is no intact file of decoded pixels ({reason}): the photograph is decoded again (further "
+                    "files like this are not reported)"
+                )
+
+    def _count(self, nbytes: int, seconds: float) -> None:
+        """Count bytes that were read or written, and note the rate of a network disk."""
+        if not self._network:
+            return
+        with self._lock:
+            self._moved += nbytes
+            self._seconds += seconds
+            if self._network and self._moved >= NETWORK_SAMPLE_BYTES:
+                rate = amount(int(self._moved / max(self._seconds, 1e-6)))
+                self._notes.append(
+                    f"{self.folder}: is on a network disk ({self._network}), which moves {rate} a second: a local "
+                    "folder (--cache DIR) may be faster"
+                )
+                self._network = ""
+
+
+def remove_decoded(folder: Path) -> None:
+    """Remove the files of decoded photographs in a folder, and the folder if nothing else is in it."""
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if path.suffix == SUFFIX or TEMPORARY_NAME.fullmatch(path.name):
+                remove(path)
+        folder.rmdir()
+
+
+def _read(path: Path, key: bytes) -> NDArray[Any]:
+    """Pixels of a file. Raises OSError, and ValueError for a file that is not whole or not `key`'s."""
+    with open(path, "rb", buffering=0) as file:
+        size = os.fstat(file.fileno()).st_size
+        head = file.read(_HEADER_BYTES)
+        if len(head) < _HEADER_BYTES:
+            raise ValueError(f"it has only {len(head)} bytes")
+        magic, version, kind, height, width, channels, own = _HEADER.unpack(head[: _HEADER.size])
+        if (magic, version, own) != (_MAGIC, FORMAT_VERSION, key) or kind >= len(_TYPES):
+            raise ValueError("its header is of something else")
+        wanted = height * width * channels * np.dtype(_TYPES[kind]).itemsize
+        if size != _HEADER_BYTES + wanted:
+            raise ValueError(f"it has {size:,} bytes, expected {_HEADER_BYTES + wanted:,}")
+        pixels = np.empty((height, width, channels), _TYPES[kind])
+        rest = pixels.reshape(-1).view(np.uint8).data
+        while rest and (count := file.readinto(rest)):
+            rest = rest[count:]
+    if rest:
+        raise ValueError("it ended while it was read")
+    if _CHECKSUM.unpack(head[_HEADER.size :])[0] != _checksum(head[: _HEADER.size], pixels):
+        raise ValueError("its checksum is wrong")
+    return pixels
+
+
+def _checksum(header: bytes, pixels: NDArray[Any]) -> int:
+    return zlib.crc32(pixels.reshape(-1).view(np.uint8).data, zlib.crc32(header))

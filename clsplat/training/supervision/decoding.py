@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels of a training view at the sizes that the warm-up needs: decoded once, or read from a cache. Policy only: no
+device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float32
+from clsplat.errors import InputError, system_trouble
+from clsplat.training.supervision.decoded_store import DecodedStore, key_of
+
+if TYPE_CHECKING:
+    from clsplat.scenes.scene import View
+
+HDR_SUFFIXES = (".exr", ".hdr", ".tif", ".tiff")
+"""Endings of files whose values may be outside 0 to 1, so that 8 bits may not hold them."""
+DECODING_PIXEL_BYTES, UNDISTORTING_PIXEL_BYTES = 40, 120
+"""Approximate peak of memory, in bytes for each pixel of the file, while a photograph is decoded and resized, and while
+it is undistorted too."""
+
+
+class PhotographError(InputError):
+    """Error about a photograph that cannot be decoded, or has changed, while training runs."""
+
+
+def stored(image: Float32, *, rounds: bool) -> NDArray[Any]:
+    """Pixels (H, W, C) as uint8 if that is exact, else as float32.
+
+    rounds: also store them as uint8 if that rounds them, unless values are outside 0 to 1.
+    """
+    levels = np.rint(image * 255)
+    fits = 0 <= levels.min() <= levels.max() <= 255
+    if fits and (rounds or np.array_equal(levels * np.float32(1 / 255), image)):  # as in target.cl
+        return levels.astype(np.uint8)
+    return np.ascontiguousarray(image, np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Decoder:
+    """Decoding of the training views.
+
+    rounds: True if pixels are rounded to 8 bits.
+    factors: divisors of the size that the training uses, largest first.
+    store: cache of decoded pixels on the disk, if there is one.
+    """
+
+    views: Sequence[View]
+    rounds: bool = False
+    factors: tuple[float, ...] = ()
+    store: DecodedStore | None = None
+
+    def size(self, index: int, factor: float) -> tuple[int, int]:
+        """Width and height of view `index` at 1/factor of its size."""
+        camera = self.views[index].camera
+        return max(int(camera.width / factor), 1), max(int(camera.height / factor), 1)
+
+    def pixels(self, index: int, factor: float, *, keeps: bool) -> dict[float, NDArray[Any]]:
+        """Pixels (H, W, C) of view `index` at 1/factor of its size. The keys are factors.
+
+        keeps: also return the sizes that the training needs later, if the file has to be decoded.
+        Raises PhotographError.
+        """
+        store = self.store
+        if store is not None and (found := store.read(self._key(index, factor))) is not None:
+            return {factor: found}
+        later = keeps or (store is not None and store.writable)
+        wanted = [factor, *(each for each in self.factors if later and each < factor)]
+        images = self._decoded(index, wanted)
+        if store is not None:
+            for each, image in images.items():
+                store.write(self._key(index, each), image)
+        return images if keeps else {factor: images[factor]}
+
+    def _decoded(self, index: int, factors: Sequence[float]) -> dict[float, NDArray[Any]]:
+        view = self.views[index]
+        try:
+            view.check_unchanged()
+            try:
+                sizes = [self.size(index, factor) for factor in factors]
+                images = view.load_sizes(sizes, reduce=self.rounds)
+            finally:
+                view.check_unchanged()  # it may have been replaced meanwhile, which may be the reason of an error
+        except InputError as error:
+            raise PhotographError(str(error)) from None
+        except OSError as error:
+            raise PhotographError(system_trouble(error)) from None
+        made = [stored(image, rounds=self.rounds) for image in images]
+        return dict(zip(factors, made, strict=True))
+
+    def _key(self, index: int, factor: float) -> bytes:
+        """Digest of everything that the pixels of a view at this size depend on."""
+        view, size = self.views[index], self.size(index, factor)
+        stamps = view.stamps or view.stamped().stamps
+        camera = view.camera
+        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        bent = (camera.projection, [float(value) for value in camera.radial])
+        mask = None if view.mask is None else asdict(view.mask.use)
+        files = [str(Path(path).absolute()) for path in view.files]
+        return key_of((files, stamps, asdict(view.lens), intrinsics, bent, view.upright, mask, self.rounds, size))
+
+    def largest(self) -> int:
+        """Bytes of the largest view at its full size, at most."""
+        return max(
+            view.camera.width
+            * view.camera.height
+            * (5 if view.mask is not None and view.mask.ignores else 4)
+            * (1 if self.rounds and view.path.suffix.lower() not in HDR_SUFFIXES else 4)
+            for view in self.views
+        )
+
+    def working(self) -> int:
+        """Approximate bytes that the decoding of a photograph needs besides the result, at most."""
+        return max(
+            view.lens.width
+            * view.lens.height
+            * (DECODING_PIXEL_BYTES if view.lens.is_pinhole else UNDISTORTING_PIXEL_BYTES)
+            for view in self.views
+        )

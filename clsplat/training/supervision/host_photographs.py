@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels of the training views on the host: kept, bounded, and read ahead of the steps. Policy only: no device."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clsplat.errors import warn
+from clsplat.training.supervision.decoding import Decoder
+
+MAX_READING_THREADS = 8
+Key = tuple[int, float]
+"""A view's index, and the divisor of its size."""
+
+
+def reading_threads() -> int:
+    """Number of threads that read ahead, and of views that they read ahead."""
+    return min(2 * (os.cpu_count() or 1), MAX_READING_THREADS)
+
+
+class HostPhotographs:
+    """Decoded photographs in main memory. Several threads may use it.
+
+    Without a limit, every view that was used stays, with the sizes that the training needs later. With a limit, only
+    the current size is kept, of as many views as fit. The views that were used last go first: a pass through the
+    views needs them again last.
+
+    at_once: number of views that a step uses.
+    """
+
+    def __init__(self, decoder: Decoder, at_once: int = 1) -> None:
+        self.decoder, self._at_once = decoder, at_once
+        self._lock = threading.Lock()
+        self._held: OrderedDict[Key, NDArray[Any]] = OrderedDict()
+        self._bytes = 0
+        self._factor = 0.0
+        self._room: int | None = None
+        self._ahead = reading_threads()
+        self._wanted: set[Key] = set()
+        self._in_use: deque[Key] = deque(maxlen=at_once + 1)
+        self._pending: dict[Key, Future[dict[float, NDArray[Any]]]] = {}
+        self._pool: ThreadPoolExecutor | None = None
+        self._closed = False
+
+    @property
+    def bounded(self) -> bool:
+        """True if photographs may have to leave the memory."""
+        return self._room is not None
+
+    @cached_property
+    def least(self) -> int:
+        """Smallest limit in bytes: the views of a step, one that is read ahead, and the decoding of one."""
+        return self._needed(1)
+
+    @cached_property
+    def _sizes(self) -> tuple[int, int]:
+        return self.decoder.largest(), self.decoder.working()
+
+    def _needed(self, ahead: int) -> int:
+        largest, working = self._sizes
+        return ahead * (working + largest) + (self._at_once + 1 + ahead) * largest
+
+    def follow(self, allowed: int) -> None:
+        """Set the maximum number of bytes, which is at least `least`."""
+        allowed, largest, working = max(allowed, self.least), *self._sizes
+        with self._lock:
+            ahead = reading_threads()
+            while ahead > 1 and self._needed(ahead) > allowed:
+                ahead -= 1
+            self._ahead, self._room = ahead, allowed - ahead * (working + largest)
+            self._evict()
+
+    def get(self, index: int, factor: float) -> NDArray[Any]:
+        """Pixels of view `index` at 1/factor of its size; do not write to them. Raises PhotographError."""
+        key = index, factor
+        with self._lock:
+            self._enter(factor)
+            self._in_use.append(key)
+            image = self._held.get(key)
+            if image is not None:
+                self._held.move_to_end(key)
+                return image
+            future = self._pending.pop(key, None)
+        # a read that has not begun is done here instead
+        made = future.result() if future is not None and not future.cancel() else self._made(key)
+        self._tell()
+        return made[factor]
+
+    def replace(self, index: int, factor: float, image: NDArray[Any]) -> None:
+        """Use other pixels for a view from now on."""
+        with self._lock:
+            self._keep((index, factor), image)
+
+    def read_ahead(self, keys: Sequence[Key]) -> None:
+        """Begin to read the views of the next steps, in the order of their use. Errors are raised by `get`."""
+        with self._lock:
+            keys = keys[: self._ahead]
+            self._wanted = set(keys)
+            missing = [key for key in keys if key not in self._held and key not in self._pending]
+            if not missing or self._closed:
+                return
+            if self._pool is None:
+                self._pool = ThreadPoolExecutor(reading_threads(), "clsplat-photographs")
+            under_way = sum(not future.done() for future in self._pending.values())
+            for key in missing[: max(self._ahead - under_way, 0)]:
+                self._pending[key] = self._pool.submit(self._made, key)
+
+    def close(self) -> None:
+        """End the threads. Photographs can still be read."""
+        with self._lock:
+            self._closed, pool, self._pool = True, self._pool, None
+            self._pending.clear()
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+        self._tell()
+
+    def _made(self, key: Key) -> dict[float, NDArray[Any]]:
+        """Read or decode a view, and keep it."""
+        index, factor = key
+        images = self.decoder.pixels(index, factor, keeps=not self.bounded)
+        with self._lock:
+            for each, image in images.items():
+                if each <= self._factor or not self._factor:  # else the training has left this size meanwhile
+                    self._keep((index, each), image)
+            self._pending.pop(key, None)
+        return images
+
+    def _keep(self, key: Key, image: NDArray[Any]) -> None:
+        before = self._held.pop(key, None)
+        self._bytes += image.nbytes - (0 if before is None else before.nbytes)
+        self._held[key] = image
+        self._evict()
+
+    def _evict(self) -> None:
+        """Remove views beyond the limit, those that were used last first, but none that is used now or next."""
+        if self._room is None or self._bytes <= self._room:
+            return
+        for key in [key for key in reversed(self._held) if key not in self._wanted and key not in self._in_use]:
+            if self._bytes <= self._room:
+                return
+            self._bytes -= self._held.pop(key).nbytes
+
+    def _enter(self, factor: float) -> None:
+        """Remove the sizes that are past, and with a limit all others, when the size changes."""
+        if factor == self._factor:
+            return
+        self._factor = factor
+        for key in [key for key in self._held if key[1] > factor or (self.bounded and key[1] != factor)]:
+            self._bytes -= self._held.pop(key).nbytes
+        for key in [key for key in self._pending if key[1] > factor]:
+            self._pending.pop(key).cancel()
+
+    def _tell(self) -> None:
+        """Warn of trouble with the cache. Threads that read ahead only note it."""
+        if self.decoder.store is not None:
+            for text in self.decoder.store.notes():
+                warn(text)
