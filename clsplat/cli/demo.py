@@ -43,7 +43,7 @@ class DemoVerb(Verb):
     town: Annotated[str | None, arg(metavar="NxM")] = None
     """Write a town of NxM city blocks of 60 metres, without training. A larger town has the photographs of a smaller
     one, byte for byte."""
-    town_photos: Annotated[int, arg(metavar="COUNT")] = 40
+    town_photos: Annotated[int, arg(metavar="COUNT")] = 60
     """Photographs of each block: three in ten straight down, four in ten at a slant, three in ten in its streets."""
     town_size: Annotated[str, arg(metavar="WxH")] = "640x400"
     """Size of the photographs in pixels."""

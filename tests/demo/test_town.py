@@ -252,7 +252,7 @@ def test_only_a_town_is_replaced_and_only_if_told(tmp_path: Path) -> None:
         ("--town 1x1 --town-rig periscope", "--town-rig"),
         ("--town 1x1 --town-exposure 5", "--town-exposure 5.0: expected 0 to 4 stops"),
         ("--town 1x1 --town-exposure nan", "--town-exposure nan: expected 0 to 4 stops"),
-        ("--town 1x1 --town-cars 101", "--town-cars 101: expected 0 to 100 cars"),
+        ("--town 1x1 --town-cars 29", "--town-cars 29: expected 0 to 28 cars"),
         ("--town 1x1 --town-origin 1,2", "--town-origin 1,2: expected three numbers"),
         ("--town 1x1 --town-origin 1,2,nan", "--town-origin 1,2,nan: expected numbers up to 1e+08 metres"),
         ("--town 1x1 --town-pose-noise=-1", "--town-pose-noise -1.0: expected 0 to 100 metres"),

@@ -29,7 +29,7 @@ TOWN_FISHEYE_COEFFICIENTS = (-0.02, 0.0005, 0.0, 0.0)
 STRAIGHT_SHARE, STREET_SHARE = 0.3, 0.3
 """Shares of a block's photographs. The others are slanted."""
 DIRECTIONS: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
-_YAWS = (0.0, 0.75, -0.75)
+_YAWS = (0.38, -0.38)
 
 
 @dataclass(frozen=True, eq=False)

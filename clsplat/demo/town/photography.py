@@ -23,7 +23,7 @@ from clsplat.demo.town.blocks import (
     car,
 )
 from clsplat.demo.town.flights import TownPhotograph
-from clsplat.demo.town.settings import TownConfig
+from clsplat.demo.town.settings import CAR_SLOTS, TownConfig
 from clsplat.demo.town.shading import Shader
 from clsplat.demo.town.solids import FACES_PER_SOLID, Builder
 from clsplat.demo.town.textures import textures
@@ -44,16 +44,14 @@ TONE = np.float32(1 / 1.6)
 class Observations:
     """Points that a photograph shows.
 
-    blocks: (n, 2), numbers of the points' blocks.
-    points: (n,), their numbers in the block.
-    places: (n, 3) float64, in the town's coordinates.
+    blocks: (n, 2) int32, numbers of the points' blocks.
+    points: (n,) int32, their numbers in the block.
     pixels: (n, 2) float64, exact.
     colours: (n, 3) uint8, of the pixels.
     """
 
-    blocks: NDArray[np.int64]
-    points: NDArray[np.int64]
-    places: Float64
+    blocks: NDArray[np.int32]
+    points: NDArray[np.int32]
     pixels: Float64
     colours: NDArray[np.uint8]
 
@@ -123,8 +121,8 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
     corner = np.array([photograph.i, photograph.j]) * BLOCK_METRES
     away = photograph.camera.position[:2] - corner
     for x, y in np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2) * BLOCK_METRES:
-        for _ in range(config.cars):
-            along, forward, upright = generator.uniform(9, 51), generator.integers(2), generator.integers(2)
+        for slot in generator.choice(CAR_SLOTS, config.cars, replace=False).tolist():
+            upright, forward, along = slot % 2, slot // 2 % 2, 12.0 + 6.0 * (slot // 4) + generator.uniform(-0.7, 0.7)
             painted = generator.choice(CAR_PAINTS)
             side = DRIVEN_METRES * (1 if forward == upright else -1)
             place = np.array([x + side, y + along] if upright else [x + along, y + side])
@@ -165,9 +163,9 @@ class _Candidates:
         with np.errstate(invalid="ignore"):
             ahead &= ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
         rows = np.flatnonzero(ahead)
-        self._numbers = np.stack([[block.i, block.j] for block in chosen])[rows // POINTS_PER_BLOCK]
-        self._points, self._surfaces = rows % POINTS_PER_BLOCK, surfaces[rows]
-        self._places, self._pixels = places[rows], pixels[rows]
+        self._numbers = np.array([[block.i, block.j] for block in chosen], np.int32)[rows // POINTS_PER_BLOCK]
+        self._points, self._surfaces = (rows % POINTS_PER_BLOCK).astype(np.int32), surfaces[rows]
+        self._pixels = pixels[rows]
         self._seen = np.zeros(len(rows), np.bool_)
 
     def see(self, surfaces: NDArray[np.int32], first: int, last: int) -> None:
@@ -184,7 +182,7 @@ class _Candidates:
         column, row = np.floor(self._pixels).astype(np.int64).T
         seen = self._seen if mask is None else self._seen & mask[row, column]
         colours = np.rint(pixels[row[seen], column[seen]] * 255).astype(np.uint8)
-        return Observations(self._numbers[seen], self._points[seen], self._places[seen], self._pixels[seen], colours)
+        return Observations(self._numbers[seen], self._points[seen], self._pixels[seen], colours)
 
 
 def _away(block: CityBlock, position: Float64) -> Float64:

@@ -16,6 +16,8 @@ MAX_TOWN_SIDE = 1000
 MAX_PHOTOS_PER_BLOCK = 1000
 MIN_TOWN_PHOTO_SIDE, MAX_TOWN_PHOTO_SIDE = 16, 8192
 """Limits of a photograph's width and height in pixels."""
+CAR_SLOTS = 28
+"""Places of moving cars in a block: seven in each direction of its two streets."""
 MAX_TOWN_ORIGIN_METRES = 1e8
 """Float64 has steps of 15 nanometres there."""
 
@@ -37,7 +39,7 @@ class TownConfig:
 
     columns: int
     rows: int
-    photos: int = 40
+    photos: int = 60
     width: int = 640
     height: int = 400
     seed: int = 0
@@ -66,7 +68,7 @@ class TownConfig:
             ("seed", self.seed, 0 <= self.seed < 1 << 32, "a whole number of at least 0 and below 2^32"),
             ("town-rig", self.rig, self.rig in get_args(TownRig), f"one of {', '.join(get_args(TownRig))}"),
             ("town-exposure", self.exposure, 0 <= self.exposure <= 4, "0 to 4 stops"),
-            ("town-cars", self.cars, 0 <= self.cars <= 100, "0 to 100 cars in each block"),
+            ("town-cars", self.cars, 0 <= self.cars <= CAR_SLOTS, f"0 to {CAR_SLOTS} cars in each block"),
             ("town-origin", given, far <= MAX_TOWN_ORIGIN_METRES, f"numbers up to {MAX_TOWN_ORIGIN_METRES:g} metres"),
             ("town-pose-noise", self.pose_noise, 0 <= self.pose_noise <= 100, "0 to 100 metres"),
         )

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
-from clsplat.cameras.fisheye import radii
 
 SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 """Places x, y of a pixel's rays from its centre."""
@@ -28,7 +27,7 @@ def lens_key(camera: Camera) -> LensKey:
     return (camera.projection, camera.width, camera.height, *intrinsics, camera.radial)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)
 def _local_rays(key: LensKey, first: int, last: int, places: tuple[tuple[float, float], ...]) -> Planes:
     """Directions in the camera's axes, as three arrays that broadcast to (places, rows, columns)."""
     projection, width, _, fx, fy, cx, cy, radial = key
@@ -40,10 +39,9 @@ def _local_rays(key: LensKey, first: int, last: int, places: tuple[tuple[float, 
     elif projection == "equirectangular":
         planes = (np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a))
     else:
-        view = Camera(1, 1, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3), projection="fisheye", radial=radial)  # type: ignore[arg-type]
-        angles = np.linspace(0, view.fold[0], _ANGLES)
+        angles = np.linspace(0, np.pi, _ANGLES)
         radius = np.hypot(a, b)
-        theta = np.interp(radius, radii(view, angles)[0], angles)
+        theta = np.interp(radius, _fisheye_radius(radial, angles), angles)
         ratio = np.sin(theta) / np.maximum(radius, 1e-12)
         planes = (ratio * a, ratio * b, np.cos(theta))
     x, y, z = (np.asarray(plane, np.float32) for plane in planes)
@@ -156,7 +154,7 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     circle = np.cos(turn) * across[:, None] + np.sin(turn) * other[:, None]
     edge = np.cos(angle)[:, None, None] * axis[:, None] + np.sin(angle)[:, None, None] * circle
     away = np.arctan2(np.hypot(edge[..., 0], edge[..., 1]), edge[..., 2])
-    radius = radii(camera, np.minimum(away, camera.fold[0]).ravel())[0].reshape(away.shape)
+    radius = _fisheye_radius(camera.radial, away)
     level = np.maximum(np.hypot(edge[..., 0], edge[..., 1]), 1e-12)
     x = camera.cx + camera.fx * radius * edge[..., 0] / level
     y = camera.cy + camera.fy * radius * edge[..., 1] / level
@@ -164,3 +162,14 @@ def _fisheye_bounds(camera: Camera, low: Float64, high: Float64) -> Float64:
     whole = theta + angle >= np.pi  # the cone has the direction backwards, around which the picture ends
     bounds[whole] = (-1e9, 1e9, -1e9, 1e9)
     return bounds
+
+
+def _fisheye_radius(radial: tuple[float, ...], theta: Float64) -> Float64:
+    """Distances from the picture's centre, in focal lengths, of angles from the axis: (18) of docs/cameras.md.
+
+    The town's fisheye rises up to 180 degrees, so that its picture ends nowhere.
+    """
+    square, series = theta * theta, np.zeros_like(theta)
+    for coefficient in reversed(radial):
+        series = (series + coefficient) * square
+    return theta * (1 + series)

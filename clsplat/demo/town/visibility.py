@@ -86,7 +86,7 @@ class Caster:
             if not self._open(rays, self._parts[index], float(self._near[index])):
                 continue
             parts, near, order = self._solids_of(index, block)
-            for solid in order:
+            for solid in order[(parts[order, 0] < last) & (parts[order, 1] > first)]:
                 for rows, columns in self._pieces(parts[solid], first, last):
                     if rays.is_open(rows, columns, float(near[solid])):
                         rays.cast(block, int(solid), int(self.starts[index] + solid), rows, columns)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float64
 from clsplat.demo.ray_caster import write_jpeg
-from clsplat.demo.town.blocks import POINTS_PER_BLOCK, block_generator
+from clsplat.demo.town.blocks import block_generator, city_block
 from clsplat.demo.town.colmap_model import (
     UNKNOWN_POINT,
     ModelImage,
@@ -165,26 +165,41 @@ def _image(config: TownConfig, shot: TownPhotograph, air: object, error: Float64
 def _tracks(config: TownConfig, seen: Sequence[Observations]) -> tuple[ModelPoints, list[NDArray[np.uint64]]]:
     """Points with their tracks, and for each photograph the numbers of its observations' points."""
     lengths = np.array([len(each.points) for each in seen])
-    blocks = np.concatenate([each.blocks for each in seen])
-    low = blocks.min(axis=0, initial=0)
-    column, row = (blocks - low).T
-    height = int(row.max(initial=0)) + 1
-    keys = (column * height + row) * POINTS_PER_BLOCK + np.concatenate([each.points for each in seen])
-    known, first, inverse, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    kept = counts >= MIN_TRACK_LENGTH
-    numbers = np.where(kept, np.cumsum(kept), 0)
-    sums = np.zeros((len(known), 3), np.int64)
-    np.add.at(sums, inverse, np.concatenate([each.colours for each in seen]))
+    rows = np.concatenate([np.column_stack([each.blocks, each.points]) for each in seen])
+    known, inverse, counts = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+    inverse, kept = inverse.ravel(), counts >= MIN_TRACK_LENGTH
+    sums = np.stack(
+        [
+            np.bincount(inverse, np.concatenate([each.colours[:, channel] for each in seen]), len(known))
+            for channel in range(3)
+        ],
+        axis=1,
+    )
     order = np.argsort(inverse, kind="stable")
     order = order[kept[inverse[order]]]
     image = np.repeat(np.arange(1, len(seen) + 1), lengths)
-    observation = np.arange(len(keys)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    places = np.concatenate([each.places for each in seen])[first[kept]] + np.array(config.origin)
-    colours = np.rint(sums[kept] / counts[kept, None]).astype(np.uint8)
-    tracks = np.concatenate([[0], np.cumsum(counts[kept])])
-    points = ModelPoints(places, colours, tracks, image[order], observation[order])
-    of_all = np.where(kept[inverse], numbers[inverse].astype(np.uint64), UNKNOWN_POINT)
+    observation = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    points = ModelPoints(
+        _places(config, known[kept]),
+        np.rint(sums[kept] / counts[kept, None]).astype(np.uint8),
+        np.concatenate([[0], np.cumsum(counts[kept])]),
+        image[order],
+        observation[order],
+    )
+    numbers = np.where(kept, np.cumsum(kept), 0).astype(np.uint64)
+    of_all = np.where(kept[inverse], numbers[inverse], UNKNOWN_POINT)
     return points, np.split(of_all, np.cumsum(lengths)[:-1])
+
+
+def _places(config: TownConfig, points: NDArray[np.int32]) -> Float64:
+    """World coordinates (n, 3) of points, each given by its block's two numbers and its own, sorted by block."""
+    places = np.empty((len(points), 3))
+    steps = np.flatnonzero((points[1:, :2] != points[:-1, :2]).any(axis=1)) + 1
+    for rows in np.split(np.arange(len(points)), steps):
+        if len(rows):
+            block = city_block(config.seed, int(points[rows[0], 0]), int(points[rows[0], 1]))
+            places[rows] = block.points[points[rows, 2]] + block.corner
+    return np.asarray(places + config.origin)
 
 
 def _move_into_place(work: Path, output: Path) -> None:
