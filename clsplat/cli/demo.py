@@ -124,7 +124,7 @@ def _write_town(verb: DemoVerb, services: Services) -> int:
         " --appearance exposure": bool(config.exposure),
         " --refine-poses": bool(config.pose_noise),
     }
-    flags = "".join(flag for flag, is_useful in more.items() if is_useful)
+    flags = " --sky 3000" + "".join(flag for flag, is_useful in more.items() if is_useful)
     exact = f"; exact cameras in {verb.output / 'exact'}" if config.pose_noise else ""
     print(
         f"town of {columns}x{rows} blocks, {record['photographs']:,} photographs and {record['points']:,} points in "

@@ -14,7 +14,8 @@ import pytest
 from calls import Capture, error_line
 from numpy.typing import NDArray
 
-from clsplat.cli.main import main
+from clsplat.cli.main import main, parse
+from clsplat.cli.train import TrainVerb
 from clsplat.config.masks import MaskUse
 from clsplat.demo.town import photography, visibility, writing
 from clsplat.demo.town.blocks import BLOCK_METRES, BLOCK_REACH_METRES, MAX_HEIGHT_METRES, city_block
@@ -272,7 +273,13 @@ def test_a_wrong_option_is_one_line(flags: str, message: str, tmp_path: Path, ca
 
 def test_the_command_says_how_to_train_the_town(tmp_path: Path, capsys: Capture) -> None:
     flags = "--town 1x1 --town-photos 2 --town-size 32x20 --town-rig fisheye --town-cars 1 --json"
+    flags += " --town-exposure 1 --town-pose-noise 0.1"
     assert main(["demo", "-o", str(tmp_path / "town"), *flags.split()]) == 0
     told = capsys.readouterr()
     assert json.loads(told.out)["photographs"] == 2
-    assert f"next: clsplat train {tmp_path / 'town'} -o RUN --lenses native --masks ignore" in told.err
+    assert f"exact cameras in {tmp_path / 'town' / 'exact'}" in told.err
+    verb = parse(told.err.strip().partition("next: clsplat ")[2].split())
+    assert isinstance(verb, TrainVerb) and verb.scene == tmp_path / "town"
+    config = verb.config
+    assert (config.sky, config.lenses, config.masks) == (3000, "native", "ignore")
+    assert (config.appearance, config.refine_poses) == ("exposure", True)

@@ -29,13 +29,13 @@ def test_copies_lie_side_by_side_and_differ_a_little(
     model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tile_model, "PIECE_ROWS", 100)
-    arguments = [str(model), str(tmp_path / "tiled.ply"), "--gaussians", "1700", "--pitch", "10"]
+    arguments = [str(model), str(tmp_path / "tiled.ply"), "--gaussians", "1700", "--box=-1,-1,-1,9,9,9"]
     assert tile_model.main(arguments) == 0
     source, tiled = Gaussians.load(model), Gaussians.load(tmp_path / "tiled.ply")
     assert len(tiled) == 1700 and tiled.sh_degree == 3 and tiled.antialiased
     kept = np.flatnonzero(np.isin(source.quaternions[:, 0], tiled.quaternions[:, 0]))
     size = len(kept)
-    assert 400 < size < 500 and 0 not in kept
+    assert size == 499 and 0 not in kept
     for copy, corner in enumerate([(0, 0, 0), (10, 0, 0), (0, 10, 0), (10, 10, 0)]):
         rows = slice(copy * size, min(copy * size + size, 1700))
         own = kept[: rows.stop - rows.start]
@@ -69,7 +69,9 @@ def test_equal_arguments_give_equal_bytes_and_fewer_degrees_a_smaller_file(model
     [
         ("--gaussians 0", "at least 1"),
         ("--gaussians 5 --sh-degree 4", "--sh-degree of 0 to 3"),
-        ("--gaussians 5 --pitch nan", "--pitch nan: expected a length"),
+        ("--gaussians 5 --box 0,0,0,1,1", "--box 0,0,0,1,1: expected six numbers"),
+        ("--gaussians 5 --box 0,0,0,1,1,-1", "--box 0,0,0,1,1,-1: expected six numbers, the low corner first"),
+        ("--gaussians 5 --box 50,0,0,60,1,1", "--box: has none of the 500 Gaussians"),
     ],
 )
 def test_a_wrong_argument_is_one_line(

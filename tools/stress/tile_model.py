@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tiles a model over a grid, to any number of Gaussians, to try large models on.
 
-    python tools/stress/tile_model.py MODEL OUTPUT.ply --gaussians N [--sh-degree 3] [--up z] [--pitch LENGTH]
+    python tools/stress/tile_model.py MODEL OUTPUT.ply --gaussians N [--sh-degree 3] [--up z] [--box X0,Y0,Z0,X1,Y1,Z1]
 
-The copies lie side by side on the plane across the up axis, row by row in a square. Each has the Gaussians inside the
-box of nearly all means, and differs a little from the others: places, sizes, opacities, colours. The output is the PLY
-of every tool, written piece by piece: memory is that of the model and of a piece. Equal arguments give equal bytes.
+The copies lie side by side on the plane across the up axis, row by row in a square. Each has the Gaussians inside a
+box, that of most means by default, and differs a little from the others: places, sizes, opacities, colours. The output
+is the PLY of every tool, written piece by piece: memory is that of the model and of a piece. Equal arguments give equal
+bytes.
 """
 
 from __future__ import annotations
@@ -33,8 +34,12 @@ PIECE_ROWS = 1 << 16
 """Gaussians that are written at once."""
 SPREAD = 0.1
 """Standard deviation of a Gaussian's displacement in a copy, in its own middle sizes, and of its logit."""
+INSIDE = 0.8
+"""Fraction of the means, along each axis, in the box if none is given. The others may be far, as those of a sky."""
 SIZE_SPREAD, TINT_SPREAD = 0.03, 0.06
 """Standard deviations of logs of scales, and of the colour of a copy."""
+
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--gaussians", type=int, required=True, help="number of Gaussians to write")
     parser.add_argument("--sh-degree", type=int, default=MAX_SH_DEGREE, help="largest degree of SH to keep; default 3")
     parser.add_argument("--up", choices=("x", "y", "z"), default="z", help="axis across the plane; default z")
-    parser.add_argument("--pitch", type=float, help="distance of neighbouring copies; by default the size of the box")
+    parser.add_argument("--box", help="corners of a tile, X0,Y0,Z0,X1,Y1,Z1; by default the box of most means")
     parser.add_argument("--seed", type=int, default=0, help="of the changes from copy to copy; default 0")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     given = parser.parse_args(argv)
@@ -53,15 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_new(given.output, overwrite=given.overwrite, sources=[given.model])
         if given.gaussians < 1 or not 0 <= given.sh_degree <= MAX_SH_DEGREE or given.seed < 0:
             raise InputError("expected --gaussians of at least 1, --sh-degree of 0 to 3 and a --seed of at least 0")
-        if given.pitch is not None and not 0 < given.pitch < math.inf:
-            raise InputError(f"--pitch {given.pitch}: expected a length")
         copies = write_tiled(
             given.output,
             Gaussians.load(given.model),
             given.gaussians,
             sh_degree=given.sh_degree,
             up="xyz".index(given.up),
-            pitch=given.pitch,
+            box=None if given.box is None else corners(given.box),
             seed=given.seed,
         )
     except ClsplatError as error:
@@ -71,21 +74,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def corners(text: str) -> Box:
+    """Two corners, the low one first. Raises InputError for anything but six numbers in this order."""
+    try:
+        numbers = np.array([float(word) for word in text.split(",")]).reshape(2, 3)
+    except ValueError:
+        numbers = np.zeros((2, 3))
+    if not (np.isfinite(numbers).all() and (numbers[0] < numbers[1]).all()):
+        raise InputError(f"--box {text}: expected six numbers, the low corner first, such as 0,0,-2,120,120,25")
+    return numbers[0], numbers[1]
+
+
 def write_tiled(
-    path: Path, model: Gaussians, count: int, *, sh_degree: int, up: int, pitch: float | None, seed: int
+    path: Path, model: Gaussians, count: int, *, sh_degree: int, up: int, box: Box | None, seed: int
 ) -> int:
     """Write `count` Gaussians. Returns the number of copies, the last of which may be a part.
 
     up: index of the axis across the plane.
-    pitch: distance of neighbouring copies; None for the size of the box.
+    box: corners (3,) of a tile, in world units, which is also the distance of the copies; None for that of most means.
+    Raises InputError if the box is empty.
     """
-    low, high = extent_of(model.means)
-    tile = take(model, np.flatnonzero(((model.means >= low) & (model.means <= high)).all(axis=1)))
+    low, high = extent_of(model.means, INSIDE) if box is None else (corner - model.origin for corner in box)
+    inside = np.flatnonzero(((model.means >= low) & (model.means < high)).all(axis=1))
+    if not len(inside):
+        raise InputError(f"--box: has none of the {len(model):,} Gaussians, expected a part of the model")
+    tile = take(model, inside)
     tile.sh = np.ascontiguousarray(tile.sh[:, : (sh_degree + 1) ** 2])
     copies = math.ceil(count / len(tile))
     across = [axis for axis in range(3) if axis != up]
     steps = np.zeros((2, 3))
-    steps[[0, 1], across] = (high - low)[across] if pitch is None else pitch
+    steps[[0, 1], across] = (high - low)[across]
     names = [*"xyz", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{index}" for index in range(3 * (tile.sh.shape[1] - 1))]
     names += ["opacity", *(f"scale_{axis}" for axis in range(3)), *(f"rot_{part}" for part in range(4))]

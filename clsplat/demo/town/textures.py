@@ -124,7 +124,8 @@ def _facade(kind: int, brush: Brush) -> Pixels:
     cell = TEXTURE_SIDE / 4
     wide, tall = ((0.40, 0.48), (0.52, 0.56), (0.84, 0.58))[kind // 3]
     frame: Colour = ((0.86, 0.85, 0.80), (0.30, 0.22, 0.16), (0.20, 0.21, 0.22))[(kind + kind // 3) % 3]
-    generator, glare = brush.generator, brush.rough(0.25, 0.9)[..., None]
+    generator = brush.generator
+    glass = (0.045 * brush.rough(0.25, 0.9)[..., None] + np.array([0.12, 0.15, 0.19], np.float32)).clip(0.03, 0.4)
     for storey in range(4):
         for column in range(4):
             left, top = (column + 0.5 - wide / 2) * cell, (storey + 0.22) * cell
@@ -132,8 +133,7 @@ def _facade(kind: int, brush: Brush) -> Pixels:
             door = kind < 5 and storey == 3 and column == kind % 4
             bottom = (storey + 1) * cell if door else bottom
             _paint(image, (left - 5, top - 5, right + 5, bottom + 5), frame)
-            glass = np.array([0.10, 0.13, 0.17]) + 0.05 * generator.uniform(0, 1) * np.ones(3)
-            _paint(image, (left, top, right, bottom), (glass + 0.045 * glare).clip(0.03, 0.4))
+            _paint(image, (left, top, right, bottom), glass)
             if door:
                 _paint(image, (left, top + 12, right, bottom), generator.uniform(0.12, 0.45, 3))
                 _paint(image, (right - 12, top + 60, right - 7, top + 66), (0.8, 0.7, 0.4))

@@ -7,8 +7,9 @@ rectangle have met something nearer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,25 @@ class Sight:
     surfaces: NDArray[np.int32]
 
 
+Slices = tuple[slice, slice, slice]
+
+
+class _Part(NamedTuple):
+    """A part of the picture that a box may cover. A box that crosses the edge of a panorama has two.
+
+    box: its number.
+    near: its distance in metres.
+    top, bottom, left, right: first and last row, first and last column; the last do not belong to it.
+    """
+
+    box: int
+    near: float
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+
 class Caster:
     """Casts the rays of one photograph against blocks.
 
@@ -74,49 +94,46 @@ class Caster:
         self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         low = np.stack([block.corner + block.low for block in blocks]) - self.position
         high = np.stack([block.corner + block.high for block in blocks]) - self.position
-        self._parts, self._near = rectangles(camera, low, high), _nearest(low, high)
-        self._wraps = camera.model.wraps
-        self._inner: dict[int, tuple[NDArray[np.int32], Float64, NDArray[np.int64]]] = {}
+        self._blocks = _placed(camera, low, high)
+        self._inner: dict[int, list[_Part]] = {}
 
     def sight(self, first: int, last: int) -> Sight:
         """The surfaces that the rays of the rows from `first` to `last` meet."""
         directions = world_rays(self.camera, first, last)
         rays = _Rays(directions, self.position, first)
-        for index, block in enumerate(self.blocks):
-            if not self._open(rays, self._parts[index], float(self._near[index])):
-                continue
-            parts, near, order = self._solids_of(index, block)
-            for solid in order[(parts[order, 0] < last) & (parts[order, 1] > first)]:
-                for rows, columns in self._pieces(parts[solid], first, last):
-                    if rays.is_open(rows, columns, float(near[solid])):
-                        rays.cast(block, int(solid), int(self.starts[index] + solid), rows, columns)
+        done = set()
+        for place in self._blocks:
+            if place.box not in done and rays.is_open(place):
+                done.add(place.box)
+                block, start = self.blocks[place.box], int(self.starts[place.box])
+                for part in self._solids_of(place.box):
+                    if rays.is_open(part):
+                        rays.cast(block, part.box, start + part.box, rays.slices(part))
         return Sight(directions, rays.surfaces)
 
-    def _open(self, rays: _Rays, part: NDArray[np.int32], near: float) -> bool:
-        last = rays.first + rays.surfaces.shape[1]
-        return any(rays.is_open(rows, columns, near) for rows, columns in self._pieces(part, rays.first, last))
-
-    def _solids_of(self, index: int, block: CityBlock) -> tuple[NDArray[np.int32], Float64, NDArray[np.int64]]:
-        """Rectangles and distances of a block's solids, and the order from near to far of those in the picture."""
+    def _solids_of(self, index: int) -> list[_Part]:
+        """The parts of a block's solids, from near to far."""
         if index not in self._inner:
+            block = self.blocks[index]
             low, high = (corner + (block.corner - self.position) for corner in block.solids.bounds())
-            parts, near = rectangles(self.camera, low, high), _nearest(low, high)
-            seen = np.flatnonzero((parts[:, 0] < parts[:, 1]) & (parts[:, 2] < parts[:, 3]))
-            self._inner[index] = parts, near, seen[np.argsort(near[seen], kind="stable")]
+            self._inner[index] = _placed(self.camera, low, high)
         return self._inner[index]
 
-    def _pieces(self, part: NDArray[np.int32], first: int, last: int) -> Iterator[tuple[slice, slice]]:
-        """Slices of rows and columns of a rectangle. One that crosses the edge of a panorama has two pieces."""
-        top, bottom, left, right = part.tolist()
-        rows = slice(max(top, first) - first, min(bottom, last) - first)
-        if rows.start >= rows.stop:
-            return
-        width = self.camera.width
-        shifts = (0, width, -width) if self._wraps and right - left < width else (0,)
-        for shift in shifts:
-            columns = slice(max(left + shift, 0), min(right + shift, width))
-            if columns.start < columns.stop:
-                yield rows, columns
+
+def _placed(camera: Camera, low: Float64, high: Float64) -> list[_Part]:
+    """The parts of the picture of boxes, from near to far. low, high: as for `rectangles`."""
+    bounds, near = rectangles(camera, low, high), _nearest(low, high)
+    width, wraps = camera.width, camera.model.wraps
+    order = np.argsort(near, kind="stable")
+    parts = []
+    for index, distance, (top, bottom, left, right) in zip(
+        order.tolist(), near[order].tolist(), bounds[order].tolist(), strict=True
+    ):
+        if top < bottom:
+            shifts = (0, width, -width) if wraps and right - left < width else (0,)
+            pieces = ((max(left + shift, 0), min(right + shift, width)) for shift in shifts)
+            parts += [_Part(index, distance, top, bottom, begin, end) for begin, end in pieces if begin < end]
+    return parts
 
 
 def _nearest(low: Float64, high: Float64) -> Float64:
@@ -139,13 +156,20 @@ class _Rays:
         x, y, z = (axis[:, :: max(axis.shape[1] - 1, 1), :: max(axis.shape[2] - 1, 1)] for axis in directions)
         self._longest = float(np.sqrt((x**2 + y**2 + z**2).max()))  # a picture's corners have the longest
 
-    def is_open(self, rows: slice, columns: slice, near: float) -> bool:
-        """True if a ray of the rectangle goes on to the distance `near`, in metres."""
-        return bool(self.distance[:, rows, columns].max() * self._longest > near)
+    def slices(self, part: _Part) -> Slices:
+        """The samples, rows and columns of a part of the picture among these rays."""
+        rows = slice(max(part.top - self.first, 0), max(part.bottom - self.first, 0))
+        return slice(None), rows, slice(part.left, part.right)
 
-    def cast(self, block: CityBlock, solid: int, number: int, rows: slice, columns: slice) -> None:
-        """Cast the rays of a rectangle against a solid. number: that of the solid in the picture."""
-        solids, part = block.solids, (slice(None), rows, columns)
+    def is_open(self, part: _Part) -> bool:
+        """True if a ray of a part of the picture goes on to the distance of its box."""
+        if part.bottom <= self.first or part.top >= self.first + self.distance.shape[1]:
+            return False
+        return bool(self.distance[self.slices(part)].max() * self._longest > part.near)
+
+    def cast(self, block: CityBlock, solid: int, number: int, part: Slices) -> None:
+        """Cast the rays of a part against a solid. number: that of the solid in the picture."""
+        solids = block.solids
         centre = (self.position - block.corner - solids.centres[solid]).astype(np.float32)
         half, kind = solids.halves[solid].astype(np.float32), int(solids.kinds[solid])
         turn = solids.turns[solid].astype(np.float32)
@@ -156,7 +180,7 @@ class _Rays:
             else:
                 self._polyhedron(part, centre, half, turn, kind, base)
 
-    def _ball(self, part: tuple[slice, slice, slice], start: Float32, radius: np.float32, base: int) -> None:
+    def _ball(self, part: Slices, start: Float32, radius: np.float32, base: int) -> None:
         x, y, z = self.x[part], self.y[part], self.z[part]
         square = x * x
         square += y * y
@@ -172,9 +196,7 @@ class _Rays:
         hit = (rest > 0) & (enter > 0) & (enter < self.distance[part])
         self._meet(part, hit, enter, base)
 
-    def _polyhedron(
-        self, part: tuple[slice, slice, slice], start: Float32, half: Float32, turn: Float32, kind: int, base: int
-    ) -> None:
+    def _polyhedron(self, part: Slices, start: Float32, half: Float32, turn: Float32, kind: int, base: int) -> None:
         over_x, over_y, y = self._turned(part, turn)
         start = np.array([turn[0] * start[0] + turn[1] * start[1], turn[0] * start[1] - turn[1] * start[0], start[2]])
         begin, end = _slab(over_x, start[0], half[0])
@@ -211,7 +233,7 @@ class _Rays:
                 face = np.where(enter == other, np.int32(base + code), face)
             self._meet(part, hit, enter, face)
 
-    def _turned(self, part: tuple[slice, slice, slice], turn: Float32) -> tuple[Float32, Float32, Float32]:
+    def _turned(self, part: Slices, turn: Float32) -> tuple[Float32, Float32, Float32]:
         """Reciprocals of the directions along a solid's own x and y, and the directions along its y."""
         x, y = self.x[part], self.y[part]
         if turn[1] == 0:
@@ -224,7 +246,7 @@ class _Rays:
             np.reciprocal(turned_x, out=turned_x)
             return turned_x, np.reciprocal(turned_y), turned_y
 
-    def _meet(self, part: tuple[slice, slice, slice], hit: Bool, enter: Float32, face: NDArray[np.int32] | int) -> None:
+    def _meet(self, part: Slices, hit: Bool, enter: Float32, face: NDArray[np.int32] | int) -> None:
         np.copyto(self.distance[part], enter, where=hit)
         np.copyto(self.surfaces[part], face, where=hit)
 
