@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from tyro.conf import arg
 
@@ -16,6 +16,7 @@ from clsplat.cli.options import DeviceChoice, Flag, Output, Verb
 from clsplat.cli.session import Services
 from clsplat.config.cli_defaults import DEMO_ITERATIONS
 from clsplat.config.training import TrainConfig
+from clsplat.demo.town.settings import TownConfig, TownRig, three_numbers, two_numbers
 from clsplat.errors import InputError
 from clsplat.progress import StageProgress
 
@@ -43,23 +44,23 @@ class DemoVerb(Verb):
     town: Annotated[str | None, arg(metavar="NxM")] = None
     """Write a town of NxM city blocks of 60 metres, without training. A larger town has the photographs of a smaller
     one, byte for byte."""
-    town_photos: Annotated[int, arg(metavar="COUNT")] = 60
+    town_photos: Annotated[int, arg(metavar="COUNT")] = TownConfig.photos
     """Photographs of each block: three in ten straight down, four in ten at a slant, three in ten in its streets."""
-    town_size: Annotated[str, arg(metavar="WxH")] = "640x400"
+    town_size: Annotated[str, arg(metavar="WxH")] = f"{TownConfig.width}x{TownConfig.height}"
     """Size of the photographs in pixels."""
-    town_rig: Literal["perspective", "fisheye", "panorama"] = "perspective"
+    town_rig: TownRig = TownConfig.rig
     """Cameras in the streets: perspective, fisheye (OPENCV_FISHEYE, 180 degrees across the picture) or panorama
     (EQUIRECTANGULAR, W x W/2 pixels)."""
-    town_exposure: Annotated[float, arg(metavar="STOPS")] = 0.0
+    town_exposure: Annotated[float, arg(metavar="STOPS")] = TownConfig.exposure
     """Largest change of exposure, in stops: it differs from flight to flight, and drifts along a flight."""
-    town_cars: Annotated[int, arg(metavar="COUNT")] = 0
+    town_cars: Annotated[int, arg(metavar="COUNT")] = TownConfig.cars
     """Moving cars in each block, elsewhere in each photograph. Masks leave them out."""
     town_origin: Annotated[str, arg(metavar="X,Y,Z")] = "0,0,0"
     """World coordinates of the town's corner in metres, such as 500000,4650000,0, as in a survey."""
-    town_pose_noise: Annotated[float, arg(metavar="METRES")] = 0.0
+    town_pose_noise: Annotated[float, arg(metavar="METRES")] = TownConfig.pose_noise
     """Standard deviation of the written camera positions along each axis. The exact cameras are written to the
     sub-folder exact."""
-    seed: int = 0
+    seed: int = TownConfig.seed
     """Seed of the town, its cameras and all noise."""
     overwrite: Flag = False
     """Replace an earlier town in the output folder."""
@@ -96,8 +97,6 @@ def run(verb: DemoVerb, services: Services) -> int:
 
 
 def _write_town(verb: DemoVerb, services: Services) -> int:
-    from clsplat.demo.town.settings import TownConfig, three_numbers, two_numbers
-
     assert verb.town is not None
     columns, rows = two_numbers("town", verb.town, "3x2")
     width, height = two_numbers("town-size", verb.town_size, "640x400")
@@ -119,7 +118,7 @@ def _write_town(verb: DemoVerb, services: Services) -> int:
     if verb.json:
         print(json.dumps(record, indent=2))
     more = {
-        " --lenses native": config.rig == "fisheye",
+        " --lenses native": config.is_fisheye,
         " --masks ignore": bool(config.cars),
         " --appearance exposure": bool(config.exposure),
         " --refine-poses": bool(config.pose_noise),

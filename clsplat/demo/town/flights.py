@@ -61,12 +61,12 @@ def lenses(config: TownConfig) -> tuple[Lens, Lens]:
         focal = 0.5 * max(width, height) / math.tan(0.5 * angle)
         return Lens("PINHOLE", width, height, (focal, focal, *centre))
 
-    if config.rig == "fisheye":  # half a circle across the longer side
+    if config.is_fisheye:  # half a circle across the longer side
         k1, k2, *_ = TOWN_FISHEYE_COEFFICIENTS
         angle = math.pi / 2
         focal = 0.5 * max(width, height) / (angle * (1 + k1 * angle**2 + k2 * angle**4))
         street = Lens("OPENCV_FISHEYE", width, height, (focal, focal, *centre, *TOWN_FISHEYE_COEFFICIENTS))
-    elif config.rig == "panorama":
+    elif config.is_panorama:
         tall = width // 2
         street = Lens("EQUIRECTANGULAR", width, tall, (float(width), float(tall)))
     else:

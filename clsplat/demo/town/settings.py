@@ -49,6 +49,16 @@ class TownConfig:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pose_noise: float = 0.0
 
+    @property
+    def is_fisheye(self) -> bool:
+        """True for fisheyes in the streets."""
+        return self.rig == "fisheye"
+
+    @property
+    def is_panorama(self) -> bool:
+        """True for panoramas in the streets."""
+        return self.rig == "panorama"
+
     def check(self) -> None:
         """Raise InputError, which names the flag, for a value without sense."""
         sides = f"1 to {MAX_TOWN_SIDE} blocks a side, such as 3x2"

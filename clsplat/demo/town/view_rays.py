@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
+from clsplat.cameras.model import CameraModel
 
 SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 """Places x, y of a pixel's rays from its centre."""
@@ -18,25 +19,25 @@ _ANGLES = 1 << 16
 _CIRCLE = 32
 """Directions of the edge of a cone around a ball, from which its part of the picture follows."""
 Planes = tuple[Float32, Float32, Float32]
-LensKey = tuple[str, int, int, float, float, float, float, tuple[float, ...]]
+LensKey = tuple[CameraModel, int, int, float, float, float, float, tuple[float, ...]]
 
 
 def lens_key(camera: Camera) -> LensKey:
     """The camera without its pose, to keep its rays."""
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-    return (camera.projection, camera.width, camera.height, *intrinsics, camera.radial)
+    return (camera.model, camera.width, camera.height, *intrinsics, camera.radial)
 
 
 @lru_cache(maxsize=16)
 def _local_rays(key: LensKey, first: int, last: int, places: tuple[tuple[float, float], ...]) -> Planes:
     """Directions in the camera's axes, as three arrays that broadcast to (places, rows, columns)."""
-    projection, width, _, fx, fy, cx, cy, radial = key
+    model, width, _, fx, fy, cx, cy, radial = key
     across, down = np.array(places).T
     a = ((np.arange(width) + 0.5 + across[:, None] - cx) / fx)[:, None, :]
     b = ((np.arange(first, last) + 0.5 + down[:, None] - cy) / fy)[:, :, None]
-    if projection == "perspective":
+    if model.is_pinhole:
         planes = (a, b, np.ones((1, 1, 1)))
-    elif projection == "equirectangular":
+    elif model.wraps:
         planes = (np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a))
     else:
         angles = np.linspace(0, np.pi, _ANGLES)
@@ -68,14 +69,14 @@ def rectangles(camera: Camera, low: Float64, high: Float64) -> NDArray[np.int32]
     the edges, where the picture repeats.
     low, high: (n, 3), corners of the boxes, from the camera's centre along the world's axes.
     """
-    if camera.projection == "perspective":
+    if camera.is_pinhole:
         bounds = _flat_bounds(camera, low, high)
-    elif camera.projection == "equirectangular":
+    elif camera.model.wraps:
         bounds = _panorama_bounds(camera, low, high)
     else:
         bounds = _fisheye_bounds(camera, low, high)
     left, right, top, bottom = bounds.T
-    wide = camera.width if camera.projection == "equirectangular" else 0
+    wide = camera.width if camera.model.wraps else 0
     edges = (
         np.clip(np.floor(top - 1), 0, camera.height),
         np.clip(np.ceil(bottom + 1), 0, camera.height),

@@ -147,9 +147,9 @@ class _Rays:
     def __init__(self, directions: tuple[Float32, Float32, Float32], position: Float64, first: int) -> None:
         self.position, self.first = position, first
         self.x, self.y, self.z = directions
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):
             self.over_x, self.over_y, self.over_z = (np.reciprocal(axis) for axis in directions)
-        ground = np.float32(-position[2]) * self.over_z
+            ground = np.float32(-position[2]) * self.over_z
         falls = self.z < 0
         self.distance = np.where(falls, ground, np.float32(np.inf))
         self.surfaces = np.where(falls, np.int32(GROUND_FACE), np.int32(SKY_FACE))
@@ -174,7 +174,7 @@ class _Rays:
         half, kind = solids.halves[solid].astype(np.float32), int(solids.kinds[solid])
         turn = solids.turns[solid].astype(np.float32)
         base = number * FACES_PER_SOLID
-        with np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             if kind == SOLID_BALL:
                 self._ball(part, centre, half[0], base)
             else:
@@ -242,9 +242,8 @@ class _Rays:
         turned_x += turn[1] * y
         turned_y = turn[0] * y
         turned_y -= turn[1] * x
-        with np.errstate(divide="ignore"):
-            np.reciprocal(turned_x, out=turned_x)
-            return turned_x, np.reciprocal(turned_y), turned_y
+        np.reciprocal(turned_x, out=turned_x)
+        return turned_x, np.reciprocal(turned_y), turned_y
 
     def _meet(self, part: Slices, hit: Bool, enter: Float32, face: NDArray[np.int32] | int) -> None:
         np.copyto(self.distance[part], enter, where=hit)
