@@ -318,6 +318,6 @@ def _baked_sky(brush: Brush) -> Pixels:
 
 
 @lru_cache(maxsize=2)
-def textures(seed: int) -> Any:
+def textures(seed: int) -> Textures:
     """The textures of a seed, kept for the next photographs."""
     return Textures(seed)

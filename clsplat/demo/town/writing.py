@@ -36,11 +36,14 @@ from clsplat.files.atomic import atomic_write, replace
 from clsplat.files.documents import is_file
 from clsplat.images.writing import write_image
 from clsplat.progress import CountedFraction, Progress, no_progress
+from clsplat.scenes.dataset import Lens
 
 TOWN_RECORD_FILE = "town.json"
 """File in a town's folder with its settings. It marks the folder as one that may be replaced."""
 EXACT_POSES_FOLDER = "exact"
 """Folder with the exact cameras, a COLMAP model without points, if the written ones are noisy."""
+MAX_TOWN_WORKERS = 8
+"""Largest number of threads if none is given. More would wait for the interpreter's lock, and take more memory."""
 MIN_TRACK_LENGTH = 2
 """Photographs that must show a point of the scene."""
 
@@ -59,7 +62,7 @@ def write_town(
     Equal settings give equal bytes, and a larger town has the photographs of a smaller one.
 
     overwrite: replace an earlier town.
-    workers: threads; one for each core if None. They change no bytes.
+    workers: threads; one for each core, up to MAX_TOWN_WORKERS, if None. They change no bytes.
     progress: function that is called with a text and the completed fraction.
     Raises InputError for settings without sense and for a folder that must not be replaced, and ClsplatError if a file
     cannot be written. After KeyboardInterrupt no files remain.
@@ -75,7 +78,7 @@ def write_town(
             shot for j in range(config.rows) for i in range(config.columns) for shot in photographs(config, i, j)
         ]
         planned.sort(key=lambda shot: shot.name)
-        seen = _take_all(result, config, planned, workers or os.cpu_count() or 1, progress)
+        seen = _take_all(result, config, planned, workers or min(os.cpu_count() or 1, MAX_TOWN_WORKERS), progress)
         points = _write_model(result, config, planned, seen)
         record = {"town": config.record(), "photographs": len(planned), "points": points}
         atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
@@ -154,8 +157,8 @@ def _noise(config: TownConfig, shot: TownPhotograph) -> Float64:
     return block_generator(config.seed, 6, shot.i, shot.j, shot.index).normal(0, 1, 3) * config.pose_noise
 
 
-def _image(config: TownConfig, shot: TownPhotograph, air: object, error: Float64) -> ModelImage:
-    """A photograph without observations, whose written position is wrong by `error` (3,)."""
+def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) -> ModelImage:
+    """A photograph without observations, whose written position is wrong by `error` (3,). air: lens of the flights."""
     rotation = shot.camera.rotation
     position = shot.camera.position + np.array(config.origin) + error
     none = np.zeros((0, 2)), np.zeros(0, np.uint64)
