@@ -48,6 +48,7 @@ class Services:
     renderer: Callable[..., Renderer] = imported("clsplat.rendering.renderer.Renderer")
     open_frame_renderer: Callable[..., Any] = imported("clsplat.sequence.frame_renderer.open_frame_renderer")
     run_demo: Callable[..., Evaluation] = imported("clsplat.demo.run.run_demo")
+    write_town: Callable[..., dict[str, Any]] = imported("clsplat.demo.town.writing.write_town")
 
 
 def load_scene(

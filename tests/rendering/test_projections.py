@@ -25,6 +25,7 @@ OTHER_MEANINGS = {
     "torch/projection.py",
     "torch/rendering.py",
     "reference/ewa.py",  # the twin of gsplat's projection
+    "demo/town/settings.py",  # cameras in the streets of a town
     "models/formats/usd.py",  # a hint of USD's about sorting
     "models/info.py",  # --perspective, as the model says it
     "runs/run.py",  # the name of that setting

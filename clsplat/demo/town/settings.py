@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The settings of a town, and the rules for them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+from clsplat.errors import InputError
+
+TownRig = Literal["perspective", "fisheye", "panorama"]
+MAX_TOWN_SIDE = 1000
+"""Largest number of blocks along a side."""
+MAX_PHOTOS_PER_BLOCK = 1000
+MIN_TOWN_PHOTO_SIDE, MAX_TOWN_PHOTO_SIDE = 16, 8192
+"""Limits of a photograph's width and height in pixels."""
+CAR_SLOTS = 28
+"""Places of moving cars in a block: seven in each direction of its two streets."""
+MAX_TOWN_ORIGIN_METRES = 1e8
+"""Float64 has steps of 15 nanometres there."""
+
+
+@dataclass(frozen=True)
+class TownConfig:
+    """A town's settings.
+
+    columns, rows: number of photographed blocks along x and y. The world itself has no end.
+    photos: number of photographs of each block.
+    width, height: size of a photograph in pixels. A panorama has half its width as height.
+    seed: seed of the world, of the cameras and of all noise.
+    rig: cameras in the streets.
+    exposure: largest change of exposure between flights, in stops.
+    cars: number of moving cars in each block.
+    origin: world coordinates of the corner of block (0, 0), in metres.
+    pose_noise: standard deviation of the written camera positions along each axis, in metres.
+    """
+
+    columns: int
+    rows: int
+    photos: int = 60
+    width: int = 640
+    height: int = 400
+    seed: int = 0
+    rig: TownRig = "perspective"
+    exposure: float = 0.0
+    cars: int = 0
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pose_noise: float = 0.0
+
+    @property
+    def is_fisheye(self) -> bool:
+        """True for fisheyes in the streets."""
+        return self.rig == "fisheye"
+
+    @property
+    def is_panorama(self) -> bool:
+        """True for panoramas in the streets."""
+        return self.rig == "panorama"
+
+    def check(self) -> None:
+        """Raise InputError, which names the flag, for a value without sense."""
+        sides = f"1 to {MAX_TOWN_SIDE} blocks a side, such as 3x2"
+        size = f"{MIN_TOWN_PHOTO_SIDE} to {MAX_TOWN_PHOTO_SIDE} pixels a side, such as 640x400"
+        shorter, longer = min(self.width, self.height), max(self.width, self.height)
+        far = max(map(abs, self.origin)) if all(map(math.isfinite, self.origin)) else math.inf
+        given = ",".join(f"{value:g}" for value in self.origin)
+        rules: tuple[tuple[str, object, bool, str], ...] = (
+            ("town", f"{self.columns}x{self.rows}", min(self.columns, self.rows) >= 1, sides),
+            ("town", f"{self.columns}x{self.rows}", max(self.columns, self.rows) <= MAX_TOWN_SIDE, sides),
+            (
+                *("town-photos", self.photos, 1 <= self.photos <= MAX_PHOTOS_PER_BLOCK),
+                f"1 to {MAX_PHOTOS_PER_BLOCK} photographs of each block",
+            ),
+            ("town-size", f"{self.width}x{self.height}", shorter >= MIN_TOWN_PHOTO_SIDE, size),
+            ("town-size", f"{self.width}x{self.height}", longer <= MAX_TOWN_PHOTO_SIDE, size),
+            ("seed", self.seed, 0 <= self.seed < 1 << 32, "a whole number of at least 0 and below 2^32"),
+            ("town-rig", self.rig, self.rig in get_args(TownRig), f"one of {', '.join(get_args(TownRig))}"),
+            ("town-exposure", self.exposure, 0 <= self.exposure <= 4, "0 to 4 stops"),
+            ("town-cars", self.cars, 0 <= self.cars <= CAR_SLOTS, f"0 to {CAR_SLOTS} cars in each block"),
+            ("town-origin", given, far <= MAX_TOWN_ORIGIN_METRES, f"numbers up to {MAX_TOWN_ORIGIN_METRES:g} metres"),
+            ("town-pose-noise", self.pose_noise, 0 <= self.pose_noise <= 100, "0 to 100 metres"),
+        )
+        for flag, value, makes_sense, expected in rules:
+            if not makes_sense:
+                raise InputError(f"--{flag} {value}: expected {expected}")
+
+    def record(self) -> dict[str, Any]:
+        """The settings, for JSON."""
+        return asdict(self) | {"origin": list(self.origin)}
+
+
+def two_numbers(flag: str, text: str, example: str) -> tuple[int, int]:
+    """The numbers of a text such as 3x2. Raises InputError, which names the flag."""
+    match = re.fullmatch(r"\s*(\d{1,9})\s*[xX]\s*(\d{1,9})\s*", text)
+    if match is None:
+        raise InputError(f"--{flag} {text}: expected two whole numbers, such as {example}")
+    return int(match[1]), int(match[2])
+
+
+def three_numbers(flag: str, text: str) -> tuple[float, float, float]:
+    """The coordinates of a text such as 500000,4650000,0. Raises InputError, which names the flag."""
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        raise InputError(f"--{flag} {text}: expected three numbers, such as 500000,4650000,0") from None
+    return x, y, z

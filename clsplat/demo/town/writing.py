@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A town as a COLMAP scene: its photographs, masks, cameras and points with tracks."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.arrays import Float64
+from clsplat.demo.ray_caster import write_jpeg
+from clsplat.demo.town.blocks import block_generator, city_block
+from clsplat.demo.town.colmap_model import (
+    UNKNOWN_POINT,
+    ModelImage,
+    ModelPoints,
+    write_cameras,
+    write_images,
+    write_points,
+)
+from clsplat.demo.town.flights import TownPhotograph, lenses, photographs
+from clsplat.demo.town.photography import Observations, take
+from clsplat.demo.town.settings import TownConfig
+from clsplat.demo.town.textures import textures
+from clsplat.errors import InputError
+from clsplat.files.atomic import atomic_write, replace
+from clsplat.files.documents import is_file
+from clsplat.images.writing import write_image
+from clsplat.progress import CountedFraction, Progress, no_progress
+from clsplat.scenes.dataset import Lens
+
+TOWN_RECORD_FILE = "town.json"
+"""File in a town's folder with its settings. It marks the folder as one that may be replaced."""
+EXACT_POSES_FOLDER = "exact"
+"""Folder with the exact cameras, a COLMAP model without points, if the written ones are noisy."""
+MAX_TOWN_WORKERS = 8
+"""Largest number of threads if none is given. More would wait for the interpreter's lock, and take more memory."""
+MIN_TRACK_LENGTH = 2
+"""Photographs that must show a point of the scene."""
+
+
+def write_town(
+    output: Path,
+    config: TownConfig,
+    *,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Write a town to the folder `output`. Returns its record, as in TOWN_RECORD_FILE.
+
+    The folder has `images/`, `masks/` with moving cars, and `sparse/0/`. It is created when all files are complete.
+    Equal settings give equal bytes, and a larger town has the photographs of a smaller one.
+
+    overwrite: replace an earlier town.
+    workers: threads; one for each core, up to MAX_TOWN_WORKERS, if None. They change no bytes.
+    progress: function that is called with a text and the completed fraction.
+    Raises InputError for settings without sense and for a folder that must not be replaced, and ClsplatError if a file
+    cannot be written. After KeyboardInterrupt no files remain.
+    """
+    config.check()
+    check_folder(output, overwrite=overwrite)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=f".{output.name}-town-", dir=output.parent))
+    try:
+        result = work / "result"
+        result.mkdir()
+        planned = [
+            shot for j in range(config.rows) for i in range(config.columns) for shot in photographs(config, i, j)
+        ]
+        planned.sort(key=lambda shot: shot.name)
+        seen = _take_all(result, config, planned, workers or min(os.cpu_count() or 1, MAX_TOWN_WORKERS), progress)
+        points = _write_model(result, config, planned, seen)
+        record = {"town": config.record(), "photographs": len(planned), "points": points}
+        atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
+        _move_into_place(work, output)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return record
+
+
+def check_folder(output: Path, *, overwrite: bool) -> None:
+    """Raise InputError if a town must not be written at `output`."""
+    if not (output.exists() or output.is_symlink()):
+        return
+    if not output.is_dir():
+        raise InputError(f"{output}: is a file, expected a folder for the town or a new name")
+    if not any(output.iterdir()):
+        return
+    if not is_file(output / TOWN_RECORD_FILE):
+        raise InputError(f"{output}: is neither empty nor a town of clsplat demo, expected a new folder")
+    if not overwrite:
+        raise InputError(f"{output}: exists already; name another folder, or give --overwrite to replace it")
+
+
+def _take_all(
+    result: Path, config: TownConfig, planned: Sequence[TownPhotograph], workers: int, progress: Progress
+) -> list[Observations]:
+    """Take and write all photographs. Returns their observations."""
+    for i, j in sorted({(shot.i, shot.j) for shot in planned}):
+        for folder in ("images", "masks") if config.cars else ("images",):
+            (result / folder / f"{i:04d}_{j:04d}").mkdir(parents=True)
+    progress("painting the town", 0.0)
+    textures(config.seed)
+    seen: list[Observations] = []
+    pool = ThreadPoolExecutor(workers, "clsplat-town")  # NumPy releases the interpreter lock in its loops
+    try:
+        for done, observations in enumerate(pool.map(partial(_take_and_write, result, config), planned), 1):
+            seen.append(observations)
+            progress("taking photographs", CountedFraction(done, len(planned), "taken"))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return seen
+
+
+def _take_and_write(result: Path, config: TownConfig, shot: TownPhotograph) -> Observations:
+    taken = take(config, shot)
+    write_jpeg(result / "images" / shot.name, taken.pixels)
+    if taken.mask is not None:
+        write_image(result / "masks" / f"{shot.name}.png", taken.mask.astype(np.uint8) * 255)
+    return taken.seen
+
+
+def _write_model(
+    result: Path, config: TownConfig, planned: Sequence[TownPhotograph], seen: Sequence[Observations]
+) -> int:
+    """Write the cameras and points. Returns the number of points."""
+    sparse = result / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    points, of_image = _tracks(config, seen)
+    air, street = lenses(config)
+    write_cameras(sparse / "cameras.bin", [air, street])
+    noisy = [_image(config, shot, air, _noise(config, shot)) for shot in planned]
+    for image, observations, numbers in zip(noisy, seen, of_image, strict=True):
+        image.pixels, image.points = observations.pixels, numbers
+    write_images(sparse / "images.bin", len(noisy), noisy)
+    write_points(sparse / "points3D.bin", points)
+    if config.pose_noise:
+        exact = result / EXACT_POSES_FOLDER
+        exact.mkdir()
+        write_cameras(exact / "cameras.bin", [air, street])
+        write_images(exact / "images.bin", len(planned), (_image(config, shot, air, np.zeros(3)) for shot in planned))
+    return len(points.places)
+
+
+def _noise(config: TownConfig, shot: TownPhotograph) -> Float64:
+    """Error (3,) of the written position of a camera, in metres."""
+    return block_generator(config.seed, 6, shot.i, shot.j, shot.index).normal(0, 1, 3) * config.pose_noise
+
+
+def _image(config: TownConfig, shot: TownPhotograph, air: Lens, error: Float64) -> ModelImage:
+    """A photograph without observations, whose written position is wrong by `error` (3,). air: lens of the flights."""
+    rotation = shot.camera.rotation
+    position = shot.camera.position + np.array(config.origin) + error
+    none = np.zeros((0, 2)), np.zeros(0, np.uint64)
+    return ModelImage(shot.name, 1 if shot.lens == air else 2, rotation, -rotation @ position, *none)
+
+
+def _tracks(config: TownConfig, seen: Sequence[Observations]) -> tuple[ModelPoints, list[NDArray[np.uint64]]]:
+    """Points with their tracks, and for each photograph the numbers of its observations' points."""
+    lengths = np.array([len(each.points) for each in seen])
+    rows = np.concatenate([np.column_stack([each.blocks, each.points]) for each in seen])
+    known, inverse, counts = np.unique(rows, axis=0, return_inverse=True, return_counts=True)
+    inverse, kept = inverse.ravel(), counts >= MIN_TRACK_LENGTH
+    sums = np.stack(
+        [
+            np.bincount(inverse, np.concatenate([each.colours[:, channel] for each in seen]), len(known))
+            for channel in range(3)
+        ],
+        axis=1,
+    )
+    order = np.argsort(inverse, kind="stable")
+    order = order[kept[inverse[order]]]
+    image = np.repeat(np.arange(1, len(seen) + 1), lengths)
+    observation = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    points = ModelPoints(
+        _places(config, known[kept]),
+        np.rint(sums[kept] / counts[kept, None]).astype(np.uint8),
+        np.concatenate([[0], np.cumsum(counts[kept])]),
+        image[order],
+        observation[order],
+    )
+    numbers = np.where(kept, np.cumsum(kept), 0).astype(np.uint64)
+    of_all = np.where(kept[inverse], numbers[inverse], UNKNOWN_POINT)
+    return points, np.split(of_all, np.cumsum(lengths)[:-1])
+
+
+def _places(config: TownConfig, points: NDArray[np.int32]) -> Float64:
+    """World coordinates (n, 3) of points, each given by its block's two numbers and its own, sorted by block."""
+    places = np.empty((len(points), 3))
+    steps = np.flatnonzero((points[1:, :2] != points[:-1, :2]).any(axis=1)) + 1
+    for rows in np.split(np.arange(len(points)), steps):
+        if len(rows):
+            block = city_block(config.seed, int(points[rows[0], 0]), int(points[rows[0], 1]))
+            places[rows] = block.points[points[rows, 2]] + block.corner
+    return np.asarray(places + config.origin)
+
+
+def _move_into_place(work: Path, output: Path) -> None:
+    """Move the finished town to `output`. If that fails, an earlier town is restored."""
+    earlier = work / "earlier"
+    if output.exists():
+        replace(output, earlier)
+    try:
+        replace(work / "result", output)
+    except BaseException:
+        if earlier.exists():
+            replace(earlier, output)
+        raise
