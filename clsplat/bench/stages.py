@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -193,9 +193,9 @@ class _Picture(View):
 
     pixels: Float32 = field(kw_only=True)
 
-    # width and height are ignored: the picture exists in one size only
-    def load_masked(self, width: int | None = None, height: int | None = None) -> Float32:  # noqa: ARG002
-        return self.pixels
+    # the picture exists in one size only
+    def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[Float32]:  # noqa: ARG002
+        return [self.pixels for _ in sizes]
 
 
 def trainer_of(subject: Subject, device: Device, config: RasterizerConfig) -> Trainer:

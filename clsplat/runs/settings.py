@@ -51,7 +51,7 @@ RETIRED_SETTINGS |= {
 """Settings of earlier versions, each with the value that switched it off."""
 _ADDED_SETTINGS: dict[str, tuple[str, Any]] = {
     "train.test_most": ("test_every", 0),
-    "train.photos": ("iterations", "exact"),
+    "train.photos": ("test_every", "exact"),
 }
 """Settings that runs of earlier versions lack. Each has a setting that these runs have, and the value that stands for
 what these versions did."""

@@ -67,7 +67,7 @@ class Span(NamedTuple):
 class Forecast:
     """Seconds until the end of a training. Call `see` with each report, in order.
 
-    photographs: number of photographs to train on. Each is read when it is first seen in a size.
+    photographs: number of photographs to train on. Each is read when it is first seen, for all sizes.
     pixels: of a photograph at full size.
     """
 
@@ -108,12 +108,12 @@ class Forecast:
         return pace * float(sum(span.steps * (cost @ np.array(self._amounts(span))) for span in ahead))
 
     def _reads(self, before: int, step: int) -> float:
-        """Number of photographs that the steps after `before` up to `step` read: those not yet seen in this size.
+        """Number of photographs that the steps after `before` up to `step` read: those not yet seen.
 
-        Each epoch shows every photograph once, in a random order, and a size may begin in the middle of one.
+        Each epoch shows every photograph once, in a random order, and a training may resume in the middle of one.
         """
         assert self.begun is not None
-        begin = max([self.begun[0] - 1, *(last for last, _ in self.sizes.until if last <= before)])
+        begin = self.begun[0] - 1
         epoch = self.photographs / self.config.batch
         epoch_end = math.ceil(begin / epoch) * epoch
         unseen = 1 - (epoch_end - begin) / epoch  # in the epoch after that

@@ -318,8 +318,8 @@ def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Pa
     for more in ("", "--dry-run"):
         assert render(shot, tmp_path, f"--skip-existing --quality 5 {more}", "a.####.jpg") == 0
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith("clsplat: warning: --skip-existing: 4 of the frames that are there do not say how")
-        assert "a.0001.jpg: they are kept, whatever their cameras, precision and other settings are" in line
+        assert line.startswith("clsplat: warning: --skip-existing: 4 existing frames have no record of their settings")
+        assert line.endswith("a.0001.jpg; they are kept unchecked")
     assert render(shot, tmp_path, "", "a.####.png") == 0
     assert "clsplat:settings" in " ".join(png_chunks(tmp_path / "a.0001.png"))
     assert render(shot, tmp_path, "--skip-existing --bits 16", "a.####.png") == 0

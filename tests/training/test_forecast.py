@@ -33,7 +33,7 @@ def made_up(config: TrainConfig, counts: Sequence[int], costs: tuple[float, floa
     for step in range(1, config.iterations + 1):
         count = counts[(step - 1) // 100]
         pixels = 38_400 / sizes.factor(step) ** 2
-        read = step <= 30 or 250 < step <= 280 or 500 < step <= 530
+        read = step <= 30
         seconds += 1e-3 * (costs[0] + 2.5e-4 * (costs[1] * pixels + costs[2] * count) + costs[3] * read)
         if step % 10 == 0:
             made.append(Report(step, count, seconds))

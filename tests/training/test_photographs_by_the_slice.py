@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from calls import Capture
 from compare import assert_same_bits
-from same_bytes import gone_on, interrupted, model_bytes
+from same_bytes import gone_on, model_bytes, stopped
 from tiny import short, write_scene
 
 from clsplat.api import train
@@ -330,7 +330,7 @@ def test_an_interrupted_run_goes_on_with_its_cache(
     assert run.model_path.read_bytes() == unbounded
     assert max(decoded.values()) == 1, "by the sanity checks and the evaluation: all are in the cache"
     assert not run.cache_path.exists()
-    assert interrupted(scene, CONFIG, default_device, tmp_path / "other") == unbounded
+    assert stopped(1, scene, CONFIG, default_device, tmp_path / "other")["model.ply"].tobytes() == unbounded
 
 
 def test_too_small_a_limit_is_refused_before_anything_is_written(own: Path, tmp_path: Path, capsys: Capture) -> None:
@@ -403,7 +403,8 @@ def test_a_photograph_that_changes_ends_the_run_with_a_checkpoint(
     assert caught.value.exit_status == 2
     paths[0].unlink(missing_ok=True)
     shutil.copy2(saved, paths[0])
-    assert gone_on(load_scene(own), CONFIG, default_device, Run.create(run.path, CONFIG, resume=True)) == unbounded
+    resumed = gone_on(load_scene(own), CONFIG, default_device, Run.create(run.path, CONFIG, resume=True))
+    assert resumed["model.ply"].tobytes() == unbounded
 
 
 # Large scenes

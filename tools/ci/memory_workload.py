@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -271,8 +272,8 @@ def scene_of(view: Camera, pixels: NDArray[np.float32], views: int = 1) -> Scene
     """A view, once or more often, its picture in memory at any size."""
 
     class Picture(_Picture):
-        def load_masked(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
-            return self.pixels[: height or view.height, : width or view.width]
+        def load_sizes(self, sizes: Sequence[tuple[int, int]], *, reduce: bool = False) -> list[NDArray[np.float32]]:  # noqa: ARG002
+            return [self.pixels[:height, :width] for width, height in sizes]
 
     lens = Lens("PINHOLE", view.width, view.height, (view.fx, view.fy, view.cx, view.cy))
     means = cloud(18, camera(view.width, view.height), 5, degree=0).means.astype(np.float64)
