@@ -158,7 +158,7 @@ def test_8_bits_follow_the_number_of_photographs() -> None:
 
 
 def test_runs_of_earlier_versions_are_exact() -> None:
-    config, _ = parse_config("clsplat = '0'\n[train]\niterations = 7\n", Path("config.toml"))
+    config, _ = parse_config("clsplat = '0'\n[train]\niterations = 7\ntest_every = 8\n", Path("config.toml"))
     assert config.photos == "exact"
 
 
