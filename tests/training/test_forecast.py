@@ -64,8 +64,8 @@ def ratios(config: TrainConfig, made: list[Report], every: int, forecast: Foreca
 BOUNDS = {"bonsai": 0.15, "fox": 0.25, "fox_at_640": 0.3, "banana": 0.5}
 """Largest error of the time told in the first four tenths.
 
-A room's is known best. A scene by phone tells little of its growth before it grows. The 13 photographs of banana grow to
-three times as many Gaussians as its number of points tells: with the true numbers the times told are within a ninth.
+A room's is known best. A scene by phone tells little of its growth before it grows. The 13 photographs of banana grow
+to three times as many Gaussians as its number of points tells: with the true numbers the times told are within a ninth.
 """
 
 
