@@ -225,6 +225,22 @@ def replace(source: Path, target: Path) -> None:
     _patiently(lambda: source.replace(target))
 
 
+def move_into_place(work: Path, output: Path) -> None:
+    """Move the finished folder `work`/result to `output`. If that fails, an earlier folder there is restored.
+
+    Raises OSError.
+    """
+    earlier = work / "earlier"
+    if output.exists():
+        replace(output, earlier)
+    try:
+        replace(work / "result", output)
+    except BaseException:
+        if earlier.exists():
+            replace(earlier, output)
+        raise
+
+
 def remove(path: Path) -> None:
     """Remove a file if it exists. Raises OSError."""
     _patiently(lambda: path.unlink(missing_ok=True))

@@ -279,7 +279,7 @@ def task_of(monkeypatch):
         tasks.append({path.name: path.read_bytes() for path in (work / "photos").rglob("*") if path.is_file()})
 
     monkeypatch.setattr(sfm, "_run_worker", run)
-    monkeypatch.setattr(sfm, "_move_into_place", move)
+    monkeypatch.setattr(sfm, "move_into_place", move)
     real = sfm_photos.stage_photos
 
     def stage(images, paths, target, report, threads):

@@ -32,7 +32,7 @@ from clsplat.demo.town.photography import Observations, take
 from clsplat.demo.town.settings import TownConfig
 from clsplat.demo.town.textures import textures
 from clsplat.errors import InputError
-from clsplat.files.atomic import atomic_write, replace
+from clsplat.files.atomic import atomic_write, move_into_place
 from clsplat.files.documents import is_file
 from clsplat.images.writing import write_image
 from clsplat.progress import CountedFraction, Progress, no_progress
@@ -82,7 +82,7 @@ def write_town(
         points = _write_model(result, config, planned, seen)
         record = {"town": config.record(), "photographs": len(planned), "points": points}
         atomic_write(result / TOWN_RECORD_FILE, (json.dumps(record, indent=2) + "\n").encode())
-        _move_into_place(work, output)
+        move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return record
@@ -203,16 +203,3 @@ def _places(config: TownConfig, points: NDArray[np.int32]) -> Float64:
             block = city_block(config.seed, int(points[rows[0], 0]), int(points[rows[0], 1]))
             places[rows] = block.points[points[rows, 2]] + block.corner
     return np.asarray(places + config.origin)
-
-
-def _move_into_place(work: Path, output: Path) -> None:
-    """Move the finished town to `output`. If that fails, an earlier town is restored."""
-    earlier = work / "earlier"
-    if output.exists():
-        replace(output, earlier)
-    try:
-        replace(work / "result", output)
-    except BaseException:
-        if earlier.exists():
-            replace(earlier, output)
-        raise

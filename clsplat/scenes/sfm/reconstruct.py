@@ -21,7 +21,7 @@ from typing import IO, Any, Literal
 
 from clsplat.config.masks import MaskUse
 from clsplat.errors import ClsplatError, InputError, examples, warn
-from clsplat.files.atomic import replace
+from clsplat.files.atomic import move_into_place
 from clsplat.files.documents import is_file
 from clsplat.process import apart
 from clsplat.progress import CountedFraction, Progress, no_progress
@@ -146,7 +146,7 @@ def reconstruct(
             raise InputError(_no_model(images, len(photos), answer["failure"]))
         _write_record(work / "result", fingerprint, photos, answer["result"])
         _warn_of_losses(images, photos, answer["result"]["registered"], work / "result" / "images", masks)
-        _move_into_place(work, output)
+        move_into_place(work, output)
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return output
@@ -399,19 +399,6 @@ def _rows(database: Path, table: str) -> int:
             return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])  # noqa: S608 - our names
     except sqlite3.Error:
         return 0
-
-
-def _move_into_place(work: Path, output: Path) -> None:
-    """Move the finished result to `output`. If that fails, an earlier result is restored."""
-    earlier = work / "earlier"
-    if output.exists():
-        replace(output, earlier)
-    try:
-        replace(work / "result", output)
-    except BaseException:
-        if earlier.exists():
-            replace(earlier, output)
-        raise
 
 
 def _no_model(images: Path, count: int, evidence: dict[str, int]) -> str:
