@@ -38,6 +38,13 @@ MIN_FOCAL_PER_SIDE = 1 / 20
 """Minimum plausible focal length, as a fraction of the longer side. A fisheye of 220 degrees has 1/4."""
 MIN_CENTRE_CHECK_SIDE_PX = 16
 """Minimum shorter side in pixels. Only in smaller pictures may the principal point plausibly lie in the first pixel."""
+POINTS_PER_OCCLUSION_CELL = 16
+"""Mean number of points in an occlusion cell.
+
+With fewer points, occluded points show through the gaps. With more, cells are so wide that they cover adjacent objects.
+"""
+MAX_OCCLUSION_CELL_FRACTION = 1 / 25
+"""Maximum side of an occlusion cell, relative to the picture's longer side. It keeps cells small if points are few."""
 
 
 @cache
@@ -335,6 +342,12 @@ def pixels_of(
     x, y = camera.fx * local[:, 0] / by + camera.cx, camera.fy * local[:, 1] / by + camera.cy
     inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     return y[inside].astype(np.int64), x[inside].astype(np.int64), inside
+
+
+def occlusion_cell(camera: Camera, points: int) -> float:
+    """Side in pixels of a cell for `nearest_around`, for so many points in the camera's picture."""
+    cell = np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(points, 1))
+    return float(max(min(cell, MAX_OCCLUSION_CELL_FRACTION * max(camera.width, camera.height)), 1.0))
 
 
 def nearest_around(rows: NDArray[np.int64], columns: NDArray[np.int64], depths: Float64, cell: float) -> Float64:

@@ -16,7 +16,6 @@ from clsplat.errors import InputError, examples, warn
 from clsplat.files.documents import is_file
 from clsplat.images.depth_maps import DEPTH_MAP_SUFFIXES, map_header, read_map
 from clsplat.scenes.dataset import pixels_of
-from clsplat.scenes.photo_names import match
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.sidecar_files import bases_of, beside, owned
 from clsplat.scenes.supervision.depth_samples import KnownDepth, sampled
@@ -66,15 +65,14 @@ def _tracked(scene: Scene, asked: str) -> dict[str, KnownDepth]:
         raise InputError(f"{scene.name}: {asked} needs to know which photographs show a point, expected a COLMAP model")
     tracks = colmap.read_tracks(model)
     weights = 1 / (1 + np.square(np.maximum(tracks.errors, 0.0)))
-    tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
+    tracked = sorted(name for name, rows in tracks.by_image.items() if len(rows))
     if not tracked:
         raise InputError(f"{model}: no point has a track, and {asked} needs tracks; export the model with them")
-    names = match([view.name for view in scene.train_views], tracked).names
-    rows = {name: tracked[theirs] for name, theirs in names.items()}
-    known = {name: KnownDepth(tracks.points[which], weights[which]) for name, which in rows.items()}
+    shown = tracks.shown_in([view.name for view in scene.train_views])
+    known = {name: KnownDepth(tracks.points[rows], weights[rows]) for name, rows in shown.items()}
     if not known:
         raise InputError(
-            f"{model}: has photographs such as {examples(sorted(tracked))} but none of the scene's "
+            f"{model}: has photographs such as {examples(tracked)} but none of the scene's "
             f"({examples([view.name for view in scene.train_views])}), expected the same; {asked} uses their points"
         )
     _check_frame(scene, known, model)

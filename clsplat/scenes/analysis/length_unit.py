@@ -8,8 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from clsplat.arrays import Float64
-from clsplat.scenes.dataset import nearest_around, pixels_of
-from clsplat.scenes.photo_names import match
+from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of
 from clsplat.scenes.readers import colmap
 from clsplat.scenes.scene import Scene, View
 
@@ -27,8 +26,6 @@ MAX_SAMPLED_VIEWS = 200
 """Maximum number of photographs whose points are looked at, spread evenly over the training photographs."""
 MAX_SAMPLED_POINTS = 100_000
 """Maximum number of a scene's points that are projected, if it is not known which photographs show them."""
-POINTS_PER_DEPTH_CELL = 16
-"""Mean number of projected points in a cell of a picture. Only the nearest point of a cell counts as shown."""
 
 
 def length_unit_of(scene: Scene) -> float:
@@ -62,9 +59,7 @@ def _tracked(scene: Scene, views: Sequence[View]) -> dict[str, Float64]:
     if model is None or not len(scene.points):
         return {}
     tracks = colmap.read_tracks(model)
-    tracked = {name: rows for name, rows in tracks.by_image.items() if len(rows)}
-    names = match([view.name for view in views], tracked).names
-    return {name: tracks.points[tracked[theirs]] for name, theirs in names.items()}
+    return {name: tracks.points[rows] for name, rows in tracks.shown_in([view.name for view in views]).items()}
 
 
 def _nearest(points: Float64, view: View, near: float) -> Float64:
@@ -75,6 +70,6 @@ def _nearest(points: Float64, view: View, near: float) -> Float64:
     camera = view.camera.before(near)
     rows, columns, inside = pixels_of(points, camera, view.lens)
     depths = camera.depths_of(points[inside])
-    cell = max(float(np.sqrt(POINTS_PER_DEPTH_CELL * camera.width * camera.height / max(len(depths), 1))), 1.0)
-    nearest: Float64 = depths[depths == nearest_around(rows, columns, depths, cell)]
+    around = nearest_around(rows, columns, depths, occlusion_cell(camera, len(depths)))
+    nearest: Float64 = depths[depths == around]
     return nearest

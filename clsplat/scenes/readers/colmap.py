@@ -15,7 +15,7 @@ import os
 import re
 import struct
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -43,7 +43,7 @@ from clsplat.scenes.dataset import (
     in_pixels,
     models,
 )
-from clsplat.scenes.photo_names import is_legible, legible, slashed
+from clsplat.scenes.photo_names import is_legible, legible, match, slashed
 
 COLMAP_FILE_STEMS = ("cameras", "images", "points3D")
 COLMAP_COUNT = struct.Struct("<Q")
@@ -130,6 +130,14 @@ class Tracks:
     points: Float64
     errors: Float64
     by_image: dict[str, NDArray[np.int64]]
+
+    def shown_in(self, names: Sequence[str]) -> dict[str, NDArray[np.int64]]:
+        """Indices (k,) of the points of each photograph, by its name; without photographs that have none.
+
+        names: the photographs' names, which may differ from the images' names as in `photo_names.match`.
+        """
+        tracked = {name: rows for name, rows in self.by_image.items() if len(rows)}
+        return {name: tracked[theirs] for name, theirs in match(names, tracked).names.items()}
 
 
 def read_tracks(folder: Path) -> Tracks:

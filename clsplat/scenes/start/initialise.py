@@ -16,7 +16,7 @@ from clsplat.camera import DEFAULT_NEAR_PLANE
 from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images.alpha import composite
-from clsplat.scenes.dataset import nearest_around, pixels_of
+from clsplat.scenes.dataset import nearest_around, occlusion_cell, pixels_of
 from clsplat.scenes.point_files import UNCOLOURED_GREY, of_one_colour
 from clsplat.spherical_harmonics import SH_C0
 
@@ -43,13 +43,6 @@ COLOUR_VIEWS_PER_POINT = 15
 In distant photographs the colour of a point is mixed with its surroundings. With fewer photographs than this number, a
 photograph with something else in front of the point would have too much weight.
 """
-POINTS_PER_OCCLUSION_CELL = 16
-"""Mean number of points in an occlusion cell.
-
-With fewer points, occluded points show through the gaps. With more, cells are so wide that they cover adjacent objects.
-"""
-MAX_OCCLUSION_CELL_FRACTION = 1 / 25
-"""Maximum side of an occlusion cell, relative to the picture's longer side. It keeps cells small if points are few."""
 OCCLUSION_DEPTH_RATIO = 1.05
 """Ratio of a point's depth to that of the nearest point in its cell, above which the point counts as occluded."""
 HIDDEN_POINT_RANK = 1e30
@@ -168,9 +161,7 @@ def photographed(scene: Scene, background: ArrayLike) -> Float32:
         camera, picture = view.camera.before(scene.near), view.load_masked()
         rows, columns, inside = pixels_of(scene.points, camera, view.lens)
         which, depths = np.flatnonzero(inside), camera.depths_of(scene.points[inside])
-        cell = np.sqrt(POINTS_PER_OCCLUSION_CELL * camera.width * camera.height / max(len(which), 1))
-        cell = max(min(cell, MAX_OCCLUSION_CELL_FRACTION * max(camera.width, camera.height)), 1.0)
-        behind = depths / nearest_around(rows, columns, depths, cell)
+        behind = depths / nearest_around(rows, columns, depths, occlusion_cell(camera, len(which)))
         rank = np.where(behind <= OCCLUSION_DEPTH_RATIO, depths / camera.fx, HIDDEN_POINT_RANK * behind)
         pixels = picture[rows, columns]
         counts = pixels[:, 4] > 0 if pixels.shape[1] == 5 else np.ones(len(which), np.bool_)
