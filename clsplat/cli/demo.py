@@ -67,8 +67,8 @@ class DemoVerb(Verb):
 
     def completed(self, given: Collection[str]) -> DemoVerb:
         """The arguments. Raises InputError for flags of a town without --town, and of a training with it."""
-        others = {"iterations", "device"} if self.town is not None else _TOWN_FLAGS
-        if wrong := sorted(name for name in given if name.replace("_", "-") in others):
+        others = ("iterations", "device") if self.town is not None else ("town_", "seed", "overwrite")
+        if wrong := sorted(name for name in given if name.startswith(others)):
             flag = wrong[0].replace("_", "-")
             raise InputError(
                 f"--{flag}: a town is not trained, expected it without --town; clsplat train has it"
@@ -76,12 +76,6 @@ class DemoVerb(Verb):
                 else f"--{flag}: expected it with --town, such as --town 2x2"
             )
         return self
-
-
-_TOWN_FLAGS = {
-    *("town-photos", "town-size", "town-rig", "town-exposure", "town-cars", "town-origin", "town-pose-noise"),
-    *("seed", "overwrite"),
-}
 
 
 def run(verb: DemoVerb, services: Services) -> int:

@@ -97,9 +97,8 @@ def steps_made_for(preset: Preset, schedule: Schedule | None) -> int:
 def by_passes(config: TrainConfig, passes: int, photographs: int, given: Collection[str] = ()) -> TrainConfig:
     """The same schedule, stretched or shortened to `passes` passes through the training photographs.
 
-    Settings that count steps are scaled like `iterations`: those of densification, SH degrees, opacity resets, warm-up
-    sizes, learning rates and cooldown. A densification then sees the same part of the photographs, however many there
-    are. Steps stay in order, and those that are not 0 stay at least 1.
+    All STEP_SETTINGS are multiplied by the same factor, so that a densification sees the same part of the photographs,
+    however many there are. A setting of at least 1 stays at least 1.
     given: names of settings that must not change.
     Raises InputError if `passes` is less than 1.
     """

@@ -237,7 +237,7 @@ def rotate_sh(sh: Float32, turn: Float64) -> Float32:
 def sh_rotations(turn: Float64, degree: int) -> list[Float64]:
     """Matrices (2 l + 1, 2 l + 1) of the bands l = 0 to `degree`, which rotate SH by Q = `turn`.
 
-    They map a band's coefficients of f to those of f(Q^T d).
+    Each maps the coefficients of a function f(d) to the coefficients of f(Q^T d).
 
     Each band is closed under rotation (Wigner 1931), so enough directions d determine the coefficients c' of f(Q^T d):
     B c' = B_Q c. Rows of B are the basis at d, rows of B_Q the basis at Q^T d. With many directions B has a condition

@@ -137,7 +137,7 @@ def _moving_cars(config: TownConfig, photograph: TownPhotograph) -> CityBlock:
 
 
 class _Candidates:
-    """Points that a photograph may show, and those that it does."""
+    """Points in front of a photograph's camera, some of which solids may hide."""
 
     def __init__(self, caster: Caster, blocks: int) -> None:
         camera, position = caster.camera, caster.position

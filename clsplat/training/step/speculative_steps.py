@@ -137,7 +137,7 @@ class SpeculativeSteps:
         return copy() if copy is not None else step.result.sums.get()
 
     def settle(self) -> None:
-        """Wait for all steps in flight, and repeat those that turn out incomplete.
+        """Wait until the device has done all launched steps, and repeat the incomplete ones.
 
         Call it before reading or changing the model, its statistics, or the random state that steps use.
         """

@@ -42,7 +42,7 @@ _HEADER_BYTES = _HEADER.size + _CHECKSUM.size
 
 
 def key_of(parts: Sequence[object]) -> bytes:
-    """Digest of what the pixels depend on: `parts`, and the versions of this package, its format and its decoder."""
+    """Digest of `parts`, of this package's version, and of the versions of the format and the decoder."""
     versions = [FORMAT_VERSION, package_version(), oiio.VERSION_STRING]
     text = json.dumps([versions, *parts], default=repr)
     return hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=KEY_BYTES).digest()
