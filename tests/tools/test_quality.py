@@ -111,7 +111,7 @@ def test_an_experiment_makes_its_table(
     table = capsys.readouterr().out
     assert status == 0 or name == "units", table
     assert table.count("|---") >= 2
-    assert printed(capsys, words, status=status).out == table, "runs that are there are not made again"
+    assert printed(capsys, words, call=main, status=status).out == table, "runs that are there are not made again"
 
 
 def write_binary(folder: Path) -> Path:

@@ -150,7 +150,7 @@ def write_transforms(folder: Path, capture: Capture, counts: tuple[int, int], se
     every, shades = np.concatenate(points), np.concatenate(colors)
     for name, count in zip(("sparse", "dense"), counts, strict=True):
         chosen = np.sort(np.random.default_rng(seed).permutation(len(every))[:count])
-        write_cloud(folder / f"{name}.ply", every[chosen], np.rint(255 * shades[chosen]))
+        write_cloud(folder / f"{name}.ply", every[chosen], np.rint(255 * shades[chosen, :3]))
     document = {"ply_file_path": "sparse.ply", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document), "utf-8")
     return folder
@@ -353,7 +353,7 @@ def changed(scene: Scene, folder: Path, changes: Changes) -> Scene:
         if not path.exists():
             write_image(path, changes.on(len(views), view, composite(view.load(), (0, 0, 0))))
         lens = replace(view.lens, width=view.camera.width, height=view.camera.height)  # the size of the written file
-        views.append(replace(view, path=path, lens=lens))
+        views.append(replace(view, path=path, lens=lens).stamped())
     return replace(scene, views=views)
 
 
