@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -187,6 +188,7 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
     verb.output.mkdir(parents=True, exist_ok=True)
     locks.enter_context(locked(verb.output, "train"))
     run = Run.create(verb.output, config, scene=source, resume=verb.resume, overwrite=verb.overwrite)
+    run.resume_command += _flags_of_machine(verb)
     if changed:
         scene_record.write(run, scene)
     _tell_of(scene, devices)
@@ -198,6 +200,17 @@ def _train(verb: TrainVerb, services: Services, locks: ExitStack) -> int:
         print_summary(result)
     print(f"model in {run.model_path}", file=sys.stderr)
     return 0
+
+
+def _flags_of_machine(verb: TrainVerb) -> str:
+    """The given flags that are about the machine: the run does not keep them, so that --resume needs them again."""
+    given = {
+        "--device": verb.device.selector,
+        "--max-device-mem": verb.device.max_device_mem,
+        "--max-host-mem": verb.max_host_mem,
+        "--cache": verb.cache,
+    }
+    return "".join(f" {flag} {shlex.quote(str(value))}" for flag, value in given.items() if value is not None)
 
 
 def _stages(config: TrainConfig) -> tuple[str, ...]:
@@ -273,7 +286,7 @@ def _train_run(
     except KeyboardInterrupt as error:
         steps = run.checkpoints()
         at = f"at step {steps[-1][0]}" if steps else "before the first checkpoint"
-        error.args = (f"{at}; go on with: clsplat train -o {run.path} --resume",)
+        error.args = (f"{at}; go on with: {run.resume_command}",)
         raise
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -52,6 +53,7 @@ class Run:
         self.checkpoints_path = path / "checkpoints"
         self.test_path = path / "test"
         self.cache_path = path / "cache"
+        self.resume_command = shlex.join(["clsplat", "train", "-o", str(path), "--resume"])
 
     @classmethod
     def create(

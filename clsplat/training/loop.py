@@ -156,8 +156,7 @@ class TrainingSession:
             return f"; its checkpoint could not be written ({error})"
         if not 0 < self.trainer.step <= self.saved:
             return ""
-        resume = f"clsplat train -o {self.run.path} --resume"
-        return f"; a checkpoint of step {self.trainer.step} is written: {resume} continues from it"
+        return f"; a checkpoint of step {self.trainer.step} is written: {self.run.resume_command} continues from it"
 
     def go_back(self) -> bool:
         """Report non-finite values. After too many troubled steps, go back to the last checkpoint with smaller learning
@@ -346,8 +345,7 @@ class TrainingSession:
         except InputError as error:
             if self.run is None:
                 raise
-            go_on = f"; go on with: clsplat train -o {self.run.path} --resume"
-            raise InputError(f"{error}{self.rescue() or go_on}") from None
+            raise InputError(f"{error}{self.rescue() or f'; go on with: {self.run.resume_command}'}") from None
 
     def _train(self, between: Between | None) -> Gaussians:
         trainer, run = self.trainer, self.run

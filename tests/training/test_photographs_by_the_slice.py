@@ -447,11 +447,13 @@ def test_a_damaged_photograph_of_a_large_scene(
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2] + bytes(200) + data[len(data) // 2 + 200 :])
     line = ["train", str(own), "-o", str(tmp_path / "run"), "--iterations", "9", "--no-report", "--warmup", ""]
+    line += ["--max-host-mem", "1GiB", "--cache", str(tmp_path / "my cache")]
     assert main(line) == 2
     errors = [each for each in capsys.readouterr().err.splitlines() if each.startswith("clsplat: error: ")]
     assert len(errors) == 1
     assert str(path) in errors[0]
-    assert f"clsplat train -o {tmp_path / 'run'} --resume" in errors[0]
+    again = f"--max-host-mem 1GiB --cache '{tmp_path / 'my cache'}'"
+    assert f"clsplat train -o {tmp_path / 'run'} --resume {again}" in errors[0]
 
 
 def test_keys_follow_what_pixels_depend_on(scene: Scene, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from quality.made_scenes import (
     photograph,
     picked,
     refocused,
+    rescaled,
     rgbd,
     turntable,
     with_block,
@@ -480,6 +481,38 @@ def units(given: Namespace) -> Rows:
     return int(off > 0)
 
 
+def towns(given: Namespace) -> Rows:
+    """Towns of growing size, then the first one in millimetres and in kilometres, each trained with the length unit of
+    its depths and with its extent.
+
+    All towns have as many photographs and Gaussians a block, and as many passes. PSNR is that of all held-out
+    photographs, and of those of the first block, which are the same photographs in every town.
+    """
+    renderer, known = Renderer(open_device()), [(size, 1.0) for size in given.towns]
+    yield "town", "metres a unit", "length unit", "steps", "Gaussians", "PSNR, dB", "of the first block", "seconds"
+    for size, metres in [*known, (given.towns[0], 1e-3), (given.towns[0], 1e3)]:
+        folder = given.folder / size
+        if not folder.exists():
+            town = "--town", size, "--town-photos", str(given.town_photos), "--town-size", given.town_size
+            with redirect_stdout(sys.stderr):
+                if status := clsplat(["demo", *town, "-o", str(folder)]):
+                    raise SystemExit(status)
+        scene = load_scene(folder if metres == 1 else rescaled(folder, 1 / metres))
+        blocks = len({view.name.split("/")[0] for view in scene.views})
+        limit = f"density.growth=budget,density.max-gaussians={given.sky + given.gaussians * blocks}"
+        usual = {"iterations": given.iterations or None, "passes": None if given.iterations else given.passes}
+        for kind, unit in (("depths", None), ("extent", scene.extent)):
+            settings = ",".join([limit, f"sky={given.sky}", given.settings])
+            done = trained(given, f"{size} {metres:g} {kind}", replace(scene, unit=unit), settings=settings, **usual)
+            first = [view for view in scene.test_views if view.name.startswith("0000_0000/")]
+            draw = partial(picture_of, renderer, done.model)
+            psnr = [psnr_of(draw, views) for views in (scene.test_views, first)]
+            record = _json(done.run / "scene.json")
+            cells = f"{record.get('length_unit', scene.extent):.3g}", f"{done.last['step']:,}", f"{len(done.model):,}"
+            yield size, f"{metres:g}", *cells, *(f"{each:.2f}" for each in psnr), f"{done.last['seconds']:.0f}"
+    return 0
+
+
 def numbers(text: str) -> list[int]:
     """Parse whole numbers separated by commas."""
     return [int(number) for number in text.split(",")]
@@ -509,6 +542,14 @@ WITH = {"--with": {"dest": "settings", "default": "", "help": "setting=value,...
 SEEDS = {"--seeds": _numbers([0])}
 TRY = {"--try": {"dest": "tried", "action": "append", "default": [], "help": "NAME:setting=value,..."}}
 APPEARANCE = {"--appearance": {"default": "exposure"}, "--mixes": _number(0.0), "--corners": _number(0.0)}
+TOWNS = {
+    "--towns": {"type": lambda text: text.split(","), "default": ["1x1", "3x3", "6x6"], "help": "with commas between"},
+    "--town-photos": _number(40, "photographs a block"),
+    "--town-size": {"default": "320x200", "help": "size of the photographs"},
+    "--gaussians": _number(5000, "Gaussians a block"),
+    "--sky": _number(3000, "Gaussians of the sky"),
+    "--passes": _number(30, "passes through the photographs, if --iterations is 0"),
+}
 EXPERIMENTS = {
     "masks": Experiment(masks, 1, 7000, RESOLUTION),
     "exposure": Experiment(exposure, 1, 2000, {**RESOLUTION, **WITH, **APPEARANCE}),
@@ -518,6 +559,7 @@ EXPERIMENTS = {
     "poses": Experiment(poses, "?", 7000, {"--width": _number(WIDTH, "pixels across"), "--lens": _number(0.0)}),
     "views": Experiment(views, 1, 2000, {**RESOLUTION, **SEEDS, **TRY, "--views": _numbers([3, 6, 9, 12])}),
     "seeds": Experiment(seeds, "+", 2000, {**RESOLUTION, **WITH, **SEEDS}),
+    "towns": Experiment(towns, 0, 0, {**WITH, **TOWNS}),
     "units": Experiment(units, 1, 300, {**RESOLUTION, "--bound": _number(0.3, "dB")}),
 }
 """The experiments, keyed by name."""

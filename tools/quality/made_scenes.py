@@ -286,6 +286,18 @@ def in_units(scene: Scene, factor: float, offset: Float64) -> Scene:
     return Scene(scene.name, views, factor * scene.points + offset, scene.point_colors, (low, high))
 
 
+def rescaled(folder: Path, factor: float) -> Path:
+    """The folder of a COLMAP scene whose world is scaled by factor. Its photographs are linked."""
+    scaled = folder.with_name(f"{folder.name}-times-{factor:g}")
+    if not scaled.exists():
+        model = pycolmap.Reconstruction(folder / "sparse" / "0")
+        model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+        (scaled / "sparse" / "0").mkdir(parents=True)
+        (scaled / "images").symlink_to((folder / "images").resolve())
+        model.write_binary(scaled / "sparse" / "0")
+    return scaled
+
+
 def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:
     """The scene with its training poses, except the two fixed ones, turned and shifted by percent of the extent."""
     rng = np.random.default_rng(seed)
