@@ -79,6 +79,8 @@ EXPOSED = (
 """Rows of the exposure experiment: name, True if gains change the photographs, True if appearance is learnt."""
 UNITS = (*((factor, 0.0) for factor in (1.0, 1e-7, 1e-4, 1e4, 1e7)), (1.0, 1e6))
 """Factors by which a scene's world is scaled, and distances by which it is moved."""
+BLOCKS = ("", "0000_0000/", "0001_0001/")
+"""Beginnings of the names of all photographs of a town, and of two of its blocks."""
 
 
 @dataclass(frozen=True)
@@ -482,15 +484,15 @@ def units(given: Namespace) -> Rows:
 
 
 def towns(given: Namespace) -> Rows:
-    """Towns of growing size, then the first one in millimetres and in kilometres, each trained with the length unit of
-    its depths and with its extent.
+    """Towns of growing size, then a town in metres, millimetres and kilometres: each is trained with the length unit of
+    its depths, and with its extent where that differs.
 
     All towns have as many photographs and Gaussians a block, and as many passes. PSNR is that of all held-out
-    photographs, and of those of the first block, which are the same photographs in every town.
+    photographs, of those of block 0, 0, and of those of block 1, 1, which has neighbours on all sides from 3x3 on.
     """
-    renderer, known = Renderer(open_device()), [(size, 1.0) for size in given.towns]
-    yield "town", "metres a unit", "length unit", "steps", "Gaussians", "PSNR, dB", "of the first block", "seconds"
-    for size, metres in [*known, (given.towns[0], 1e-3), (given.towns[0], 1e3)]:
+    renderer = Renderer(open_device())
+    yield "town", "metres a unit", "length unit", "steps", "Gaussians", "PSNR, dB", "block 0, 0", "block 1, 1", "seconds"
+    for size, metres in [(size, 1.0) for size in given.towns] + [(given.scaled, metres) for metres in (1.0, 1e-3, 1e3)]:
         folder = given.folder / size
         if not folder.exists():
             town = "--town", size, "--town-photos", str(given.town_photos), "--town-size", given.town_size
@@ -504,12 +506,14 @@ def towns(given: Namespace) -> Rows:
         for kind, unit in (("depths", None), ("extent", scene.extent)):
             settings = ",".join([limit, f"sky={given.sky}", given.settings])
             done = trained(given, f"{size} {metres:g} {kind}", replace(scene, unit=unit), settings=settings, **usual)
-            first = [view for view in scene.test_views if view.name.startswith("0000_0000/")]
             draw = partial(picture_of, renderer, done.model)
-            psnr = [psnr_of(draw, views) for views in (scene.test_views, first)]
-            record = _json(done.run / "scene.json")
-            cells = f"{record.get('length_unit', scene.extent):.3g}", f"{done.last['step']:,}", f"{len(done.model):,}"
-            yield size, f"{metres:g}", *cells, *(f"{each:.2f}" for each in psnr), f"{done.last['seconds']:.0f}"
+            of = {name: [view for view in scene.test_views if view.name.startswith(name)] for name in BLOCKS}
+            psnr = [f"{psnr_of(draw, views):.2f}" if views else "" for views in of.values()]
+            used = _json(done.run / "scene.json").get("length_unit", scene.extent)
+            cells = f"{used:.3g}", f"{done.last['step']:,}", f"{len(done.model):,}"
+            yield size, f"{metres:g}", *cells, *psnr, f"{done.last['seconds']:.0f}"
+            if used == scene.extent:
+                break
     return 0
 
 
@@ -544,6 +548,7 @@ TRY = {"--try": {"dest": "tried", "action": "append", "default": [], "help": "NA
 APPEARANCE = {"--appearance": {"default": "exposure"}, "--mixes": _number(0.0), "--corners": _number(0.0)}
 TOWNS = {
     "--towns": {"type": lambda text: text.split(","), "default": ["1x1", "3x3", "6x6"], "help": "with commas between"},
+    "--scaled": {"default": "8x1", "help": "the town in metres, millimetres and kilometres"},
     "--town-photos": _number(40, "photographs a block"),
     "--town-size": {"default": "320x200", "help": "size of the photographs"},
     "--gaussians": _number(5000, "Gaussians a block"),
