@@ -491,8 +491,9 @@ def towns(given: Namespace) -> Rows:
     photographs, of those of block 0, 0, and of those of block 1, 1, which has neighbours on all sides from 3x3 on.
     """
     renderer = Renderer(open_device())
-    yield "town", "metres a unit", "length unit", "steps", "Gaussians", "PSNR, dB", "block 0, 0", "block 1, 1", "seconds"
-    for size, metres in [(size, 1.0) for size in given.towns] + [(given.scaled, metres) for metres in (1.0, 1e-3, 1e3)]:
+    yield "town", "metres a unit", "unit", "steps", "Gaussians", "PSNR, dB", "block 0, 0", "block 1, 1", "seconds"
+    towns = [(size, 1.0) for size in given.towns.split(",")]
+    for size, metres in [*towns, *((given.scaled, metres) for metres in (1.0, 1e-3, 1e3))]:
         folder = given.folder / size
         if not folder.exists():
             town = "--town", size, "--town-photos", str(given.town_photos), "--town-size", given.town_size
@@ -547,7 +548,7 @@ SEEDS = {"--seeds": _numbers([0])}
 TRY = {"--try": {"dest": "tried", "action": "append", "default": [], "help": "NAME:setting=value,..."}}
 APPEARANCE = {"--appearance": {"default": "exposure"}, "--mixes": _number(0.0), "--corners": _number(0.0)}
 TOWNS = {
-    "--towns": {"type": lambda text: text.split(","), "default": ["1x1", "3x3", "6x6"], "help": "with commas between"},
+    "--towns": {"default": "1x1,3x3,6x6", "help": "with commas between"},
     "--scaled": {"default": "8x1", "help": "the town in metres, millimetres and kilometres"},
     "--town-photos": _number(40, "photographs a block"),
     "--town-size": {"default": "320x200", "help": "size of the photographs"},
