@@ -17,7 +17,7 @@ from clsplat.api import train
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
-from clsplat.errors import CapacityError, InputError
+from clsplat.errors import CapacityError
 from clsplat.rendering.renderer import Renderer
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
@@ -58,9 +58,7 @@ def loaded(scene: Path) -> Scene:
     ids=str,
 )
 def test_settings_of_another_kind_are_named(config: Any, message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        config.check()
-    assert message in str(caught.value)
+    assert message in refuses(".", config.check)
 
 
 def test_numbers_of_numpy_serve_and_come_back(tmp_path: Path) -> None:
@@ -80,9 +78,7 @@ def test_numbers_of_numpy_serve_and_come_back(tmp_path: Path) -> None:
     ids=str,
 )
 def test_arguments_of_another_kind_are_named(arguments: dict[str, Any], message: str, loaded: Scene) -> None:
-    with pytest.raises(InputError) as caught:
-        train(**{"scene": loaded, "config": FEW, **arguments})
-    assert message in str(caught.value)
+    assert message in refuses(".", train, **{"scene": loaded, "config": FEW, **arguments})
 
 
 @pytest.mark.parametrize(
@@ -100,9 +96,7 @@ def test_arguments_of_another_kind_are_named(arguments: dict[str, Any], message:
     ids=str,
 )
 def test_numbers_of_a_scene_that_are_not_whole_are_named(arguments: dict[str, Any], message: str, scene: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        load_scene(scene, **arguments)
-    assert str(caught.value).startswith(message)
+    assert refuses(".", load_scene, scene, **arguments).startswith(message)
 
 
 @pytest.mark.parametrize("degree", [3.0, "3", True, 4, -1], ids=repr)
@@ -138,9 +132,8 @@ def test_a_run_that_is_there_is_not_trained_into_and_knows_its_settings(
         ({"config": replace(FEW, iterations=1), "resume": True}, "is already at step 3; expected more"),
         ({"config": replace(FEW, seed=9), "resume": True}, "seed is 0, a resumed run cannot change it to 9"),
     ):
-        with pytest.raises(InputError) as caught:
-            train(**{"scene": loaded, "device": default_device, "run": Run.open(run.path), **call})
-        assert message in str(caught.value)
+        given = {"scene": loaded, "device": default_device, "run": Run.open(run.path), **call}
+        assert message in refuses(".", train, **given)
     assert run.metrics_path.read_bytes() == metrics
     again = train(loaded, device=default_device, run=Run.open(run.path), resume=True)  # to the run's 3 steps
     assert len(again) == len(clsplat.Gaussians.load(run.model_path))

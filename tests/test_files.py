@@ -7,7 +7,7 @@ import pickle
 from pathlib import Path
 
 import pytest
-from calls import refuses
+from calls import raising, refuses
 from systems import posix
 
 from clsplat.cli.main import one_line
@@ -37,12 +37,9 @@ def test_failure_in_the_middle_leaves_the_previous_file(tmp_path: Path, error: t
 
 
 def test_disk_full_while_flushing_leaves_the_previous_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     path = tmp_path / "model.ply"
     path.write_bytes(b"old")
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", raising(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
     refuses("the disk is full", atomic_write, path, b"new", error=OSError)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
@@ -91,9 +88,8 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="no /proc on this system")
 def test_a_place_that_takes_no_files() -> None:
-    with pytest.raises(WriteError) as caught:
-        atomic_write("/proc/x.ply", b"")
-    assert str(caught.value) == "/proc/x.ply: cannot be written: no file can be made in /proc"
+    said = refuses(".", atomic_write, "/proc/x.ply", b"", error=WriteError)
+    assert said == "/proc/x.ply: cannot be written: no file can be made in /proc"
 
 
 def test_a_full_disk_says_how_much_is_needed(tmp_path: Path) -> None:

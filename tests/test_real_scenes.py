@@ -12,15 +12,14 @@ import scenes
 from compare import assert_close_images
 from models import real_file
 from quick import quick
+from same_bytes import trained_run
 
-from clsplat.api import train
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.reference.render import render as reference
 from clsplat.rendering.renderer import Renderer
-from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 
@@ -58,8 +57,7 @@ def test_a_short_training_on_photographs(default_device: Device, tmp_path: Path)
     held_out = whole.test_views[::3]  # three of them say enough
     scene = Scene("fox", [*whole.train_views, *held_out], whole.points, whole.point_colors, whole.bounds)
     config = TrainConfig(iterations=120, warmup=(30, 60), resolution=200, checkpoint_every=0)
-    run = Run.create(tmp_path / "run", config)
-    train(scene, config, device=default_device, run=run)
+    run = trained_run(scene, config, default_device, tmp_path / "run")
     result = run.model_record()
     assert [view["name"] for view in result["views"]] == [view.name for view in held_out]
     # Measured 19.47, 19.61 and 19.66 dB with three seeds; 14.2 after half the steps, 8.8 after the first.

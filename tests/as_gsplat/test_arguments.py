@@ -188,5 +188,4 @@ def test_the_largest_alpha() -> None:
 
 
 def test_the_device_is_named() -> None:
-    with pytest.raises(Exception, match="no such thing"):
-        rasterization(**given(), device="no such thing")
+    refuses("no such thing", rasterization, **given(), device="no such thing", error=Exception)

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import python, refuses
 from needs import require
 
 import clsplat
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 
 require("jax")
 import jax  # noqa: E402
@@ -225,8 +225,7 @@ def test_counts(default_device: Device, count: int) -> None:
     ],
 )
 def test_an_argument_that_is_wrong_is_named_before_anything_runs(name: str, value: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        jax.eval_shape(lambda: clsplat.jax.rasterize(**{**cloud(), **SIZE, name: value}))
+    refuses(message, jax.eval_shape, lambda: clsplat.jax.rasterize(**{**cloud(), **SIZE, name: value}))
 
 
 def test_channels_beyond_one_pass_of_the_kernels_and_a_size_of_an_array(default_device: Device) -> None:
@@ -272,8 +271,7 @@ print("done")
 def run_python(code: str) -> subprocess.CompletedProcess[str]:
     """Code in a Python of its own."""
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    command, variables = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": path}
-    return subprocess.run(command, env=variables, capture_output=True, text=True, timeout=240, check=False)
+    return python("-c", code, env={**os.environ, "PYTHONPATH": path}, timeout=240)
 
 
 @pytest.mark.slow

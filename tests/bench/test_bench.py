@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from calls import Capture, printed, refuses, rejected
 from pipeline import BACKGROUND, Pipeline, shaped
 from quick import quick
 from tiny import run_steps, write_scene
@@ -28,7 +29,6 @@ from clsplat.cli.main import main
 from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import SPLAT, TILE
 from clsplat.reference import render as reference
@@ -40,7 +40,6 @@ LIMITS = Limits(1e9, 5e8, 1e10, 8, 1)
 SMALL = ["--gaussians", "400", "--size", "70x50", "--repeat", "1"]
 FRAME = {"project", "duplicate", "ranges", "blend"}
 STEP = {"target", "loss", "blend_grad", "project_grad", "statistics"}
-Capture = pytest.CaptureFixture[str]
 
 quick_limits = partial(measure_limits, seconds=1e-3, repeat=1, copy_bytes=2**16)
 
@@ -284,8 +283,8 @@ def test_synthetic_scene_is_the_same_every_time() -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("_quick")
 def test_json_has_the_contract(capsys: Capture) -> None:
-    assert main(["bench", *SMALL, "--json", "--preset", "fast", "--rasterizer.sh-degree-limit", "1"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    flags = ["--json", "--preset", "fast", "--rasterizer.sh-degree-limit", "1"]
+    result = json.loads(printed(capsys, ["bench", *SMALL, *flags]).out)
     assert {"device", "driver", "stages", "frame_ms", "iteration_ms", "gaussians", "width", "height", "pairs"} <= set(
         result
     )
@@ -304,8 +303,7 @@ def test_json_has_the_contract(capsys: Capture) -> None:
 
 @pytest.mark.usefixtures("_quick")
 def test_table(capsys: Capture) -> None:
-    assert main(["bench", *SMALL]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed(capsys, ["bench", *SMALL]).out.splitlines()
     assert {line.split()[0] for line in lines if line} >= FRAME | STEP
     assert "synthetic: 400 Gaussians" in "\n".join(lines)
     queue = [line.split() for line in lines if line.startswith(("queue", "training step  "))]
@@ -322,8 +320,7 @@ def test_scene_run_and_model(tmp_path: Path, capsys: Capture) -> None:
     capsys.readouterr()
     for source, size in ((scene, (48, 40)), (run, (48, 40)), (run / "model.ply", (48, 40)), (loose, (24, 20))):
         extra = ["--size", "24x20"] if source == loose else []
-        assert main(["bench", str(source), "--repeat", "1", "--json", *extra]) == 0
-        result = json.loads(capsys.readouterr().out)
+        result = json.loads(printed(capsys, ["bench", source, "--repeat", "1", "--json", *extra]).out)
         assert (result["width"], result["height"]) == size
         assert result["pairs"]["contributing"] > 0
         assert result["source"] == str(source)
@@ -565,14 +562,13 @@ def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(tradeoff, "settings", lambda: some)
     path = tmp_path / "plot.svg"
     files = tmp_path / "plot-switches.svg", tmp_path / "plot-error.svg"
-    assert main(["bench", *SMALL, "--plot", str(path), "--json"]) == 0
-    printed = capsys.readouterr()
-    result = json.loads(printed.out)["settings"]
+    told = printed(capsys, ["bench", *SMALL, "--plot", path, "--json"])
+    result = json.loads(told.out)["settings"]
     assert [(point["name"], point["approximate"]) for point in result["points"]] == [("exact", False), ("fast", True)]
     assert result["exact"] == "exact"
     for file in files:
         assert file.exists()
-        assert f"plot in {file}\n" in printed.err
+        assert f"plot in {file}\n" in told.err
     assert not path.exists()
     for file, other in (files, files[::-1]):
         other.unlink(missing_ok=True)
@@ -588,10 +584,8 @@ def test_verb_plots(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyP
 
 def test_plot_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(InputError, match=r"pip install 'clsplat\[plot\]'"):
-        plots.check_plot(tmp_path / "a.svg")
-    assert main(["bench", *SMALL, "--plot", str(tmp_path / "a.svg")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    refuses(r"pip install 'clsplat\[plot\]'", plots.check_plot, tmp_path / "a.svg")
+    rejected(capsys, ["bench", *SMALL, "--plot", tmp_path / "a.svg"])
 
 
 @pytest.mark.parametrize(
@@ -612,18 +606,12 @@ def test_plot_without_matplotlib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ids=str,
 )
 def test_wrong_calls_are_one_line(arguments: list[str], named: str, capsys: Capture) -> None:
-    assert main(["bench", *arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    assert named in captured.err
-    assert captured.err.startswith("clsplat: error: ")
+    assert named in rejected(capsys, ["bench", *arguments])
 
 
 @pytest.mark.slow
 def test_preset_in_training(tmp_path: Path, capsys: Capture) -> None:
     scene, run = write_scene(tmp_path / "scene"), tmp_path / "run"
-    assert main(["train", str(scene), "-o", str(run), "--iterations", "1", "--preset", "fast"]) == 0
+    printed(capsys, ["train", scene, "-o", run, "--iterations", "1", "--preset", "fast"])
     assert "alpha_min = 0.0078" in (run / "config.toml").read_text()
-    assert main(["train", "-o", str(run), "--resume", "--preset", "fast"]) == 2
-    assert "--preset fast and --resume" in capsys.readouterr().err
+    assert "--preset fast and --resume" in rejected(capsys, ["train", "-o", run, "--resume", "--preset", "fast"])

@@ -11,7 +11,7 @@ from typing import Any
 
 import pyopencl as cl
 import pytest
-from calls import no_warnings
+from calls import Capture, no_warnings, printed, raising, refuses
 from pipeline import shaped
 
 from clsplat.bench import shapes as tune
@@ -30,7 +30,6 @@ from clsplat.device.drivers.shapes import (
 )
 from clsplat.errors import DeviceError
 
-Capture = pytest.CaptureFixture[str]
 A, B, C = Shape(8, 1, 8), Shape(16, 1, 8), Shape(4, 1, 8)
 
 
@@ -84,8 +83,7 @@ def test_the_environment_goes_first(default_device: Device, monkeypatch: pytest.
 )
 def test_a_shape_that_makes_no_sense(text: str, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
     monkeypatch.setenv("CLSPLAT_SHAPE", text)
-    assert main(["devices"]) == 2
-    assert f"CLSPLAT_SHAPE={text}: expected LANESxITEMS" in capsys.readouterr().err
+    assert f"CLSPLAT_SHAPE={text}: expected LANESxITEMS" in printed(capsys, ["devices"], status=2).err
 
 
 def test_a_shape_that_is_too_large_for_the_device(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,8 +125,7 @@ def test_a_shape_with_sub_groups(default_device: Device, monkeypatch: pytest.Mon
     assert shape_of(device)[0] == default_shape(device)
     monkeypatch.setenv("CLSPLAT_SHAPE", "1x128s")
     message = "CLSPLAT_SHAPE=1x128s: .* has no sub-groups .* expected a shape without the s, such as 1x128$"
-    with pytest.raises(DeviceError, match=message):
-        shape_of(device)
+    refuses(message, shape_of, device, error=DeviceError)
 
 
 def gpu(items: int, local_kib: int) -> Any:
@@ -192,11 +189,8 @@ def test_a_home_that_is_no_folder_or_cannot_be_read(
 
 
 def test_a_user_without_a_home(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unknown() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
     monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setattr(Path, "home", unknown)
+    monkeypatch.setattr(Path, "home", raising(RuntimeError("Could not determine home directory.")))
     device = default_device.cl_device
     assert shape_of(device)[0] == default_shape(device)
     with pytest.raises(OSError):  # tune says that it cannot keep what it found
@@ -218,19 +212,16 @@ def test_the_verb(default_device: Device, monkeypatch: pytest.MonkeyPatch, capsy
     chosen = candidates(device)[1]
     monkeypatch.setattr(tune, "_in_a_process", lambda _index, shape: 5.0 if shape == chosen else 7.0)
     name = str(next(info.index for info in list_devices() if info.version == default_device.driver))
-    assert main(["tune", "--device", name, "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = json.loads(printed(capsys, ["tune", "--device", name, "--json"]).out)
     assert (result["best"]["lanes"], result["best"]["items"]) == (chosen.lanes, chosen.items)
     assert shape_of(device)[0] == chosen
-    assert main(["tune", "--device", name]) == 0
-    assert "5.00 ms  <- saved" in capsys.readouterr().out
+    assert "5.00 ms  <- saved" in printed(capsys, ["tune", "--device", name]).out
     assert main(["tune", "--device", name, "--forget"]) == 0
     assert shape_of(device)[0] == default_shape(device)
 
 
 def test_no_such_device(capsys: Capture) -> None:
-    assert main(["tune", "--device", "abacus"]) == 2
-    assert "abacus" in capsys.readouterr().err
+    assert "abacus" in printed(capsys, ["tune", "--device", "abacus"], status=2).err
 
 
 def test_device_error_is_of_input(monkeypatch: pytest.MonkeyPatch, default_device: Device) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture, command, error_line, fails, printed, python, rejected
+from calls import Capture, command, error_line, fails, printed, python, raising, ran, rejected
 from fakes import Pipeline
 
 from clsplat.cli.eval import EvalVerb
@@ -111,10 +111,7 @@ def test_settings_without_sense(flags: str, message: str, folder: str, tmp_path:
     ],
 )
 def test_exit_status(error: Exception, status: int, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
-    def fail(*_: object) -> int:
-        raise error
-
-    monkeypatch.setattr("clsplat.cli.devices.run", fail)
+    monkeypatch.setattr("clsplat.cli.devices.run", raising(error))
     monkeypatch.delenv("CLSPLAT_DEBUG", raising=False)
     line = rejected(capsys, ["devices"], status=status)
     assert (" ".join(str(error).split()) if isinstance(error, ClsplatError) else "model.ply: the disk is full") in line
@@ -125,8 +122,8 @@ def test_exit_status(error: Exception, status: int, monkeypatch: pytest.MonkeyPa
 def test_warnings_are_lines(model: str, folder: str, pipeline: Pipeline, capsys: Capture) -> None:
     with open(model, "ab") as file:
         file.write(b"more")
-    assert pipeline.main(["eval", model, "--scene", folder]) == 0
-    assert f"clsplat: warning: {model}: 4 bytes after the last Gaussian are ignored\n" in capsys.readouterr().err
+    said = ran(capsys, pipeline.main, ["eval", model, "--scene", folder]).err
+    assert f"clsplat: warning: {model}: 4 bytes after the last Gaussian are ignored\n" in said
 
 
 def test_sfm(folder: str, tmp_path: Path, capsys: Capture) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from calls import Capture, error_line, rejected
 from fakes import Pipeline, camera
+from rendered import camera_file
 
 from clsplat.cli.main import main, parse
 from clsplat.cli.render.flags import RenderVerb
@@ -123,10 +124,7 @@ def test_render_along_a_path(path: str, model: str, folder: str, pipeline: Pipel
 
 
 def test_render_of_frames_that_begin_negative(model: str, pipeline: Pipeline, tmp_path: Path) -> None:
-    key = {"position": [0, 0, 0], "world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": -5, **key}, {"frame": 5, **key}]
-    cameras = tmp_path / "cameras.json"
-    cameras.write_text(json.dumps({"clsplat_cameras": 1, "width": 8, "height": 6, "keys": keys}))
+    cameras = camera_file(tmp_path / "cameras.json", {-5: 0, 5: 0}, size=(8, 6))
     out = str(tmp_path / "{frame}.png")
     assert pipeline.main(["render", model, "--cameras", str(cameras), "-o", out, "--frames=-2-1"]) == 0
     assert set(pipeline.written) == {str(tmp_path / f"{i}.png") for i in (-2, -1, 0, 1)}

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import tyro
-from calls import Capture, ran
+from calls import Capture, noted, ran
 
 from clsplat.cli import parsing
 from clsplat.cli.main import main, parse
@@ -62,13 +62,7 @@ def test_a_command_line_is_parsed_once(line: str, tmp_path: Path, monkeypatch: p
     run = tmp_path / "run"
     Run.create(run, TrainConfig(seed=5), scene=tmp_path)
     calls: list[Any] = []
-    cli = tyro.cli
-
-    def counted(kind: Any, **options: Any) -> Any:
-        calls.append(options["args"])
-        return cli(kind, **options)
-
-    monkeypatch.setattr(tyro, "cli", counted)
+    noted(monkeypatch, tyro, "cli", lambda _, **options: calls.append(options["args"]))
     words = [word.replace("RUN", str(run)) for word in line.replace(" --overwrite", "").split()]
     assert parse(words).json  # type: ignore[attr-defined]
     assert calls == [words]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import tyro
-from calls import Capture, error_line, printed, rejected
+from calls import Capture, error_line, printed, raising, rejected
 from models import random_gaussians
 
 from clsplat.cli.flags import OTHER_FLAGS_TITLE, grouped_help, near, options
@@ -183,18 +183,12 @@ def test_an_error_is_json_where_json_is_asked_for(
 
 
 def test_work_that_failed_or_was_interrupted_is_json_too(capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(error: BaseException) -> None:
-        def run(*_: object) -> int:
-            raise error
-
-        monkeypatch.setattr("clsplat.cli.devices.run", run)
-
     for error, status, said in (
         (MemoryError("1 GiB"), 1, "there is not enough main memory: 1 GiB"),
         (OSError(28, "No space left on device", "a.png"), 1, "a.png"),
         (KeyboardInterrupt("after 3 of 9 frames"), 130, "interrupted after 3 of 9 frames"),
     ):
-        failing(error)
+        monkeypatch.setattr("clsplat.cli.devices.run", raising(error))
         found = json.loads(printed(capsys, ["devices", "--json"], status=status).out)
         assert found["status"] == status
         assert said in found["error"]

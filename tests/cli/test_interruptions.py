@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from calls import Capture, error_line, printed, python, refuses, rejected
+from calls import Capture, error_line, printed, python, raising, refuses, rejected
 from quick import quick
 from tiny import short, write_scene
 
@@ -64,22 +64,28 @@ def holder(folder: Path) -> Iterator[subprocess.Popen[str]]:
 # Signals
 
 
+def signalled(views: Scene, device: Device, folder: Path, *numbers: int) -> tuple[Run, BaseException]:
+    """A run to which these signals come before its fifth step, and how it ended."""
+    config = short(iterations=9, report=False, density={"every": 0})
+    run = Run.create(folder, config)
+
+    def ask(trainer: Trainer, _interrupted: object) -> None:
+        for number in numbers if trainer.step == 4 else ():
+            signal.raise_signal(number)
+
+    with process.terminable(), pytest.raises(KeyboardInterrupt) as caught:
+        train(views, config, device=device, run=run, between=ask)
+    return run, caught.value
+
+
 @posix
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_writes_a_checkpoint_first(
     number: signal.Signals, views: Scene, default_device: Device, tmp_path: Path
 ) -> None:
-    config = short(iterations=9, report=False, density={"every": 0})
-    run = Run.create(tmp_path / "run", config)
-
-    def ask(trainer: Trainer, _interrupted: object) -> None:
-        if trainer.step == 4:
-            signal.raise_signal(number)
-
     before = signal.getsignal(number)
-    with process.terminable(), pytest.raises(KeyboardInterrupt) as caught:
-        train(views, config, device=default_device, run=run, between=ask)
-    assert process.status_of(caught.value) == 128 + number
+    run, end = signalled(views, default_device, tmp_path / "run", number)
+    assert process.status_of(end) == 128 + number
     assert signal.getsignal(number) == before
     assert [step for step, _ in run.checkpoints()] == [5], "the step that was begun is finished"
     assert not (run.path / locks.LOCK_FILE_NAME).exists()
@@ -87,16 +93,8 @@ def test_a_signal_writes_a_checkpoint_first(
 
 @posix
 def test_a_second_signal_does_not_wait(views: Scene, default_device: Device, tmp_path: Path) -> None:
-    config = short(iterations=9, report=False, density={"every": 0})
-    run = Run.create(tmp_path / "run", config)
-
-    def ask(trainer: Trainer, _interrupted: object) -> None:
-        if trainer.step == 4:
-            signal.raise_signal(signal.SIGTERM)
-            signal.raise_signal(signal.SIGTERM)
-
-    with process.terminable(), pytest.raises(process.Interrupted):
-        train(views, config, device=default_device, run=run, between=ask)
+    run, end = signalled(views, default_device, tmp_path / "run", signal.SIGTERM, signal.SIGTERM)
+    assert isinstance(end, process.Interrupted)
     assert not run.checkpoints()
 
 
@@ -226,10 +224,7 @@ def test_verbs_that_write_into_a_run_are_kept_out(verb: str, tmp_path: Path, cap
 def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import errno
 
-    def none(_file: object) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(locks, "try_lock", none)
+    monkeypatch.setattr(locks, "try_lock", raising(OSError(errno.ENOLCK, "No locks available")))
     with pytest.warns(UserWarning, match="on a file system without locks"), locks.locked(tmp_path, "train"):
         pass
 
@@ -237,9 +232,9 @@ def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.slow
 @posix
 def test_the_tool_makes_tables() -> None:
-    tool = [sys.executable, str(Path(__file__).parents[2] / "tools" / "stress" / "interruptions.py"), "--markdown"]
+    tool = Path(__file__).parents[2] / "tools" / "stress" / "interruptions.py"
     calls = ["--verbs", "train,info", "--events", "SIGTERM,second process"]
-    done = subprocess.run([*tool, *calls], capture_output=True, text=True, timeout=300, check=False)
+    done = python(tool, "--markdown", *calls, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "| `info` | 143 | `clsplat: interrupted` | - |" in done.stdout
     assert "| `train` | 2 | `clsplat: error: OUT/run: is being written by clsplat train (process 123)" in done.stdout

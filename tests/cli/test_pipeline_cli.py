@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import Capture, flags, one_error, train
+from calls import Capture, flags, one_error, raising, train
 from compare import assert_close
 from pages import parse
 from quick import quick
@@ -239,12 +239,9 @@ def test_ctrl_c_before_the_first_step(
 ) -> None:
     from clsplat.training import trained_model
 
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
     run = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setattr(trained_model, "upload_gaussians", interrupt)
+        patch.setattr(trained_model, "upload_gaussians", raising(KeyboardInterrupt()))
         assert train(scene, run, CONFIG) == 130
     message = f"clsplat: interrupted before the first checkpoint; go on with: clsplat train -o {run} --resume"
     looked, started, *_, interrupted = capfd.readouterr().err.splitlines()

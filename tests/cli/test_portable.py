@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 import pytest
-from calls import refuses
+from calls import noted, python, raising, refuses
 from models import random_gaussians
 from packaging.requirements import Requirement
 from quick import quick
@@ -119,13 +119,9 @@ def test_a_file_that_another_program_has_open_is_tried_again(monkeypatch: pytest
     assert len(tries) == 1
     atomic._patiently(act, windows=True)
     assert len(tries) == 4
-
-    def never() -> None:
-        raise PermissionError(errno.EACCES, "in use")
-
     monkeypatch.setattr(atomic, "WINDOWS_RETRY_SECONDS", 0.05)
-    with pytest.raises(PermissionError, match="in use"):
-        atomic._patiently(never, windows=True)
+    never = raising(PermissionError(errno.EACCES, "in use"))
+    refuses("in use", atomic._patiently, never, windows=True, error=PermissionError)
 
 
 def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,15 +130,14 @@ def test_what_is_flushed_may_be_written_to(tmp_path: Path, monkeypatch: pytest.M
     pytest.importorskip("av", reason="the extra `video` brings it")
     from clsplat.images.video import frame_planes, video_writer
 
-    real, asked = os.fsync, []
+    asked = []
 
     def as_windows(descriptor: int) -> None:
         asked.append(descriptor)
         if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
             raise OSError(errno.EBADF, "Bad file descriptor")
-        real(descriptor)
 
-    monkeypatch.setattr(os, "fsync", as_windows)
+    noted(monkeypatch, os, "fsync", as_windows)
     with video_writer(tmp_path / "a.mp4") as video:
         video.add(frame_planes(np.zeros((32, 32, 3), np.float32)))
     assert asked
@@ -307,8 +302,7 @@ use()
 @pytest.mark.skipif(os.name != "posix", reason="takes away what only POSIX has")
 def test_no_module_wants_what_only_posix_has(tmp_path: Path) -> None:
     random_gaussians(4).save(tmp_path / "a.ply")
-    command = [sys.executable, "-c", LACKING, str(tmp_path / "a.ply"), str(tmp_path / "b.splat")]
-    done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=120, check=False)
+    done = python("-c", LACKING, tmp_path / "a.ply", tmp_path / "b.splat", encoding="utf-8", timeout=120)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "b.splat").stat().st_size == 4 * 32
 

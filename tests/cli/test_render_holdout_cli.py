@@ -13,6 +13,7 @@ import pytest
 from calls import Capture, fails, ran
 from cg import sphere, sphere_samples, write_flat, write_samples
 from numpy.typing import NDArray
+from pictures import write_pixels
 from rendered import camera_file, pixels_of
 from tiny import HEIGHT, WIDTH, hidden_model
 
@@ -217,12 +218,9 @@ def test_depths_of_other_kinds(folder: Path, tmp_path: Path, how: str) -> None:
 def test_depths_of_half_floats_are_told(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     depth = np.nan_to_num(sphere(camera_of(folder, 2), CENTRE, RADIUS), posinf=0.0)
     for name, kinds in (("whole", ("half", "float")), ("coarse", ("float", "half"))):
-        spec = oiio.ImageSpec(WIDTH, HEIGHT, 2, oiio.FLOAT)
-        spec.channelnames, spec.channelformats = ("A", "Z"), tuple(map(oiio.TypeDesc, kinds))
-        file = oiio.ImageOutput.create(str(tmp_path / f"{name}.exr"))
-        assert file.open(str(tmp_path / f"{name}.exr"), spec)
-        assert file.write_image(np.stack([np.ones_like(depth), depth], axis=2).astype(np.float32))
-        assert file.close()
+        channels = {"channelnames": ("A", "Z"), "channelformats": tuple(map(oiio.TypeDesc, kinds))}
+        pixels = np.stack([np.ones_like(depth), depth], axis=2).astype(np.float32)
+        write_pixels(tmp_path / f"{name}.exr", pixels, **channels)
         assert render(folder, tmp_path / name, f"--holdout {tmp_path}/{name}.exr --dry-run") == 0
         told = "coarse.exr: has depths of half floats" in capsys.readouterr().err
         assert told == (name == "coarse")

@@ -17,8 +17,9 @@ import pytest
 import stress_render_kills
 from calls import Capture, error_line, fails, left_behind, ran
 from needs import require
+from pictures import write_pixels
 from quick import quick
-from rendered import contents
+from rendered import camera_file, contents
 from systems import posix
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
@@ -102,10 +103,7 @@ def test_every_channel_is_that_of_the_renderer(shot: list[str], tmp_path: Path, 
 
 def test_up_in_a_file_is_up_in_the_picture(shot: list[str], tmp_path: Path) -> None:
     """The camera sinks, so what it sees rises, and v is positive."""
-    key = {"world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    keys = [{"frame": 1, "position": [0, 0, -4], **key}, {"frame": 2, "position": [0, 0.5, -4], **key}]  # y is down
-    path = tmp_path / "keys.json"
-    path.write_text(json.dumps({"clsplat_cameras": 1, "width": 48, "height": 40, "keys": keys}))
+    path = camera_file(tmp_path / "keys.json", {1: 0, 2: [0, 0.5, -4]})  # y is down
     assert (
         main(["render", shot[0], "--cameras", str(path), "-o", f"{tmp_path}/##.exr", "--channels", "alpha,motion"]) == 0
     )
@@ -172,8 +170,7 @@ def test_gaps_alone_are_rendered(shot: list[str], tmp_path: Path, capsys: Captur
 @pytest.mark.slow
 def test_frames_made_otherwise_are_told_and_rendered_again(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     """By their cameras, precision or model; a frame that is broken is rendered without a word."""
-    assert render(shot, tmp_path) == 0
-    capsys.readouterr()
+    ran(capsys, render, shot, tmp_path)
     assert ran(capsys, render, shot, tmp_path, "--skip-existing").err == ""
     for change in (("--frames", "1-4", "--exr", "half"), ("--background", "white"), ("--rasterizer.alpha-min", "0.01")):
         assert render(shot, tmp_path, "--skip-existing", *change) == 0
@@ -334,12 +331,17 @@ def test_the_kill_test_finds_damage(shot: list[str], tmp_path: Path, monkeypatch
     assert json.loads(capsys.readouterr().out)["damaged"] == ["frame.0001.exr"]
 
 
-def test_frames_that_show_nothing(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+def save_away(folder: Path) -> str:
+    """The path of a model that no camera sees."""
     away = hidden_model(5)
     away.means += np.float32(1000)
-    away.save(tmp_path / "away.ply")
+    away.save(folder / "away.ply")
+    return str(folder / "away.ply")
+
+
+def test_frames_that_show_nothing(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
+    call = [save_away(tmp_path), *shot[1:]]
     for channels in ("rgb", "rgb,alpha"):
-        call = [str(tmp_path / "away.ply"), *shot[1:]]
         captured = ran(capsys, render, call, tmp_path, "--json", "--channels", channels, "--overwrite")
         assert [record["blank"] for record in json.loads(captured.out)] == [True] * COUNT
         said = "6 of 6 frames show nothing of the model: 1, 2, 3 and 3 more; are the cameras in the model's world?"
@@ -360,12 +362,9 @@ def test_frames_that_show_nothing(shot: list[str], tmp_path: Path, capsys: Captu
 def test_frames_in_strips_and_deep_ones_that_show_nothing(
     flags: str, shot: list[str], tmp_path: Path, capsys: Capture
 ) -> None:
-    away = hidden_model(5)
-    away.means += np.float32(1000)
-    away.save(tmp_path / "away.ply")
-    for model, blank in ((str(tmp_path / "away.ply"), True), (shot[0], False)):
-        assert render([model, *shot[1:]], tmp_path, "--json", "--frames", "2", "--overwrite", *flags.split()) == 0
-        captured = capsys.readouterr()
+    more = ["--json", "--frames", "2", "--overwrite", *flags.split()]
+    for model, blank in ((save_away(tmp_path), True), (shot[0], False)):
+        captured = ran(capsys, render, [model, *shot[1:]], tmp_path, *more)
         assert json.loads(captured.out)[0]["blank"] is blank
         assert ("1 of 1 frames show nothing of the model: 2; are the cameras" in captured.err) is blank
 
@@ -374,10 +373,7 @@ def test_frames_in_strips_and_deep_ones_that_show_nothing(
 def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     pattern, photo = f"a.####.{extension}", tmp_path / f"a.0002.{extension}"
     pixels = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
-    output = oiio.ImageOutput.create(str(photo))
-    assert output.open(str(photo), oiio.ImageSpec(WIDTH, HEIGHT, 3, "uint8" if extension != "exr" else "half"))
-    assert output.write_image(pixels)
-    output.close()
+    write_pixels(photo, pixels, "uint8" if extension != "exr" else "half")
     before = photo.read_bytes()
     assert render(shot, tmp_path, pattern=pattern) == 2
     assert f"{photo}: exist, and clsplat did not make them; name other files, or give --over" in error_line(capsys)
@@ -390,8 +386,8 @@ def test_pictures_of_others_are_left(extension: str, shot: list[str], tmp_path: 
 
 def test_flags_that_the_files_have_no_use_for(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     flags = ("--frames", "1", "--exr", "half", "--compression", "piz", "--quality", "50")
-    assert render(shot, tmp_path, *flags, pattern="a.####.png") == 0
-    assert "warning: not used for .png: --exr, --compression, --quality\n" in capsys.readouterr().err
+    said = ran(capsys, render, shot, tmp_path, *flags, pattern="a.####.png").err
+    assert "warning: not used for .png: --exr, --compression, --quality\n" in said
     assert render(shot, tmp_path, "--frames", "1", "--channels", "depth", "--background", "white", "--bits", "16") == 0
     assert "warning: not used for .exr of these channels: --bits, --background\n" in capsys.readouterr().err
 

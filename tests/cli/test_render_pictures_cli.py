@@ -14,6 +14,7 @@ import OpenImageIO as oiio
 import pytest
 from calls import Capture, error_line, fails, printed, ran
 from headers import exr_attributes, png_chunks
+from pictures import write_pixels
 from quick import quick
 from rendered import camera_file, contents
 from systems import can_link
@@ -255,15 +256,10 @@ def test_a_frame_of_other_settings_is_not_what_is_wanted(
     change: str, shot: list[str], tmp_path: Path, capsys: Capture
 ) -> None:
     """Of a still camera: only the last three change no frame."""
-    key = {"frame": 1, "position": [0, 0, -4], "world_from_cam": [1, 0, 0, 0], "fov_x": 60}
-    other = {**key, "position": [1e-3, 0, -4]} if change == "moved" else key
     kept = change in ("nothing", "--quality 50", "--samples 3")
-    names = []
-    for index, keys in enumerate(([key], [other])):
-        document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": keys}
-        names.append(tmp_path / f"{index}.json")
-        names[-1].write_text(json.dumps(document))
-    first, second = ([*shot[:2], str(name)] for name in names)
+    places = [0, 1e-3 if change == "moved" else 0]
+    files = [camera_file(tmp_path / f"{index}.json", {1: x}) for index, x in enumerate(places)]
+    first, second = ([*shot[:2], str(file)] for file in files)
     flags = "--channels rgb,depth" if change == "--parts several" else ""
     assert render(first, tmp_path, flags) == 0
     before = (tmp_path / "a.0001.exr").stat().st_mtime_ns
@@ -309,12 +305,8 @@ def test_files_without_attributes_say_how_they_were_made(
 
 def test_frames_that_do_not_say_how_they_were_made(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     for number in range(1, 5):
-        spec = oiio.ImageSpec(WIDTH, HEIGHT, 3, oiio.UINT8)
-        spec.attribute("Software", "clsplat of an earlier version")
-        file = oiio.ImageOutput.create("jpg")
-        assert file.open(str(tmp_path / f"a.{number:04d}.jpg"), spec)
-        assert file.write_image(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-        assert file.close()
+        made = {"Software": "clsplat of an earlier version"}
+        write_pixels(tmp_path / f"a.{number:04d}.jpg", np.zeros((HEIGHT, WIDTH, 3), np.uint8), attributes=made)
     for more in ("", "--dry-run"):
         assert render(shot, tmp_path, f"--skip-existing --quality 5 {more}", "a.####.jpg") == 0
         (line,) = capsys.readouterr().err.splitlines()

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from calls import ended
 from models import random_gaussians
 from quick import quick
 from systems import posix
@@ -21,9 +22,7 @@ def shell(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
     path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
     script = f'clsplat() {{ "{sys.executable}" -m clsplat "$@"; }}; {line}'
     environment = {**os.environ, "PYTHONPATH": path}
-    return subprocess.run(
-        ["sh", "-c", script], capture_output=True, text=True, timeout=120, check=False, cwd=folder, env=environment
-    )
+    return ended("sh", "-c", script, timeout=120, cwd=folder, env=environment)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from calls import Capture, printed, refuses, rejected
 from tiny import write_scene
 
 from clsplat.cli.main import main
@@ -22,10 +23,7 @@ from clsplat.config.presets import (
     steps_made_for,
 )
 from clsplat.config.training import DensityConfig, OptimiserConfig, TrainConfig
-from clsplat.errors import InputError
 from clsplat.runs.run import Run
-
-Capture = pytest.CaptureFixture[str]
 
 OUT_OF_RANGE = {
     "--optimiser.means-rate": ("-1e-4", "nan", "inf"),
@@ -66,14 +64,11 @@ OUT_OF_RANGE = {
 
 def refused(flags: list[str], tmp_path: Path, capsys: Capture) -> str:
     """The one line of an error that names the flag; nothing is written."""
-    assert main(["train", str(tmp_path), "-o", str(tmp_path / "run"), *flags]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1, captured.err
-    assert captured.err.startswith(f"clsplat: error: {flags[0]} "), captured.err
-    assert "expected" in captured.err
+    said = rejected(capsys, ["train", tmp_path, "-o", tmp_path / "run", *flags])
+    assert said.startswith(f"clsplat: error: {flags[0]} "), said
+    assert "expected" in said
     assert not list(tmp_path.iterdir())
-    return captured.err
+    return said
 
 
 @pytest.mark.parametrize(
@@ -108,7 +103,7 @@ def test_defaults_presets_and_the_ends_of_ranges_make_sense() -> None:
 
 def test_an_evaluation_after_the_last_step(tmp_path: Path, capsys: Capture) -> None:
     line = refused(["--eval-at", "300,500,1000", "--iterations", "499"], tmp_path, capsys)
-    assert line == "clsplat: error: --eval-at 500: training ends before that, expected at most --iterations 499\n"
+    assert line == "clsplat: error: --eval-at 500: training ends before that, expected at most --iterations 499"
     TrainConfig(iterations=500, eval_at=(300, 500)).check()
 
 
@@ -150,8 +145,7 @@ def test_short_schedule_on_the_command_line(tmp_path: Path, capsys: Capture) -> 
     wanted = bundled("fast", "short", 14)
     wanted = replace(wanted, optimiser=replace(wanted.optimiser, opacities_rate=0.04))
     assert Run.open(run).config == wanted, "flags go before the bundles, which go together"
-    assert main(["train", "-o", str(run), "--resume", *short]) == 2
-    assert "--schedule short and --resume" in capsys.readouterr().err
+    assert "--schedule short and --resume" in printed(capsys, ["train", "-o", run, "--resume", *short], status=2).err
 
 
 def test_high_rates_are_those_of_the_short_schedule_but_for_these() -> None:
@@ -162,8 +156,7 @@ def test_high_rates_are_those_of_the_short_schedule_but_for_these() -> None:
     assert high.optimiser == replace(short.optimiser, **rates)  # type: ignore[arg-type]
     assert high.density == replace(short.density, noise_rate=2e5)
     assert high == replace(short, sh_degree_every=300, optimiser=high.optimiser, density=high.density)
-    with pytest.raises(InputError, match="--preset fast and --schedule high-rates exclude each other"):
-        bundled("fast", "high-rates", 7000)
+    refuses("--preset fast and --schedule high-rates exclude each other", bundled, "fast", "high-rates", 7000)
 
 
 @pytest.mark.slow
@@ -230,8 +223,7 @@ def test_passes_stretch_a_schedule(schedule: Schedule, passes: int, photographs:
 def test_passes_leave_settings_that_are_given() -> None:
     config = TrainConfig().changed("density.stop", 900)
     assert by_passes(config, 60, 1000, {"density.stop"}).density.stop == 900
-    with pytest.raises(InputError, match="--passes 0: expected at least 1"):
-        by_passes(config, 0, 10)
+    refuses("--passes 0: expected at least 1", by_passes, config, 0, 10)
 
 
 @pytest.mark.slow
@@ -242,8 +234,7 @@ def test_passes_on_the_command_line(tmp_path: Path, capsys: Capture) -> None:
         ("0", (), "--passes 0: expected at least 1"),
         ("2", ("--iterations", "9"), "--passes 2 and --iterations 9 exclude each other"),
     ):
-        assert main([*words, number, *more]) == 2
-        assert said in capsys.readouterr().err
+        assert said in printed(capsys, [*words, number, *more], status=2).err
         assert not run.exists()
     assert main([*words, "2", "--schedule", "short", "--density.start", "3"]) == 0
     wanted = by_passes(scheduled("short", 7000), 2, 8).changed("density.start", 3)

@@ -4,11 +4,11 @@ from __future__ import annotations
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from calls import refuses
 
 from clsplat.camera import Camera
 from clsplat.demo import ray_caster
 from clsplat.demo import run as demo
-from clsplat.errors import InputError
 from clsplat.shots.viewpoints import look_at
 
 
@@ -23,8 +23,7 @@ def surfaces():
 def test_a_folder_of_somebody_else_is_no_demos(tmp_path, name):
     (tmp_path / name).mkdir()
     (tmp_path / name / "mine.txt").write_text("mine")
-    with pytest.raises(InputError, match=f"holds {name}, which the demo did not create .* choose another folder"):
-        demo.run_demo(tmp_path)
+    refuses(f"holds {name}, which the demo did not create .* choose another folder", demo.run_demo, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 

@@ -9,6 +9,7 @@ from copy import copy
 import numpy as np
 import pyopencl as cl
 import pytest
+from calls import raising
 
 from clsplat.device import command_buffer
 from clsplat.device.buffers import Workspace, allocate
@@ -175,11 +176,7 @@ def test_where_each_launch_is_wanted(made: Work, monkeypatch: pytest.MonkeyPatch
 
 def test_a_launch_that_fails_is_named(made: Work, monkeypatch: pytest.MonkeyPatch) -> None:
     made.replayed()
-
-    def fails(*_: object) -> None:
-        raise cl.RuntimeError("OUT_OF_RESOURCES")
-
-    monkeypatch.setattr(command_buffer.cl, "enqueue_nd_range_kernel", fails)
+    monkeypatch.setattr(command_buffer.cl, "enqueue_nd_range_kernel", raising(cl.RuntimeError("OUT_OF_RESOURCES")))
     assert made.replayed("another key") == EXPECTED  # kernels are called there
     with pytest.raises(DriverError, match=r"words\.cl, words, cannot be launched: .*OUT_OF_RESOURCES"):
         made.replayed("another key")

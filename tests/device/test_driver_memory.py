@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture
+from calls import Capture, printed, refuses, warned
 from dying import ALWAYS, DRIVER, Standing
 
 from clsplat.cli.main import main
@@ -87,8 +87,7 @@ def test_a_lock_is_waited_for_and_not_for_ever(tmp_path: Path) -> None:
 def test_what_could_not_be_written_is_written_later(elsewhere: Path) -> None:
     device = context.all_devices()[0]
     elsewhere.write_text("a file where the folder would be")
-    with pytest.warns(UserWarning, match="cannot be written"):
-        driver_records.remember(device, "8x1", kernels={"first": ""})
+    warned("cannot be written", driver_records.remember, device, "8x1", kernels={"first": ""})
     driver_records.remember(device, "8x1", kernels={"second": ""})  # told once
     assert set(driver_records.entries(device)["8x1"].kernels) == {"first", "second"}
     elsewhere.unlink()
@@ -103,15 +102,12 @@ def test_a_shape_that_one_device_cannot_take(elsewhere: Path, monkeypatch: pytes
     monkeypatch.setenv("CLSPLAT_SHAPE", "1x1024")
     small = context.all_devices()[0]
     monkeypatch.setattr(shapes, "most_items", lambda device: 256 if device == small else 4096)
-    assert main(["devices", "--json"]) == 0
-    told = {each["index"]: each["shape"] for each in json.loads(capsys.readouterr().out)}
+    told = {each["index"]: each["shape"] for each in json.loads(printed(capsys, ["devices", "--json"]).out)}
     assert told.pop(0) == "cannot take CLSPLAT_SHAPE=1x1024"
     assert set(told.values()) <= {"1 lanes x 1024 items"}
-    with pytest.raises(DeviceError, match=r"CLSPLAT_SHAPE=1x1024: .* expected at most 256 items"):
-        context.open_device("0")
+    refuses(r"CLSPLAT_SHAPE=1x1024: .* expected at most 256 items", context.open_device, "0", error=DeviceError)
     monkeypatch.setenv("CLSPLAT_SHAPE", "wide")
-    assert main(["devices"]) == 2
-    assert "expected LANESxITEMS" in capsys.readouterr().err
+    assert "expected LANESxITEMS" in printed(capsys, ["devices"], status=2).err
 
 
 def test_only_what_is_used_warns_and_names_what_is_taken(
@@ -127,8 +123,7 @@ def test_only_what_is_used_warns_and_names_what_is_taken(
         opened = context.open_device()
     assert "warning" not in capsys.readouterr().err
     assert opened.shape == second
-    with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {second.label} is taken"):
-        opened.kernels("scan")
+    warned(f"shape {first.label} failed: it failed; {second.label} is taken", opened.kernels, "scan")
     driver_records.tell_once.cache_clear()
     monkeypatch.setattr(driver_check, "_short_test", lambda tried, _: "as well" if tried.shape == second else "")
     with pytest.warns(UserWarning, match=f"shape {first.label} failed: it failed; {third.label} is taken") as told:
@@ -151,8 +146,7 @@ def test_a_failure_is_forgotten_when_what_failed_works(
     assert f"Its kernel shape is still not used: {failed}; tried once more: " in capsys.readouterr().out
     assert driver_records.entries(device)[label].failed == failed
     standing("abort", ALWAYS)
-    assert main(["selftest", "--device", str(index), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)[0]["remembered"] == ""
+    assert json.loads(printed(capsys, ["selftest", "--device", index, "--json"]).out)[0]["remembered"] == ""
     assert driver_records.entries(device)[label].failed == ""
 
 
@@ -182,8 +176,7 @@ def test_a_python_that_cannot_be_started(
     assert main(["bench", "--gaussians", "300", "--size", "64x48", "--repeat", "1"]) == 1
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert line.endswith("CLSPLAT_TRUST_DRIVER=1 goes on without")
-    with pytest.raises(DriverError, match="CLSPLAT_TRUST_DRIVER=1"):
-        context.open_device().kernels("scan")
+    refuses("CLSPLAT_TRUST_DRIVER=1", context.open_device().kernels, "scan", error=DriverError)
 
 
 @POSIX

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from calls import Capture, train
+from calls import Capture, printed, ran, refuses, train
 from dying import ALWAYS, DRIVER, LATE, VERBS, Standing, call, error_of, forget
 from tiny import CONFIG
 
@@ -81,8 +81,7 @@ def test_another_shape_is_taken(
     # the next process begins with it
     failed = driver_records.entries(standing_device.cl_device)[label].failed
     assert failed in warning
-    assert main(["devices", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(printed(capsys, ["devices", "--json"]).out)
     assert found[DRIVER]["shape"] != f"{label.replace('x', ' lanes x ')} items"
 
 
@@ -90,8 +89,7 @@ def test_a_program_without_kernels_is_built_anew(
     standing: Standing, scene: Path, trained: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     numbers = standing("empty", 3, 3)
-    assert call("eval", scene, trained, tmp_path / "new") == 0
-    assert "warning" not in capsys.readouterr().err
+    assert "warning" not in ran(capsys, call, "eval", scene, trained, tmp_path / "new").err
     assert len(numbers.read_text().splitlines()) > 5
 
 
@@ -104,19 +102,16 @@ def test_a_process_that_ended_once_is_no_failure(
 ) -> None:  # fmt: skip
     """A driver aborts where its linker is killed, by a Ctrl-C or for want of memory."""
     standing("once", number, number)
-    assert call("eval", scene, trained, tmp_path / "new") == 0
-    assert "warning" not in capsys.readouterr().err
+    assert "warning" not in ran(capsys, call, "eval", scene, trained, tmp_path / "new").err
     assert not any(entry.failed for entry in driver_records.entries(standing_device.cl_device).values())
 
 
 def test_what_failed_is_not_waited_for_twice(standing: Standing, monkeypatch: pytest.MonkeyPatch) -> None:
     standing("abort", 1)
     device = context.open_device()
-    with pytest.raises(DriverError, match="signal 6"):
-        device.kernels("scan")
+    refuses("signal 6", device.kernels, "scan", error=DriverError)
     monkeypatch.setattr(sandbox._Process, "ask", lambda *_: pytest.fail("it was tried again"))
-    with pytest.raises(DriverError, match="signal 6"):
-        device.kernels("scan")
+    refuses("signal 6", device.kernels, "scan", error=DriverError)
 
 
 def test_modules_of_the_folder_that_we_are_in_are_not_taken(
@@ -177,8 +172,7 @@ def test_what_failed_in_every_shape_is_tried_anew(
     device = standing_device.cl_device
     for shape in shapes_in_turn(device):
         driver_records.remember(device, shape.label, failed="it did once")
-    assert call("eval", scene, trained, tmp_path / "new") == 0
-    assert "warning" not in capsys.readouterr().err
+    assert "warning" not in ran(capsys, call, "eval", scene, trained, tmp_path / "new").err
     assert driver_records.entries(device)[standing_device.shape.label].failed == ""
 
 

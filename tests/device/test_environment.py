@@ -9,7 +9,7 @@ from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import pytest
-from calls import python
+from calls import python, raising
 
 from clsplat.device.drivers.quirks import make_cache_folder, pin_threads
 
@@ -36,10 +36,7 @@ def test_nothing_is_done_where_the_cache_can_be_made(tmp_path: Path) -> None:
 
 
 def test_no_place_at_all_leaves_it_to_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(**_: object) -> str:
-        raise FileNotFoundError("no usable temporary directory")
-
-    monkeypatch.setattr("tempfile.mkdtemp", full)
+    monkeypatch.setattr("tempfile.mkdtemp", raising(FileNotFoundError("no usable temporary directory")))
     environment = {"HOME": "/dev/null/home"}
     assert make_cache_folder(environment) is None
     assert "POCL_CACHE_DIR" not in environment
@@ -68,26 +65,21 @@ def pinned(monkeypatch: pytest.MonkeyPatch, allowed: AbstractSet[int], **given: 
     return environment
 
 
-@LINUX
-def test_threads_are_pinned_where_all_processors_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert pinned(monkeypatch, {0, 1, 2, 3}) == {"POCL_AFFINITY": "1"}
+FEWER = ("POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "POCL_MAX_COMPUTE_UNITS")
 
 
 @LINUX
-@pytest.mark.parametrize("allowed", [{0, 1}, {2, 3}, {0, 1, 2, 4}])
-def test_not_where_a_thread_s_number_may_be_nobody_s_processor(
-    monkeypatch: pytest.MonkeyPatch, allowed: set[int]
+@pytest.mark.parametrize(
+    ("allowed", "given"),
+    [
+        ({0, 1, 2, 3}, {}),
+        *((allowed, {}) for allowed in ({0, 1}, {2, 3}, {0, 1, 2, 4})),  # a thread's number may be nobody's processor
+        *(({0, 1, 2, 3}, {name: "1"}) for name in FEWER),
+        *(({0, 1, 2, 3}, {"POCL_AFFINITY": value}) for value in ("0", "1", "")),
+    ],
+)
+def test_threads_are_pinned_where_all_processors_may_be_used_and_no_variable_is_set(
+    monkeypatch: pytest.MonkeyPatch, allowed: set[int], given: dict[str, str]
 ) -> None:
-    assert pinned(monkeypatch, allowed) == {}
-
-
-@LINUX
-@pytest.mark.parametrize("name", ["POCL_CPU_MAX_CU_COUNT", "POCL_MAX_PTHREAD_COUNT", "POCL_MAX_COMPUTE_UNITS"])
-def test_not_where_pocl_has_fewer_threads(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    assert pinned(monkeypatch, {0, 1, 2, 3}, **{name: "1"}) == {name: "1"}
-
-
-@LINUX
-@pytest.mark.parametrize("value", ["0", "1", ""])
-def test_a_variable_that_is_set_is_left(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
-    assert pinned(monkeypatch, {0, 1, 2, 3}, POCL_AFFINITY=value) == {"POCL_AFFINITY": value}
+    added = {"POCL_AFFINITY": "1"} if allowed == {0, 1, 2, 3} and not given else {}
+    assert pinned(monkeypatch, allowed, **given) == given | added

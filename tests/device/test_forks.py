@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import python
+from calls import python, refuses
 from scenes import one
 
 from clsplat.device import forks
@@ -91,6 +91,5 @@ def test_each_way_to_a_device_is_closed(default_device: Device, monkeypatch: pyt
     array = np.zeros(4, np.float32)
     monkeypatch.setattr(forks, "_owner", [-1])
     for call in (all_devices, open_device, default_device.finish, lambda: default_device.queue):
-        with pytest.raises(DeviceError, match="was forked from -1"):
-            call()
+        refuses("was forked from -1", call, error=DeviceError)
     assert array.sum() == 0

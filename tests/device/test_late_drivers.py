@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture, train
+from calls import Capture, noted, train
 from compare import assert_same_arrays
 from dying import ALWAYS, DRIVER, LATE, Standing, call, error_of, forget, number_of
 
@@ -36,20 +36,17 @@ WITHOUT = replace(LATE, checkpoint_every=0, optimiser=replace(LATE.optimiser, sp
 
 def failing_at(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) -> None:
     """What needs the text or the kernel of this name ends so, as where its trial does."""
-    real_kernels, real_enqueue = Device.kernels, launch._enqueue
 
-    def kernels(self, stem, defines: Mapping[str, object] = {}):
+    def kernels(_self, _stem, defines: Mapping[str, object] = {}):
         if name in [f"{key}={value}" for key, value in defines.items()]:
             raise error
-        return real_kernels(self, stem, defines)
 
-    def enqueue(device, kernel, *given):
+    def enqueue(_device, kernel, *_given):
         if name == kernel.name:
             raise error
-        real_enqueue(device, kernel, *given)
 
-    monkeypatch.setattr(Device, "kernels", kernels)
-    monkeypatch.setattr(launch, "_enqueue", enqueue)
+    noted(monkeypatch, Device, "kernels", kernels)
+    noted(monkeypatch, launch, "_enqueue", enqueue)
 
 
 @pytest.fixture(scope="module")
@@ -117,14 +114,12 @@ def test_what_is_half_changed_is_not_kept(
 ) -> None:
     """A launch that fails although its trial did not, behind the first that changes rows."""
     run = Run.create(tmp_path / "run", WITHOUT, scene=scene)
-    real = monitor.StepMonitor.add_statistics
 
-    def add_statistics(self, statistics, rows):
-        if self.number == 5 and self.changes.__self__.mark is None:
+    def fail(step, _statistics, _rows):
+        if step.number == 5 and step.changes.__self__.mark is None:
             raise DriverError("it failed")
-        return real(self, statistics, rows)
 
-    monkeypatch.setattr(monitor.StepMonitor, "add_statistics", add_statistics)
+    noted(monkeypatch, monitor.StepMonitor, "add_statistics", fail)
     with pytest.raises(DriverError) as raised:
         train_on(load_scene(scene), WITHOUT, device=default_device, run=run)
     assert str(raised.value) == "it failed"

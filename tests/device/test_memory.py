@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calls import refuses
 
 from clsplat.cli.main import main
 from clsplat.config.checks import parse_bytes
 from clsplat.device.buffers import Workspace, allocate
 from clsplat.device.context import Device, open_device
-from clsplat.errors import CapacityError, InputError
+from clsplat.errors import CapacityError
 
 
 @pytest.mark.parametrize(
@@ -33,8 +34,7 @@ def test_sizes_that_can_be_read(text: str, size: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "lots", "-1MiB", "0", "0.1", "1.5X", "MiB", "1e9", "nan", "1 000"])
 def test_sizes_that_make_no_sense(text: str) -> None:
-    with pytest.raises(InputError, match=r"--max-device-mem .*expected a size such as 256MiB"):
-        parse_bytes(text)
+    refuses(r"--max-device-mem .*expected a size such as 256MiB", parse_bytes, text)
 
 
 @pytest.mark.parametrize(
@@ -60,8 +60,7 @@ def test_buffers_are_counted_while_they_live(default_device: Device) -> None:
     del second
     assert (device.memory.used, device.memory.peak) == (4000, 10_000)
     said = "--max-device-mem 10,000 bytes is too little: 4,000 bytes of the device's memory are in use, and 6,004 bytes"
-    with pytest.raises(CapacityError, match=said):
-        allocate(device, (1501,), np.float32)
+    refuses(said, allocate, device, (1501,), np.float32, error=CapacityError)
     del first
     assert device.memory.used == 0
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from calls import refuses
 
 from clsplat.device import context
 from clsplat.device.context import Device
@@ -63,6 +64,5 @@ def test_none_of_the_ways_works(device: Device, monkeypatch: pytest.MonkeyPatch)
     opened = with_ways(device)
     monkeypatch.setattr(context, "subgroup_ways", lambda device: [{"SUBGROUP": 8, "EXCHANGED(x,step)": "(x)"}])
     message = r"items of a sub-group do not exchange the right values; .* such as CLSPLAT_SHAPE=1x64$"
-    with pytest.raises(DeviceError, match=message):
-        opened.kernels("blend_grad")
+    refuses(message, opened.kernels, "blend_grad", error=DeviceError)
     assert opened.kernels("blend"), "other kernels have no sub-groups"

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import refuses
 from scenes import random_cloud
 
 from clsplat.device.context import Device, open_device
-from clsplat.errors import DriverError, InputError
+from clsplat.errors import DriverError
 from clsplat.rendering.renderer import Renderer
 
 
@@ -52,5 +53,4 @@ def test_the_kernel_is_named(waiting: Device, monkeypatch: pytest.MonkeyPatch, s
 def test_a_value_that_makes_no_sense(monkeypatch: pytest.MonkeyPatch) -> None:
     device = open_device()
     monkeypatch.setenv("CLSPLAT_SYNC", "yes")
-    with pytest.raises(InputError, match="CLSPLAT_SYNC=yes: expected 1, or 0"):
-        device.with_shape(items=device.shape.items)
+    refuses("CLSPLAT_SYNC=yes: expected 1, or 0", device.with_shape, items=device.shape.items)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import refuses
 from numpy.typing import NDArray
 
 from clsplat.device.buffers import DeviceArray, Workspace, allocate, shared, upload
@@ -43,8 +44,7 @@ def test_a_copy_that_nothing_waits_for_keeps_its_array(device: Device) -> None:
 def test_what_is_sent_has_to_fit(default_device: Device) -> None:
     array = allocate(default_device, (4, 2), np.float32)
     for values in (np.zeros((2, 4), np.float32), np.zeros((4, 2))):
-        with pytest.raises(ValueError, match="expected float32"):
-            array.send(values)
+        refuses("expected float32", array.send, values, error=ValueError)
 
 
 def test_a_read_waits_for_what_was_before_it(device: Device) -> None:

@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
+from calls import refuses
 from scipy.ndimage import correlate1d
 
-from clsplat.errors import InputError
 from clsplat.evaluation import metrics
 
 
@@ -56,10 +56,8 @@ def test_single_precision_is_widened() -> None:
 
 
 def test_too_small_or_different() -> None:
-    with pytest.raises(InputError, match="10x20 pixels is too small"):
-        metrics.ssim(np.zeros((20, 10, 3)), np.zeros((20, 10, 3)))
-    with pytest.raises(ValueError, match="expected"):
-        metrics.psnr(np.zeros((20, 10, 3)), np.zeros((10, 20, 3)))
+    refuses("10x20 pixels is too small", metrics.ssim, np.zeros((20, 10, 3)), np.zeros((20, 10, 3)))
+    refuses("expected", metrics.psnr, np.zeros((20, 10, 3)), np.zeros((10, 20, 3)), error=ValueError)
 
 
 def test_lpips_or_the_reason_why_not() -> None:

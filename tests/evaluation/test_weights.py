@@ -15,11 +15,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from calls import Capture
+from calls import Capture, ran, refuses
 from calls import train as command_train
 from tiny import short
 
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError
 from clsplat.evaluation import held_out, lpips_weights, metrics
 
 BODY = b"the weights" * 1000
@@ -97,25 +97,23 @@ def test_a_silent_server_has_a_limit(seconds: str, server: str, monkeypatch: pyt
     monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/silent/{NAME}")
     monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, seconds)
     start = time.monotonic()
-    with pytest.raises(ClsplatError) as caught:
-        lpips_weights.fetch()
+    said = refuses(
+        f"curl --create-dirs -o {lpips_weights.place()} {server}/silent/{NAME}", lpips_weights.fetch, error=ClsplatError
+    )
     assert time.monotonic() - start < 2
-    assert f"curl --create-dirs -o {lpips_weights.place()} {server}/silent/{NAME}" in str(caught.value)
-    assert ("did not arrive in 0.3 s" in str(caught.value)) == (seconds != "0")
+    assert ("did not arrive in 0.3 s" in said) == (seconds != "0")
 
 
 def test_a_page_in_their_place_is_not_kept(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/other/{NAME}")
-    with pytest.raises(ClsplatError, match=r"could not be downloaded \(the SHA-256 of the download"):
-        lpips_weights.fetch()
+    refuses(r"could not be downloaded \(the SHA-256 of the download", lpips_weights.fetch, error=ClsplatError)
     assert not list(lpips_weights.place().parent.iterdir())
 
 
 def test_a_limit_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("soon", "-1", "nan", "inf"):
         monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, text)
-        with pytest.raises(InputError, match=f"{lpips_weights.LPIPS_TIMEOUT_VARIABLE} is '{text}', expected seconds"):
-            lpips_weights.limit()
+        refuses(f"{lpips_weights.LPIPS_TIMEOUT_VARIABLE} is '{text}', expected seconds", lpips_weights.limit)
 
 
 @pytest.mark.usefixtures("installed")
@@ -134,8 +132,7 @@ def test_train_says_once_what_is_missing(
     monkeypatch.setattr(lpips_weights, "VGG16_WEIGHTS_URL", f"{server}/silent/{NAME}")
     monkeypatch.setenv(lpips_weights.LPIPS_TIMEOUT_VARIABLE, "0.2")
     config = short(iterations=2, eval_at=(1,), report=False, density={"every": 0})
-    assert command_train(scene, tmp_path / "run", config, "--json") == 0
-    captured = capsys.readouterr()
+    captured = ran(capsys, command_train, scene, tmp_path / "run", config, "--json")
     told = [line for line in captured.err.splitlines() if line.startswith("no LPIPS: ")]
     assert len(told) == 1
     assert told[0].startswith("no LPIPS: VGG-16's weights did not arrive in 0.2 s (CLSPLAT_LPIPS_TIMEOUT): curl")

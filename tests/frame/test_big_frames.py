@@ -10,6 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import scenes
+from calls import refuses
 from compare import assert_same_bits
 from quick import quick
 
@@ -123,8 +124,7 @@ def test_what_cannot_be(tmp_path: Path) -> None:
     draw = drawn_by(Renderer(), CLOUD)
     with pytest.raises(InputError, match="--parts several: a picture of 150x200 is written in strips"):
         write_in_strips(tmp_path / "a.exr", draw, CAMERA, ("rgb",), 16, Encoding(parts="several"))
-    with pytest.raises(InputError, match="no such folder"):
-        write_in_strips(tmp_path / "none" / "a.exr", draw, CAMERA, ("rgb",), 16)
+    refuses("no such folder", write_in_strips, tmp_path / "none" / "a.exr", draw, CAMERA, ("rgb",), 16)
 
     def fails(camera: Camera, names: object) -> dict[str, np.ndarray]:
         if camera.window and camera.window.y > 50:

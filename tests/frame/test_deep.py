@@ -11,6 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import scenes
+from calls import refuses
 from compare import assert_close, assert_same_bits
 from numpy.typing import NDArray
 from quick import quick
@@ -19,7 +20,6 @@ from slices import flattened, in_front
 from clsplat.camera import Camera, Window
 from clsplat.config.pictures import ColourConfig, DeepConfig, Encoding, PictureConfig
 from clsplat.device.context import Device, open_device
-from clsplat.errors import InputError
 from clsplat.frame.deep import render_deep
 from clsplat.frame.deep_exr import write_deep
 from clsplat.frame.pipeline import FramePipeline, FrameRequest
@@ -228,14 +228,12 @@ def test_colours_are_converted(tmp_path: Path) -> None:
 
 def test_what_cannot_be(tmp_path: Path) -> None:
     gaussians, camera = scenes.one()
-    with pytest.raises(InputError, match=r"a\.png: deep samples need an \.exr file"):
-        write(tmp_path / "a.png", Renderer(), gaussians, camera)
+    refuses(r"a\.png: deep samples need an \.exr file", write, tmp_path / "a.png", Renderer(), gaussians, camera)
     for config, message in (
         (DeepConfig(bins=0), "--deep.bins 0: expected 1 to 256"),
         (DeepConfig(bins=257), "--deep.bins 257: expected 1 to 256"),
     ):
-        with pytest.raises(InputError, match=message):
-            config.check()
+        refuses(message, config.check)
 
 
 def test_a_model_that_counts_from_far_away() -> None:

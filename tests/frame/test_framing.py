@@ -9,6 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import scenes
+from calls import refuses
 from compare import assert_close, assert_same_bits
 from quick import quick
 
@@ -165,8 +166,7 @@ def test_a_camera_gets_the_window_of_another() -> None:
     assert (again.width, again.height, again.fx, again.cx) == (30, 40, part.fx, part.cx)
     assert again.window == part.window
     assert reframed(camera, camera).window is None
-    with pytest.raises(ValueError, match="edges on whole pixels"):
-        part.resized(31, 40)
+    refuses("edges on whole pixels", part.resized, 31, 40, error=ValueError)
 
 
 @pytest.mark.parametrize(
@@ -182,8 +182,7 @@ def test_a_camera_gets_the_window_of_another() -> None:
     ],
 )
 def test_settings_that_make_no_sense(config: FramingConfig, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        config.check()
+    refuses(message, config.check)
 
 
 def test_what_the_camera_cannot(default_device: Device) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import scenes
+from calls import refuses
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
@@ -126,5 +127,4 @@ def test_what_deep_pictures_have_not() -> None:
     with pytest.raises(InputError, match="deep EXR: --supersample cannot filter deep samples"):
         PictureConfig(framing=FramingConfig(supersample=2)).check_deep()
     PictureConfig(sampling=SamplingConfig(shutter_angle=9.0)).check_deep()
-    with pytest.raises(InputError, match="--supersample 0"):
-        FramePipeline(Renderer(), CLOUD, PictureConfig(framing=FramingConfig(supersample=0)))
+    refuses("--supersample 0", FramePipeline, Renderer(), CLOUD, PictureConfig(framing=FramingConfig(supersample=0)))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from calls import refuses
 from compare import assert_close, assert_same_bits
 
 from clsplat.camera import Camera
@@ -192,8 +193,7 @@ def test_nothing_open_is_one_camera() -> None:
     ],
 )
 def test_settings_that_make_no_sense(config: SamplingConfig, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        config.check()
+    refuses(message, config.check)
     SamplingConfig(shutter_angle=180.0, f_stop=2.8, focus=3.0).check()
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import scenes
-from calls import Capture, error_line
+from calls import Capture, error_line, fails, ran, rejected
+from pictures import write_pixels
+from rendered import camera_file
 from scipy import ndimage
 from tiny import hidden_model
 
@@ -37,10 +38,8 @@ BARREL = Lens("SIMPLE_RADIAL", 120, 80, (100.0, 60.0, 40.0, -0.2))
 def shot(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     folder = tmp_path_factory.mktemp("shot")
     hidden_model().save(folder / "model.ply")
-    key = {"frame": 1, "position": [0, 0, -4], "world_from_cam": [1, 0, 0, 0], "fov_x": 30}
-    document = {"clsplat_cameras": 1, "width": WIDTH, "height": HEIGHT, "keys": [key]}
-    (folder / "cameras.json").write_text(json.dumps(document))
-    return [str(folder / "model.ply"), "--cameras", str(folder / "cameras.json")]
+    cameras = camera_file(folder / "cameras.json", {1: 0}, size=(WIDTH, HEIGHT), fov_x=30)
+    return [str(folder / "model.ply"), "--cameras", str(cameras)]
 
 
 @pytest.fixture(scope="module")
@@ -259,8 +258,8 @@ def test_a_deep_frame_by_a_map(shot: list[str], tmp_path: Path) -> None:
 def test_skip_existing_goes_by_the_map(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     write_stmap(tmp_path / "a.exr", grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
     (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes())
-    assert render(shot, tmp_path / "frame.exr", f"--stmap {tmp_path}/a.exr --dry-run") == 0
-    assert f"{WIDTH}x{HEIGHT}" in capsys.readouterr().out
+    plan = ran(capsys, render, shot, tmp_path / "frame.exr", f"--stmap {tmp_path}/a.exr --dry-run").out
+    assert f"{WIDTH}x{HEIGHT}" in plan
     assert render(shot, tmp_path / "frame.exr", f"--stmap {tmp_path}/a.exr") == 0
     stamp = (tmp_path / "frame.exr").stat().st_mtime_ns
     assert render(shot, tmp_path / "frame.exr", f"--stmap {tmp_path}/b.exr --skip-existing") == 0
@@ -287,17 +286,12 @@ def test_skip_existing_goes_by_the_map(shot: list[str], tmp_path: Path, capsys: 
 )
 def test_errors_are_one_line(shot: list[str], tmp_path: Path, capsys: Capture, flags: str, message: str) -> None:
     write_stmap(tmp_path / "map.exr", grid(WIDTH, HEIGHT), WIDTH, HEIGHT)
-    spec = oiio.ImageSpec(4, 4, 3, oiio.UINT8)
-    file = oiio.ImageOutput.create("png")
-    assert file.open(str(tmp_path / "whole.png"), spec)
-    assert file.write_image(np.zeros((4, 4, 3), np.uint8))
-    assert file.close()
+    write_pixels(tmp_path / "whole.png", np.zeros((4, 4, 3), np.uint8))
     paths = {"GIVEN": str(tmp_path / "map.exr"), "WHOLE": str(tmp_path / "whole.png")}
     for word, path in paths.items():
         flags, message = flags.replace(word, path), message.replace(word, path)
     before = sorted(tmp_path.iterdir())
-    assert render(shot, tmp_path / "a.exr", flags) == 2
-    assert message in error_line(capsys)
+    assert message in fails(capsys, render, shot, tmp_path / "a.exr", flags)
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -348,8 +342,6 @@ def test_a_map_that_points_nowhere_is_told(shot: list[str], tmp_path: Path, caps
 def test_stmaps_of_cameras_that_do_not_bend(shot: list[str], tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} 90 90 48 32\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 photo.png\n\n")
-    assert main(["stmaps", str(tmp_path), "-o", str(tmp_path / "maps")]) == 2
-    assert "its lenses have no distortion" in error_line(capsys)
-    assert main(["stmaps", shot[2], "-o", str(tmp_path / "maps")]) == 2
-    assert "describes no photographs with lenses" in error_line(capsys)
+    assert "its lenses have no distortion" in rejected(capsys, ["stmaps", tmp_path, "-o", tmp_path / "maps"])
+    assert "describes no photographs with lenses" in rejected(capsys, ["stmaps", shot[2], "-o", tmp_path / "maps"])
     assert not (tmp_path / "maps").exists()

@@ -11,6 +11,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from calls import ended
 
 ROOT = Path(__file__).resolve().parents[2]
 STEP = re.compile(r'\bstep ("[^"]+") .*')
@@ -30,9 +31,7 @@ def ran(folder: Path, *arguments: str, **steps: str) -> subprocess.CompletedProc
     script.parent.mkdir()
     script.write_text(STEP.sub(stub, (ROOT / ".ci/run").read_text()).replace("\n    inherit\n", "\n"))
     variables = {**os.environ, "TMPDIR": str(folder)}
-    result = subprocess.run(
-        ["bash", str(script), *arguments], capture_output=True, text=True, check=False, env=variables
-    )
+    result = ended("bash", script, *arguments, env=variables)
     assert [path.name for path in folder.iterdir()] == [".ci"]
     shutil.rmtree(script.parent)
     return result

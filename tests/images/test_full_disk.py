@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from calls import ended
 from models import random_gaussians
 from needs import missing
 from quick import quick
@@ -37,9 +38,9 @@ mounts = pytest.mark.skipif(not can_mount(), reason="this user may not mount a f
 
 def on_disk(folder: Path, size: str, code: str, *words: str, **variables: str) -> list[str]:
     """What Python code prints where `folder` is a disk of that size."""
-    command = ["unshare", "-rm", "sh", "-c", MOUNT, "sh", str(folder), size, sys.executable, "-c", code, *words]
+    command = ["unshare", "-rm", "sh", "-c", MOUNT, "sh", folder, size, sys.executable, "-c", code, *words]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **variables}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120, env=environment)
+    done = ended(*command, timeout=120, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from calls import refuses
+from calls import raising, refuses
 from other_pictures import HEIGHT, KINDS, WIDTH, other_picture
+from pictures import write_pixels
 from PIL import Image as Pillow
 from PIL import ImageOps
 
@@ -18,15 +19,6 @@ from clsplat.images.writing import write_image
 
 RNG = np.random.default_rng(1)
 PHOTO = RNG.integers(0, 256, (37, 53, 4), dtype=np.uint8)
-
-
-def write_raw(path: Path, pixels: np.ndarray, names: tuple[str, ...], kind: object = oiio.FLOAT) -> None:
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], kind)
-    spec.channelnames = names
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec)
-    assert output.write_image(pixels)
-    assert output.close()
 
 
 @pytest.mark.parametrize(("mode", "channels"), [("L", 3), ("LA", 4), ("RGB", 3), ("RGBA", 4), ("P", 3)])
@@ -47,25 +39,23 @@ def test_sixteen_bits(tmp_path: Path) -> None:
 
 
 def test_exr_keeps_values_beyond_one_and_loses_premultiplication(tmp_path: Path) -> None:
-    write_raw(tmp_path / "a.exr", np.array([[[2, 1, 0.5, 0.5], [0.25, 0, 0, 0]]], np.float32), ("R", "G", "B", "A"))
+    write_pixels(
+        tmp_path / "a.exr", np.array([[[2, 1, 0.5, 0.5], [0.25, 0, 0, 0]]], np.float32), channelnames=tuple("RGBA")
+    )
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), [[[4, 2, 1, 0.5], [0.25, 0, 0, 0]]])
 
 
 def test_exr_of_many_channels_gives_those_named_rgb(tmp_path: Path) -> None:
     pixels = np.arange(5, dtype=np.float32).reshape(1, 1, 5)
-    write_raw(tmp_path / "a.exr", pixels, ("R", "G", "B", "Z", "N"))
+    write_pixels(tmp_path / "a.exr", pixels, channelnames=tuple("RGBZN"))
     np.testing.assert_array_equal(read_image(tmp_path / "a.exr"), [[[0, 1, 2]]])
-    write_raw(tmp_path / "b.exr", pixels, ("u", "v", "w", "Z", "N"))
+    write_pixels(tmp_path / "b.exr", pixels, channelnames=tuple("uvwZN"))
     refuses(r"b\.exr: has the channels .*expected grey or RGB", read_image, tmp_path / "b.exr")
 
 
 def test_exr_data_window_is_placed_in_the_display_window(tmp_path: Path) -> None:
-    spec = oiio.ImageSpec(2, 1, 3, oiio.FLOAT)
-    spec.x, spec.y, spec.full_width, spec.full_height = 1, 2, 4, 5
-    output = oiio.ImageOutput.create("exr")
-    assert output.open(str(tmp_path / "a.exr"), spec)
-    output.write_image(np.ones((1, 2, 3), np.float32))
-    output.close()
+    window = {"x": 1, "y": 2, "full_width": 4, "full_height": 5}
+    write_pixels(tmp_path / "a.exr", np.ones((1, 2, 3), np.float32), **window)
     image = read_image(tmp_path / "a.exr")
     assert image.shape == (5, 4, 3)
     assert image_size(tmp_path / "a.exr") == (4, 5)
@@ -100,7 +90,7 @@ def test_undecodable_images_are_named_with_the_reason(tmp_path: Path) -> None:
 
 
 def test_values_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    write_raw(tmp_path / "a.exr", np.full((2, 2, 3), np.nan, np.float32), ("R", "G", "B"))
+    write_pixels(tmp_path / "a.exr", np.full((2, 2, 3), np.nan, np.float32))
     refuses(r"a\.exr: has 4 pixels that are not finite", read_image, tmp_path / "a.exr")
 
 
@@ -135,12 +125,8 @@ def test_a_failed_write_leaves_the_previous_file_and_nothing_else(
     path = tmp_path / "a.png"
     write_image(path, np.zeros((2, 2, 3), np.float32))
     before = path.read_bytes()
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Path, "replace", interrupted)
+        patch.setattr(Path, "replace", raising(KeyboardInterrupt()))
         write_image(path, np.ones((2, 2, 3), np.float32))
     assert path.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import refuses
 from compare import assert_close, assert_close_gradient, assert_same_bits
 from flat import cloud
 
@@ -109,8 +110,7 @@ def test_arrays_in_any_order_of_memory_and_on_the_device(default_device: Device)
 
 def test_more_pairs_than_there_is_room_for(default_device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pixels_module, "MAX_PAIRS_PER_BAND", 10)
-    with pytest.raises(CapacityError, match="has room for 10"):
-        cloud(60, WIDTH, HEIGHT).pixels(default_device, WIDTH, HEIGHT)
+    refuses("has room for 10", cloud(60, WIDTH, HEIGHT).pixels, default_device, WIDTH, HEIGHT, error=CapacityError)
 
 
 @pytest.mark.parametrize("pretend", ["", "gpu"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture, no_warnings, only, printed, warnings_of
+from calls import Capture, no_warnings, only, printed, warned, warnings_of
 from models import random_gaussians
 from splats import lopsided
 
@@ -191,16 +191,13 @@ def test_the_program_tells_what_its_scales_are(tmp_path: Path, generator: object
     if not logs:
         np.testing.assert_allclose(formats.load(path).log_scales, np.log(stored), atol=1e-6)  # float32's
         return
-    with pytest.warns(UserWarning, match=f"are read as logs of scales, .* as {generator} wrote them") as caught:
-        np.testing.assert_array_equal(formats.load(path).log_scales, stored)
-    assert len(caught) == 1
+    read = warned(f"are read as logs of scales, .* as {generator} wrote them", formats.load, path)
+    np.testing.assert_array_equal(read.log_scales, stored)
 
 
 def test_all_primitives_decide_together(tmp_path: Path) -> None:
     """One has logs that are all over 0, as a coarse level of detail does."""
     path = tmp_path / "model.gltf"
     stored = generated(path, "another", 0.5, -3.0)
-    with pytest.warns(UserWarning, match="of 200 have a negative one: all are read as logs of scales") as caught:
-        np.testing.assert_array_equal(formats.load(path).log_scales, np.concatenate(stored))
-    assert len(caught) == 1
-    assert f"{path}: primitive 1 of node 0: Gaussian " in str(caught[0].message)
+    told = f"{path}: primitive 1 of node 0: Gaussian .* of 200 have a negative one: all are read as logs of scales"
+    np.testing.assert_array_equal(warned(told, formats.load, path).log_scales, np.concatenate(stored))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import printed, refuses
 from compare import assert_same_bits
 from quick import quick
 from same_bytes import model_bytes, opened_again
@@ -236,8 +237,7 @@ def test_the_plan_in_words() -> None:
     assert planned(1000) == "about 211.6 MiB of device memory needed, 1,000.0 MiB allowed: all at once"
     assert planned(190).endswith("190.0 MiB allowed: the image is rendered in about 2 bands of tiles")
     assert "allowed: parameters are streamed, 20,128 Gaussians at a time, the image" in planned(140)
-    with pytest.raises(CapacityError, match=r"at least about 68.3 MiB of device memory, or 211.6 MiB to be processed"):
-        planned(65)
+    refuses(r"at least about 68.3 MiB of device memory, or 211.6 MiB to be processed", planned, 65, error=CapacityError)
     small = Need(gaussians=40, **ROW, planes=50_000, scratch=1024)
     with pytest.raises(CapacityError, match=r"about [0-9]+ KiB .* KiB to be processed at once, but 4,000 bytes are"):
         plan(small, 4000, 2**31, 32)
@@ -272,10 +272,8 @@ def test_the_command_line_says_what_it_will_do(
 @pytest.mark.slow
 def test_bench_under_a_limit(capsys: pytest.CaptureFixture[str]) -> None:
     call = ["bench", "--gaussians", "2000", "--size", "96x64", "--repeat", "1", "--json"]
-    found = []
-    for limit in ([], ["--max-device-mem", "1.2MiB"]):
-        assert main([*call, *limit]) == 0
-        found.append(json.loads(capsys.readouterr().out))
+    limits = [], ["--max-device-mem", "1.2MiB"]
+    found = [json.loads(printed(capsys, [*call, *limit]).out) for limit in limits]
     assert found[0]["pairs"] == found[1]["pairs"]
     assert found[0]["visible"] == found[1]["visible"]
 

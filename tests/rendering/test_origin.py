@@ -9,21 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import refuses
 from calls import train as train_by_command
 from models import assert_equal, random_gaussians
+from same_bytes import trained_run
 from scipy.spatial.transform import Rotation
 from tiny import CONFIG, cameras, write_scene
 
 from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.images.reading import read_image
 from clsplat.models.formats import ply
 from clsplat.reference import render as reference
 from clsplat.rendering.renderer import Renderer
-from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import FAR_ORIGIN_RATIO
 
@@ -79,8 +79,7 @@ def test_a_far_scene_counts_from_its_middle(tmp_path: Path) -> None:
 def test_training_is_as_near_the_origin(scene: Path, tmp_path: Path, default_device: Device) -> None:
     scores = []
     for name, folder in (("near", scene), ("far", far_scene(tmp_path / "scene"))):
-        run = Run.create(tmp_path / name, CONFIG)
-        train(load_scene(folder), CONFIG, device=default_device, run=run)
+        run = trained_run(load_scene(folder), CONFIG, default_device, tmp_path / name)
         scores.append(json.loads(run.eval_path.read_text())["mean"]["psnr"])
     # cameras that are given to 1e-10, and a grid of float32 that lies otherwise: 1e-7 in positions, grown by training
     assert abs(scores[0] - scores[1]) < 0.01
@@ -106,8 +105,7 @@ def test_commands_from_training_to_frames(tmp_path: Path) -> None:
 def test_resume_gives_the_same_bytes(tmp_path: Path, default_device: Device) -> None:
     loaded = load_scene(far_scene(tmp_path / "scene"))
     whole = train(loaded, replace(CONFIG, iterations=12), device=default_device)
-    run = Run.create(tmp_path / "run", replace(CONFIG, iterations=6, checkpoint_every=6))
-    train(loaded, replace(CONFIG, iterations=6, checkpoint_every=6), device=default_device, run=run)
+    run = trained_run(loaded, replace(CONFIG, iterations=6, checkpoint_every=6), default_device, tmp_path / "run")
     resumed = train(loaded, replace(CONFIG, iterations=12), device=default_device, run=run, resume=True)
     assert_equal(whole, resumed)
     np.testing.assert_array_equal(whole.origin, resumed.origin)
@@ -183,8 +181,7 @@ def test_cut_element_is_named(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     far_model().save(path)
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(InputError, match=r"truncated: element clsplat_local needs 2400 bytes but has 2399"):
-        Gaussians.load(path)
+    refuses(r"truncated: element clsplat_local needs 2400 bytes but has 2399", Gaussians.load, path)
 
 
 @pytest.mark.parametrize("words", ["nan 0 0", "1 2", "a b c", "inf 0 0", "1 2 3 4", ""])
@@ -199,13 +196,11 @@ def test_origin_out_of_all_bounds(tmp_path: Path) -> None:
     path = tmp_path / "model.ply"
     random_gaussians(5).save(path)
     path.write_bytes(path.read_bytes().replace(b"element", b"comment clsplat origin 1e300 0 0\nelement", 1))
-    with pytest.raises(InputError, match="gives means that are not finite"):
-        Gaussians.load(path)
+    refuses("gives means that are not finite", Gaussians.load, path)
 
 
 def test_origin_is_checked() -> None:
-    with pytest.raises(ValueError, match="origin is float32"):
-        replace(random_gaussians(2), origin=np.zeros(3, np.float32)).check()
+    refuses("origin is float32", replace(random_gaussians(2), origin=np.zeros(3, np.float32)).check, error=ValueError)
 
 
 def test_a_near_model_has_no_new_bytes(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from calls import refuses
 from compare import assert_same_arrays, assert_same_bits
 from golden_frames import FOCALS, checksums, pictures_of
 from numpy.typing import NDArray
@@ -24,7 +25,6 @@ from clsplat.config.presets import RASTERIZER_PRESETS
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
 from clsplat.device.source import kernel_root, kernel_source
-from clsplat.errors import InputError
 from clsplat.rendering.build_flags import kernel_defines
 from clsplat.sequence.task import digest_of
 
@@ -235,8 +235,7 @@ def test_gradient_of_bands_left_out_is_zero(default_device: Device) -> None:
     ],
 )
 def test_values_that_make_no_sense(change: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="expected"):
-        replace(RasterizerConfig(), **change).check()
+    refuses("expected", replace(RasterizerConfig(), **change).check)
 
 
 def test_a_user_s_command_has_the_six_settings_that_approximate(capsys: pytest.CaptureFixture[str]) -> None:

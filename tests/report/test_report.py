@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calls import Capture, rejected, train
+from calls import Capture, raising, rejected, train
 from pages import charts_of, figures_of, outside_of, parse, rows_of
 from systems import links
 from tiny import CONFIG, run_steps, short
@@ -369,10 +369,7 @@ def test_training_is_the_same_with_it_and_without(
 def test_a_report_that_fails_does_not_fail_the_training(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: Capture
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise ClsplatError("no room")
-
-    monkeypatch.setattr(report_page, "write_report", fail)
+    monkeypatch.setattr(report_page, "write_report", raising(ClsplatError("no room")))
     assert train(scene, tmp_path / "run", short(iterations=5)) == 0
     assert "warning: no report.html (no room); try again with: clsplat report" in capfd.readouterr().err
     assert (tmp_path / "run" / "eval.json").exists()

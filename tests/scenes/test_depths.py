@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calls import refuses, warned
-from depths import add_maps, add_tracks, depth_of, write_levels
+from depths import add_maps, add_tracks, depth_of
 from models import real_file
+from pictures import write_pixels
 from tiny import HEIGHT, WIDTH, cameras, write_scene
 
 from clsplat.config.depth import DepthUse
@@ -116,7 +117,7 @@ def test_a_map_of_another_size_is_sampled_and_never_blended(folder: Path) -> Non
     small = np.zeros((HEIGHT // 4, WIDTH // 4), np.uint16)
     small[:, 3:], small[:, 5:], small[:, 7:] = 2000, 4000, 65535
     for index in range(len(cameras())):
-        write_levels(folder / "depths" / f"{index:02d}.png.png", small)
+        write_pixels(folder / "depths" / f"{index:02d}.png.png", small[:, :, None])
     scene = with_depths(load_scene(folder), MAPS)
     nearness, weights = planes(scene, 2)
     assert set(np.unique(nearness)) == {0.0, 0.25, 0.5}, "0 and 65535 are unknown"
@@ -211,7 +212,7 @@ def test_what_is_refused(folder: Path) -> None:
     (maps / "00_depth.png").write_bytes((maps / "00.png").read_bytes())
     refuses(r"is a second depth map of 00\.png, beside 00\.png", with_depths, scene, MAPS)
     (maps / "00_depth.png").unlink()
-    write_levels(maps / "03.png", np.ones((HEIGHT, WIDTH // 2), np.uint16))
+    write_pixels(maps / "03.png", np.ones((HEIGHT, WIDTH // 2, 1), np.uint16))
     refuses(r"03\.png: the depth map has 24x40 pixels, expected the aspect ratio", with_depths, scene, MAPS)
     (maps / "03.png").write_bytes(b"no picture")
     refuses(r"03\.png", with_depths, scene, MAPS)
@@ -225,7 +226,7 @@ def test_what_is_refused(folder: Path) -> None:
 def test_maps_in_which_nothing_is_known(folder: Path) -> None:
     add_maps(folder)
     for name, level in (("03", 0), ("04", 65535)):
-        write_levels(folder / "depths" / f"{name}.png", np.full((HEIGHT, WIDTH), level, np.uint16))
+        write_pixels(folder / "depths" / f"{name}.png", np.full((HEIGHT, WIDTH, 1), level, np.uint16))
     warned(r"no depths are known for 2 photograph\(s\) \(03\.png, 04\.png\)", with_depths, load_scene(folder), MAPS)
 
 
@@ -243,7 +244,7 @@ def test_depths_are_part_of_what_a_run_knows_of_its_scene(folder: Path) -> None:
     first = with_depths(load_scene(folder), MAPS).digests
     assert first != plain
     assert with_depths(load_scene(folder), replace(MAPS, unit=2e-3)).digests != first
-    write_levels(folder / "depths" / "03.png", np.full((HEIGHT, WIDTH), 9, np.uint16))
+    write_pixels(folder / "depths" / "03.png", np.full((HEIGHT, WIDTH, 1), 9, np.uint16))
     changed = with_depths(load_scene(folder), MAPS).digests
     assert [name for name in first if changed[name] != first[name]] == ["03.png"]
     scene = with_depths(load_scene(folder), MAPS)

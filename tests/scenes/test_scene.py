@@ -2,9 +2,7 @@
 from __future__ import annotations
 
 import codecs
-import errno
 import json
-import os
 import shutil
 import warnings
 from pathlib import Path
@@ -13,10 +11,11 @@ import numpy as np
 import pycolmap
 import pytest
 from calls import refuses
+from compare import similarity
 from models import real_file
 from needs import SCENES
 from PIL import Image as Pillow
-from systems import links
+from systems import links, locked
 
 from clsplat.camera import Camera
 from clsplat.images.reading import companions, read_image
@@ -213,15 +212,7 @@ def test_links_that_lead_nowhere_are_no_pictures(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_colmap(tmp_path)
-    (tmp_path / "images" / "locked").mkdir()
-    real = os.scandir
-
-    def scandir(path: str) -> object:
-        if str(path).endswith("locked"):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
-        return real(path)
-
-    monkeypatch.setattr(os, "scandir", scandir)
+    locked(monkeypatch, tmp_path / "images" / "locked")
     refuses(r"images/locked: cannot be searched for pictures: permission is denied", load_scene, tmp_path)
 
 
@@ -410,17 +401,6 @@ def test_real_scenes(name: str, views: int, held_out: int, points: int) -> None:
     low, high = scene.bounds
     inside = ((scene.points > low) & (scene.points < high)).all(axis=1)
     assert inside.mean() > 0.8 if points else (high - low == 2.6).all()
-
-
-def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation and translation that take points (N, 3) to others (Umeyama 1991)."""
-    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    centred = source - mean_source
-    u, s, v = np.linalg.svd((target - mean_target).T @ centred)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ v))])
-    rotation = u @ sign @ v
-    scale = float((s * np.diag(sign)).sum() / (centred**2).sum())
-    return scale, rotation, mean_target - scale * rotation @ mean_source
 
 
 @pytest.mark.needs("scenes")

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 
@@ -10,10 +9,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pycolmap
 import pytest
-from calls import refuses, warnings_of
+from calls import noted, refuses, warnings_of
+from compare import similarity
 from demo_photographs import photographs
+from pictures import write_pixels
 from PIL import Image as Pillow
-from systems import can_link
+from systems import can_link, locked
 
 from clsplat.config.masks import MaskUse
 from clsplat.demo import ray_caster
@@ -35,23 +36,12 @@ STORED_FROM_SHOWN = {
 
 
 def write_image(path, pixels, orientation=1):
-    pixels = np.ascontiguousarray(pixels)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, "uint8")
-    spec.attribute("Compression", "jpeg:97")
-    spec.attribute("jpeg:subsampling", "4:4:4")
-    if orientation != 1:
-        spec.attribute("Orientation", orientation)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
+    turned = {"Orientation": orientation} if orientation != 1 else {}
+    write_pixels(path, pixels, attributes={"Compression": "jpeg:97", "jpeg:subsampling": "4:4:4", **turned})
 
 
 def write_png(path, pixels):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], pixels.shape[2], "uint8")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_image(pixels) and output.close()
+    write_pixels(path, pixels, attributes={"oiio:UnassociatedAlpha": 1})
 
 
 def read_image(path):
@@ -96,15 +86,6 @@ def leftovers(folder):
     return [path.name for path in folder.iterdir()]
 
 
-def centres_after_alignment(found, true):
-    """Found positions (n, 3) moved, turned and scaled onto the true ones (Umeyama 1991)."""
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    scale = (s * np.diag(sign)).sum() / (a**2).sum()
-    return scale * a @ (u @ sign @ vt).T + true.mean(axis=0)
-
-
 def test_every_pose_is_recovered(scene, pictures):
     output, heard = scene
     model = pycolmap.Reconstruction(output / "sparse/0")
@@ -112,7 +93,8 @@ def test_every_pose_is_recovered(scene, pictures):
     assert [image.name for image in images] == [f"view_{index:02d}.jpg" for index in range(COUNT)]
     found = np.stack([image.projection_center() for image in images])
     true = np.stack([camera.position for camera in pictures[1]])
-    errors = np.linalg.norm(centres_after_alignment(found, true) - true, axis=1)
+    scale, rotation, translation = similarity(found, true)
+    errors = np.linalg.norm(scale * found @ rotation.T + translation - true, axis=1)
     assert errors.max() < 0.02  # metres; the cameras are 2.5 m from the middle
     (camera,) = model.cameras.values()
     assert camera.model_name == "PINHOLE"
@@ -210,20 +192,28 @@ def test_photos_that_lose_their_alpha_are_named(pictures, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "form", "begin"), [("view_03.jpg", "GIF", b"\xff\xd8\xff"), ("view_03.png", "GIF", b"\x89PNG")]
+    ("name", "form", "begin", "off"),
+    [
+        ("view_03.jpg", "GIF", b"\xff\xd8\xff", 6),  # a palette of 256 colours, and JPEG
+        ("view_03.png", "GIF", b"\x89PNG", 6),
+        ("view_03.jpg", "WEBP", b"\xff\xd8\xff", 4),
+    ],
 )
-def test_a_gif_under_another_name_is_written_anew(name, form, begin, photos, tmp_path, monkeypatch):
+def test_a_photo_of_another_kind_than_its_name_says_is_written_anew(
+    name, form, begin, off, photos, tmp_path, monkeypatch
+):
+    """pycolmap reads neither GIF nor WebP."""
     folder = shutil.copytree(photos, tmp_path / "photos")
     picture = read_image(folder / "view_03.jpg")
     (folder / "view_03.jpg").unlink()
-    Pillow.fromarray(picture).save(folder / name, form)
+    Pillow.fromarray(picture).save(folder / name, form, quality=95)
     tasks = task_of(monkeypatch)
     assert warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "out")) == []
     assert name in tasks[0]["groups"][0]
     assert tasks[1][name].startswith(begin)
+    assert tasks[1]["view_04.jpg"] == (folder / "view_04.jpg").read_bytes()
     (tmp_path / name).write_bytes(tasks[1][name])
-    # a palette of 256 colours, and JPEG
-    assert np.abs(np.asarray(Pillow.open(tmp_path / name).convert("RGB"), float) - picture).mean() < 6
+    assert np.abs(np.asarray(Pillow.open(tmp_path / name).convert("RGB"), float) - picture).mean() < off
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "float32"])
@@ -280,13 +270,11 @@ def task_of(monkeypatch):
 
     monkeypatch.setattr(sfm, "_run_worker", run)
     monkeypatch.setattr(sfm, "move_into_place", move)
-    real = sfm_photos.stage_photos
 
-    def stage(images, paths, target, report, threads):
+    def stage(_images, _paths, target, *_):
         (target.parent / "result" / "images").mkdir(parents=True)
-        return real(images, paths, target, report, threads)
 
-    monkeypatch.setattr(sfm_photos, "stage_photos", stage)
+    noted(monkeypatch, sfm_photos, "stage_photos", stage)
     return tasks
 
 
@@ -311,30 +299,9 @@ def test_what_is_no_photo_is_left_out_with_a_line(photos, tmp_path, monkeypatch)
 def test_a_folder_of_photos_that_cannot_be_read_is_named(photos, tmp_path, monkeypatch):
     folder = tmp_path / "photos"
     shutil.copytree(photos, folder / "a")
-    (folder / "locked").mkdir()
-    real = os.scandir
-
-    def scandir(path):
-        if str(path).endswith("locked"):
-            raise PermissionError(13, "Permission denied", str(path))
-        return real(path)
-
-    monkeypatch.setattr(os, "scandir", scandir)
+    locked(monkeypatch, folder / "locked")
     with pytest.raises(InputError, match="locked: cannot be searched for pictures: permission is denied; make it read"):
         sfm.reconstruct(folder, tmp_path / "out")
-
-
-def test_a_photo_of_another_kind_than_its_name_says_is_written_anew(photos, tmp_path, monkeypatch):
-    """pycolmap reads no WebP."""
-    folder = shutil.copytree(photos, tmp_path / "photos")
-    picture = read_image(folder / "view_03.jpg")
-    Pillow.fromarray(picture).save(folder / "view_03.jpg", "WEBP", quality=95)
-    tasks = task_of(monkeypatch)
-    assert warnings_of(lambda: sfm.reconstruct(folder, tmp_path / "out")) == []
-    assert tasks[1]["view_03.jpg"].startswith(b"\xff\xd8\xff")
-    assert tasks[1]["view_04.jpg"] == (folder / "view_04.jpg").read_bytes()
-    (tmp_path / "staged.jpg").write_bytes(tasks[1]["view_03.jpg"])
-    assert np.abs(read_image(tmp_path / "staged.jpg").astype(int) - picture).mean() < 4
 
 
 def test_photos_without_texture_say_what_there_was(tmp_path):

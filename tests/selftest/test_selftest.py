@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import Capture, printed, raising, refuses, warned
 from drivers import KEPT
 from pipeline import shaped
 from quick import quick
@@ -23,7 +24,7 @@ from clsplat.device.drivers import driver_records
 from clsplat.device.drivers.shapes import shape_of
 from clsplat.device.drivers.worker_process import CHILD_MESSAGE_PREFIX, DRIVER_TIMEOUT_VARIABLE, TRUST_DRIVER_VARIABLE
 from clsplat.device.program import BREAK_KERNEL_VARIABLE
-from clsplat.errors import DeviceError, InputError
+from clsplat.errors import DeviceError
 from clsplat.selftest import driver_check
 from clsplat.selftest import result as stage_groups
 from clsplat.selftest.driver_check import DriverReport, examine
@@ -38,8 +39,6 @@ from clsplat.selftest.result import (
 )
 from clsplat.selftest.scenes import keys, scenes
 from clsplat.selftest.worker import DEFAULT_DEFINES, run
-
-Capture = pytest.CaptureFixture[str]
 
 BROKEN = {
     "arithmetic: x / y": ("x * y", "arithmetic"),
@@ -209,8 +208,7 @@ def test_a_change_that_makes_no_sense(
     change: str, message: str, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
-    with pytest.raises(InputError, match=message):
-        default_device.with_shape().kernels("blend")
+    refuses(message, default_device.with_shape().kernels, "blend")
 
 
 def test_errors_in_ulp() -> None:
@@ -270,8 +268,7 @@ def test_every_driver_here_passes(capsys: Capture) -> None:
 @pytest.mark.slow
 def test_the_table(capsys: Capture) -> None:
     index = min(KEPT)
-    assert main(["selftest", "--device", str(index)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed(capsys, ["selftest", "--device", index]).out.splitlines()
     assert lines[0].startswith(f"{index}: {KEPT[index].name}, OpenCL ")
     assert lines[1].split()[:3] == ["stage", "worst", "error"]
     assert [line.split()[0] for line in lines[2:-1]] == ["build", *SELFTEST_STAGES]
@@ -291,16 +288,14 @@ def test_the_table(capsys: Capture) -> None:
 )
 def test_a_broken_driver_fails(change: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(BREAK_KERNEL_VARIABLE, change)
-    assert main(["selftest", "--device", str(min(KEPT))]) == 1
-    captured = capsys.readouterr()
+    captured = printed(capsys, ["selftest", "--device", min(KEPT)], status=1)
     assert captured.out.splitlines()[-1].startswith("This driver cannot be trusted: ")
     (line,) = captured.err.splitlines()
     assert line.startswith("clsplat: error: 1 of 1 drivers cannot be trusted: ")
 
 
 def test_no_such_device(capsys: Capture) -> None:
-    assert main(["selftest", "--device", "abacus"]) == 2
-    assert "no such device" in capsys.readouterr().err
+    assert "no such device" in printed(capsys, ["selftest", "--device", "abacus"], status=2).err
 
 
 # Drivers that die
@@ -395,8 +390,7 @@ def test_a_memory_that_is_broken_or_read_only(
     assert len(json.loads(untrusting.read_text())) == 1
     monkeypatch.setenv("POCL_CACHE_DIR", str(untrusting.parent))  # it has no device without a folder for its kernels
     monkeypatch.setenv("XDG_CACHE_HOME", str(untrusting))  # a file, where a folder would have to be
-    with pytest.warns(UserWarning, match="cannot be written"):
-        driver_check.require(default_device, FORWARD_STAGES)
+    warned("cannot be written", driver_check.require, default_device, FORWARD_STAGES)
     driver_check.require(default_device, FORWARD_STAGES)
     assert len(made) == 2, "this process remembers it"
 
@@ -458,8 +452,7 @@ def test_rendering_and_evaluating_ask_for_what_they_need(
         ["demo", "-o", str(tmp_path / "demo")],
     ):
         capsys.readouterr()
-        assert main(words) == 2
-        assert "cannot be trusted: blend: " in capsys.readouterr().err
+        assert "cannot be trusted: blend: " in printed(capsys, words, status=2).err
 
 
 @pytest.mark.smoke
@@ -467,9 +460,5 @@ def test_asking_again_starts_no_process(
     untrusting: Path, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     driver_check.require(default_device, FORWARD_STAGES)
-
-    def started(*_: object, **__: object) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(driver_check, "examine", started)
+    monkeypatch.setattr(driver_check, "examine", raising(AssertionError()))
     driver_check.require(default_device, FORWARD_STAGES)

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from calls import refuses
 from test_render_job import OPTIONS, rendered, tasks_in
 
 from clsplat.files import atomic, locks
@@ -100,8 +101,7 @@ def test_a_disk_without_room_leaves_no_claim(tmp_path: Path, monkeypatch: pytest
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "open", lambda path, mode, buffering: Full(path, "x"))
-    with pytest.raises(OSError, match="No space left"):
-        claim(tmp_path / "a.exr")
+    refuses("No space left", claim, tmp_path / "a.exr", error=OSError)
     assert [*tmp_path.iterdir()] == []
 
 

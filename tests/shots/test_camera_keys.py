@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import refuses
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
@@ -175,8 +176,7 @@ def test_one_key_and_beyond_the_ends() -> None:
 def test_keys_that_cannot_be() -> None:
     key = Key(1.0, camera([0, 0, 0]))
     for keys, loop in (([], None), ([key, key], None), ([key, replace(key, frame=5.0)], 4.0)):
-        with pytest.raises(ValueError, match="expected"):
-            interpolate(keys, [1.0], loop=loop)
+        refuses("expected", interpolate, keys, [1.0], loop=loop, error=ValueError)
 
 
 def test_tangents_are_those_of_a_parabola() -> None:

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from calls import refuses
 from scipy.spatial.transform import Rotation
 
 from clsplat.camera import Camera
@@ -138,5 +139,4 @@ def test_any_number_of_frames(make: Callable[[Sequence[Camera], int], list[Camer
         assert all(np.isfinite(camera.rotation).all() and np.isfinite(camera.translation).all() for camera in path)
     assert len(make(cameras[:1], 3)) == 3
     for wrong, frames in (([], 3), (cameras, 0)):
-        with pytest.raises(ValueError, match="expected at least one of each"):
-            make(wrong, frames)
+        refuses("expected at least one of each", make, wrong, frames, error=ValueError)

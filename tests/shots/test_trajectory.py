@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calls import refuses
 
 from clsplat.camera import Camera
 from clsplat.shots.generated import turntable
@@ -101,7 +102,6 @@ def test_covered_arc_may_cross_the_seam():
 
 
 def test_nothing_to_turn():
-    with pytest.raises(ValueError, match="expected at least one"):
-        turntable([], 10)
+    refuses("expected at least one", turntable, [], 10, error=ValueError)
     single = ring([0.5], rotated_world(0), CENTRE)
     assert len(turntable(single, 3)) == 3

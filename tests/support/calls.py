@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
@@ -83,10 +83,14 @@ def train(scene: Path, run: Path, config: TrainConfig, *more: str) -> int:
     return main(["train", str(scene), "-o", str(run), *flags(config), *more])
 
 
+def ended(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """The process of this command, once it has ended; options: of subprocess.run."""
+    return subprocess.run([*map(str, words)], capture_output=True, text=True, check=False, **options)
+
+
 def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """A Python process that is given these words, once it has ended; options: of subprocess.run."""
-    command = [sys.executable, *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    return ended(sys.executable, *words, **options)
 
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -133,6 +137,26 @@ def rejected(capsys: Capture, words: Iterable[object], *, call: Callable[[list[s
     return fails(capsys, call, [*map(str, words)], **how)
 
 
+def raising(error: BaseException) -> Callable[..., Any]:
+    """A function that raises this error, whatever it is called with."""
+
+    def call(*_: object, **__: object) -> NoReturn:
+        raise error
+
+    return call
+
+
+def noted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, note: Callable[..., object]) -> None:
+    """Let each call of a function or method go to `note` first, with the same arguments; what `note` raises ends it."""
+    real = getattr(owner, name)
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        note(*arguments, **options)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, call)
+
+
 def error_line(capsys: Capture) -> str:
     """The one line on standard error, and nothing on standard output."""
     captured = capsys.readouterr()
@@ -154,8 +178,8 @@ def one_error(capfd: Capture) -> str:
 
 def left_behind(target: Path) -> str:
     """Write what one who was killed while writing this file leaves beside it; its name."""
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    name = temporary_name(target).name.replace(f"{os.getpid():08x}", f"{ended.pid:08x}")
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    name = temporary_name(target).name.replace(f"{os.getpid():08x}", f"{child.pid:08x}")
     target.with_name(name).write_bytes(b"half")
     return name

@@ -10,20 +10,12 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
+from pictures import write_pixels
 
 from clsplat.camera import Camera
 
 Samples = Sequence[Sequence[Sequence[float]]]
 """Of each pixel its samples, of each the values of its channels."""
-
-
-def specification(size: tuple[int, int], names: Sequence[str], window: tuple[int, int, int, int] | None) -> Any:
-    """Of an EXR of a frame of that size; window: x, y, width, height of the data."""
-    x, y, width, height = window or (0, 0, *size)
-    spec = oiio.ImageSpec(width, height, len(names), oiio.FLOAT)
-    spec.channelnames = tuple(names)
-    spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = x, y, 0, 0, *size
-    return spec
 
 
 def write_flat(
@@ -33,19 +25,18 @@ def write_flat(
     size: tuple[int, int] | None = None,
     window: tuple[int, int, int, int] | None = None,
 ) -> Path:
-    """Channels (H, W) of the data window, which is the frame where none is given."""
-    height, width = next(iter(channels.values())).shape
-    output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), specification(size or (width, height), list(channels), window))
-    assert output.write_image(np.ascontiguousarray(np.stack(list(channels.values()), axis=2), np.float32))
-    output.close()
-    return path
+    """An EXR of channels (H, W) of the data window (x, y, width, height), which is the frame where none is given."""
+    pixels = np.stack(list(channels.values()), axis=2).astype(np.float32)
+    x, y = (window or (0, 0))[:2]
+    width, height = size or (pixels.shape[1], pixels.shape[0])
+    frame: dict[str, Any] = {"full_x": 0, "full_y": 0, "full_width": width, "full_height": height}
+    return write_pixels(path, pixels, channelnames=tuple(channels), x=x, y=y, **frame)
 
 
 def write_samples(path: Path, size: tuple[int, int], samples: Samples, names: Sequence[str] = ("A", "Z")) -> Path:
     """A deep EXR of a frame of that size (width, height)."""
-    spec = specification(size, names, None)
-    spec.deep = True
+    spec = oiio.ImageSpec(*size, len(names), oiio.FLOAT)
+    spec.channelnames, spec.deep = tuple(names), True
     data = oiio.DeepData()
     data.init(size[0] * size[1], len(names), [oiio.TypeDesc("float")] * len(names), list(names))
     for pixel, each in enumerate(samples):

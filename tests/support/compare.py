@@ -113,6 +113,19 @@ def assert_slopes(
         assert error <= tolerance * np.linalg.norm(gradient), name
 
 
+def similarity(
+    source: NDArray[np.float64], target: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """Scale, rotation and translation that take points (N, 3) to others (Umeyama 1991)."""
+    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    centred = source - mean_source
+    u, s, v = np.linalg.svd((target - mean_target).T @ centred)
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ v))])
+    rotation = u @ sign @ v
+    scale = float((s * np.diag(sign)).sum() / (centred**2).sum())
+    return scale, rotation, mean_target - scale * rotation @ mean_source
+
+
 def assert_same_arrays(got: Mapping[str, NDArray[Any]], wanted: Mapping[str, NDArray[Any]]) -> None:
     """Arrays by name, each with the same bits."""
     assert got.keys() == wanted.keys()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pictures import write_pixels
 from tiny import HEIGHT, WIDTH, cameras, hidden_model
 
 from clsplat.images.writing import write_image
@@ -42,14 +43,4 @@ def add_maps(scene: Path, kind: str = ".png", folder: str = "depths") -> None:
         elif kind == ".exr":
             write_image(target / f"{index:02d}.exr", np.repeat(depth[:, :, None], 3, axis=2).astype(np.float32))
         else:
-            write_levels(target / f"{index:02d}.png", np.rint(1000 * depth).astype(np.uint16))
-
-
-def write_levels(path: Path, levels: NDArray[np.uint16]) -> None:
-    """Write whole numbers (H, W) of 16 bits."""
-    import OpenImageIO as oiio
-
-    output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), oiio.ImageSpec(levels.shape[1], levels.shape[0], 1, "uint16"))
-    assert output.write_image(levels[:, :, None])
-    output.close()
+            write_pixels(target / f"{index:02d}.png", np.rint(1000 * depth[:, :, None]).astype(np.uint16))

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -15,12 +16,21 @@ from clsplat.arrays import Float32
 
 
 def camera_file(
-    path: Path, places: Mapping[float, float], *, size: tuple[int, int] = (WIDTH, HEIGHT), fov_x: float = 60
+    path: Path,
+    places: Mapping[float, float | Sequence[float]],
+    *,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    fov_x: float = 60,
+    lens: Mapping[str, Any] | None = None,
+    **settings: Any,
 ) -> Path:
-    """A clsplat camera file: at these frames the camera is at these x, 4 before the origin."""
-    lens = {"world_from_cam": [1, 0, 0, 0], "fov_x": fov_x}
-    keys = [{"frame": frame, "position": [x, 0, -4], **lens} for frame, x in places.items()]
-    path.write_text(json.dumps({"clsplat_cameras": 1, "width": size[0], "height": size[1], "keys": keys}))
+    """A clsplat camera file: the camera at these frames is at these places, or x, 4 before the origin. lens: instead of
+    the angle; settings: of the file."""
+    own = {"world_from_cam": [1, 0, 0, 0], **(lens or {"fov_x": fov_x})}
+    positions = {frame: [at, 0, -4] if isinstance(at, int | float) else [*at] for frame, at in places.items()}
+    keys = [{"frame": frame, "position": position, **own} for frame, position in positions.items()]
+    document = {"clsplat_cameras": 1, "width": size[0], "height": size[1], **settings, "keys": keys}
+    path.write_text(json.dumps(document))
     return path
 
 

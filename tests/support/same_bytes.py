@@ -86,11 +86,16 @@ def scene_for(folder: Path, config: TrainConfig) -> Scene:
     return with_depths(load_scene(folder, masks=config.mask_use), config.depth_use)
 
 
-def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> bytes:
-    """model.ply of a training."""
+def trained_run(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> Run:
+    """The run of a training, in this folder."""
     run = Run.create(folder, config, resume=options.get("resume", False))
     train(scene, config, device=device, run=run, **options)
-    return run.model_path.read_bytes()
+    return run
+
+
+def model_bytes(scene: Scene, config: TrainConfig, device: Device, folder: Path, **options: Any) -> bytes:
+    """model.ply of a training."""
+    return trained_run(scene, config, device, folder, **options).model_path.read_bytes()
 
 
 @pytest.fixture(scope="module")

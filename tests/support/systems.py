@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from functools import cache
 from pathlib import Path
 
 import pytest
+from calls import noted
 
 
 @cache
@@ -20,6 +22,17 @@ def can_link() -> bool:
         except OSError:
             return False
     return True
+
+
+def locked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Make a folder that this user may not look into, root neither."""
+    folder.mkdir()
+
+    def refuse(path: object = ".") -> None:
+        if str(path) == str(folder):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+    noted(monkeypatch, os, "scandir", refuse)
 
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs signals, pipes or modes of files as POSIX has them")

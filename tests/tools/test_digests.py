@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import digests
 import pytest
+from calls import python
 from compare import relative_error
 from digests import EXPECTED, Job, Row, in_turn, problems
 from golden_frames import SCENES, arrays_of
@@ -85,8 +84,7 @@ def test_tables_have_every_driver() -> None:
 
 @pytest.mark.slow
 def test_a_child(tmp_path: Path) -> None:
-    command = [sys.executable, digests.__file__, "child", "0", "8x1", str(tmp_path / "arrays.npz")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    done = python(digests.__file__, "child", "0", "8x1", tmp_path / "arrays.npz")
     told = json.loads(done.stdout.splitlines()[-1])
     assert set(told) == {"frame", "gradient", "pictures"}
     channels = {"deep", *FRAME_CHANNELS}

@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import calls
 import pytest
 from calls import Capture, ran, refuses
 
@@ -159,17 +160,8 @@ def test_a_machine_without_pips_driver_has_none(tmp_path: Path) -> None:
     for name in ("drivers", "no-drivers", "home", "tmp"):
         (tmp_path / name).mkdir()
     row = rows()["none"]
-    counts = [
-        subprocess.run(
-            [sys.executable, "-c", child, code],
-            env=environment_of(each, tmp_path),
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=ROOT,
-        ).stdout.split()
-        for each in (row, replace(row, pypi=True))
-    ]
+    both = [environment_of(each, tmp_path) for each in (row, replace(row, pypi=True))]
+    counts = [calls.python("-c", child, code, env=environment, cwd=ROOT).stdout.split() for environment in both]
     assert counts[0] == ["0", "0"], "nor in a child"
     assert counts[1][0] == counts[1][1]
 

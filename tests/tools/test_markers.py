@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import drivers
 import needs
 import pytest
+from calls import python, refuses
 from drivers import KEPT, NARROW
 from quick import quick
 
@@ -24,8 +23,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_what_is_missing_is_told_with_the_line_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(needs, "find_spec", lambda _: None)
     assert needs.missing("av") == "needs PyAV: python3 tools/environment.py video"
-    with pytest.raises(pytest.skip.Exception, match="needs PyAV"):
-        needs.require("av")
+    refuses("needs PyAV", needs.require, "av", error=pytest.skip.Exception)
     monkeypatch.setattr(needs, "find_spec", lambda _: object())
     assert needs.missing("av") == ""
     monkeypatch.setenv("CLSPLAT_CHROMIUM", "/nowhere/chromium")
@@ -52,11 +50,10 @@ def test_words_narrow_the_drivers_down(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_no_driver_of_that_name_is_an_error() -> None:
     options = ["-q", "-p", "xdist", "-p", "no:cacheprovider"]
-    command = [sys.executable, "-m", "pytest", *options, "tests/tools/test_markers.py"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # they take seconds to be imported
     environment[NARROW] = "abacus"
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    done = python("-m", "pytest", *options, "tests/tools/test_markers.py", cwd=ROOT, env=environment)
     assert done.returncode == pytest.ExitCode.USAGE_ERROR
     assert f"{NARROW}=abacus: no OpenCL device contains one of these words; there are: " in done.stderr
 

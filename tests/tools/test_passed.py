@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from calls import python
 
 ROOT = Path(__file__).resolve().parents[2]
 HOOKS = """
@@ -79,10 +78,8 @@ def run(tmp_path: Path) -> Callable[..., set[str]]:
 
     def started(*arguments: str, **more: str) -> set[str]:
         file = tmp_path / "told"
-        command = [sys.executable, "-m", "pytest", "-p", "xdist", f"--write-passed={file}"]
-        done = subprocess.run(
-            [*command, *arguments], capture_output=True, text=True, check=False, cwd=house, env={**kept, **more}
-        )
+        words = ["-m", "pytest", "-p", "xdist", f"--write-passed={file}", *arguments]
+        done = python(*words, cwd=house, env={**kept, **more})
         assert done.returncode in {0, 1}, done.stdout + done.stderr
         return set(file.read_text("utf-8").splitlines())
 

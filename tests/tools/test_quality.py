@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from calls import printed
+from calls import printed, python
 from quality import experiments, made_scenes
 from quality.experiments import EXPERIMENTS, words_of
 from quality.run import main
@@ -125,8 +123,7 @@ def write_binary(folder: Path) -> Path:
 
 
 def test_a_scene_that_is_none(tmp_path: Path) -> None:
-    tool = [sys.executable, str(ROOT / "tools/quality/run.py"), "masks"]
-    done = subprocess.run([*tool, tmp_path / "out", tmp_path / "none"], capture_output=True, text=True, check=False)
+    done = python(ROOT / "tools/quality/run.py", "masks", tmp_path / "out", tmp_path / "none")
     folder = tmp_path / "none" / "sparse" / "0"
     said = f"quality masks: error: {folder}: no such folder, expected a COLMAP scene\n"
     assert (done.returncode, done.stdout, done.stderr) == (2, "", said)

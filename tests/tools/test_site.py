@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from calls import python
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ("README.md", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "SECURITY.md")
@@ -28,8 +28,7 @@ def copy(tmp_path: Path) -> Path:
 
 def build(root: Path) -> subprocess.CompletedProcess[str]:
     """The site of a copy, in its `out`."""
-    command = [sys.executable, str(root / "tools/ci/site.py"), str(root / "out")]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    return python(root / "tools/ci/site.py", root / "out", timeout=240)
 
 
 def test_pages_have_docstrings_examples_formulas_and_decisions(copy: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from calls import python
 from groups import group_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -100,7 +101,7 @@ def test_as_many_processes_as_are_worth_it(
 
 
 def test_help_installs_nothing() -> None:
-    done = subprocess.run([sys.executable, str(ROOT / "tools/test"), "--help"], capture_output=True, text=True)  # noqa: PLW1510
+    done = python(ROOT / "tools/test", "--help")
     assert (done.returncode, done.stderr) == (0, "")
     assert "tools/test --all" in done.stdout
 
@@ -115,10 +116,8 @@ def run(tool: ModuleType, folder: Path, *more: str) -> subprocess.CompletedProce
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST", "COV"))}
     environment["PYTHONPATH"] = str(ROOT / "tests/support")
     environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"  # the others take seconds to be imported in each process
-    command = [sys.executable, "-m", "pytest", "-p", "xdist", *how, *more, str(folder)]
-    return subprocess.run(
-        command, capture_output=True, text=True, timeout=PATIENCE, check=False, cwd=folder, env=environment
-    )
+    words = ["-m", "pytest", "-p", "xdist", *how, *more, folder]
+    return python(*words, timeout=PATIENCE, cwd=folder, env=environment)
 
 
 def test_a_crash_ends_the_run_and_is_named(tool: ModuleType, tmp_path: Path) -> None:

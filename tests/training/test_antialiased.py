@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import noted
 from tiny import CONFIG, run_steps
 
 from clsplat.device.context import Device
 from clsplat.reference.sampling import sampling_limits
 from clsplat.scenes.scene import Scene
-from clsplat.stages.device_gaussians import AnyGaussians
 from clsplat.training import mip_filter
 from clsplat.training.mip_filter import MipFilter
 from clsplat.training.trainer import Trainer
@@ -37,14 +37,8 @@ def test_the_cameras_are_looked_at_every_hundred_steps(
     views: int, scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[int] = []
-    renew = MipFilter.before_step
-
-    def noted(self: MipFilter, gaussians: AnyGaussians) -> None:
-        looked.append(trainer.step)
-        renew(self, gaussians)
-
     monkeypatch.setattr(mip_filter, "SAMPLING_LIMIT_INTERVAL_STEPS", 12)
-    monkeypatch.setattr(MipFilter, "before_step", noted)
+    noted(monkeypatch, MipFilter, "before_step", lambda *_: looked.append(trainer.step))
     config = replace(SMOOTH, density=replace(SMOOTH.density, every=0), batch=views, iterations=48)
     trainer = Trainer(scene, config, default_device)
     while trainer.step < 48:

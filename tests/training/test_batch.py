@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import noted, refuses
 from compare import assert_close, assert_same_arrays
 from tiny import CONFIG, short
 
@@ -21,7 +22,6 @@ from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device, open_devices
 from clsplat.errors import DeviceError, DriverError, InputError
 from clsplat.gaussians import PARAMETER_GROUPS
-from clsplat.optimisation.step_noise import Exploration
 from clsplat.reference.adam import adam as reference
 from clsplat.reference.adam import add_views
 from clsplat.runs.run import Run
@@ -108,10 +108,8 @@ def test_without_being_told_a_batch_has_a_view_for_each_device(scene: Scene, def
     devices = halves(default_device.index)
     wanted = train(scene, short(iterations=12, batch=2))
     assert_same_arrays(train(scene, short(iterations=12), device=devices).arrays(), wanted.arrays())
-    with pytest.raises(InputError, match=r"--batch 3: expected a multiple of 2, the number of devices"):
-        train(scene, short(batch=3), device=devices)
-    with pytest.raises(InputError, match="expected open devices"):
-        train(scene, short(), device=[])
+    refuses(r"--batch 3: expected a multiple of 2, the number of devices", train, scene, short(batch=3), device=devices)
+    refuses("expected open devices", train, scene, short(), device=[])
 
 
 def test_a_run_goes_on_with_its_batch_on_any_devices(scene: Scene, default_device: Device, tmp_path: Path) -> None:
@@ -124,8 +122,7 @@ def test_a_run_goes_on_with_its_batch_on_any_devices(scene: Scene, default_devic
         if trainer.step == 18:
             raise RuntimeError("stop here")
 
-    with pytest.raises(RuntimeError, match="stop here"):
-        train(scene, config, device=devices, run=run, between=stop)
+    refuses("stop here", train, scene, config, device=devices, run=run, between=stop, error=RuntimeError)
     assert [step for step, _ in run.checkpoints()] == [8, 14], "the first steps that have come to 7 and 14"
     assert run.config.batch == 2
     again = Run.create(run.path, Run.open(run.path).config, resume=True)
@@ -234,8 +231,7 @@ def test_trouble_on_a_further_device_ends_the_training(
         raise DriverError("the second device has failed")
 
     monkeypatch.setattr(Replica, "view", fail)
-    with pytest.raises(DriverError, match="the second device has failed"):
-        train(scene, TWO, device=devices)
+    refuses("the second device has failed", train, scene, TWO, device=devices, error=DriverError)
 
     def interrupted(*_: Any) -> None:
         begun.wait()
@@ -252,13 +248,8 @@ def test_trouble_on_a_further_device_ends_the_training(
 def test_the_noise_of_a_batch_is_tried_before_anything_changes(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, made = batch.noise, []
-
-    def noise(device: Device, explore: Exploration, *given: Any) -> None:
-        made.append((device.only_tries, explore.amount))
-        real(device, explore, *given)
-
-    monkeypatch.setattr(batch, "noise", noise)
+    made: list[tuple[bool, float]] = []
+    noted(monkeypatch, batch, "noise", lambda device, by, *_: made.append((device.only_tries, by.amount)))
     density = {"growth": "mcmc", "max_gaussians": 150}
     train(scene, short(batch=2, iterations=2, density=density), device=default_device)
     (amount,) = {each for _, each in made}

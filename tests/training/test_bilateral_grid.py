@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from held_out import change_photographs
+from same_bytes import trained_run
 from tiny import CONFIG
 
-from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.device.context import Device
-from clsplat.runs.run import Run
 from clsplat.scenes.scene import Scene
 from clsplat.stages.grid import GRID_SHAPE
 from clsplat.training.trainer import Trainer
@@ -43,8 +42,7 @@ def test_a_run_keeps_its_grids(
     change_photographs(monkeypatch, lambda index, values: values * np.float32(0.6 if index % 2 else 1.0))
     density = replace(CONFIG.density, every=0)
     config = replace(WITH_GRIDS, iterations=20 * count, density=density, warmup=())
-    run = Run.create(tmp_path / "run", config)
-    train(scene, config, device=default_device, run=run)
+    run = trained_run(scene, config, default_device, tmp_path / "run")
     record = json.loads(run.appearance_path.read_text("utf-8"))
     assert record["kind"] == "grid"
     with np.load(run.appearance_path.with_suffix(".npz")) as file:

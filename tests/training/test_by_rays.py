@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture
+from calls import Capture, printed
 from test_intrinsics import write_lens_scene
 from tiny import CONFIG, hidden_model
 
@@ -62,12 +62,9 @@ def test_files_that_say_so(scene: Scene, folder: Path, tmp_path: Path, capsys: C
         assert path.exists() or main(["convert", str(run), str(path)]) == 0
         assert f"cannot store {name}" not in capsys.readouterr().err
         assert getattr(load(path), field)
-        assert main(["info", str(path), "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)[field] is True
-    assert main(["info", str(run / "model.ply")]) == 0
-    assert {"by_rays": "along rays"}.get(field, field) in capsys.readouterr().out
-    assert main(["convert", str(run), str(tmp_path / "model.splat")]) == 0
-    assert f"splat cannot store {name}" in capsys.readouterr().err
+        assert json.loads(printed(capsys, ["info", path, "--json"]).out)[field] is True
+    assert {"by_rays": "along rays"}.get(field, field) in printed(capsys, ["info", run / "model.ply"]).out
+    assert f"splat cannot store {name}" in printed(capsys, ["convert", run, tmp_path / "model.splat"]).err
     assert main(f"render {run} --cameras {folder} -o {tmp_path}/{{name}}.exr --frames 1".split()) == 0
 
 
@@ -85,8 +82,7 @@ def test_models_that_are_drawn_differently_do_not_merge(tmp_path: Path, capsys: 
 
 def test_what_it_does_not_go_with(folder: Path, tmp_path: Path, capsys: Capture) -> None:
     call = ["train", str(folder), "-o", str(tmp_path / "run"), "--perspective", "rays", "--refine-lenses"]
-    assert main(call) == 2
-    assert "not supported with --perspective rays, expected --perspective plane" in capsys.readouterr().err
+    assert "not supported with --perspective rays, expected --perspective plane" in printed(capsys, call, status=2).err
     assert main(["train", str(folder), "-o", str(tmp_path / "run"), "--perspective", "fisheye"]) == 2
     assert "--perspective" in capsys.readouterr().err
     assert main([*call[:-1], "--iterations", "2", "--no-report"]) == 0

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import refuses
 from compare import assert_close
 from held_out import change_photographs, psnr_of
 from tiny import CONFIG, trained_to
@@ -126,8 +127,7 @@ def test_a_damaged_row(tmp_path: Path, change: dict[str, object]) -> None:
     run = Run.create(tmp_path / "run", OF_CAMERAS)
     row = {"log2_gains": [0.0] * 3, "mixes": [0.0] * 6, "vignette": [0.0] * 3, "centre": [0.5, 0.5]} | change
     run.write_appearance({"kind": "ppisp", "photographs": {"a.jpg": row}, "held_out": {}})
-    with pytest.raises(InputError, match=r"appearance.json: .*expected a file that clsplat train --appearance"):
-        gains_of(run.path, "a.jpg")
+    refuses(r"appearance.json: .*expected a file that clsplat train --appearance", gains_of, run.path, "a.jpg")
 
 
 def with_two_lenses(scene: Scene) -> Scene:

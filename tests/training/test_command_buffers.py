@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import refuses
 from quick import quick
 from same_bytes import PLAIN, SETTINGS, Stepped, assert_alike, scene_for, stepped, write_known_scene
 
@@ -17,7 +18,6 @@ from clsplat.device.buffers import Workspace, upload
 from clsplat.device.command_buffer import CHECK_TAPES, CommandBuffer
 from clsplat.device.command_buffer import TAPES_VARIABLE as TAPES
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene
 from clsplat.stages import project
@@ -99,8 +99,7 @@ def test_another_word_than_those_is_refused(
     default_device: Device, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(TAPES, "yes")
-    with pytest.raises(InputError, match=f"{TAPES}=yes: expected 1, 0 or check"):
-        Trainer(load_scene(folder), PLAIN, default_device)
+    refuses(f"{TAPES}=yes: expected 1, 0 or check", Trainer, load_scene(folder), PLAIN, default_device)
 
 
 def test_kernel_objects_are_used_by_other_command_buffers(default_device: Device) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import refuses
 from compare import assert_close_gradients
 from numpy.typing import NDArray
 from pipeline import Pipeline
@@ -18,7 +19,6 @@ from clsplat.arrays import Float32, Float64
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.gaussians import Gaussians
 from clsplat.optimisation.dropout import Thinning, thinning_of
 from clsplat.reference.dropout import factors, logit_grad, thinned_logits
@@ -102,5 +102,4 @@ def test_frame_and_gradient_are_those_of_thinned_opacities(shaped_device: Device
 
 @pytest.mark.parametrize("rate", [-0.1, 0.95])
 def test_a_share_that_makes_no_sense(rate: float) -> None:
-    with pytest.raises(InputError, match=f"--thinning {rate}: expected 0 to 0.9"):
-        TrainConfig(thinning=rate).check()
+    refuses(f"--thinning {rate}: expected 0 to 0.9", TrainConfig(thinning=rate).check)

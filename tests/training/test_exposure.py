@@ -8,13 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
+from calls import refuses
 from compare import assert_same_bits
 from held_out import change_photographs
+from pictures import write_pixels
+from same_bytes import trained_run
 from tiny import CONFIG, trained_to
 
-from clsplat.api import train
 from clsplat.cli.main import main
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
@@ -24,7 +25,6 @@ from clsplat.images.exif import exposure_of
 from clsplat.images.reading import read_image
 from clsplat.runs.appearance import held_out_looks
 from clsplat.runs.checkpoints import Checkpoint
-from clsplat.runs.run import Run
 from clsplat.scenes.analysis.visible_points import VisiblePoints
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.appearance import exposure as gains
@@ -118,8 +118,7 @@ def test_gains_of_photographs_are_learnt(
     truth = np.where(np.arange(len(scene.train_views)) % 2, 1.0, -1.0)
     exposed(monkeypatch, truth)
     config = replace(EXPOSED, iterations=400, density=replace(CONFIG.density, every=0), warmup=())
-    run = Run.create(tmp_path / "run", config)
-    train(scene, config, device=default_device, run=run)
+    run = trained_run(scene, config, default_device, tmp_path / "run")
     record = json.loads(run.appearance_path.read_text("utf-8"))
     logs = np.array([record["photographs"][view.name]["log2_gains"] for view in scene.train_views])
     assert np.abs(logs.mean(axis=0)).max() < 1e-6
@@ -144,17 +143,11 @@ def test_exposures_that_exif_tells(default_device: Device, scene: Scene, tmp_pat
     def told(index: int, view: View) -> View:
         path = tmp_path / f"{index}.png"
         pixels = np.rint(255 * view.load()[:, :, :3]).astype(np.uint8)
-        spec = oiio.ImageSpec(pixels.shape[1], pixels.shape[0], 3, oiio.UINT8)
         time, stop, speed = [(1 / 60, 2.0, 100), (1 / 30, 2.0, 100), (1 / 60, 2.0, 400), (1 / 60, 4.0, 100)][index % 4]
-        spec.attribute("ExposureTime", time)
-        spec.attribute("FNumber", stop)
-        if index != 3:
-            spec.attribute("Exif:PhotographicSensitivity", speed)
-        file = oiio.ImageOutput.create(str(path))
-        assert file.open(str(path), spec)
-        assert file.write_image(pixels)
-        file.close()
-        return replace(view, path=path)
+        film = {} if index == 3 else {"Exif:PhotographicSensitivity": speed}
+        return replace(
+            view, path=write_pixels(path, pixels, attributes={"ExposureTime": time, "FNumber": stop, **film})
+        )
 
     scene = replace(scene, views=[told(index, view) for index, view in enumerate(scene.views)])
     exposures = {view.name: exposure_of(view.path) for view in scene.views}
@@ -186,8 +179,7 @@ def test_switched_off_there_is_nothing_of_it(default_device: Device, scene: Scen
 def test_a_checkpoint_without_gains_is_refused(default_device: Device, scene: Scene) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
     trainer.train_step()
-    with pytest.raises(InputError, match="appearance/logs"):
-        Trainer(scene, EXPOSED, default_device).restore(Checkpoint(1, *trainer.checkpoint()))
+    refuses("appearance/logs", Trainer(scene, EXPOSED, default_device).restore, Checkpoint(1, *trainer.checkpoint()))
 
 
 def test_settings_that_exclude_each_other() -> None:

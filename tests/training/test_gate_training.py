@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import warnings_of
+from calls import warned, warnings_of
 from compare import assert_same_arrays
 from held_out import psnr_of
-from same_bytes import gone_on, outcome
+from same_bytes import gone_on, outcome, trained_run
 from tiny import short, trained_to, write_scene
 
 from clsplat.api import train
@@ -86,8 +86,7 @@ def test_the_cameras_stay_then(scene: Scene, default_device: Device, sabotaged: 
             trainer.train_step()
             seen[trainer.step] = poses_of(trainer)
 
-    with pytest.warns(UserWarning, match="held-out views had"):
-        make_steps()
+    warned("held-out views had", make_steps)
     best, ended = trainer.cameras.gate.best[0], trainer.cameras.gate.ended
     assert ended is not None
     assert ended < 50
@@ -99,8 +98,7 @@ def test_the_cameras_stay_then(scene: Scene, default_device: Device, sabotaged: 
 def test_good_poses_are_let_be(scene: Scene, default_device: Device, tmp_path: Path, undisturbed: bytes) -> None:
     """A gate that never closes changes no byte."""
     config = replace(CONFIG, refine_gate=0.0)
-    run = Run.create(tmp_path / "run", config)
-    train(scene, config, device=default_device, run=run)
+    run = trained_run(scene, config, default_device, tmp_path / "run")
     assert run.model_path.read_bytes() == undisturbed
     assert not any("gate" in record for record in run.read_metrics())
     trainer = trained_to(CONFIG.iterations, scene, CONFIG, default_device)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import raising
 from compare import assert_same_arrays
 from tiny import short, write_scene
 
@@ -79,12 +80,9 @@ def test_those_that_do_not_fit_stay_on_the_host(scene: Scene, default_device: De
 def test_a_device_that_has_less_than_it_says(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> DeviceArray:
-        raise CapacityError("no memory left")
-
     store = ImageCache(scene.require_training_views(), with_memory_of_its_own(default_device))
     store.follow(2**30)
-    monkeypatch.setattr(image_cache, "allocate", full)
+    monkeypatch.setattr(image_cache, "allocate", raising(CapacityError("no memory left")))
     assert not isinstance(store.bring(0, 1.0), DeviceArray)
     monkeypatch.setattr(image_cache, "allocate", allocate)
     assert not isinstance(store.bring(1, 1.0), DeviceArray), "no second trial"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import printed, refuses
 from compare import assert_close, assert_same_arrays, assert_same_bits
 from same_bytes import outcome, stopped
 from test_trainer import host, quiet
@@ -15,11 +16,10 @@ from tiny import HEIGHT, WIDTH, cameras, hidden_model, short, write_scene
 
 from clsplat.api import train
 from clsplat.camera import Camera
-from clsplat.cli.main import main, parse
+from clsplat.cli.main import parse
 from clsplat.cli.render.flags import RenderVerb
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.evaluation.held_out import EvaluatedModel, evaluate
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.images.reading import read_image
@@ -147,8 +147,7 @@ def test_a_fisheye_is_undistorted_unless_asked(tmp_path: Path) -> None:
 def test_a_panorama_of_another_size_is_named(tmp_path: Path) -> None:
     folder = write_lens_scene(tmp_path / "scene", "panorama")
     (folder / "sparse/0/cameras.txt").write_text("1 EQUIRECTANGULAR 96 48 96 40\n")
-    with pytest.raises(InputError, match="expected the size of a full panorama, 96 48"):
-        load_scene(folder)
+    refuses("expected the size of a full panorama, 96 48", load_scene, folder)
 
 
 @pytest.mark.slow
@@ -161,8 +160,7 @@ def test_frames_are_drawn_through_the_lens_that_the_run_was_trained_with(
 
     def projections(*more: str) -> set[str]:
         words = ["render", str(run), "--cameras", str(scene.source), "-o", str(tmp_path / "{name}.##.png"), *more]
-        assert main([*words, "--overwrite"]) == 0
-        capsys.readouterr()
+        printed(capsys, [*words, "--overwrite"])
         verb = parse(words)
         assert isinstance(verb, RenderVerb)
         assert verb.lenses is not None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture, error_line
+from calls import Capture, refuses, rejected, warned
 from ring import write_cloud
 from tiny import CONFIG, FEW, hidden_model, write_scene
 
@@ -16,7 +16,6 @@ from clsplat.cli.main import main
 from clsplat.config.points import SKY_RADIUS_RATIO
 from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.training.density.adaptive import Adaptive
@@ -70,8 +69,7 @@ def test_a_run_starts_from_the_cloud_and_goes_on(
 def test_calls_that_make_no_sense(
     scene: Path, tmp_path: Path, capsys: Capture, words: tuple[str, ...], said: str
 ) -> None:
-    assert main(["train", str(scene), "-o", str(tmp_path / "run"), *words, *WORDS]) == 2
-    assert said in error_line(capsys)
+    assert said in rejected(capsys, ["train", scene, "-o", tmp_path / "run", *words, *WORDS])
     assert not (tmp_path / "run").exists()
 
 
@@ -81,19 +79,16 @@ def test_a_cloud_that_changes_is_refused(scene: Path, tmp_path: Path, capsys: Ca
     assert main(["train", str(scene), "-o", str(run), "--points", str(cloud), *WORDS]) == 0
     hidden_model(60).save(cloud)
     capsys.readouterr()
-    assert main(["train", "-o", str(run), "--resume", "--iterations", "5"]) == 2
-    assert "other points (50 then, 60 now)" in error_line(capsys)
+    assert "other points (50 then, 60 now)" in rejected(capsys, ["train", "-o", run, "--resume", "--iterations", "5"])
 
 
 def test_colours_come_from_the_photographs(scene: Path, cloud: Path) -> None:
     config = replace(FEW, points=str(cloud), points_use="join")
     read = load_scene(scene)
-    with pytest.warns(UserWarning, match="have no colours"):
-        got = begin(read, config, None, resume=False)
+    got = warned("have no colours", begin, read, config, None, resume=False)
     assert len(got.points) == len(read.points) + 300
     assert np.ptp(got.point_colors[len(read.points) :], axis=0).min() > 0.05
-    with pytest.raises(InputError, match=r"lost\.ply"):
-        begin(read, replace(FEW, points="lost.ply"), None, resume=False)
+    refuses(r"lost\.ply", begin, read, replace(FEW, points="lost.ply"), None, resume=False)
 
 
 def test_a_sky_is_not_pruned_for_its_size(default_device: Device, scene: Path) -> None:

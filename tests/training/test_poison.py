@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import refuses
 from compare import assert_same_bits
 from golden_frames import checksums
 from tiny import short, trained_to, write_scene
@@ -16,7 +17,6 @@ from tiny import short, trained_to, write_scene
 from clsplat.config.training import TrainConfig
 from clsplat.device.buffers import DeviceArray, Workspace, allocate
 from clsplat.device.context import Device
-from clsplat.errors import InputError
 from clsplat.gaussians import PARAMETER_GROUPS
 from clsplat.layouts.columns import SPLAT
 from clsplat.scenes.loading import load_scene
@@ -57,8 +57,7 @@ def test_memory_is_poisoned_when_asked_for(default_device: Device, monkeypatch: 
                 assert_same_bits(array.get().view(np.uint8)[:whole], pattern[:whole])
                 array.fill(0)
     monkeypatch.setenv("CLSPLAT_POISON", "much")
-    with pytest.raises(InputError, match="CLSPLAT_POISON much: expected 1, or 32 bits"):
-        Workspace(default_device)
+    refuses("CLSPLAT_POISON much: expected 1, or 32 bits", Workspace, default_device)
 
 
 @pytest.mark.parametrize("word", WORDS)

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calls import Capture, no_warnings
+from calls import Capture, no_warnings, refuses
+from same_bytes import trained_run
 from tiny import run_steps, short, trained_to
 
 from clsplat.api import train
@@ -21,7 +22,6 @@ from clsplat.config.training import TrainConfig
 from clsplat.device.context import Device
 from clsplat.errors import InputError
 from clsplat.runs.appearance import held_out_looks
-from clsplat.runs.run import Run
 from clsplat.scenes.loading import load_scene
 from clsplat.scenes.scene import Scene, View
 from clsplat.training.cameras.export import doubt_poses
@@ -94,8 +94,7 @@ def test_a_held_out_view_is_aligned(scene: Scene, default_device: Device) -> Non
 def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Device, tmp_path: Path) -> None:
     """refined/ is a COLMAP model of the same pictures: training views have moved, but for two, and held-out ones and
     the points as they have on average."""
-    run = Run.create(tmp_path / "run", CONFIG)
-    train(scene, CONFIG, device=default_device, run=run)
+    run = trained_run(scene, CONFIG, default_device, tmp_path / "run")
     result = json.loads(run.eval_path.read_text())
     assert result["mean"]["psnr_aligned"] >= result["mean"]["psnr"] - 0.05  # the loss is not the PSNR alone
     again = load_scene(
@@ -158,8 +157,7 @@ def test_a_checkpoint_that_is_damaged(
     poses = Trainer(scene, CONFIG, default_device).cameras.poses
     arrays = {key.removeprefix("poses/"): values for key, values in poses.arrays().items()}
     poses.load(arrays)
-    with pytest.raises(ValueError, match=text):
-        poses.load({**arrays, name: spoilt(arrays[name])})
+    refuses(text, poses.load, {**arrays, name: spoilt(arrays[name])}, error=ValueError)
 
 
 def test_settings_that_make_no_sense(scene: Scene, default_device: Device, tmp_path: Path) -> None:
@@ -167,15 +165,11 @@ def test_settings_that_make_no_sense(scene: Scene, default_device: Device, tmp_p
         (replace(CONFIG, batch=2), "--refine-poses: not supported with --batch 2 or several devices"),
         (replace(CONFIG, pose_reach=0.0), "--pose-reach 0.0: expected over 0"),
     ):
-        with pytest.raises(InputError, match=text):
-            config.check()
-    with pytest.raises(InputError, match="--refine-poses: not supported with 2 devices"):
-        CONFIG.on_devices(2, explicit=False)
+        refuses(text, config.check)
+    refuses("--refine-poses: not supported with 2 devices", CONFIG.on_devices, 2, explicit=False)
     few = replace(scene, views=[*scene.train_views[:2], *scene.test_views])
-    with pytest.raises(InputError, match="--refine-poses: 2 training views, expected 3 or more"):
-        Trainer(few, CONFIG, default_device)
-    run = Run.create(tmp_path / "run", replace(CONFIG, iterations=3))
-    train(scene, run.config, device=default_device, run=run)
+    refuses("--refine-poses: 2 training views, expected 3 or more", Trainer, few, CONFIG, default_device)
+    run = trained_run(scene, replace(CONFIG, iterations=3), default_device, tmp_path / "run")
     with pytest.raises(InputError, match="refine_poses is True, a resumed run"):
         train(scene, replace(CONFIG, refine_poses=False), device=default_device, run=run, resume=True)
 

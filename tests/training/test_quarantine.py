@@ -14,7 +14,7 @@ from pathlib import Path
 import bench_guards
 import numpy as np
 import pytest
-from calls import Capture
+from calls import Capture, noted, ran, refuses
 from calls import train as command_train
 from compare import assert_same_bits
 from quick import quick
@@ -24,7 +24,7 @@ from clsplat.api import train
 from clsplat.config.training import OptimiserConfig, TrainConfig
 from clsplat.device.context import Device
 from clsplat.device.source import kernel_source
-from clsplat.errors import ClsplatError, InputError
+from clsplat.errors import ClsplatError
 from clsplat.gaussians import MAX_SH_COEFFICIENT, PARAMETER_GROUPS, group_shapes
 from clsplat.runs.checkpoints import read_checkpoint, write_checkpoint
 from clsplat.runs.run import Run
@@ -52,17 +52,15 @@ Due = Callable[[Trainer], bool]
 @contextmanager
 def spoilt(due: Due, group: str = "means", row: int = 5, value: float = np.nan) -> Iterator[None]:
     """Before a step that is due a parameter turns bad, as in a memory that forgets."""
-    real = Trainer.train_step
 
-    def step(self: Trainer, **options: bool) -> object:
-        if due(self):
-            values = self.parameters[group].get()
+    def spoil(trainer: Trainer, **_: bool) -> None:
+        if due(trainer):
+            values = trainer.parameters[group].get()
             values.reshape(len(values), -1)[row, 0] = value
-            self.parameters[group].set(values)
-        return real(self, **options)
+            trainer.parameters[group].set(values)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "train_step", step)
+        noted(patch, Trainer, "train_step", spoil)
         yield
 
 
@@ -212,15 +210,13 @@ def test_repeated_trouble_goes_back_with_smaller_steps(scene: Scene, default_dev
 
 def test_a_model_that_is_mostly_broken_is_not_mended(scene: Scene, default_device: Device, tmp_path: Path) -> None:
     run = Run.create(tmp_path / "run", CHECKED)
-    real = Trainer.train_step
 
-    def step(self: Trainer, **options: bool) -> object:
-        if self.step == 17 and self.monitor.retries.rate_factor == 1.0:
-            self.parameters["sh_dc"].fill(np.nan)
-        return real(self, **options)
+    def spoil(trainer: Trainer, **_: bool) -> None:
+        if trainer.step == 17 and trainer.monitor.retries.rate_factor == 1.0:
+            trainer.parameters["sh_dc"].fill(np.nan)
 
     with heard() as lines, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Trainer, "train_step", step)
+        noted(patch, Trainer, "train_step", spoil)
         result = train(scene, CHECKED, device=default_device, run=run)
     assert re.search(r"parameters of (\d+) Gaussians .*; \1 of \1 are too many to remove", lines[0])
     assert re.match(r"step (19|20): 1 of the last 100 steps had trouble: training returns to step 15", lines[1])
@@ -277,12 +273,10 @@ def test_a_bundle_has_no_more_than_it_needs(
     assert kept == 1 < of
     assert {model.count for model in bundle.models.values()} == {1}
     assert path.stat().st_size < 50_000
-    assert repro_bundle.main([str(path)]) == 0
-    out = capsys.readouterr().out
+    out = ran(capsys, repro_bundle.main, [str(path)]).out
     assert "first in parameters" in out
     assert f"1 of {of} Gaussians" in out
-    assert repro_bundle.main([str(path), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["stage"] == "parameters"
+    assert json.loads(ran(capsys, repro_bundle.main, [str(path), "--json"]).out)["stage"] == "parameters"
 
 
 def test_a_bundle_of_a_sound_step_says_so(
@@ -296,8 +290,7 @@ def test_a_bundle_of_a_sound_step_says_so(
     path = repro_bundle.write_bundle(tmp_path, trainer, trainer.monitor.latest)
     assert repro_bundle.read_bundle(path).record["of"] == [40, 40]
     assert not repro_bundle.read_bundle(path).record["reproduced"]
-    assert repro_bundle.main([str(path)]) == 1
-    assert "all is well on this device" in capsys.readouterr().out
+    assert "all is well on this device" in ran(capsys, repro_bundle.main, [str(path)], status=1).out
 
 
 def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
@@ -320,14 +313,11 @@ def test_a_bundle_with_a_setting_of_an_earlier_version_loads(
 
 def test_what_is_no_bundle_is_named(tmp_path: Path, capsys: Capture) -> None:
     path = tmp_path / "some.npz"
-    assert repro_bundle.main([str(path)]) == 2
-    assert f"{path}: no such file" in capsys.readouterr().err
+    assert f"{path}: no such file" in ran(capsys, repro_bundle.main, [str(path)], status=2).err
     np.savez(path, a=np.zeros(3))
-    with pytest.raises(InputError, match="not a bundle"):
-        repro_bundle.read_bundle(path)
+    refuses("not a bundle", repro_bundle.read_bundle, path)
     path.write_bytes(b"PK")
-    with pytest.raises(InputError, match="not a bundle"):
-        repro_bundle.read_bundle(path)
+    refuses("not a bundle", repro_bundle.read_bundle, path)
 
 
 def test_without_a_run_it_says_how_to_get_a_bundle(scene: Scene, default_device: Device) -> None:
@@ -368,14 +358,12 @@ def unguarded(device: Device) -> Device:
 @pytest.mark.slow
 def test_the_cost_of_the_checks_is_told(scene: Scene, capsys: Capture) -> None:
     folder = Path(scene.views[0].path).parents[1]
-    assert bench_guards.main([str(folder), "--repeat", "2", "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    result = json.loads(ran(capsys, bench_guards.main, [str(folder), "--repeat", "2", "--json"]).out)
     assert result["gaussians"] == 40
     for kind in ("wall", "cpu"):
         assert result[kind]["with_ms"] > 0
         assert result[kind]["without_ms"] > 0
-    assert bench_guards.main(["--repeat", "0"]) == 2
-    assert "--repeat 0: expected at least 1" in capsys.readouterr().err
+    assert "--repeat 0: expected at least 1" in ran(capsys, bench_guards.main, ["--repeat", "0"], status=2).err
 
 
 def test_rates_are_the_settings_where_nothing_happened(scene: Scene, default_device: Device) -> None:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calls import refuses
+from same_bytes import trained_run
 from tiny import short
 
 from clsplat.api import train
@@ -56,8 +58,7 @@ def test_a_lens_comes_back(scene: Scene, default_device: Device) -> None:
 
 def test_what_a_run_has_of_them(folder: Path, scene: Scene, default_device: Device, tmp_path: Path) -> None:
     """refined/ has the changed lens, for held-out pictures too, and the poses as they were."""
-    run = Run.create(tmp_path / "run", CONFIG)
-    train(scene, CONFIG, device=default_device, run=run)
+    run = trained_run(scene, CONFIG, default_device, tmp_path / "run")
     assert "psnr_aligned" not in json.loads(run.eval_path.read_text())["mean"]
     again = load_scene(
         shutil.copytree(run.refined_path, tmp_path / "again" / "sparse").parent, images=folder / "images"
@@ -100,18 +101,15 @@ def test_the_file_and_the_working_size_change_alike() -> None:
 def test_what_is_bent_is_refused(scene: Scene) -> None:
     bent = Lens("SIMPLE_RADIAL", 100, 80, (90.0, 50.0, 40.0, 0.1))
     views = [replace(view, lens=bent) for view in scene.train_views]
-    with pytest.raises(InputError, match=r"is SIMPLE_RADIAL, with distortion; expected photographs without distortion"):
-        RefinedLenses(CONFIG, views)
+    refuses(r"is SIMPLE_RADIAL, with distortion; expected photographs without distortion", RefinedLenses, CONFIG, views)
     RefinedLenses(replace(CONFIG, refine_lenses=False), views)
 
 
 def test_refusals(scene: Scene, default_device: Device, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--refine-lenses: not supported with --batch 2"):
-        TrainConfig(refine_lenses=True, batch=2).check()
+    refuses("--refine-lenses: not supported with --batch 2", TrainConfig(refine_lenses=True, batch=2).check)
     with pytest.raises(InputError, match="--refine-lenses: not supported with 2 devices"):
         TrainConfig(refine_lenses=True).on_devices(2, explicit=False)
-    with pytest.raises(InputError, match="over 0 and at most 50 hundredths"):
-        TrainConfig(lens_reach=0.0).check()
+    refuses("over 0 and at most 50 hundredths", TrainConfig(lens_reach=0.0).check)
     run = Run.create(tmp_path / "run", CONFIG)
     train(scene, replace(CONFIG, iterations=4), device=default_device, run=run)
     with pytest.raises(InputError, match="refine_lenses is True, a resumed run"):

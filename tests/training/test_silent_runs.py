@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from calls import Capture, error_line, no_warnings, python, warnings_of
+from calls import Capture, no_warnings, python, rejected, warnings_of
 from tiny import FEW, short, write_scene
 
 import clsplat
@@ -40,15 +40,13 @@ def test_a_scene_that_is_no_path_is_named(value: str, run: Path, capsys: Capture
     text = (run / "config.toml").read_text()
     lines = [f"scene = {value}" if line.startswith("scene = ") else line for line in text.splitlines()]
     (run / "config.toml").write_text("\n".join(lines))
-    assert main(["train", "-o", str(run), "--resume"]) == 2
-    assert "expected the scene's path as text" in error_line(capsys)
+    assert "expected the scene's path as text" in rejected(capsys, ["train", "-o", run, "--resume"])
 
 
 @pytest.mark.parametrize("line", ["train  -o run", "train scene -o ", "eval ", "info "])
 def test_an_empty_path_is_not_the_working_directory(line: str, capsys: Capture) -> None:
     """As a shell makes it of a variable that is not set."""
-    assert main(line.split(" ")) == 2
-    assert "the path is empty" in error_line(capsys)
+    assert "the path is empty" in rejected(capsys, line.split(" "))
 
 
 def without_digests(change: Callable[[dict[str, Any], dict[str, Any]], object]) -> Callable[[Path], None]:

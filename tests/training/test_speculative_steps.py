@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
+from calls import noted, refuses
 from quick import quick
 from same_bytes import assert_alike, stepped
 from tiny import run_steps, short, trained_to
@@ -15,8 +14,6 @@ from clsplat.bench import stages as bench_stages
 from clsplat.bench import workload as bench_subject
 from clsplat.config.rasterizer import BenchSwitches, RasterizerConfig
 from clsplat.device.context import Device
-from clsplat.device.program import Kernel
-from clsplat.errors import InputError
 from clsplat.scenes.scene import Scene
 from clsplat.stages.device_gaussians import upload_gaussians
 from clsplat.training.density import ModelState, RowPlan
@@ -96,13 +93,7 @@ def test_what_is_looked_at_or_tight_is_exact(
 ) -> None:
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     asked: list[int] = []
-    real = SpeculativeSteps.launch
-
-    def launch(self: SpeculativeSteps, run: Any, room: int, **options: Any) -> Any:
-        asked.append(room)
-        return real(self, run, room, **options)
-
-    monkeypatch.setattr(SpeculativeSteps, "launch", launch)
+    noted(monkeypatch, SpeculativeSteps, "launch", lambda _, run, room, **options: asked.append(room))
     pairs = short(rasterizer=BenchSwitches(depth_sort="pairs"))
     trainers = [
         Trainer(scene, CONFIG, default_device, strategy=_Looks),
@@ -120,8 +111,7 @@ def test_the_default_is_the_kind_of_the_device(default_device: Device, monkeypat
     monkeypatch.delenv(BY_CAPACITY_VARIABLE, raising=False)
     assert by_capacity(default_device) == (default_device.kind != "cpu")
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "yes")
-    with pytest.raises(InputError, match=f"{BY_CAPACITY_VARIABLE}=yes: expected 1, or 0"):
-        by_capacity(default_device)
+    refuses(f"{BY_CAPACITY_VARIABLE}=yes: expected 1, or 0", by_capacity, default_device)
 
 
 def test_launches_come_from_tapes(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,13 +119,7 @@ def test_launches_come_from_tapes(device: Device, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv(BY_CAPACITY_VARIABLE, "1")
     trainer = bench_stages.trainer_of(bench_subject.synthetic(200, 80, 60), device, RasterizerConfig())
     made: list[str] = []
-    real = Device.enqueue
-
-    def enqueue(self: Device, kernel: Kernel, *arguments: Any, **options: Any) -> Any:
-        made.append(kernel.name)
-        return real(self, kernel, *arguments, **options)
-
-    monkeypatch.setattr(Device, "enqueue", enqueue)
+    noted(monkeypatch, Device, "enqueue", lambda _, kernel, *given, **options: made.append(kernel.name))
     steps = []
     for _ in range(12):
         made.clear()

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import noted, refuses
 from compare import assert_close, assert_same_bits
 from marking import on_host
-from same_bytes import model_bytes
+from same_bytes import model_bytes, trained_run
 from test_density import split_of
 from tiny import CONFIG, EVENTS, HEIGHT, WIDTH, hidden_model, loss_curve, run_steps, short, trained_to, write_scene
 
@@ -140,10 +141,7 @@ def test_the_test_run_has_everything_in_it(
         return made
 
     monkeypatch.setattr(adaptive, "plan", plan)
-    real_reset = adaptive.reset_opacities
-    monkeypatch.setattr(
-        adaptive, "reset_opacities", lambda config, logits: resets.append(trainer.step) or real_reset(config, logits)
-    )
+    noted(monkeypatch, adaptive, "reset_opacities", lambda *_: resets.append(trainer.step))
     trainer = Trainer(scene, CONFIG, default_device)
     coefficients = []
     for _ in range(CONFIG.iterations):
@@ -203,8 +201,7 @@ def test_a_crash_goes_on_from_the_last_checkpoint(
         train(scene, config, device=default_device, run=run, on_step=crash)
     assert [step for step, _ in run.checkpoints()] == [21, 28]
     assert not run.model_path.exists()
-    run = Run.create(tmp_path / "run", config, resume=True)
-    train(scene, config, device=default_device, run=run, resume=True)
+    run = trained_run(scene, config, default_device, tmp_path / "run", resume=True)
     assert run.model_path.read_bytes() == undisturbed
     assert [record["step"] for record in run.read_metrics()] == [10, 20, 30, 40]
 
@@ -222,8 +219,7 @@ def test_ctrl_c_saves_the_step_it_came_in(
         train(scene, CONFIG, device=default_device, run=run, on_step=press)
     assert signal.getsignal(signal.SIGINT) is before
     assert [step for step, _ in run.checkpoints()] == [20]
-    run = Run.create(tmp_path / "run", CONFIG, resume=True)
-    train(scene, CONFIG, device=default_device, run=run, resume=True)
+    run = trained_run(scene, CONFIG, default_device, tmp_path / "run", resume=True)
     assert run.model_path.read_bytes() == undisturbed
 
 
@@ -266,8 +262,7 @@ def test_pictures_and_render_have_one_background(
 def test_random_backgrounds_leave_empty_space_empty(alpha_scene: Scene, default_device: Device, tmp_path: Path) -> None:
     """Held-out views come over black, which none of the random backgrounds was: alpha has been learnt."""
     config = replace(END_TO_END, background="random")
-    run = Run.create(tmp_path / "run", config)
-    train(alpha_scene, config, device=default_device, run=run)
+    run = trained_run(alpha_scene, config, default_device, tmp_path / "run")
     # Measured 25.91 to 27.87 dB with four seeds; 13.3 dB from pictures without alpha.
     assert run.model_record()["mean"]["psnr"] > 25.0
 
@@ -290,16 +285,15 @@ def test_the_warm_up_doubles_the_resolution(
     scene: Scene, default_device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trainer = Trainer(scene, CONFIG, default_device)
-    sizes, real = [], trainer.rasterizer.forward
+    sizes = []
 
-    def forward(gaussians: Any, camera: Any, background: Any, **how: Any) -> Any:
+    def look(_gaussians: Any, camera: Any, *_: Any, **__: Any) -> None:
         # the same view on a coarser grid, not a part of it
         assert camera.fx / camera.width == pytest.approx(50 / WIDTH)
         assert camera.cy / camera.height == pytest.approx(0.5)
         sizes.append((camera.width, camera.height))
-        return real(gaussians, camera, background, **how)
 
-    monkeypatch.setattr(trainer.rasterizer, "forward", forward)
+    noted(monkeypatch, trainer.rasterizer, "forward", look)
     run_steps(12, trainer)
     quarter, half, full = ((WIDTH // factor, HEIGHT // factor) for factor in (4, 2, 1))
     assert sizes == [quarter] * 4 + [half] * 5 + [full] * 3
@@ -455,18 +449,16 @@ def test_nothing_left_stops_it(scene: Scene, default_device: Device) -> None:
 
 def test_no_training_views(scene: Scene, default_device: Device) -> None:
     nothing = Scene("empty", scene.test_views, scene.points, scene.point_colors, scene.bounds)
-    with pytest.raises(InputError, match="empty: all 2 views are held out; use --test-every 0"):
-        train(nothing, CONFIG, device=default_device)
+    refuses("empty: all 2 views are held out; use --test-every 0", train, nothing, CONFIG, device=default_device)
 
 
 def test_a_checkpoint_of_other_shapes_is_refused(scene: Scene, default_device: Device, tmp_path: Path) -> None:
-    run = Run.create(tmp_path / "run", config := short(iterations=3))
-    train(scene, config, device=default_device, run=run)
+    run = trained_run(scene, short(iterations=3), default_device, tmp_path / "run")
     checkpoint = run.load_latest_checkpoint()
     assert checkpoint is not None
     checkpoint.arrays["first/quaternions"] = checkpoint.arrays["first/quaternions"][:-1]
     with pytest.raises(InputError, match=r"checkpoint of step 3: first/quaternions has shape \(39, 4\)"):
-        Trainer(scene, config, default_device).restore(checkpoint)
+        Trainer(scene, run.config, default_device).restore(checkpoint)
 
 
 def test_doubling() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from calls import refuses
 from numpy.typing import NDArray
 from scenes import tilted_camera
 
@@ -15,7 +16,6 @@ from clsplat.arrays import Float64
 from clsplat.camera import Camera
 from clsplat.config.presets import scheduled
 from clsplat.config.training import DensityConfig, TrainConfig
-from clsplat.errors import InputError
 from clsplat.training.cameras.validation_gate import CameraGate, Drift, drift, spread, steps_of
 
 CONFIG = TrainConfig(iterations=1000, refine_poses=True, refine_gate=0.5, density=DensityConfig(every=0))
@@ -179,8 +179,7 @@ def test_the_bound_is_a_setting() -> None:
         assert not any(gate.is_due(step) for step in range(1001))
         assert not gate.arrays()
     for value in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(InputError, match="--refine-gate"):
-            replace(CONFIG, refine_gate=value).check()
+        refuses("--refine-gate", replace(CONFIG, refine_gate=value).check)
 
 
 @pytest.mark.parametrize("values", [[], [20.0], [20, 19.4], [20, 19.4, 19.4], [20, 19.4, 19.4, 21]])
@@ -209,5 +208,4 @@ def test_a_checkpoint_has_all_of_it(values: list[float]) -> None:
 )
 def test_a_damaged_checkpoint_is_told(name: str, value: NDArray[Any], text: str) -> None:
     good = {key.removeprefix("gate/"): array for key, array in judged([20.0])[0].arrays().items()}
-    with pytest.raises(ValueError, match=text):
-        CameraGate(CONFIG, 2).load({**good, name: value}, arrays(7))
+    refuses(text, CameraGate(CONFIG, 2).load, {**good, name: value}, arrays(7), error=ValueError)
