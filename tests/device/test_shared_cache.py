@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A driver's cache of kernels that other processes use at the same time, and signals while it is filled.
 
-`tools/stress/stress_cache.py` starts forty processes at once on an empty one.
+`tools/stress/run cache` starts forty processes at once on an empty one.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import sys
 
 import pyopencl as cl
 import pytest
-from calls import python
+from calls import python, refuses
 from drivers import KEPT
 
 from clsplat.device import program
@@ -80,8 +80,7 @@ def test_what_fails_twice_is_an_error(
 ) -> None:
     texts = contended(monkeypatch, failures)
     variant = Variant("two", TEXT.format(name="two"), ("-cl-std=CL1.2",))
-    with pytest.raises(error, match=words):
-        build(default_device.context, default_device.cl_device, variant)
+    refuses(words, build, default_device.context, default_device.cl_device, variant, error=error)
     assert len(texts) == 2
 
 

@@ -207,7 +207,7 @@ def test_a_folder_that_is_read_only_is_named(scene: Path, tmp_path: Path, capfd:
 
 @pytest.mark.slow
 def test_a_few_kills(capfd: Capture, default_device: object) -> None:
-    """`tools/stress/stress_kills.py --kills 100` is the long form."""
+    """`tools/stress/run kills --kills 100` is the long form."""
     assert stress_kills.main(["--kills", "2", "--seed", "5"]) == 0
     out = capfd.readouterr().out
     assert re.match(r"2 kills survived in \d+ s: .* each with the bytes of an undisturbed one", out)

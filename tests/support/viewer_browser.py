@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import pytest
-from needs import require
+from clsplat.errors import ClsplatError
 
 SLOW = 60_000
 """Milliseconds for what takes one second on a machine that has nothing else to do."""
@@ -21,7 +20,6 @@ SLOW = 60_000
 @contextmanager
 def clsplat(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """A command that serves a page, with --port 0: its address, and the process, which is ended as by Ctrl-C."""
-    require("viser")
     command = [sys.executable, "-m", "clsplat", *arguments, "--port", "0"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stderr is not None
@@ -33,7 +31,7 @@ def clsplat(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
                 yield found[1].rstrip(";"), process
                 break
         else:
-            pytest.fail("".join(lines))
+            raise ClsplatError(f"clsplat {arguments[0]} has ended: {' '.join(lines)}")
     finally:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
@@ -42,7 +40,7 @@ def clsplat(*arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
-            pytest.fail(f"{arguments[0]} does not end")
+            raise ClsplatError(f"clsplat {arguments[0]} does not end") from None
 
 
 def choose(page: Any, label: str, option: str) -> None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files that were made to do harm: one line that names the file, in bounded memory and time. A sample of what
-`tools/stress/stress_files.py` does at length, and each defect that it found, by name."""
+`tools/stress/run files` does at length, and each defect that it found, by name."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from typing import Any
 
 import calls
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import stress_files
 from calls import warned
@@ -34,7 +33,8 @@ from hostile import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from spoilers import SPOILERS
+from pictures import write_pixels
+from spoilers import SPOILERS, npy
 from stress_files import stress, verdict
 from systems import links, posix
 
@@ -53,10 +53,9 @@ from clsplat.scenes.sfm import reconstruct
 
 def refusal(read: Callable[[], object]) -> str:
     """The message of the InputError, which is one line."""
-    with pytest.raises(InputError) as caught:
-        read()
-    assert str(caught.value).isprintable()
-    return str(caught.value)
+    said = calls.refuses(".", read)
+    assert said.isprintable()
+    return said
 
 
 def peak_of(read: Callable[[], object]) -> int:
@@ -121,7 +120,7 @@ def test_a_crash_and_a_loop_are_failures(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     # in the children `hostile` gets a reader of ours: they import it anew
     (tmp_path / "sitecustomize.py").write_text(
-        f"import sys\nsys.path.insert(0, {str(Path(stress_files.__file__).parent)!r})\n"
+        f"import sys\nsys.path[:0] = {[str(Path(each.__file__).parent) for each in (stress_files, calls)]!r}\n"
         "import hostile, hostile_fakes\n"
         "kinds = ('truncate', 'append')\n"
         "fake = hostile.Reader('fake', hostile_fakes.make, hostile_fakes.read, ('a',), kinds)\n"
@@ -161,34 +160,17 @@ def test_messages_are_one_plain_line() -> None:
     assert plain("Kölner Dom \U0001f4a9.png") == "Kölner Dom \U0001f4a9.png"
 
 
-def pipe(path: Path) -> None:
-    os.mkfifo(path)
+PLACES: dict[str, Callable[[Path], object]] = {
+    "pipe": getattr(os, "mkfifo", Path.touch),
+    "loop": lambda path: path.symlink_to(path.name),
+    "folder": Path.mkdir,
+    "zeros": lambda path: path.symlink_to("/dev/zero"),
+    "huge": lambda path: (path.touch(), os.truncate(path, 1 << 33)),  # takes no room on the disk
+}
+NEEDED = {"pipe": posix, "loop": links, "zeros": posix}
 
 
-def loop(path: Path) -> None:
-    path.symlink_to(path.name)
-
-
-def folder(path: Path) -> None:
-    path.mkdir()
-
-
-def zeros(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def huge(path: Path) -> None:
-    with open(path, "wb") as file:
-        file.truncate(1 << 33)  # takes no room on the disk
-
-
-PLACES = (
-    *(pytest.param(pipe, marks=posix), pytest.param(loop, marks=links)),
-    *(folder, pytest.param(zeros, marks=posix), huge),
-)
-
-
-@pytest.mark.parametrize("place", PLACES, ids=lambda place: place.__name__)
+@pytest.mark.parametrize("place", [pytest.param(place, marks=NEEDED.get(place, ())) for place in PLACES])
 @pytest.mark.parametrize(
     ("make", "name"),
     [
@@ -202,17 +184,15 @@ PLACES = (
     ],
     ids=["ply", "colmap", "colmap text", "transforms", "cloud", "config", "photo"],
 )
-def test_what_is_no_plain_file(
-    make: Callable[[Path], None], name: str, place: Callable[[Path], None], tmp_path: Path
-) -> None:
+def test_what_is_no_plain_file(make: Callable[[Path], None], name: str, place: str, tmp_path: Path) -> None:
     make(tmp_path)
     (tmp_path / name).unlink()
-    place(tmp_path / name)
+    PLACES[place](tmp_path / name)
     reader = {"model.ply": "ply", "run/config.toml": "config", "photos/a.png": "photos"}.get(name, "transforms")
     refused, trouble = verdict(READERS[reader], tmp_path)
     assert trouble == ""
     # points may be missing, which is a warning or nothing; a folder and a link that leads nowhere are no photos
-    assert refused or name in ("cloud.ply", "sparse/0/points3D.txt") or place in (folder, loop)
+    assert refused or name in ("cloud.ply", "sparse/0/points3D.txt") or place in ("folder", "loop")
 
 
 # PLY
@@ -260,17 +240,17 @@ def test_wide_rows_are_read_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.
     np.testing.assert_array_equal(ply.read(tmp_path / "model.ply").sh, whole.sh)
 
 
-def test_a_clouds_property_twice(tmp_path: Path) -> None:
-    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "x"))
+@pytest.mark.parametrize(
+    ("names", "count", "said"), [("xyzx", 1, "property x twice"), ("xyz", 10**15, "")], ids=["twice", "claim"]
+)
+def test_a_cloud_has_each_property_once_and_claims_at_most_what_it_has(
+    names: str, count: int, said: str, tmp_path: Path
+) -> None:
+    properties = "".join(f"property float {name}\n" for name in names)
     for form in ("binary_little_endian", "ascii"):
-        path = model(tmp_path, f"ply\nformat {form} 1.0\nelement vertex 1\n{names}end_header\n1 2 3 4 5 6 7 8".encode())
-        assert "property x twice" in refusal(lambda path=path: point_files.read_point_cloud(path))
-
-
-def test_a_cloud_claims_at_most_what_it_has(tmp_path: Path) -> None:
-    names = "".join(f"property float {name}\n" for name in "xyz")
-    for form in ("binary_little_endian", "ascii"):
-        path = model(tmp_path, f"ply\nformat {form} 1.0\nelement vertex {10**15}\n{names}end_header\n1 2 3\n".encode())
+        head = f"ply\nformat {form} 1.0\nelement vertex {count}\n{properties}end_header\n"
+        path = model(tmp_path, f"{head}1 2 3 4 5 6 7 8\n".encode())
+        assert said in refusal(lambda path=path: point_files.read_point_cloud(path))
         assert peak_of(lambda path=path: point_files.read_point_cloud(path)) < 2e6
 
 
@@ -304,16 +284,12 @@ def test_far_cameras_are_refused(tmp_path: Path) -> None:
     assert "has the pose" in refusal(lambda: colmap.read_model(path.parent))
 
 
-@pytest.mark.parametrize(
-    "name", ["..\\..\\x.png", "C:\\x.png", "C:x.png", "\\\\host\\x.png", "/x.png", "a/../../x.png", "a\nb", ""]
-)
+LEAVING = ("..\\..\\x.png", "C:\\x.png", "C:x.png", "\\\\host\\x.png", "/x.png", "a/../../x.png", "a\nb", "")
+
+
+@pytest.mark.parametrize("name", [*LEAVING, "a.png", "sub/a.png", "..a.png", "a..b/c.png", "Kölner Dom.jpg"])
 def test_names_that_leave_the_images_folder(name: str) -> None:
-    assert not colmap.safe_name(name)
-
-
-@pytest.mark.parametrize("name", ["a.png", "sub/a.png", "..a.png", "a..b/c.png", "Kölner Dom.jpg"])
-def test_names_that_do_not(name: str) -> None:
-    assert colmap.safe_name(name)
+    assert colmap.safe_name(name) == (name not in LEAVING)
 
 
 # transforms.json
@@ -430,30 +406,23 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 def test_a_png_of_100_000_by_100_000_pixels(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0))
-    path.write_bytes(reading.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
-    for read in (image_size, read_image):
-        assert "does not decode" in refusal(lambda read=read: read(path))  # OpenImageIO's own limit
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0))
-    path.write_bytes(reading.PNG_SIGNATURE + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b""))
-    for read in (image_size, read_image):
-        assert "30000 x 30000" in refusal(lambda read=read: read(path))
-
-
-def exr(path: Path, width: int, height: int, full: int) -> Path:
-    spec = oiio.ImageSpec(width, height, 3, oiio.HALF)
-    spec.full_width = spec.full_height = full
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec)
-    assert output.write_image(np.zeros((height, width, 3), np.float32))
-    assert output.close()
-    return path
+    rest = chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
+    for side, kind, said in (
+        (100_000, 2, "does not decode"),
+        (30_000, 0, "30000 x 30000"),
+    ):  # its limit, ours
+        head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, kind, 0, 0, 0))
+        path.write_bytes(reading.PNG_SIGNATURE + head + rest)
+        for read in (image_size, read_image):
+            assert said in refusal(lambda read=read: read(path))
 
 
 def test_an_exr_shown_as_100_000_by_100_000_pixels(tmp_path: Path) -> None:
-    path = exr(tmp_path / "a.exr", 8, 8, 100_000)
+    path, black = tmp_path / "a.exr", np.zeros((8, 8, 3), np.float32)
+    write_pixels(path, black, "half", full_width=100_000, full_height=100_000)
     assert peak_of(lambda: read_image(path)) < 1e6
-    assert read_image(exr(path, 8, 8, 3000)).shape == (3000, 3000, 3)
+    write_pixels(path, black, "half", full_width=3000, full_height=3000)
+    assert read_image(path).shape == (3000, 3000, 3)
 
 
 def test_large_flat_pictures_are_pictures(tmp_path: Path) -> None:
@@ -544,40 +513,32 @@ def test_metrics_that_are_none_are_left_out(line: str, tmp_path: Path) -> None:
     assert run.model_record()["step"] == 2
 
 
-def archive(path: Path, members: list[tuple[str, bytes]], compression: int = zipfile.ZIP_STORED) -> None:
+def archive(path: Path, members: list[tuple[str, bytes]], *, packed: bool = False) -> None:
+    compression = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
     with warnings.catch_warnings(), zipfile.ZipFile(path, "w", compression) as file:
         warnings.simplefilter("ignore")
         for name, data in members:
             file.writestr(name, data)
 
 
-def saved(values: Any, **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, values, **options)
-    return buffer.getvalue()
-
-
 def state(text: bytes) -> tuple[str, bytes]:
-    return ("state.json.npy", saved(np.frombuffer(text, np.uint8)))
+    return ("state.json.npy", npy(np.frombuffer(text, np.uint8)))
 
 
 GOOD = state(b'{"step": 2, "state": {}}')
-WEIGHTS = saved(np.arange(12, dtype=np.float32).reshape(4, 3))
-CHECKPOINTS: dict[str, tuple[list[tuple[str, bytes]], int]] = {
-    "claim": (
-        [GOOD, ("a.npy", WEIGHTS.replace(b"(4, 3), }   ", b"(40000000, 3), }"[:12] + b"   "))],
-        zipfile.ZIP_STORED,
-    ),
-    "packed": ([GOOD, ("a.npy", saved(np.zeros(10**6)))], zipfile.ZIP_DEFLATED),
-    "pickle": ([GOOD, ("a.npy", saved(np.array([{}], object), allow_pickle=True))], zipfile.ZIP_STORED),
-    "twice": ([GOOD, ("a.npy", WEIGHTS), ("a.npy", WEIGHTS)], zipfile.ZIP_STORED),
-    "foreign": ([GOOD, ("../../a", WEIGHTS)], zipfile.ZIP_STORED),
-    "no state": ([("a.npy", WEIGHTS)], zipfile.ZIP_STORED),
-    "nested": ([state(b"[" * 100_000)], zipfile.ZIP_STORED),
-    "no step": ([state(b'{"step": "2", "state": {}}')], zipfile.ZIP_STORED),
-    "negative step": ([state(b'{"step": -2, "state": {}}')], zipfile.ZIP_STORED),
-    "infinite step": ([state(b'{"step": 1e999, "state": {}}')], zipfile.ZIP_STORED),
-    "no dictionary": ([state(b'{"step": 2, "state": []}')], zipfile.ZIP_STORED),
+WEIGHTS = npy(np.arange(12, dtype=np.float32).reshape(4, 3))
+CHECKPOINTS: dict[str, list[tuple[str, bytes]]] = {
+    "claim": [GOOD, ("a.npy", WEIGHTS.replace(b"(4, 3), }   ", b"(40000000, 3), }"[:12] + b"   "))],
+    "packed": [GOOD, ("a.npy", npy(np.zeros(10**6)))],
+    "pickle": [GOOD, ("a.npy", npy(np.array([{}], object), allow_pickle=True))],
+    "twice": [GOOD, ("a.npy", WEIGHTS), ("a.npy", WEIGHTS)],
+    "foreign": [GOOD, ("../../a", WEIGHTS)],
+    "no state": [("a.npy", WEIGHTS)],
+    "nested": [state(b"[" * 100_000)],
+    "no step": [state(b'{"step": "2", "state": {}}')],
+    "negative step": [state(b'{"step": -2, "state": {}}')],
+    "infinite step": [state(b'{"step": 1e999, "state": {}}')],
+    "no dictionary": [state(b'{"step": 2, "state": []}')],
 }
 
 
@@ -585,7 +546,7 @@ CHECKPOINTS: dict[str, tuple[list[tuple[str, bytes]], int]] = {
 def test_checkpoints_that_are_none_are_passed_over(kind: str, tmp_path: Path) -> None:
     make_run(tmp_path)
     run = runs.Run.open(tmp_path / "run")
-    archive(run.checkpoints_path / "step-0000002.npz", *CHECKPOINTS[kind])
+    archive(run.checkpoints_path / "step-0000002.npz", CHECKPOINTS[kind], packed=kind == "packed")
     checkpoint = warned("is a damaged checkpoint", run.load_latest_checkpoint)
     assert checkpoint.step == 1
 

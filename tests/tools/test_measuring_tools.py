@@ -120,7 +120,7 @@ def test_line_of_relative_residuals() -> None:
     ("tool", "flags", "message"),
     [
         (bench_library, "--gaussians 0", "--gaussians 0: expected at least 1"),
-        (bench_library, "--size 0x30", "--size 0x30: expected at least 1x1"),
+        (bench_library, "--size 0x30", "--size 0x30: expected a width and a height in pixels"),
         (bench_library, "--repeat 0", "--repeat 0: expected at least 1"),
         (bench_sort, "--max 9999", "--max 9999: expected at least 10000"),
         (bench_sort, "--repeat 0", "--repeat 0: expected at least 1"),

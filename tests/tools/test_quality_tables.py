@@ -91,7 +91,7 @@ def test_rows_of_other_code_or_settings_are_made_anew(
 
 
 def test_a_statement_that_bytes_are_the_same(
-    tmp_path: Path, fake: FakeClsplat, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    tmp_path: Path, fake: FakeClsplat, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     where = ["--kept", str(tmp_path / "rows.json"), "--why", "compared"]
     for code in ("first", "second", "third"):
@@ -102,8 +102,7 @@ def test_a_statement_that_bytes_are_the_same(
             Kept(tmp_path / "rows.json").say_same(Same("third", "second", "compared"))
         book_at(tmp_path, 1).results("growth", ENDS[0], ENDS)
     assert len(fake.calls) == 1
-    assert tables.run(["--same-as", "fourth", *where]) == 2
-    assert capsys.readouterr().err.endswith("rows.json has this digest\n")
+    refuses(r"rows\.json has this digest$", tables.run, ["--same-as", "fourth", *where])
 
 
 def test_the_digest_is_of_code_alone(tmp_path: Path) -> None:
@@ -174,13 +173,13 @@ def test_sizes_are_measured(tmp_path: Path, fake: FakeClsplat) -> None:
 
 
 def test_a_table_that_is_not_known(tmp_path: Path, capsys: Capture) -> None:
-    assert tables.run([str(tmp_path), "-o", str(tmp_path), "--only", "grwth"]) == 2
-    assert "--only grwth: no such table, expected some of growth" in capsys.readouterr().err
+    said = ran(capsys, quality, ["tables", str(tmp_path), "-o", str(tmp_path), "--only", "grwth"], status=2).err
+    assert said.startswith("quality tables: error: --only grwth: no such table, expected some of growth")
 
 
 def test_a_scene_that_is_missing_is_said(tmp_path: Path, capsys: Capture) -> None:
-    assert tables.run([str(tmp_path), "-o", str(tmp_path / "work"), "--only", "antialiasing", "--list"]) == 0
-    assert "lego is left out: no " in capsys.readouterr().err
+    where = [str(tmp_path), "-o", str(tmp_path / "work"), "--only", "antialiasing", "--list"]
+    assert "lego is left out: no " in ran(capsys, tables.run, where).err
 
 
 def test_only_the_rows_that_are_asked_for(tmp_path: Path, fake: FakeClsplat, capsys: Capture) -> None:
@@ -188,8 +187,8 @@ def test_only_the_rows_that_are_asked_for(tmp_path: Path, fake: FakeClsplat, cap
         (tmp_path / scene).mkdir()
     where = [str(tmp_path), "-o", str(tmp_path / "work"), "--only", "growth", "--seeds", "1"]
     where += ["--kept", str(tmp_path / "rows.json")]
-    assert tables.run([*where, "--rows", "fox mcmc,bonsai mcmc ???k"]) == 0
-    rows = [line.split(" | ")[0] for line in capsys.readouterr().out.splitlines()[4:] if line]
+    said = ran(capsys, tables.run, [*where, "--rows", "fox mcmc,bonsai mcmc ???k"]).out
+    rows = [line.split(" | ")[0] for line in said.splitlines()[4:] if line]
     assert rows == ["| fox mcmc", "| bonsai mcmc 290k"]
     trained = {row["row"] for row in json.loads((tmp_path / "rows.json").read_text())["rows"]}
     assert trained == {"fox default", "fox short", "fox mcmc", "bonsai mcmc 290k"}  # and what they are half of
@@ -197,8 +196,7 @@ def test_only_the_rows_that_are_asked_for(tmp_path: Path, fake: FakeClsplat, cap
     rows = json.loads((tmp_path / "rows.json").read_text())["rows"]
     (settings,) = (row["settings"] for row in rows if row["row"] == "sceaux_castle mcmc paper")
     assert settings[settings.index("--density.stop") + 1] == "500"
-    assert tables.run([*where, "--rows", "fax *"]) == 2
-    assert capsys.readouterr().err.endswith("--rows fax *: no such row; --list prints them\n")
+    refuses(r"--rows fax \*: no such row; --list prints them$", tables.run, [*where, "--rows", "fax *"])
 
 
 def test_experiments_take_the_words_of_their_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import kept
+from needs import require
 from systems import posix
 from tiny import CONFIG, cameras
 from viewer_browser import SLOW, choose, clsplat
@@ -26,6 +27,7 @@ from clsplat.rendering.renderer import Renderer
 from clsplat.shots import choose_shot
 from clsplat.viewer.pose import start_of
 
+require("viser")
 PAGE = {"width": 900, "height": 600}
 EXACT = re.compile(r"^\d+ x \d+, exact$")
 """The remark on an exact picture, which has fewer pixels than the page where the browser is slow."""

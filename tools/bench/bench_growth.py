@@ -18,6 +18,7 @@ from __future__ import annotations
 import statistics
 import sys
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from measuring import Result, machine, number, options_parser, parsed, require, show, sizes, tool
@@ -27,7 +28,7 @@ from clsplat.bench.workload import synthetic
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.progress import aligned
-from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
+from clsplat.rendering.rasterizer import Rasterizer
 from clsplat.stages.device_gaussians import upload_gaussians
 
 GAUSSIANS, WIDTH, HEIGHT = 200_000, 1024, 768
@@ -51,10 +52,7 @@ def measure(device: Device, count: int, width: int, height: int, repeat: int) ->
     rasterizer = Rasterizer(device)
     gaussians = upload_gaussians(device, subject.gaussians)
     background = upload(device, np.zeros(3, np.float32))
-
-    def draw() -> ForwardPass:
-        return rasterizer.forward(gaussians, subject.camera, background, backward=False)
-
+    draw = partial(rasterizer.forward, gaussians, subject.camera, background, backward=False)
     frames = [draw() for _ in range(2)]  # the first builds kernels and allocates memory
     ms = statistics.median(device.timed(draw)[1] for _ in range(repeat))
     pairs = frames[-1].listed.pairs.tile_keys.shape[0]

@@ -25,6 +25,7 @@ from measuring import Result, machine, number, options_parser, parsed, require, 
 
 from clsplat.bench.workload import Subject, synthetic
 from clsplat.camera import Camera
+from clsplat.cli.bench import parse_size
 from clsplat.device.buffers import upload
 from clsplat.device.context import Device, open_device
 from clsplat.library.rasterize import rasterize
@@ -36,12 +37,6 @@ from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 DEGREE = 3
 Call = tuple[str, Callable[[], Callable[[], object]]]
 """A name, and a function that prepares the call, untimed, and returns the function to time."""
-
-
-def size(text: str) -> tuple[int, int]:
-    """Width and height, from WxH."""
-    width, height = text.lower().split("x")
-    return int(width), int(height)
 
 
 def arrays_of(subject: Subject) -> dict[str, Any]:
@@ -68,9 +63,6 @@ def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]
     black = upload(device, np.zeros(3, np.float32))
     planes = upload(device, gradient_of(camera).transpose(2, 0, 1))
 
-    def forward() -> Callable[[], object]:
-        return lambda: renderer.render(subject.gaussians, camera)
-
     def finished(work: Callable[[], Any]) -> Any:
         found = work()
         device.finish()
@@ -82,10 +74,9 @@ def of_the_renderer(device: Device, subject: Subject) -> tuple[Call, Call, Call]
         frame = finished(draw)
         return lambda: finished(lambda: rasterizer.backward(gaussians, frame, planes, gradients))
 
-    def frame() -> Callable[[], object]:
-        return lambda: finished(draw)
-
-    return ("Renderer.render", forward), ("Rasterizer.forward", frame), ("Rasterizer.backward", backward)
+    render = partial(renderer.render, subject.gaussians, camera)
+    whole, frame = ("Renderer.render", lambda: render), ("Rasterizer.forward", lambda: partial(finished, draw))
+    return whole, frame, ("Rasterizer.backward", backward)
 
 
 def of_numpy(device: Device, subject: Subject) -> tuple[Call, Call, Call]:
@@ -129,10 +120,7 @@ def of_torch(device: Device, subject: Subject, *, packed: bool) -> tuple[Call, C
         images = call()[0]
         return lambda: images.backward(gradient)
 
-    def without() -> Any:
-        with torch.no_grad():
-            return call()
-
+    without = torch.no_grad()(call)
     title = f"torch.rasterization, packed={packed}"
     return (f"{title}, no_grad", lambda: without), (title, lambda: call), (f"{title}, backward", backward)
 
@@ -169,11 +157,12 @@ def main(arguments: Sequence[str]) -> int:
     """Run the measurement and print its results."""
     parser = options_parser(__doc__, 25, plot=False)
     parser.add_argument("--gaussians", metavar="N", type=number, default=100_000)
-    parser.add_argument("--size", metavar="WxH", type=size, default=(640, 480))
+    parser.add_argument("--size", metavar="WxH", default="640x480")
     options = parsed(parser, arguments)
     require(options.gaussians >= 1, f"--gaussians {options.gaussians}: expected at least 1")
-    require(min(options.size) >= 1, f"--size {options.size[0]}x{options.size[1]}: expected at least 1x1")
-    device, subject = open_device(options.device), synthetic(options.gaussians, *options.size)
+    size = parse_size(options.size)
+    assert size is not None
+    device, subject = open_device(options.device), synthetic(options.gaussians, *size)
     groups = [of_the_renderer(device, subject), of_numpy(device, subject)]
     try:
         groups += [of_torch(device, subject, packed=packed) for packed in (False, True)]
@@ -183,8 +172,8 @@ def main(arguments: Sequence[str]) -> int:
     result = {
         **machine(device, options.repeat),
         "gaussians": options.gaussians,
-        "width": options.size[0],
-        "height": options.size[1],
+        "width": size[0],
+        "height": size[1],
         "rows": rows,
     }
     lines = [("call", "ms", "ratio"), *((row["call"], f"{row['ms']:.1f}", f"{row['ratio']:.2f}") for row in rows)]

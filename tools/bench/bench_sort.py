@@ -19,6 +19,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,17 +68,8 @@ def random_pairs(n: int) -> tuple[UInt32, UInt32]:
 def keys_case(device: Device, n: int) -> Case:
     """The work of one sort of keys."""
     keys, work = random_keys(n), Workspace(device)
-    on_device = upload(device, keys)
-
-    def ours() -> Order:
-        order: Order = sort(device, work, "keys", on_device, DEPTH_BITS)[1].get()
-        return order
-
-    return (
-        lambda: sort(device, work, "keys", on_device, DEPTH_BITS),
-        ours,
-        lambda: np.argsort(keys, kind="stable"),
-    )
+    once = partial(sort, device, work, "keys", upload(device, keys), DEPTH_BITS)
+    return once, once()[1].get, partial(np.argsort, keys, kind="stable")
 
 
 def pairs_case(device: Device, n: int) -> Case:
@@ -100,7 +92,7 @@ def pairs_case(device: Device, n: int) -> Case:
         order: Order = gaussian_from_rank[rank] * SIDE**2 + slot
         return order
 
-    return both, ours, lambda: np.argsort(keys, kind="stable")
+    return both, ours, partial(np.argsort, keys, kind="stable")
 
 
 CASES: dict[str, Callable[[Device, int], Case]] = {"keys": keys_case, "pairs": pairs_case}

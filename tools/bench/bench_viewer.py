@@ -10,22 +10,22 @@ The time until viser's page has its canvas, before it connects, is printed too. 
 from __future__ import annotations
 
 import os
-import re
-import shutil
 import statistics
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
+
 import measuring
 import numpy as np
+from needs import chromium_path
+from scenes import make_gaussians
+from viewer_browser import clsplat
 
 from clsplat.device.context import open_device
-from clsplat.errors import ClsplatError
 from clsplat.gaussians import Gaussians
 from clsplat.runs.run import model_file
 
@@ -67,9 +67,7 @@ def made_up(count: int) -> Gaussians:
     sh = rng.normal(0, 0.05, (count, 16, 3))
     sh[:, 0] = rng.uniform(-1.5, 1.5, (count, 3))
     sizes = np.log(rng.uniform(0.3, 1.5, (count, 3)) * count ** (-1 / 3))
-    arrays = (means, rng.normal(size=(count, 4)), sizes, rng.normal(0, 2, count), sh)
-    places, turns, logs, logits, harmonics = (np.ascontiguousarray(each, np.float32) for each in arrays)
-    return Gaussians(places, turns, logs, logits, harmonics)
+    return make_gaussians(means, rng.normal(size=(count, 4)), sizes, 1 / (1 + np.exp(-rng.normal(0, 2, count))), sh)
 
 
 def processor_seconds(process: int) -> float:
@@ -86,27 +84,6 @@ def processor_seconds(process: int) -> float:
     while more := {child for child, parent in parents.items() if parent in family} - family:
         family |= more
     return sum(used.get(each, 0.0) for each in family)
-
-
-@contextmanager
-def serving(model: Path, device: str | None) -> Iterator[tuple[str, int]]:
-    """Start `clsplat view` for the model; yields its address and its process."""
-    command = [sys.executable, "-m", "clsplat", "view", str(model), "--port", "0"]
-    process = subprocess.Popen(
-        command + (["--device", device] if device else []), stderr=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL
-    )
-    assert process.stderr is not None
-    try:
-        lines = []
-        for line in process.stderr:
-            lines.append(line)
-            if found := re.search(r"viewer at (http://\S+);", line):
-                yield found[1], process.pid
-                return
-        raise ClsplatError(f"clsplat view ended: {' '.join(lines)}")
-    finally:
-        process.terminate()
-        process.communicate(timeout=30)
 
 
 def visit(browser: Any, url: str, server: int) -> dict[str, float]:
@@ -145,12 +122,13 @@ def bench(model: Path, device: str | None, repeat: int, flags: tuple[str, ...]) 
     """Measurements of `repeat` visits to the page, after a warm-up visit."""
     from playwright.sync_api import sync_playwright
 
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    path = chromium_path()
     measuring.require(path is not None, "no chromium on the path, expected Debian's: apt install chromium")
-    with serving(model, device) as (url, server), sync_playwright() as playwright:
+    words = ("view", str(model), *(("--device", device) if device else ()))
+    with clsplat(*words) as (url, server), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--use-gl=angle", *flags])
-        visit(browser, url, server)  # warms up the browser
-        found = [visit(browser, url, server) for _ in range(repeat)]
+        visit(browser, url, server.pid)  # warms up the browser
+        found = [visit(browser, url, server.pid) for _ in range(repeat)]
         browser.close()
     return found
 

@@ -86,7 +86,8 @@ def main(arguments: list[str]) -> int:
         pairs = [_written(path, again, spec) for _ in range(options.repeats)]
         writes, of_writer = ([pair[which] for pair in pairs] for which in (0, 1))
         same = path.read_bytes() == again.read_bytes()
-        data = _deep_data(path)
+        image = oiio.ImageBuf(str(path))
+        data = image.deepdata()
         samples = sum(data.samples(pixel) for pixel in range(data.pixels))
     total, kernel, write = map(statistics.median, (totals, kernels, writes))
     print(
@@ -98,19 +99,10 @@ def main(arguments: list[str]) -> int:
     return int(not same)
 
 
-def _deep_data(path: Path) -> Any:
-    """The samples of a file."""
-    source = oiio.ImageInput.open(str(path))
-    assert source is not None, oiio.geterror()
-    data = source.read_native_deep_image()
-    assert data is not None, source.geterror()
-    source.close()
-    return data
-
-
 def _written(path: Path, again: Path, spec: Any) -> tuple[float, float]:
     """Wall and CPU seconds of writing the samples of a file."""
-    data = _deep_data(path)
+    image = oiio.ImageBuf(str(path))
+    data = image.deepdata()
     start, used = time.monotonic(), time.process_time()
     target = oiio.ImageOutput.create(str(again))
     assert target is not None, oiio.geterror()

@@ -38,6 +38,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / part) for part in ("tests/support", ".")]
 
 import numpy as np  # noqa: E402
+from compare import relative_error  # noqa: E402
 from processor import processor  # noqa: E402
 
 SUBGROUPED = ("1x32s", "1x64s", "1x128s", "1x256s")
@@ -263,9 +264,7 @@ def child(index: int, shape: str, arrays: Path, scene: Path | None) -> None:
 
 def _difference(got: Any, wanted: Any) -> float:
     """The largest relative difference, in norm, of all arrays."""
-    return max(
-        float(np.linalg.norm(got[key].astype(np.float64) - wanted[key]) / np.linalg.norm(wanted[key])) for key in wanted
-    )
+    return max(relative_error(got[key], wanted[key]) for key in wanted)
 
 
 def problems(rows: list[Row]) -> list[str]:
@@ -288,22 +287,19 @@ def problems(rows: list[Row]) -> list[str]:
         if row.frame != first.frame:
             found.append(f"{at}: the frame is {row.frame}, on {first.driver}, {first.shape} it is {first.frame}")
         found += other_channels(row, first)
-        other = by_shape.setdefault(row.shape.removesuffix("s"), row)
-        if row.gradient != other.gradient:
-            found.append(
-                f"{at}: the gradient is {row.gradient}, on {other.driver} in that shape it is {other.gradient}"
-            )
         if not row.difference <= GRADIENT_BOUND:
-            found.append(
-                f"{at}: the gradient is {row.difference:.1e} from that of {first.shape}, over {GRADIENT_BOUND:g}"
-            )
+            off = f"{row.difference:.1e} from that of {first.shape}, over {GRADIENT_BOUND:g}"
+            found.append(f"{at}: the gradient is {off}")
+        same_shape = [("gradient", by_shape.setdefault(row.shape.removesuffix("s"), row))]
+        same_shape += [("model", trained.setdefault(row.shape, row))] if row.model is not None else []
+        for what, other in same_shape:
+            got, wanted = getattr(row, what), getattr(other, what)
+            if got != wanted:
+                found.append(f"{at}: the {what} is {got}, on {other.driver} in that shape it is {wanted}")
         if row.model is None:
             continue
         if not row.repeats:
             found.append(f"{at}: two trainings gave two models")
-        other = trained.setdefault(row.shape, row)
-        if row.model != other.model:
-            found.append(f"{at}: the model is {row.model}, on {other.driver} in that shape it is {other.model}")
         reference = next(iter(trained.values()))
         if not abs(row.psnr - reference.psnr) <= PSNR_BOUND:
             found.append(f"{at}: the model has {row.psnr:.2f} dB, that of {reference.shape} {reference.psnr:.2f} dB")

@@ -36,6 +36,8 @@ from typing import Any
 from opencl_drivers import BESIDE, SYSTEM_VENDORS
 from processor import has_avx512, processor
 
+from clsplat.progress import aligned
+
 ROOT = Path(__file__).resolve().parents[2]
 HOOKS = ROOT / "tools" / "ci" / "hooks"
 PYTHON = sys.executable
@@ -93,6 +95,9 @@ class Step:
     without: str = "Traceback"
 
 
+Drivers = tuple[tuple[str, str], ...]
+
+
 @dataclass(frozen=True)
 class Machine:
     """A row of the table. drivers: names and contents of the .icd files. pypi: True to keep PyPI's PoCL visible.
@@ -102,7 +107,7 @@ class Machine:
     name: str
     purpose: str
     steps: tuple[Step, ...] = ()
-    drivers: tuple[tuple[str, str], ...] = ()
+    drivers: Drivers = ()
     pypi: bool = False
     variables: tuple[tuple[str, str], ...] = ()
     wrap: tuple[str, ...] = ()
@@ -312,6 +317,11 @@ def machines(found: Found) -> list[Machine]:
     debian, intel, rusticl = ((("debian", found.debian),), (("intel", found.intel),), (("rusticl", found.rusticl),))
     no_avx512 = "" if found.avx512 else "this processor has no AVX-512"
 
+    def alone(name: str, purpose: str, drivers: Drivers, missing: str, **variables: str) -> Machine:
+        """A machine with these drivers alone; without any it has what pip brings."""
+        own = tuple(variables.items())
+        return Machine(name, purpose, usual, drivers, pypi=not drivers, variables=own, missing=missing)
+
     def at_home(name: str, purpose: str, *steps: Step, **changes: Any) -> Machine:
         """A machine with what pip brings, for another user or in another place. steps: those before the smoke tests."""
         tests = (short_test(), *steps, elsewhere)
@@ -322,41 +332,17 @@ def machines(found: Found) -> list[Machine]:
         (name, path) for name, path in (*debian, *intel, *rusticl) if path
     )  # other rows report what is missing here
     return [
-        Machine("pypi-pocl", "what pip brings, alone", usual, pypi=True, missing=no_pypi),
-        Machine(
-            "pypi-pocl-1-thread",
-            "the same, with one thread",
-            usual,
-            pypi=True,
-            variables=(("POCL_MAX_PTHREAD_COUNT", "1"),),
-            missing=no_pypi,
-        ),
+        alone("pypi-pocl", "what pip brings, alone", (), no_pypi),
+        alone("pypi-pocl-1-thread", "the same, with one thread", (), no_pypi, POCL_MAX_PTHREAD_COUNT="1"),
         emulated(found, no_pypi),
-        Machine("debian-pocl", "the distribution's PoCL", usual, debian, missing=no_debian),
-        *(
-            Machine(
-                f"debian-pocl-{library}",
-                f"the same, its built-ins for {library.upper()}",
-                usual,
-                debian,
-                variables=(("POCL_KERNELLIB_NAME", library),),
-                missing=no_debian,
-            )
-            for library in ("sse2", "avx2")
-        ),
-        Machine("intel", "Intel's runtime", usual, intel, missing=no_intel),
-        *(
-            Machine(
-                f"intel-{target}",
-                f"the same, for {processor}",
-                usual,
-                intel,
-                variables=(("CL_CONFIG_CPU_TARGET_ARCH", target),),
-                missing=no_intel or (no_avx512 if target == "skx" else ""),
-            )
-            for target, processor in (("corei7", "SSE4.2"), ("core-avx2", "AVX2"), ("skx", "AVX-512"))
-        ),
-        Machine("rusticl", "Mesa's Rusticl on llvmpipe, shaped as a GPU", usual, rusticl, missing=no_rusticl),
+        alone("debian-pocl", "the distribution's PoCL", debian, no_debian),
+        alone("debian-pocl-sse2", "the same, its built-ins for SSE2", debian, no_debian, POCL_KERNELLIB_NAME="sse2"),
+        alone("debian-pocl-avx2", "the same, its built-ins for AVX2", debian, no_debian, POCL_KERNELLIB_NAME="avx2"),
+        alone("intel", "Intel's runtime", intel, no_intel),
+        alone("intel-corei7", "the same, for SSE4.2", intel, no_intel, CL_CONFIG_CPU_TARGET_ARCH="corei7"),
+        alone("intel-core-avx2", "the same, for AVX2", intel, no_intel, CL_CONFIG_CPU_TARGET_ARCH="core-avx2"),
+        alone("intel-skx", "the same, for AVX-512", intel, no_intel or no_avx512, CL_CONFIG_CPU_TARGET_ARCH="skx"),
+        alone("rusticl", "Mesa's Rusticl on llvmpipe, shaped as a GPU", rusticl, no_rusticl),
         Machine(
             "all",
             f"all of them together: {', '.join(['pypi', *(name for name, _ in every)])}",
@@ -519,10 +505,7 @@ def table(results: Sequence[Result], *, markdown: bool = False) -> str:
         rows[1:] = [(f"`{row[0]}`", *row[1:]) for row in rows[1:]]
         rows.insert(1, ("---",) * 4)
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    return "\n".join(aligned(rows, left=range(4)))
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -15,14 +15,18 @@ import json
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from clsplat.device.context import Device
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
+
+from golden_frames import checksums
+from tiny import loss_curve, write_scene
+
+from clsplat.device.context import Device, open_device
+from clsplat.scenes.loading import load_scene
+from clsplat.selftest.worker import run, shape_label
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT / "tests" / "support"), str(ROOT)]
-
 GOLDEN = ROOT / "tests" / "golden"
 
 
@@ -40,11 +44,6 @@ def main(names: list[str]) -> int:
 
 def write_loss_curve(path: Path) -> None:
     """Train and write the losses."""
-    from tiny import loss_curve, write_scene
-
-    from clsplat.device.context import open_device
-    from clsplat.scenes.loading import load_scene
-
     device = open_device()
     with tempfile.TemporaryDirectory() as folder:
         scene = load_scene(write_scene(Path(folder) / "scene"))
@@ -55,10 +54,6 @@ def write_loss_curve(path: Path) -> None:
 
 def write_frames(path: Path) -> None:
     """Render and write the checksums."""
-    from golden_frames import checksums
-
-    from clsplat.device.context import open_device
-
     device = open_device()
     sums = checksums(device)
     _write(path, device, {"checksums": sums})
@@ -76,9 +71,6 @@ ORDERED = ("/blend_grad", "/values")
 
 def write_selftest(path: Path) -> None:
     """Run the self-test in every shape and write the digests: one for all shapes, but one per shape in ORDERED."""
-    from clsplat.device.context import open_device
-    from clsplat.selftest.worker import run, shape_label
-
     device = open_device()
     by_shape: dict[str, dict[str, str]] = {}
     for label in SHAPES:

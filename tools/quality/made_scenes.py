@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import json
-import shutil
-import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -253,17 +251,23 @@ def with_block(scene: Path, folder: Path, seed: int) -> Path:
 
 
 def without_colours(scene: Path, folder: Path) -> Path:
-    """Copy a COLMAP scene with grey points, and link its photographs."""
-    copied = shutil.copytree(scene / "sparse" / "0", folder / "sparse" / "0", dirs_exist_ok=True) / "points3D.bin"
-    data = bytearray(copied.read_bytes())
-    (count,), place = struct.unpack_from("<Q", data), 8
-    for _ in range(count):
-        (track,) = struct.unpack_from("<Q", data, place + 43)
-        data[place + 32 : place + 35] = bytes([128, 128, 128])
-        place += 51 + 8 * track
-    copied.write_bytes(data)
-    if not (folder / "images").exists():
+    """Write a COLMAP scene with grey points. Its photographs are linked."""
+
+    def grey(model: Any) -> None:
+        for point in model.points3D.values():
+            point.color = np.full(3, 128, np.uint8)
+
+    return remodelled(scene, folder, grey)
+
+
+def remodelled(scene: Path, folder: Path, change: Callable[[Any], None]) -> Path:
+    """Write a COLMAP scene with a changed model, unless it is there. Its photographs are linked."""
+    if not folder.exists():
+        model = pycolmap.Reconstruction(scene / "sparse" / "0")
+        change(model)
+        (folder / "sparse" / "0").mkdir(parents=True)
         (folder / "images").symlink_to((scene / "images").resolve())
+        model.write_binary(folder / "sparse" / "0")
     return folder
 
 
@@ -288,14 +292,10 @@ def in_units(scene: Scene, factor: float, offset: Float64) -> Scene:
 
 def rescaled(folder: Path, factor: float) -> Path:
     """The folder of a COLMAP scene whose world is scaled by factor. Its photographs are linked."""
-    scaled = folder.with_name(f"{folder.name}-times-{factor:g}")
-    if not scaled.exists():
-        model = pycolmap.Reconstruction(folder / "sparse" / "0")
-        model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
-        (scaled / "sparse" / "0").mkdir(parents=True)
-        (scaled / "images").symlink_to((folder / "images").resolve())
-        model.write_binary(scaled / "sparse" / "0")
-    return scaled
+    larger = pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3))
+    return remodelled(
+        folder, folder.with_name(f"{folder.name}-times-{factor:g}"), lambda model: model.transform(larger)
+    )
 
 
 def disturbed(scene: Scene, degrees: float, percent: float, seed: int) -> Scene:

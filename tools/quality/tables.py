@@ -32,6 +32,7 @@ from statistics import mean
 
 from quality.kept_rows import Finished, Kept, Same, code_digest, device_of
 
+from clsplat.errors import InputError
 from clsplat.files.atomic import atomic_write
 from clsplat.scenes.analysis.recommendations import SETTINGS_BY_FINDING
 
@@ -246,17 +247,17 @@ def commit() -> str:
 
 
 def say_same(kept: Kept, was: str, why: str) -> int:
-    """Store the statement that a digest's rows hold for the current code. Returns 2 if there are no such rows."""
+    """Store the statement that a digest's rows hold for the current code. Raises InputError if there are no such
+    rows."""
     for mcmc in (False, True):
         if kept.has(was, mcmc=mcmc):
             kept.say_same(Same(code_digest(ROOT, mcmc=mcmc), was, why))
             return 0
-    print(f"quality tables: --same-as {was}: no row of {kept.path} has this digest", file=sys.stderr)
-    return 2
+    raise InputError(f"--same-as {was}: no row of {kept.path} has this digest")
 
 
 def run(arguments: list[str]) -> int:
-    """Make the tables and print them. Returns 2 for unknown tables or missing scenes."""
+    """Make the tables and print them. Raises InputError for unknown tables or rows."""
     names = [*TRAININGS, *EXPERIMENTS]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenes", type=Path, nargs="?")
@@ -279,14 +280,11 @@ def run(arguments: list[str]) -> int:
         parser.error("expected a folder of scenes, and -o FOLDER")
     wanted = given.only.split(",")
     if unknown := [name for name in wanted if name not in names]:
-        known = ", ".join(names)
-        print(f"quality tables: --only {unknown[0]}: no such table, expected some of {known}", file=sys.stderr)
-        return 2
+        raise InputError(f"--only {unknown[0]}: no such table, expected some of {', '.join(names)}")
     patterns = given.rows.split(",")
     every = [row.name for name in wanted if name in TRAININGS for row in TRAININGS[name]()]
     if strange := [each for each in patterns if each != "*" and not fnmatch.filter(every, each)]:
-        print(f"quality tables: --rows {strange[0]}: no such row; --list prints them", file=sys.stderr)
-        return 2
+        raise InputError(f"--rows {strange[0]}: no such row; --list prints them")
     text = ""
     folder = given.output / f"{code_digest(ROOT, mcmc=True)}-{given.iterations}-{given.resolution or 'full'}"
     size = (given.iterations, given.resolution)

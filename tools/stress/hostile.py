@@ -18,12 +18,15 @@ from typing import Any
 
 import numpy as np
 from hostile_meshes import make_obj, make_usd_mesh, read_volume
+from ksplats import ksplat
+from models import random_gaussians
 from other_pictures import KINDS, other_picture
+from pictures import write_pixels
 from spoilers import MOST_BYTES, SPOILERS, spoil_place
 
 from clsplat.camera import Camera
 from clsplat.config.training import TrainConfig
-from clsplat.gaussians import Gaussians, group_shapes
+from clsplat.gaussians import group_shapes
 from clsplat.images.reading import image_size, read_image
 from clsplat.images.writing import write_image
 from clsplat.models import formats
@@ -57,17 +60,10 @@ class Reader:
 # Valid files
 
 
-def _gaussians() -> Gaussians:
-    rng = np.random.default_rng(0)
-    shapes = ((7, 3), (7, 4), (7, 3), (7,), (7, 4, 3))
-    means, quaternions, sizes, logits, sh = (rng.standard_normal(shape).astype(np.float32) for shape in shapes)
-    return Gaussians(means, quaternions, sizes, logits, sh)
-
-
 def make_ply(folder: Path, form: str = "binary_little_endian") -> None:
     """model.ply, SH degree 1, 7 Gaussians."""
     path = folder / "model.ply"
-    ply.write(path, _gaussians())
+    ply.write(path, random_gaussians(7, 1))
     head, mark, body = path.read_bytes().partition(b"end_header\n")
     head = head.replace(b"binary_little_endian", form.encode())
     table = np.frombuffer(body, "<f4").reshape(7, -1)
@@ -92,7 +88,7 @@ def make_cloud(folder: Path, form: str) -> None:
 
 def make_model(folder: Path, name: str, **options: Any) -> None:
     """A model file of another format; options of its writer."""
-    formats.save(folder / name, _gaussians(), **options)
+    formats.save(folder / name, random_gaussians(7, 1), **options)
 
 
 def make_zip(folder: Path, name: str) -> None:
@@ -105,21 +101,8 @@ def make_zip(folder: Path, name: str) -> None:
 
 
 def make_ksplat(folder: Path) -> None:
-    """model.ksplat of level 1: one section, a full bucket of 4 and one of 3, SH of degree 1."""
-    header, section = bytearray(4096), bytearray(1024)
-    struct.pack_into("<BBxx4IH", header, 0, 0, 1, 1, 1, 7, 7, 1)
-    struct.pack_into("<4IfHxxI4xIIH", section, 0, 7, 7, 4, 2, 5.0, 12, 32767, 1, 1, 1)
-    rng = np.random.default_rng(0)
-    rows = b"".join(
-        rng.integers(0, 65536, 3).astype("<u2").tobytes()
-        + rng.random(7).astype("<f2").tobytes()
-        + bytes([10, 20, 30, 200])
-        + rng.random(9).astype("<f2").tobytes()
-        for _ in range(7)
-    )
-    (folder / "model.ksplat").write_bytes(
-        bytes(header) + bytes(section) + struct.pack("<I6f", 3, *range(6)) + rows  # lengths, centres, Gaussians
-    )
+    """model.ksplat of level 1: one section, a full bucket of 4 and two others, SH of degree 1."""
+    (folder / "model.ksplat").write_bytes(ksplat(random_gaussians(7, 1), 1, (7,), bucket=4)[0])
 
 
 PICTURES = ("a.png", "b.png", "sub/c.png")
@@ -136,12 +119,13 @@ def make_colmap_text(folder: Path) -> None:
     sparse.mkdir(parents=True)
     cameras = "# comment\n1 PINHOLE 12 9 11.5 11 6 4.5\n2 OPENCV 12 9 11.5 11 6 4.5 0.01 -0.002 0.001 0.0005\n"
     (sparse / "cameras.txt").write_text(cameras)
+    seen = f"1.5 2.5 -1 {' '.join(f'3.5 {i}.5 {i + 1}' for i in range(6))}"
     lines = [
-        f"{index + 1} 1 0 0 0 {0.1 * index} 0 {2 + index} {1 + index % 2} {name}\n1.5 2.5 -1 3.5 4.5 1\n"
+        f"{index + 1} 1 0 0 0 {0.1 * index} 0 {2 + index} {1 + index % 2} {name}\n{seen}\n"
         for index, name in enumerate(PICTURES)
     ]
     (sparse / "images.txt").write_text("".join(lines))
-    points = "".join(f"{i + 1} {0.1 * i} 0.2 {3 + i} 10 200 30 0.5 1 0 2 1\n" for i in range(6))
+    points = "".join(f"{i + 1} {0.1 * i} 0.2 {3 + i} 10 200 30 0.5 1 {i + 1} 2 {i + 1} 3 {i + 1}\n" for i in range(6))
     (sparse / "points3D.txt").write_text(points)
     for name in PICTURES:
         _picture(folder / "images" / name)
@@ -149,22 +133,13 @@ def make_colmap_text(folder: Path) -> None:
 
 def make_colmap_binary(folder: Path) -> None:
     """The same, binary."""
+    import pycolmap
+
     make_colmap_text(folder)
     sparse = folder / "sparse" / "0"
+    pycolmap.Reconstruction(sparse).write_binary(sparse)
     for path in sparse.glob("*.txt"):
         path.unlink()
-    cameras = struct.pack("<Q", 2) + struct.pack("<IiQQ4d", 1, 1, 12, 9, 11.5, 11, 6, 4.5)
-    cameras += struct.pack("<IiQQ8d", 2, 4, 12, 9, 11.5, 11, 6, 4.5, 0.01, -0.002, 0.001, 0.0005)
-    (sparse / "cameras.bin").write_bytes(cameras)
-    images = struct.pack("<Q", 3)
-    for index, name in enumerate(PICTURES):
-        images += struct.pack("<I7dI", index + 1, 1, 0, 0, 0, 0.1 * index, 0, 2 + index, 1 + index % 2)
-        images += name.encode() + b"\0" + struct.pack("<Q2dq", 1, 1.5, 2.5, -1)
-    (sparse / "images.bin").write_bytes(images)
-    points = struct.pack("<Q", 6)
-    for i in range(6):
-        points += struct.pack("<Q3d3BdQ2i", i + 1, 0.1 * i, 0.2, 3 + i, 10, 200, 30, 0.5, 1, 1, 0)
-    (sparse / "points3D.bin").write_bytes(points)
 
 
 def _frames(names: tuple[str, ...]) -> list[dict[str, Any]]:
@@ -243,15 +218,9 @@ FORMATS = ("png", "jpg", "exr", "tif", "bmp", "hdr", "tga", "ppm", "webp")
 
 def make_image(folder: Path, extension: str) -> None:
     """One picture, with an EXIF orientation where the format has it."""
-    import OpenImageIO as oiio  # as clsplat.images.reading writes PNG and EXR alone
-
     pixels = np.random.default_rng(2).random((19, 23, 3)).astype(np.float32)
-    spec = oiio.ImageSpec(23, 19, 3, oiio.FLOAT if extension in ("exr", "hdr") else oiio.UINT8)
-    spec.attribute("Orientation", 6)
-    path = folder / f"picture.{extension}"
-    output = oiio.ImageOutput.create(str(path))
-    if output is None or not output.open(str(path), spec) or not output.write_image(pixels) or not output.close():
-        raise RuntimeError(f"{path}: cannot be written: {oiio.geterror()}")
+    kind = "float" if extension in ("exr", "hdr") else "uint8"
+    write_pixels(folder / f"picture.{extension}", pixels, kind, {"Orientation": 6})
 
 
 def make_other_image(folder: Path, kind: str) -> None:

@@ -53,6 +53,11 @@ class Verb:
     ready: str
     writes: bool = True
 
+    @property
+    def in_a_run(self) -> bool:
+        """True if it works with the finished run."""
+        return "{out}/run" in self.words and self.name != "train"
+
 
 TRAIN = " ".join(["train {scene} -o {out}/run --iterations", str(LONG), *(word or "''" for word in TRAINING)])
 VERBS = (
@@ -88,7 +93,6 @@ sys.exit(main())
 """The command line, which says in a file that it is at work."""
 SIGNALS = {"SIGINT": 1, "SIGINT twice": 2, "SIGTERM": 1, "SIGHUP": 1}
 STREAMS = (">&-", "2>&-", "| head -c 0", "2>&1 | head -c 0")
-EVENTS = (*SIGNALS, "full disk", *STREAMS, "second process")
 TITLES = {
     "SIGINT": "Ctrl-C (SIGINT) in the middle of the work",
     "SIGINT twice": "Ctrl-C twice, a twentieth of a second apart",
@@ -101,6 +105,7 @@ TITLES = {
     "2>&1 | head -c 0": "A reader of both that has gone: `2>&1 | head -c 0`",
     "second process": "Another process at work in the same folder: a training in the run, else the same verb",
 }
+EVENTS = tuple(TITLES)
 
 
 @dataclass
@@ -140,12 +145,13 @@ class Bench:
         if done.returncode:
             raise SystemExit(f"{' '.join(words)}: {done.stderr}")
 
-    def words(self, verb: Verb, out: Path) -> list[str]:
-        """The call, with {out}, where the finished run lies for verbs that write into one."""
-        if "{out}/run" in verb.words and verb.name != "train":
+    def words(self, verb: Verb, out: Path, *, ends: bool = False) -> list[str]:
+        """The call, with {out}, where the finished run lies for verbs that write into one. ends: a training does so
+        soon, in which it writes most."""
+        if verb.in_a_run:
             shutil.copytree(self.folder / "run", out / "run")
         words = verb.words.format(out=out, **self.names).split(" ")
-        return ["" if word == "''" else word for word in words]
+        return [{"''": "", str(LONG): str(SHORT if ends else LONG)}.get(word, word) for word in words]
 
 
 def command(words: Sequence[str], verb: Verb | None = None, marker: Path | None = None) -> list[str]:
@@ -269,12 +275,9 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
         with fresh(bench.folder) as out, open("/dev/full", "w") as full:
             process = start(verb, bench.words(verb, out), out, stdout=full)
             return result_of(verb, "full disk", finish(verb, process, out), out, bench.names)
-    inside = "{out}/run" in verb.words and verb.name != "train"
-    before = sum(path.stat().st_size + 4096 for path in (bench.folder / "run").rglob("*")) if inside else 0
+    before = sum(path.stat().st_size + 4096 for path in (bench.folder / "run").rglob("*")) if verb.in_a_run else 0
     with full_disk(bench.folder, before) as (out, limit):
-        words = bench.words(verb, out)
-        if verb.name == "train":  # to its end, in which it writes most
-            words[words.index(str(LONG))] = str(SHORT)
+        words = bench.words(verb, out, ends=True)
         left = FULL // 4 if verb.ready.startswith("/") else 0  # of those some find out in the middle of the work
         if limit is None:
             with suppress(OSError), open(out / "filler", "wb", buffering=0) as filler:
@@ -285,9 +288,7 @@ def on_a_full_disk(bench: Bench, verb: Verb) -> Outcome:
 def with_a_stream(bench: Bench, verb: Verb, event: str) -> Outcome:
     """One that is closed, or a pipe whose reader has gone, as by a shell."""
     with fresh(bench.folder) as out:
-        words = bench.words(verb, out)
-        if verb.name == "train":
-            words[words.index(str(LONG))] = str(SHORT)
+        words = bench.words(verb, out, ends=True)
         said = out / "said"
         line = '"$@" ' + {">&-": ">&- 2>said", "2>&-": ">said 2>&-"}.get(event, "")
         if event.endswith("head -c 0"):
@@ -309,7 +310,7 @@ def beside_another(bench: Bench, verb: Verb) -> Outcome:
     with fresh(bench.folder) as out:
         words = bench.words(verb, out)
         first, ready = words, verb
-        if "{out}/run" in verb.words and verb.name != "train":
+        if verb.in_a_run:
             resumed = ["train", "-o", str(out / "run"), "--resume", "--iterations", str(LONG)]
             first, ready = resumed, Verb("train", TRAIN, "/run/.clsplat-lock")
         other = start(ready, first, out, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -25,43 +25,35 @@ def _cut_out() -> Image.Image:
     return picture
 
 
-def _palette() -> Image.Image:
-    return colours().quantize(64)
-
-
-def _grey() -> Image.Image:
-    return colours().convert("L")
-
-
 def _more() -> dict[str, Any]:
     """A second frame, that is another picture."""
     return {"save_all": True, "append_images": [colours().rotate(180)]}
 
 
 KINDS: dict[str, tuple[str, Callable[[], Image.Image], Callable[[], dict[str, Any]]]] = {
-    "gif": ("GIF", _palette, dict),
-    "gif-grey": ("GIF", _grey, dict),
-    "gif-animated": ("GIF", _palette, _more),
+    "gif": ("GIF", lambda: colours().quantize(64), dict),
+    "gif-grey": ("GIF", lambda: colours().convert("L"), dict),
+    "gif-animated": ("GIF", lambda: colours().quantize(64), _more),
     "gif-transparent": ("GIF", _cut_out, dict),
     "webp": ("WEBP", colours, lambda: {"lossless": True}),
     "webp-animated": ("WEBP", colours, lambda: {"lossless": True, **_more()}),
     "webp-alpha": ("WEBP", _cut_out, lambda: {"lossless": True, "exact": True}),
     "bmp": ("BMP", colours, dict),
-    "bmp-palette": ("BMP", _palette, dict),
-    "tiff-palette": ("TIFF", _palette, dict),
-    "tiff-grey": ("TIFF", _grey, dict),
-    "tiff-bits": ("TIFF", lambda: _grey().convert("1"), dict),
+    "bmp-palette": ("BMP", lambda: colours().quantize(64), dict),
+    "tiff-palette": ("TIFF", lambda: colours().quantize(64), dict),
+    "tiff-grey": ("TIFF", lambda: colours().convert("L"), dict),
+    "tiff-bits": ("TIFF", lambda: colours().convert("L").convert("1"), dict),
     "tiff-16": ("TIFF", lambda: Image.fromarray((np.mgrid[:HEIGHT, :WIDTH][1] * 2000).astype(np.uint16)), dict),
     "tiff-alpha": ("TIFF", _cut_out, dict),
     "tiff-cmyk": ("TIFF", lambda: colours().convert("CMYK"), dict),
     "tiff-pages": ("TIFF", colours, _more),
     "jpeg": ("JPEG", colours, lambda: {"quality": 95}),
-    "jpeg-grey": ("JPEG", _grey, lambda: {"quality": 95}),
+    "jpeg-grey": ("JPEG", lambda: colours().convert("L"), lambda: {"quality": 95}),
     "jpeg-cmyk": ("JPEG", lambda: colours().convert("CMYK"), lambda: {"quality": 95}),
     "jpeg-2000": ("JPEG2000", colours, dict),
     "png": ("PNG", colours, dict),
-    "png-palette": ("PNG", _palette, dict),
-    "png-bits": ("PNG", lambda: _grey().convert("1"), dict),
+    "png-palette": ("PNG", lambda: colours().quantize(64), dict),
+    "png-bits": ("PNG", lambda: colours().convert("L").convert("1"), dict),
     "png-grey-alpha": ("PNG", lambda: _cut_out().convert("LA"), dict),
     "png-animated": ("PNG", colours, _more),
     "ico": ("ICO", colours, lambda: {"sizes": [(16, 13)]}),

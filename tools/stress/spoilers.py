@@ -227,7 +227,7 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
         shape = rng.choice(((10**12,), (2**62, 4), (-1,), (0, 5), (3, 10**9), (), (1,) * 40, (10**400,)))
         content = _npy_claim(f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape!r}, }}", b"\0" * 48)
     elif kind == 1:
-        content = _npy(np.array([_Mark(), {}], object), allow_pickle=True)
+        content = npy(np.array([_Mark(), {}], object), allow_pickle=True)
     elif kind == 2:
         kinds = ("'|O'", "'<f9'", "'<V99999999'", "[('a', '<f4')]", "'<U1000000000'", "None", "'<c16'", "'<M8[s]'")
         content = _npy_claim(f"{{'descr': {rng.choice(kinds)}, 'fortran_order': False, 'shape': (4, 3), }}", b"\0" * 48)
@@ -236,13 +236,13 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
         name = rng.choice(names)
     elif kind == 4:
         compression = zipfile.ZIP_DEFLATED
-        content = _npy(np.zeros(rng.choice((10, 15_000_000)), np.float32))
+        content = npy(np.zeros(rng.choice((10, 15_000_000)), np.float32))
     elif kind == 5:
         name = "state.json.npy"
         texts = (b"", b"{", b"[" * 100_000, b"null", b"[]", b'{"step": 1e999, "state": {}}', b'{"step": "x"}')
         long = b'{"step": ' + b"9" * 6000 + b', "state": {}}'
         other = rng.choice((rng.choice(texts), b'{"step": NaN, "state": 3}', long, b'{"step": -5, "state": []}'))
-        content = _npy(np.frombuffer(other, np.uint8))
+        content = npy(np.frombuffer(other, np.uint8))
         members = [member for member in members if member[0] != name]
         at = 0
     elif kind == 6:
@@ -264,7 +264,8 @@ def _archive(data: bytes, rng: random.Random) -> bytes:
     return buffer.getvalue()
 
 
-def _npy(array: Any, **options: Any) -> bytes:
+def npy(array: Any, **options: Any) -> bytes:
+    """An array as a file."""
     buffer = io.BytesIO()
     np.save(buffer, array, **options)
     return buffer.getvalue()
@@ -305,19 +306,6 @@ def _replace(path: Path, folder: Path, rng: random.Random) -> None:
             file.truncate(rng.choice((1 << 20, 1 << 33)))
 
 
-SPOILERS: dict[str, Callable[[bytes, random.Random], bytes]] = {
-    "flip": _flip,
-    "truncate": _truncate,
-    "numbers": _numbers,
-    "insert": _insert,
-    "remove": _remove,
-    "repeat": _repeat,
-    "append": _append,
-    "zeros": _zeros,
-    "swap": _swap,
-    "words": _words,
-    "lines": _lines,
-    "text": _text,
-    "json": _json,
-    "archive": _archive,
-}
+_BYTES = (_flip, _truncate, _numbers, _insert, _remove, _repeat, _append, _zeros, _swap)
+_ALL = (*_BYTES, _words, _lines, _text, _json, _archive)
+SPOILERS = {spoil.__name__.removeprefix("_"): spoil for spoil in _ALL}

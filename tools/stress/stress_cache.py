@@ -1,9 +1,8 @@
-#!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Starts many `clsplat thumbnail` at once on an empty cache of kernels, and interrupts some of them in their first
 build.
 
-    python tools/stress/stress_cache.py [--processes 40] [--interrupted 10] [--seed 0] [--device DEVICE]
+    tools/stress/run cache [--processes 40] [--interrupted 10] [--seed 0] [--device DEVICE]
 
 All share one folder of caches, which is made for it, as the processes of a farm share a home. An interrupted one gets,
 by turns, a Ctrl-C that reaches its whole group, SIGTERM or SIGKILL, at a random moment of the first builds. Each of the
@@ -13,7 +12,6 @@ status 1 if one of them does not, else 0. The result is JSON.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -27,7 +25,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from measuring import plain_parser
 
 from clsplat.bench.workload import synthetic
 
@@ -36,9 +34,9 @@ DEADLINE = 1200.0
 """Seconds that all of them may take together, however busy the machine is."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str]) -> int:
     """Run it; prints what it found as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("--processes", type=int, default=40, help="default 40")
     parser.add_argument("--interrupted", type=int, default=10, help="of them, default 10")
     parser.add_argument("--seed", type=int, default=0, help="of the moments, default 0")
@@ -132,7 +130,3 @@ def stress(folder: Path, processes: int, interrupted: int, device: str | None, c
         "seconds_alone": round(seconds, 1),
         "seconds": round(took, 1),
     }
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from clsplat.arrays import Float64
 from clsplat.camera import Camera
@@ -30,9 +31,12 @@ class Cloud:
     logits: Float64
     sh: Float64
     scales: Float64 | None = None
+    spoilt: Gaussians | None = None
 
     def gaussians(self) -> Gaussians:
-        """The Gaussians, with the means in the world, as float32."""
+        """The Gaussians, with the means in the world, as float32; or those that are spoilt."""
+        if self.spoilt is not None:
+            return self.spoilt
         camera = self.camera
         flat = (self.pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy) * self.depths[:, None]
         means = (np.column_stack([flat, self.depths]) - camera.translation) @ camera.rotation
@@ -52,17 +56,10 @@ class Cases:
     hurt: Float64
 
 
-def rotation_of(axis: Float64, angle: float) -> Float64:
-    """Rodrigues."""
-    x, y, z = axis / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    rotation: Float64 = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
-    return rotation
-
-
 def camera_of(rng: np.random.Generator) -> Camera:
     """Turned and placed at random, fx and fy apart, the principal point near the middle."""
-    rotation = rotation_of(rng.normal(size=3), rng.uniform(-np.pi, np.pi))
+    axis = rng.normal(size=3)
+    rotation = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi) * axis / np.linalg.norm(axis)).as_matrix()
     cx, cy = WIDTH * rng.uniform(0.4, 0.6), HEIGHT * rng.uniform(0.4, 0.6)
     position = rng.normal(size=3)
     return Camera(WIDTH, HEIGHT, FOCAL, 1.1 * FOCAL, cx, cy, rotation, -rotation @ position)
@@ -81,20 +78,10 @@ def cloud(rng: np.random.Generator, count: int) -> Cloud:
     )
 
 
-def _done(made: Cloud, hurt: Float64) -> Cases:
-    return Cases(made.gaussians(), made.camera, hurt)
-
-
-def ordinary(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
-    return _done(made, made.axes.max(axis=1))
-
-
-def scales(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def scales(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     size = 10 ** rng.uniform(-12, 6, (count, 1))
     made.scales = size * 10 ** rng.uniform(-0.5, 0.5, (count, 3))
-    return _done(made, size[:, 0])
+    return size[:, 0]
 
 
 def _elongated(made: Cloud, rng: np.random.Generator, low: float, high: float) -> tuple[Float64, Float64]:
@@ -106,21 +93,8 @@ def _elongated(made: Cloud, rng: np.random.Generator, low: float, high: float) -
     return longest, ratio
 
 
-def anisotropy(rng: np.random.Generator, count: int) -> Cases:
-    """Needles and discs, the longest axis as long as the image at most."""
-    made = cloud(rng, count)
-    return _done(made, _elongated(made, rng, 0, 2.8)[1])
-
-
-def giants(rng: np.random.Generator, count: int) -> Cases:
-    """Needles and discs far longer than the image."""
-    made = cloud(rng, count)
-    return _done(made, _elongated(made, rng, 2.8, 6)[0])
-
-
-def edge_on(rng: np.random.Generator, count: int) -> Cases:
+def edge_on(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     """Needles that point at the camera and discs seen from the side, up to an angle."""
-    made = cloud(rng, count)
     angle = 10 ** rng.uniform(-8, 0, count)
     needle = rng.random(count) < 0.5
     ratio = 10 ** rng.uniform(0, 8, count)
@@ -141,98 +115,87 @@ def edge_on(rng: np.random.Generator, count: int) -> Cases:
     cos, sin = np.cos(spin), np.sin(spin)
     w, x, y, _ = turn.T
     made.quaternions = np.column_stack([w * cos, x * cos + y * sin, y * cos - x * sin, w * sin])
-    return _done(made, angle)
+    return angle
 
 
-def near_plane(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def near_plane(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     apart = 10 ** rng.uniform(-7, 0, count)
     made.depths = made.camera.near * (1 + rng.choice([-1.0, 1.0], count) * apart)
     behind = rng.random(count) < 0.1
     made.depths = np.where(behind, -rng.uniform(0, 10, count), made.depths)
     made.scales = 10 ** rng.uniform(-4, -1, (count, 3))
-    return _done(made, apart)
+    return apart
 
 
-def off_frustum(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def off_frustum(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     angle, away = rng.uniform(0, 2 * np.pi, count), 10 ** rng.uniform(-1, 4, count)
     made.pixels = (WIDTH, HEIGHT) * (0.5 + away[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     made.axes *= np.maximum(away, 1)[:, None] * 10 ** rng.uniform(0, 1.5, (count, 1))
-    return _done(made, away)
+    return away
 
 
-def depths(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def depths(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     made.camera = replace(made.camera, near=1e-4)
     made.depths = 10 ** rng.uniform(-3, 7, count)
-    return _done(made, made.depths)
+    return made.depths
 
 
-def opacities(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def opacities(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     threshold = np.float32(-np.log(254.0))
     ulps = rng.integers(-3, 4, count) * np.spacing(threshold)
     kinds = rng.integers(0, 4, count)
     exact = rng.choice([-np.inf, np.inf, -3e38, 3e38, -100.0, 100.0, -87.0, 87.0, 0.0], count)
     wide = rng.uniform(-100, 100, count)
     made.logits = np.choose(kinds, [threshold + ulps, exact, wide, rng.uniform(-8, 20, count)])
-    return _done(made, np.clip(made.logits, -100, 100))
+    return np.clip(made.logits, -100, 100)
 
 
-def quaternions(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def quaternions(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     length = 10 ** rng.uniform(-14, 14, count)
     extreme = rng.random(count) < 0.1
     length = np.where(extreme, rng.choice([0.0, 1e-45, 1e-40, 1e-30, 1e-20, 1e20, 1e30, 1e37], count), length)
     made.quaternions *= (length / np.linalg.norm(made.quaternions, axis=1))[:, None]
-    return _done(made, length)
+    return length
 
 
-def far_world(rng: np.random.Generator, count: int) -> Cases:
+def far_world(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     """Around a place far from the world's origin; what rounding the means to float32 does is no error of ours."""
-    made = cloud(rng, count)
     offset = rng.normal(size=3)
     offset *= 10 ** rng.uniform(3, 6.5) / np.linalg.norm(offset)
     camera = made.camera
     made.camera = replace(camera, translation=camera.translation - camera.rotation @ offset)
     made.depths = 10 ** rng.uniform(0.5, 3, count)
-    return _done(made, np.full(count, np.linalg.norm(offset)))
+    return np.full(count, np.linalg.norm(offset))
 
 
-def off_centre(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def off_centre(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     away = rng.uniform(-5, 5, 2)
     made.camera = replace(made.camera, cx=WIDTH * (0.5 + away[0]), cy=HEIGHT * (0.5 + away[1]))
-    return _done(made, np.full(count, np.abs(away).max()))
+    return np.full(count, np.abs(away).max())
 
 
-def focal_lengths(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def focal_lengths(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     focal = float(10 ** rng.uniform(0, 6))
     made.camera = replace(made.camera, fx=focal, fy=focal * rng.uniform(0.5, 2))
-    return _done(made, np.full(count, focal))
+    return np.full(count, focal)
 
 
-def colours(rng: np.random.Generator, count: int) -> Cases:
-    made = cloud(rng, count)
+def colours(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     factor = 10 ** rng.uniform(0, 8, count)
     made.sh *= factor[:, None, None]
-    return _done(made, factor)
+    return factor
 
 
-def balls(rng: np.random.Generator, count: int) -> Cases:
+def balls(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     """All three axes nearly or just alike: a rotation hardly shows, its gradient is a small difference."""
-    made = cloud(rng, count)
     apart = 10 ** rng.uniform(-8, 0, count)
     apart[rng.random(count) < 0.05] = 0
     made.axes = made.axes[:, :1] * np.exp(apart[:, None] * rng.uniform(-1, 1, (count, 3)))
-    return _done(made, np.maximum(apart, 1e-8))
+    return np.maximum(apart, 1e-8)
 
 
-def wild(rng: np.random.Generator, count: int) -> Cases:
+def wild(made: Cloud, rng: np.random.Generator, count: int) -> Float64:
     """Any float32 there is, in one parameter or in all: nothing to compare with, only to survive."""
-    made = cloud(rng, count)
     gaussians = made.gaussians()
     everywhere = rng.random(count) < 0.2
     group = rng.integers(0, 5, count)
@@ -243,7 +206,8 @@ def wild(rng: np.random.Generator, count: int) -> Cases:
         special = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1e-45, 3.4e38, -3.4e38, 88.0, -104.0], np.float32)
         pick = rng.random(values.shape) < 0.3
         array[rows] = np.where(pick, rng.choice(special, values.shape), values)
-    return Cases(gaussians, made.camera, np.ones(count))
+    made.spoilt = gaussians
+    return np.ones(count)
 
 
 Bounds = dict[str, float]
@@ -280,21 +244,28 @@ have alphas spread evenly over about 1 / 255, of which 2e-4 each are in the band
 
 @dataclass(frozen=True)
 class Stressor:
-    """unit: of `Cases.hurt`, for the plot; bounds: those that are not PROJECTION's, `why` with the reason; finite:
-    whether nothing but that is asked of the results."""
+    """change: puts the stress on a cloud of so many, and returns `Cases.hurt`; unit: of that, for the plot; bounds:
+    those that are not PROJECTION's, `why` with the reason; finite: whether nothing but that is asked of the results."""
 
-    make: Callable[[np.random.Generator, int], Cases]
+    change: Callable[[Cloud, np.random.Generator, int], Float64]
     unit: str
     bounds: Bounds = field(default_factory=dict)
     why: str = ""
     finite: bool = False
 
+    def make(self, rng: np.random.Generator, count: int) -> Cases:
+        """A batch of so many cases."""
+        made = cloud(rng, count)
+        hurt = self.change(made, rng, count)
+        return Cases(made.gaussians(), made.camera, hurt)
+
 
 STRESSORS: dict[str, Stressor] = {
-    "ordinary": Stressor(ordinary, "longest axis, px"),
+    "ordinary": Stressor(lambda made, *_: np.asarray(made.axes.max(axis=1)), "longest axis, px"),
     "scales": Stressor(scales, "scale, world units"),
-    "anisotropy": Stressor(anisotropy, "longest axis / shortest axis"),
-    "giants": Stressor(giants, "longest axis, px"),
+    # needles and discs, the longest axis as long as the image at most, or far longer
+    "anisotropy": Stressor(lambda made, rng, _: _elongated(made, rng, 0, 2.8)[1], "longest axis / shortest axis"),
+    "giants": Stressor(lambda made, rng, _: _elongated(made, rng, 2.8, 6)[0], "longest axis, px"),
     "edge_on": Stressor(edge_on, "angle to the ray (needles) or to its perpendicular (discs), rad"),
     "near_plane": Stressor(near_plane, "|z / near - 1|"),
     "off_frustum": Stressor(off_frustum, "distance from the middle, image sizes"),

@@ -1,9 +1,8 @@
-#!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Hostile files: valid ones of every kind that is read, spoilt at random, given to their readers.
 
-    python tools/stress/stress_files.py [--cases 100000] [--seed 0] [--readers ply,scene,...] [--jobs N] [--keep FOLDER]
-    python tools/stress/stress_files.py --readers ply --first 1234 --cases 1        # a case again, by its number
+    tools/stress/run files [--cases 100000] [--seed 0] [--readers ply,scene,...] [--jobs N] [--keep FOLDER]
+    tools/stress/run files --readers ply --first 1234 --cases 1        # a case again, by its number
 
 A case passes where the reader returns, or raises InputError: one line that names a file. Anything else is a failure:
 another exception, a warning of several lines, a crash of the process, more than --seconds of a core, or more than
@@ -34,11 +33,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
 from hostile import READERS, Reader, spoil
 
 from clsplat.errors import ClsplatError
+from clsplat.progress import aligned
 
 MIB = 1 << 20
 SPOILING = 60
@@ -54,6 +52,13 @@ class Tally:
     slowest: tuple[float, int] = (0.0, -1)
     peak: tuple[float, int] = (0.0, -1)
     failures: list[tuple[int, str]] = field(default_factory=list)
+
+    def add(self, other: Tally) -> None:
+        """Count the cases of another too."""
+        self.cases += other.cases
+        self.refused += other.refused
+        self.slowest, self.peak = max(self.slowest, other.slowest), max(self.peak, other.peak)
+        self.failures += other.failures
 
 
 def numbered(seed: int, reader: str, case: int) -> random.Random:
@@ -169,12 +174,12 @@ class _Worker:
                     elif answer[0] == "end":
                         return
                     else:
-                        _count(tally, case, *answer[1:])
+                        tally.add(_one(case, *answer[1:]))
             except (EOFError, ConnectionError):
                 self.process.join(10)
                 trouble = f"the process ended, status {self.process.exitcode}"
             self.close()
-            _count(tally, case, self.seconds if "done" in trouble else 0.0, 0.0, True, trouble)
+            tally.add(_one(case, self.seconds if "done" in trouble else 0.0, 0.0, True, trouble))
             first = case + 1
             self._start()
 
@@ -184,13 +189,8 @@ class _Worker:
         self.pipe.close()
 
 
-def _count(tally: Tally, case: int, seconds: float, peak: float, refused: bool, trouble: str) -> None:
-    tally.cases += 1
-    tally.refused += refused
-    tally.slowest = max(tally.slowest, (seconds, case))
-    tally.peak = max(tally.peak, (peak, case))
-    if trouble:
-        tally.failures.append((case, trouble))
+def _one(case: int, seconds: float, peak: float, refused: bool, trouble: str) -> Tally:
+    return Tally(1, int(refused), (seconds, case), (peak, case), [(case, trouble)] if trouble else [])
 
 
 def stress(
@@ -239,10 +239,7 @@ def stress(
 def _sum(parts: list[Tally]) -> Tally:
     whole = Tally()
     for part in parts:
-        whole.cases += part.cases
-        whole.refused += part.refused
-        whole.slowest, whole.peak = max(whole.slowest, part.slowest), max(whole.peak, part.peak)
-        whole.failures += part.failures
+        whole.add(part)
     whole.failures.sort()
     return whole
 
@@ -260,18 +257,11 @@ def keep(folder: Path, name: str, case: int, seed: int) -> Path:
 
 def table(tallies: dict[str, Tally]) -> str:
     """Text table, a line each."""
-    lines = [f"{'reader':14} {'cases':>8} {'refused':>8} {'slowest':>9} {'most memory':>12} {'failures':>9}"]
-    for name, tally in tallies.items():
-        lines.append(
-            f"{name:14} {tally.cases:8,} {tally.refused:8,} {tally.slowest[0]:7.2f} s {tally.peak[0]:8.0f} MiB "
-            f"{len(tally.failures):9,}"
-        )
-    total = _sum(list(tallies.values()))
-    lines.append(
-        f"{'all':14} {total.cases:8,} {total.refused:8,} {total.slowest[0]:7.2f} s {total.peak[0]:8.0f} MiB "
-        f"{len(total.failures):9,}"
-    )
-    return "\n".join(lines)
+    rows = [("reader", "cases", "refused", "slowest", "most memory", "failures")]
+    for name, tally in {**tallies, "all": _sum(list(tallies.values()))}.items():
+        most = f"{tally.slowest[0]:.2f} s", f"{tally.peak[0]:.0f} MiB"
+        rows.append((name, f"{tally.cases:,}", f"{tally.refused:,}", *most, f"{len(tally.failures):,}"))
+    return "\n".join(aligned(rows))
 
 
 def main(arguments: list[str]) -> int:
@@ -306,7 +296,3 @@ def main(arguments: list[str]) -> int:
         if len(tally.failures) > 20:
             print(f"{name}: {len(tally.failures)} failures, the commonest: {kinds.most_common(5)}", file=sys.stderr)
     return int(failed > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

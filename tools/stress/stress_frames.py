@@ -3,31 +3,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pipeline import BACKGROUND, Pipeline
 from stress_cases import DEGREE, Cloud, camera_of
 from stress_projection import in_order
 
 from clsplat.camera import Camera
-from clsplat.device.buffers import upload
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.reference import render as reference
 from clsplat.reference.blend import blend
 from clsplat.reference.project import project
 from clsplat.reference.render import parameters
-from clsplat.rendering.rasterizer import ForwardPass, Rasterizer
-from clsplat.selftest.harness import planes_of
-from clsplat.stages.device_gaussians import allocate_gaussians, download_gaussians, upload_gaussians
 
 Array = NDArray[Any]
 Scene = tuple[Gaussians, Camera]
 GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
-BACKGROUND = (0.1, 0.2, 0.3)
 BAND = 1e-4
 """Relative distance of alpha or transmittance to a threshold, within which float32 may decide the other way."""
 
@@ -126,18 +121,8 @@ def bright(rng: np.random.Generator) -> Scene:
     return _made(cloud)
 
 
-SCENES: dict[str, Callable[[np.random.Generator], Scene]] = {
-    "counts": counts,
-    "sizes": sizes,
-    "equal_depth": equal_depth,
-    "saturated": saturated,
-    "faint": faint,
-    "needles": needles,
-    "one_pixel": one_pixel,
-    "whole_image": whole_image,
-    "off_frustum": off_frustum,
-    "bright": bright,
-}
+_ALL = (counts, sizes, equal_depth, saturated, faint, needles, one_pixel, whole_image, off_frustum, bright)
+SCENES = {make.__name__: make for make in _ALL}
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,24 +140,11 @@ class FrameOutcome:
     finite: bool
 
 
-def frame_of(device: Device, scene: Scene) -> tuple[Rasterizer, Any, ForwardPass, Array]:
-    """Rasterizer, parameters, frame, and the image (H, W, 3)."""
-    gaussians, camera = scene
-    rasterizer = Rasterizer(device)
-    on_device = upload_gaussians(device, gaussians)
-    frame = rasterizer.forward(on_device, camera, upload(device, np.array(BACKGROUND, np.float32)))
-    return (
-        rasterizer,
-        on_device,
-        frame,
-        frame.blended.image.get()[:, : camera.height, : camera.width].transpose(1, 2, 0),
-    )
-
-
 def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutcome:
     """A frame and its gradient for a random gradient of the image, which is 0 in the band."""
     gaussians, camera = scene
-    rasterizer, on_device, frame, image = frame_of(device, scene)
+    run = Pipeline.run(device, scene)
+    image = run.image
     wanted = reference.forward(gaussians, camera, BACKGROUND)
     blended = wanted.blended
     assert blended.margin is not None
@@ -181,7 +153,7 @@ def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutc
     error = np.abs(image - blended.image).max(axis=2) / scale
     d_image = rng.normal(size=(camera.height, camera.width, 3))
     d_image[band] = 0
-    got = back(rasterizer, on_device, frame, d_image)
+    got, _ = run.backward(d_image)
     by = reference.render_grad(gaussians, camera, d_image, BACKGROUND)
     norms, each = {}, {}
     finite = bool(np.isfinite(image).all())
@@ -196,14 +168,6 @@ def compare(device: Device, scene: Scene, rng: np.random.Generator) -> FrameOutc
     return FrameOutcome(float(out[0]), out[1], out[2], float(out[3]), norms, each, finite)
 
 
-def back(rasterizer: Rasterizer, on_device: Any, frame: ForwardPass, d_image: Array) -> Gaussians:
-    """Gradients of the parameters."""
-    device = rasterizer.device
-    gradients = allocate_gaussians(device, on_device.count, on_device.coefficients, zero=True)
-    rasterizer.backward(on_device, frame, upload(device, planes_of(d_image)), gradients)
-    return download_gaussians(gradients)
-
-
 def compare_8k(device: Device, rng: np.random.Generator, *, count: int = 2000, crops: int = 12) -> FrameOutcome:
     """A frame of 7680 x 4320 on some crops of it; no gradients, which have no dependence on the size."""
     width, height, side = 7680, 4320, 64
@@ -211,7 +175,7 @@ def compare_8k(device: Device, rng: np.random.Generator, *, count: int = 2000, c
     cloud.camera = replace(cloud.camera, fx=6000.0, fy=6100.0)
     cloud.axes[:2] = 10 ** rng.uniform(3, 4, (2, 3))
     scene = _made(cloud)
-    _, _, _, image = frame_of(device, scene)
+    image = Pipeline.run(device, scene).image
     projected = project(*in_order(parameters(scene[0])), scene[1], DEGREE)
     worst = flips = 0.0
     band = 0

@@ -104,6 +104,12 @@ def _summary(values: Array) -> Result:
     }
 
 
+def gradient_faults(name: str, row: Result, tail: float) -> list[str]:
+    """Faults of a gradient: its error in norm over GRADIENT_NORM, that of 99.9 % of the Gaussians over `tail`."""
+    faults = [] if row["norm"] <= GRADIENT_NORM else [f"{name} in norm {row['norm']:.2g} over {GRADIENT_NORM:g}"]
+    return faults + ([f"{name} of 99.9 % {row['p999']:.2g} over {tail:g}"] if row["p999"] > tail else [])
+
+
 def judged(name: str, tally: Tally) -> Result:
     """A stressor's row: every error with its bound, and in words what is over one."""
     bounds = {**PROJECTION, **STRESSORS[name].bounds}
@@ -116,10 +122,7 @@ def judged(name: str, tally: Tally) -> Result:
                 faults.append(f"{error} {row['max']:.2g} over {bounds[error]:g}")
         else:
             row["norm"] = tally.relative_norm(error.removeprefix("d "))
-            if not row["norm"] <= GRADIENT_NORM:
-                faults.append(f"{error} in norm {row['norm']:.2g} over {GRADIENT_NORM:g}")
-            if row["p999"] > GRADIENT_TAIL:
-                faults.append(f"{error} of 99.9 % {row['p999']:.2g} over {GRADIENT_TAIL:g}")
+            faults += gradient_faults(error, row, GRADIENT_TAIL)
         rows[error] = row
     return {"cases": tally.cases, "shown": tally.shown, "errors": rows, "faults": faults}
 
@@ -151,12 +154,8 @@ def frames(device: Device, name: str, many: int, seed: int, every: Tally | None 
         faults.append(f"band {band / pixels:.2g} of the pixels, over {BAND_SHARE:g}")
     gradients = {}
     for group in tally.errors:
-        row = {**_summary(tally.joined(group)), "norm": tally.relative_norm(group)}
-        gradients[group] = row
-        if not row["norm"] <= GRADIENT_NORM:
-            faults.append(f"d {group} in norm {row['norm']:.2g} over {GRADIENT_NORM:g}")
-        if row["p999"] > FRAME_TAIL:
-            faults.append(f"d {group} of 99.9 % {row['p999']:.2g} over {FRAME_TAIL:g}")
+        gradients[group] = {**_summary(tally.joined(group)), "norm": tally.relative_norm(group)}
+        faults += gradient_faults(f"d {group}", gradients[group], FRAME_TAIL)
     return {
         "cases": cases,
         "frames": many,

@@ -1,8 +1,7 @@
-#!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Kills trainings with SIGKILL at random moments, resumes them until they are done, and compares the models' bytes.
 
-    python tools/stress/stress_kills.py [--kills 100] [--seed 0] [--device DEVICE] [--json]
+    tools/stress/run kills [--kills 100] [--seed 0] [--device DEVICE] [--json]
 
 The scene is the small one of the tests: 40 points, 8 pictures of 48x40 and two held out. Training writes a checkpoint
 every second step, so that many kills come while one is being written. A process is killed after a random time, anywhere
@@ -13,7 +12,6 @@ differs, or a process ends in any other way than by being killed or being done.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -26,10 +24,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "support"))
-
+from measuring import plain_parser, tool
 from tiny import write_scene
+
+from clsplat.errors import ClsplatError
 
 ITERATIONS, CHECKPOINT_EVERY = 240, 2
 SETTINGS = (
@@ -84,10 +82,13 @@ class Kills:
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
 
     def end_of(self, process: subprocess.Popen[str]) -> None:
-        """Wait until it is done. Raises RuntimeError with its last words where it fails."""
-        _, said = process.communicate(timeout=DEADLINE)
+        """Wait until it is done. Raises ClsplatError with its last words where it fails or hangs."""
+        try:
+            _, said = process.communicate(timeout=DEADLINE)
+        except subprocess.TimeoutExpired as error:
+            raise ClsplatError(str(error)) from None
         if process.returncode != 0:
-            raise RuntimeError(f"a training ended with status {process.returncode}: {said.strip()[-400:]}")
+            raise ClsplatError(f"a training ended with status {process.returncode}: {said.strip()[-400:]}")
 
     @staticmethod
     def steps_of(run: Path) -> list[int]:
@@ -120,13 +121,13 @@ class Kills:
         return False
 
     def compare(self, run: Path) -> None:
-        """Raise RuntimeError where a finished run is not what it would have been."""
+        """Raise ClsplatError where a finished run is not what it would have been."""
         if (run / "model.ply").read_bytes() != self.model:
-            raise RuntimeError(f"after {self.figures.kills} kills model.ply differs")
+            raise ClsplatError(f"after {self.figures.kills} kills model.ply differs")
         if (steps := self.steps_of(run)) != self.steps:
-            raise RuntimeError(f"after {self.figures.kills} kills metrics.jsonl has the steps {steps}")
+            raise ClsplatError(f"after {self.figures.kills} kills metrics.jsonl has the steps {steps}")
         if left := list(run.rglob(".*.clsplat-tmp")):
-            raise RuntimeError(f"a half-written file has stayed: {left[0].name}")
+            raise ClsplatError(f"a half-written file has stayed: {left[0].name}")
         self.figures.compared += 1
 
     def survive(self, count: int) -> Figures:
@@ -144,11 +145,10 @@ class Kills:
         return self.figures
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@tool("stress_kills")
+def main(arguments: Sequence[str]) -> int:
     """The command line above."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = plain_parser(__doc__)
     parser.add_argument("--kills", metavar="N", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device")
@@ -157,11 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.kills < 1:
         parser.error(f"--kills {options.kills}: expected at least 1")
     with tempfile.TemporaryDirectory(prefix="clsplat-kills-") as folder:
-        try:
-            figures = Kills(Path(folder), options.device, options.seed).survive(options.kills)
-        except (RuntimeError, subprocess.TimeoutExpired) as error:
-            print(f"stress_kills: error: {error}", file=sys.stderr)
-            return 1
+        figures = Kills(Path(folder), options.device, options.seed).survive(options.kills)
     if options.json:
         print(json.dumps(asdict(figures), indent=2))
         return 0
@@ -171,7 +167,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "of an undisturbed one"
     )
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stress_cases import DEGREE, Cases
 
 from clsplat.camera import Camera
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.gaussians import Gaussians
 from clsplat.layouts.columns import PLAIN_SLOTS, SPLAT
@@ -29,6 +29,7 @@ from clsplat.reference.render import parameters
 from clsplat.spherical_harmonics import sh_basis
 from clsplat.stages import device_camera, device_gaussians
 from clsplat.stages import project as stages_project
+from clsplat.stages.device_gaussians import DeviceGaussians
 
 Array = NDArray[Any]
 WHITEN2 = np.log2(np.e) / 2
@@ -59,9 +60,11 @@ def random_sums(rng: np.random.Generator, count: int) -> Array:
     return sums.astype(np.float32)
 
 
-def on_device(device: Device, cases: Cases, sums: Array) -> tuple[Array, Array, Gaussians, Array]:
-    """splats (n, SPLAT), tile counts (n,), the gradients and the screen's (n, 2); NaN where nothing was written."""
-    work = Workspace(device)
+def there_and_back(
+    device: Device, work: Workspace, cases: Cases, sums: Array, *, by_lens: DeviceArray | None = None
+) -> tuple[stages_project.Projected, DeviceGaussians, DeviceArray]:
+    """Project, and take the sums back: splats, gradients, and those on the screen (n, 2); NaN where nothing was
+    written. by_lens: gets the gradients by the lens."""
     gaussians = device_gaussians.upload_gaussians(device, cases.gaussians)
     camera = upload(device, device_camera.pack_camera(cases.camera))
     count = len(cases.gaussians)
@@ -74,9 +77,8 @@ def on_device(device: Device, cases: Cases, sums: Array) -> tuple[Array, Array, 
     screen.gradients.fill(np.nan)
     slots = stages_project.Slots(upload(device, sums))
     assert sums.shape[1] == PLAIN_SLOTS.floats
-    stages_project.project_grad(device, gaussians, camera, projected, slots, gradients, screen)
-    back = device_gaussians.download_gaussians(gradients)
-    return projected.splats.get(), projected.tile_counts.get(), back, screen.gradients.get()
+    stages_project.project_grad(device, gaussians, camera, projected, slots, gradients, screen, by_lens=by_lens)
+    return projected, gradients, screen.gradients
 
 
 def exact(gaussians: Gaussians) -> dict[str, Array]:
@@ -164,8 +166,9 @@ def compare(device: Device, cases: Cases, rng: np.random.Generator, *, finite_on
     """Project and go back; errors as `ERRORS` says."""
     count = len(cases.gaussians)
     sums = random_sums(rng, count)
-    splats, tiles, gradients, screen = on_device(device, cases, sums)
-    shown = tiles > 0
+    projected, written, on_screen = there_and_back(device, Workspace(device), cases, sums)
+    gradients, screen = device_gaussians.download_gaussians(written), on_screen.get()
+    splats, shown = projected.splats.get(), projected.tile_counts.get() > 0
     with np.errstate(invalid="ignore"):
         columns = {name: splats[:, SPLAT.index(name)].astype(np.longdouble) for name in FIELDS}
     finite = np.isfinite(np.stack(list(columns.values()))).all(axis=0) & np.isfinite(screen).all(axis=1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kills `clsplat render` at random moments, finishes with --skip-existing, and compares with an undisturbed run.
 
-    stress_render_kills.py -o OUT --kills 10 -- MODEL --cameras SCENE --path turntable --count 120
+    tools/stress/run render_kills -o OUT --kills 10 -- MODEL --cameras SCENE --path turntable --count 120
 
 What follows -- are arguments of `clsplat render` without -o. OUT/whole and OUT/killed are made and must not exist.
 After every kill each frame that is there has to be whole, and in the end all have to be the same, byte for byte, with
@@ -10,7 +10,6 @@ nothing beside them. Exit status 0 if so, else 1.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
@@ -21,10 +20,13 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from measuring import plain_parser
+from rendered import contents
 
-def main(argv: Sequence[str] | None = None) -> int:
+
+def main(argv: Sequence[str]) -> int:
     """Run it; prints what it found as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = plain_parser(__doc__)
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the two sequences")
     parser.add_argument("--kills", type=int, default=10, help="default 10")
     parser.add_argument("--seed", type=int, default=0, help="of the moments, default 0")
@@ -36,11 +38,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     for folder in (whole, killed):
         if folder.exists():
             parser.error(f"{folder} is there already")
+    killed.mkdir(parents=True)
     all_of_it, rest = (command(arguments.render, folder, arguments.extension) for folder in (whole, killed))
     start = time.monotonic()
     subprocess.run(all_of_it, check=True, stdout=subprocess.DEVNULL)
     seconds = time.monotonic() - start
-    wanted = read(whole)
+    wanted = contents(whole)
     ends = sorted(path.stat().st_mtime for path in whole.iterdir())
     pace = (ends[-1] - ends[0]) / max(len(ends) - 1, 1)
     chance = random.Random(arguments.seed)
@@ -50,9 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         # a little more than the time of a frame, so that a kill may come at any point of it
         delay = chance.uniform(0, 1.5 * pace)
         kills.append(kill(rest, killed, more, delay))
-        troubles += [name for name, data in read(killed).items() if name[0] != "." and wanted.get(name) != data]
+        troubles += [name for name, data in contents(killed).items() if name[0] != "." and wanted.get(name) != data]
     finished = subprocess.run(rest, check=False, stdout=subprocess.DEVNULL)
-    same = read(killed) == wanted and finished.returncode == 0
+    same = contents(killed) == wanted and finished.returncode == 0
     result = {
         "frames": len(wanted),
         "seconds": round(seconds, 2),
@@ -89,13 +92,4 @@ def kill(line: Sequence[str], folder: Path, more: int, delay: float) -> int:
 
 def count(folder: Path, *, hidden: bool = False) -> int:
     """Frames in the folder, with those that are being written if hidden."""
-    return sum(hidden or path.name[0] != "." for path in folder.iterdir()) if folder.is_dir() else 0
-
-
-def read(folder: Path) -> dict[str, bytes]:
-    """Every file by name."""
-    return {path.name: path.read_bytes() for path in folder.iterdir()} if folder.is_dir() else {}
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return sum(hidden or path.name[0] != "." for path in folder.iterdir())

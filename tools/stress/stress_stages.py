@@ -6,22 +6,19 @@ from __future__ import annotations
 import numpy as np
 from measuring import Result
 from numpy.random import Generator
-from stress_cases import DEGREE, anisotropy, edge_on, focal_lengths, off_centre, ordinary
-from stress_projection import exact, in_order, on_image, random_sums
+from stress_cases import DEGREE, STRESSORS
+from stress_projection import exact, in_order, on_image, random_sums, there_and_back
 
-from clsplat.device.buffers import Workspace, upload
+from clsplat.device.buffers import Workspace
 from clsplat.device.context import Device
 from clsplat.reference.project import lens_grad, project
 from clsplat.selftest.case import Case, Deviation, faults
 from clsplat.selftest.cases.table import CASES
-from clsplat.stages import project as stages_project
-from clsplat.stages.device_camera import pack_camera
-from clsplat.stages.device_gaussians import allocate_gaussians, upload_gaussians
 from clsplat.stages.pose import LENS_NUMBERS, lens_rows, sum_of, sums_of
 
 LENS_BOUND = 1e-5
 """Relative to the sum of the terms' magnitudes: a few roundings of partial sums, and of the shape on the screen."""
-KINDS = (ordinary, anisotropy, edge_on, off_centre, focal_lengths)
+KINDS = ("ordinary", "anisotropy", "edge_on", "off_centre", "focal_lengths")
 
 
 def worst_errors(device: Device, case: Case, rng: Generator, many: int) -> dict[str, Deviation]:
@@ -42,16 +39,10 @@ def lenses(device: Device, rng: Generator, many: int) -> float:
     makes them."""
     worst, work = 0.0, Workspace(device)
     for turn in range(many):
-        made = KINDS[turn % len(KINDS)](rng, 300)
-        count, camera, sums = len(made.gaussians), made.camera, random_sums(rng, 300)
-        model, packed = upload_gaussians(device, made.gaussians), upload(device, pack_camera(camera))
-        projected = stages_project.project(device, work, model, camera, packed)
-        gradients = allocate_gaussians(device, count, model.coefficients, zero=True)
-        screen, by_lens = work.array("screen", (count, 2)), work.array("lens", (count, LENS_NUMBERS))
-        slots = stages_project.Slots(upload(device, sums))
-        view = (packed, projected, slots, gradients, stages_project.Screen(screen))
-        stages_project.project_grad(device, model, *view, by_lens=by_lens)
-        rows = sums_of(work, count, LENS_NUMBERS)
+        made = STRESSORS[KINDS[turn % len(KINDS)]].make(rng, 300)
+        camera, sums, by_lens = made.camera, random_sums(rng, 300), work.array("lens", (300, LENS_NUMBERS))
+        projected, _, _ = there_and_back(device, work, made, sums, by_lens=by_lens)
+        rows = sums_of(work, 300, LENS_NUMBERS)
         lens_rows(device, projected.tile_counts, by_lens, rows)
         got, shown = sum_of(device, work, rows).get()[0], projected.tile_counts.get() > 0
         arrays = exact(made.gaussians)
