@@ -469,9 +469,8 @@ class Trainer:
 
     def _state(self, step: int | None = None) -> ModelState:
         model, statistics, step = self.parameters, self.statistics.named(), step or self.step
-        return ModelState(
-            model.count, step, self.scene.length_unit, model.arrays, statistics, self.rng, self.model.marker()
-        )
+        lengths = self.scene.length_unit, self.scene.extent
+        return ModelState(model.count, step, *lengths, model.arrays, statistics, self.rng, self.model.marker())
 
     def _rearrange(self, plan: RowPlan | None) -> None:
         """Carry out a plan of density control, or of a repair, for the rows of all arrays."""

@@ -33,7 +33,9 @@ def state(step: int, extent: float, parameters: dict[str, np.ndarray], statistic
     """A model whose arrays are on the host."""
     arrays = ({name: HostArray(values) for name, values in held.items()} for held in (parameters, statistics))
     marker = TwinMarker(parameters, statistics)
-    return ModelState(len(parameters["opacity_logits"]), step, extent, *arrays, np.random.default_rng(0), marker)
+    return ModelState(
+        len(parameters["opacity_logits"]), step, extent, extent, *arrays, np.random.default_rng(0), marker
+    )
 
 
 def make_plan(

@@ -64,7 +64,7 @@ class HostCopy(Protocol):
 class ModelState:
     """The model as a strategy sees it: `count` Gaussians after `step` steps.
 
-    length_unit: the scene's length unit, in world units.
+    length_unit, extent: the scene's, in world units.
     parameters: parameter arrays by group.
     statistics: arrays by their names in a checkpoint.
     marker: compares the Gaussians with rules.
@@ -73,6 +73,7 @@ class ModelState:
     count: int
     step: int
     length_unit: float
+    extent: float
     parameters: Mapping[str, HostCopy]
     statistics: Mapping[str, HostCopy]
     rng: np.random.Generator

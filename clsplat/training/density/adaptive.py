@@ -11,6 +11,7 @@ from math import inf
 import numpy as np
 
 from clsplat.arrays import Float32, Float64
+from clsplat.config.points import SKY_RADIUS_RATIO
 from clsplat.config.training import DensityConfig, TrainConfig
 from clsplat.errors import ClsplatError
 from clsplat.optimisation.density_rules import MarkRules, edge
@@ -28,7 +29,7 @@ class Adaptive(Strategy):
     """The strategy of Kerbl et al., with the extensions of `DensityConfig`."""
 
     def __init__(self, config: TrainConfig) -> None:
-        self.config, self.white = config.density, config.background == "white"
+        self.config, self.white, self.sky = config.density, config.background == "white", config.sky > 0
 
     def needs(self, step: int = 0) -> StatisticsNeeds:
         """Gradients while Gaussians are densified; contributions while this or a later pruning uses them."""
@@ -50,7 +51,7 @@ class Adaptive(Strategy):
         """Densify or prune, then reset opacities, each only if it is due."""
         config, step, made = self.config, model.step, RowPlan()
         if (densifies := is_due(config, step)) or is_pruning_due(config, step):
-            made = plan(config, model) if densifies else plan_pruning(config, model)
+            made = plan(config, model, sky=self.sky) if densifies else plan_pruning(config, model)
             if made.listed is not None and made.listed.count == 0:
                 raise ClsplatError(
                     f"step {step}: every Gaussian was pruned; lower --density.min-opacity"
@@ -82,14 +83,17 @@ def is_reset_due(config: DensityConfig, step: int, *, white: bool) -> bool:
     )
 
 
-def plan(config: DensityConfig, model: ModelState) -> RowPlan:
+def plan(config: DensityConfig, model: ModelState, *, sky: bool = False) -> RowPlan:
     """Clone small and split large Gaussians with a large mean gradient. Prune Gaussians that are transparent, oversized
     or contribute little.
 
+    sky: True if some of the Gaussians are a sky, whose size follows the extent. All may then be as large.
     Retained Gaussians come first, in order. Clones and halves are fresh.
     """
     # Each rule compares like NumPy: a float32 array with a Python number, in float32.
-    too_large, dense = config.max_world_fraction * model.length_unit, config.dense_fraction * model.length_unit
+    size = SKY_RADIUS_RATIO * model.extent if sky else model.length_unit
+    too_large = config.max_world_fraction * size
+    dense = config.dense_fraction * model.length_unit
     shrinks = 1 / LONG_AXIS_HALF_RATIO if config.long_axis else config.split_factor
     rules = replace(
         _pruning(config, model),
