@@ -21,7 +21,7 @@ from clsplat.device.command_buffer import CommandBuffer
 from clsplat.device.drivers.capabilities import capabilities_of, pretended
 from clsplat.device.drivers.cpu_name import name_processor
 from clsplat.device.drivers.driver_records import tell_once
-from clsplat.device.drivers.quirks import compiles_by_size, no_device, subgroup_ways, title
+from clsplat.device.drivers.quirks import compiles_by_size, no_device, register_limit, subgroup_ways, title
 from clsplat.device.drivers.shapes import Shape, asked_shape, default_shape, shape_of, shape_text
 from clsplat.device.drivers.worker_process import DRIVER_TIMEOUT_VARIABLE, driver_timeout
 from clsplat.device.memory_account import Memory
@@ -161,7 +161,7 @@ class Device:
         self._options = "-cl-std=CL1.2"
         if capabilities.exact_division:
             self._options += " -cl-fp32-correctly-rounded-divide-sqrt"
-        self._kernels: dict[tuple[str, tuple[tuple[str, object], ...]], Kernels] = {}
+        self._kernels: dict[tuple[str, tuple[tuple[str, object], ...], int], Kernels] = {}
         self._switches: Mapping[str, object] = {}
         self.recorder = Recorder(self._queue)
         self.trials = KernelTrials(device, self.index, self.shape.label)
@@ -174,8 +174,11 @@ class Device:
         forks.check()
         return self._queue
 
-    def kernels(self, stem: str, defines: Mapping[str, object] = {}) -> Kernels:
-        """The kernels of `stem`.cl in this device's shape with these defines, built at the first call."""
+    def kernels(self, stem: str, defines: Mapping[str, object] = {}, registers: int = 0) -> Kernels:
+        """The kernels of `stem`.cl in this device's shape with these defines, built at the first call.
+
+        registers: limit per work-item, where the driver has such an option; 0 for none.
+        """
         if self._why_another:  # only now: until its first use, the self-test may choose another shape
             tell_once(self._why_another)
         if self._switches:
@@ -183,20 +186,21 @@ class Device:
             defines = {**{name: value for name, value in self._switches.items() if name in text}, **defines}
         if self.shape.subgroups and "SUBGROUPED" in kernel_source(stem):
             defines = {**self._with_subgroups(), **defines}
-        key = (stem, tuple(sorted(defines.items())) if defines else ())
+        key = (stem, tuple(sorted(defines.items())) if defines else (), registers)
         kernels = self._kernels.get(key)
         if kernels is None:
             if not self._fma:
                 self._fma.append(self._probe_fma())  # in place: copies of a device share it
-            kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines})
+            kernels = self._kernels[key] = self._built(stem, {**self._fma[0], **defines}, registers)
         return kernels
 
-    def _built(self, stem: str, defines: Mapping[str, object]) -> Kernels:
+    def _built(self, stem: str, defines: Mapping[str, object], registers: int = 0) -> Kernels:
         given, text = {"LANES": self.shape.lanes, "ITEMS": self.shape.items, **defines}, text_of(stem)
         # A driver's cache is keyed by the options. Only options that the text names are given, so that shapes share the
         # build of a file that does not depend on the shape.
         named = {name: value for name, value in given.items() if name.partition("(")[0] in text}
-        variant = variant_of(stem, named, self._options)
+        limit = register_limit(self.cl_device, registers) if registers else ""
+        variant = variant_of(stem, named, f"{self._options} {limit}")
         program, salt = build(self.context, self.cl_device, self.trials.build(variant))
         self.trials.built(variant, salt)
         return Kernels(variant, program)

@@ -26,6 +26,10 @@ CPU_STEP_ROWS = 128
 """Number of Gaussians in a group of `project_step` on a CPU. Their gradients, 30 KiB, stay in the cache, and the part
 of each array is long enough for the processor to prefetch. With groups of one vector a step takes 1.5 times as long."""
 
+STEP_REGISTERS = 96
+"""Registers of an item of `project_step` where the driver takes a limit. Adam waits for memory, so more items at a time
+are worth more than registers; clang's code for NVIDIA spills nothing even at 80."""
+
 SCREEN_GRADIENT_BYTES = 8
 """Bytes per Gaussian of the screen-space gradient; 4 more if contributions are kept."""
 
@@ -254,7 +258,7 @@ def project_step(
         kernel = device.kernels("project_grad", {"ROWS": CPU_STEP_ROWS, **defines}).project_step
         launch_groups(device, kernel, -(-parameters.count // CPU_STEP_ROWS), 1, *arguments)
     else:
-        kernel = device.kernels("project_grad", {"ROWS": DEFAULT_GROUP_ITEMS, **defines}).project_step
+        kernel = device.kernels("project_grad", {"ROWS": DEFAULT_GROUP_ITEMS, **defines}, STEP_REGISTERS).project_step
         launch_items(device, kernel, parameters.count, *arguments)
 
 

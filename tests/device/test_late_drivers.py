@@ -37,7 +37,7 @@ WITHOUT = replace(LATE, checkpoint_every=0, optimiser=replace(LATE.optimiser, sp
 def failing_at(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) -> None:
     """What needs the text or the kernel of this name ends so, as where its trial does."""
 
-    def kernels(_self, _stem, defines: Mapping[str, object] = {}):
+    def kernels(_self, _stem, defines: Mapping[str, object] = {}, _registers: int = 0):
         if name in [f"{key}={value}" for key, value in defines.items()]:
             raise error
 

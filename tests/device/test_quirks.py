@@ -6,8 +6,10 @@ from __future__ import annotations
 import ast
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import clsplat
+from clsplat.device.drivers.quirks import register_limit
 
 PACKAGE = Path(clsplat.__file__).parent
 DRIVERS = re.compile(r"pocl|intel|rusticl|llvmpipe|\bmesa\b|nvidia|amd\b|ocl_icd|cl_config", re.IGNORECASE)
@@ -30,3 +32,9 @@ def names(path: Path) -> list[str]:
 def test_drivers_are_named_in_one_module() -> None:
     named = {str(path.relative_to(PACKAGE)): found for path in PACKAGE.rglob("*.py") if (found := names(path))}
     assert set(named) == {"device/drivers/quirks.py"}, named
+
+
+def test_a_limit_of_registers_by_extension() -> None:
+    words = ("cl_khr_fp64", "cl_nv_compiler_options")
+    given = [register_limit(SimpleNamespace(extensions=" ".join(words[:count])), 96) for count in (1, 2)]  # type: ignore[arg-type]
+    assert given == ["", "-cl-nv-maxrregcount=96"]

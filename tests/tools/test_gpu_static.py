@@ -331,6 +331,13 @@ def test_occupancy_on_ada(registers: int, shared: int, items: int, waves: int, b
     assert occupancy(kernel, items) == waves / 48
 
 
+def test_a_limit_of_registers_is_for_ptxas() -> None:
+    source = Source("blend", ("-DITEMS=64", "-cl-std=CL1.2", "-cl-nv-maxrregcount=96"))
+    assert source.register_limit == ("-maxrregcount=96",)
+    assert source.options_for("sm_89") == source.options_for("gfx1100") == ("-DITEMS=64", "-cl-std=CL1.2")
+    assert Source("blend", source.common).register_limit == ()
+
+
 def test_a_file_is_compiled_once_for_shapes_that_it_does_not_tell_apart() -> None:
     """`project` does not name ITEMS, `blend` does, in a file that it includes."""
     for stem, options, same in (("project", "-DRAYS", True), ("blend", "-DRAYS", False)):
@@ -361,6 +368,9 @@ def test_ceilings() -> None:
     assert broken([*good, row("project_grad", stack=8, target="gfx1100")]) == []
     assert len(broken([*good, row("blend", spills=4, target="gfx1100")])) == 1
     assert broken([*good, row("blend", unknown="a loop")]) == ["a loop"]
+    (told,) = broken([*good, row("project_step", registers=97)])
+    assert told == "project_step, 1x64, sm_89: 97 registers, expected at most 96"
+    assert broken([*good, row("project_step", registers=97, target="gfx1100")]) == []
     assert "sort_radix: no kernel file of a step" in broken(good[:-1])[0]
 
 

@@ -75,10 +75,20 @@ class Source:
         """Number of items that exchange values, 1 if none do."""
         return next((int(each.partition("=")[2]) for each in self.options if each.startswith("-DSUBGROUP=")), 1)
 
+    @property
+    def common(self) -> tuple[str, ...]:
+        """The options without those of one maker's driver."""
+        return tuple(each for each in self.options if not each.startswith("-cl-nv-"))
+
+    @property
+    def register_limit(self) -> tuple[str, ...]:
+        """The option of ptxas for the limit of registers, if there is one."""
+        return tuple(each.replace("-cl-nv-", "-") for each in self.options if each.startswith("-cl-nv-maxrregcount="))
+
     def options_for(self, target: str) -> tuple[str, ...]:
-        """The options, including the target's functions for exchanging values."""
+        """Clang's options, including the target's functions for exchanging values."""
         shuffle = "-DSHUFFLE_PTX" if target.startswith("sm_") else "-DSHUFFLE_AMD"
-        return tuple(shuffle if each.startswith("-DSHUFFLE") else each for each in self.options)
+        return tuple(shuffle if each.startswith("-DSHUFFLE") else each for each in self.common)
 
     @property
     def shape(self) -> str:
@@ -189,9 +199,8 @@ def compile_source(source: Source, target: str, builtins: Path) -> list[Built]:
             raise ClsplatError(f"{what}: {BUILTINS.name} has no body of the built-in function {name}")
         if not target.startswith("sm_"):
             return read_amd(written, target)
-        told = run_checked(
-            [nvidia("ptxas"), "-v", "-lineinfo", f"-arch={target}", str(assembly), "-o", str(cubin)], what
-        )
+        ptxas = (nvidia("ptxas"), "-v", "-lineinfo", f"-arch={target}", *source.register_limit)
+        told = run_checked([*ptxas, str(assembly), "-o", str(cubin)], what)
         return read_nvidia(told, run_checked([nvidia("nvdisasm"), "-c", "-g", str(cubin)], what), target)
 
 

@@ -49,7 +49,7 @@ def compile_intel(source: Source, device: str) -> list[IntelBuilt]:
     with tempfile.TemporaryDirectory(prefix="clsplat-intel-") as scratch:
         text = Path(scratch) / f"{source.stem}.cl"
         text.write_text(kernel_source(source.stem), encoding="utf-8")
-        options = ("-options", " ".join(source.options), "-internal_options", "-cl-intel-allow-zebin")
+        options = ("-options", " ".join(source.common), "-internal_options", "-cl-intel-allow-zebin")
         place = ("-output_no_suffix", "-out_dir", scratch)
         run_checked([program, "compile", "-q", "-file", str(text), "-device", device, *options, *place], what)
         return read_intel(source, device, (Path(scratch) / source.stem).read_bytes())

@@ -51,16 +51,18 @@ SHAPES = ("1x32", "1x64", "1x128", "1x256")
 FORMS = ("1x32g", "1x64g", "1x32s", "1x64s")
 """Shapes that differ only in the form of blending's gradient."""
 FRAMES = Path(__file__).with_name("gpu_frames.json")
-CHECKED = (("1x64", "1x32g"), ("sm_89", "gfx1100"))
+CHECKED = (("1x64", "1x32g"), ("sm_89", "sm_90", "gfx1100", "gfx90a"))
 """Shapes and targets that have ceilings."""
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
-"""Kernel files that must use no stack memory and no spills on sm_89."""
+"""Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
 NO_SCRATCH = ("blend", "blend_grad")
-"""Kernel files that must use no stack memory and no spills on gfx1100."""
+"""Kernel files that must use no stack memory and no spills on AMD's GPUs."""
 MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
-"""Maximum number of a warp's instructions per pair, on sm_89."""
+"""Maximum number of a warp's instructions per pair, on NVIDIA's GPUs."""
 MOST_BY_GAUSSIAN = 500
-"""Maximum number of a warp's instructions per pair on sm_89, for blend_grad with a Gaussian per item."""
+"""Maximum number of a warp's instructions per pair there, for blend_grad with a Gaussian per item."""
+MOST_REGISTERS = {"project_step": 96}
+"""Maximum number of registers on NVIDIA's GPUs."""
 
 
 @dataclass(frozen=True)
@@ -212,6 +214,9 @@ def broken(rows: Sequence[Row]) -> list[str]:
         most = MOST_BY_GAUSSIAN if row.source.by_gaussian else MOST_A_PAIR.get(built.kernel)
         if most is not None and built.target.startswith("sm_") and row.a_pair is not None and row.a_pair > most:
             found.append(f"{where}: {row.a_pair:.0f} instructions of a warp for a pair, expected at most {most}")
+        most = MOST_REGISTERS.get(built.kernel)
+        if most is not None and built.target.startswith("sm_") and built.registers > most:
+            found.append(f"{where}: {built.registers} registers, expected at most {most}")
         if row.unknown:
             found.append(row.unknown)
     stems = {row.source.stem for row in rows}

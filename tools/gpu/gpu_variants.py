@@ -39,6 +39,8 @@ MEMORY = 64 << 30
 OPTIONS = "-cl-std=CL1.2 -cl-fp32-correctly-rounded-divide-sqrt"
 """Options of a build. NVIDIA's and AMD's drivers support correctly rounded division and square roots."""
 
+REGISTERS = "-cl-nv-maxrregcount="
+"""Option of NVIDIA's driver, which `gpu_compilers.py` gives to ptxas."""
 
 SUBGROUPS = {"SUBGROUP": 32, "SHUFFLE_PTX": True}
 """Defines of a shape with sub-groups. `gpu_compilers.py` adds the target's functions for exchanging values."""
@@ -101,9 +103,10 @@ class Rehearsed:
         """Replace the driver's classes."""
         rehearsed = self
 
-        def built(device: Device, stem: str, defines: Mapping[str, object]) -> _Kernels:
+        def built(device: Device, stem: str, defines: Mapping[str, object], registers: int = 0) -> _Kernels:
             shape = {"LANES": device.shape.lanes, "ITEMS": device.shape.items}
-            return _Kernels(variant_of(stem, {**shape, **defines}, OPTIONS))
+            limit = f" {REGISTERS}{registers}" if registers else ""
+            return _Kernels(variant_of(stem, {**shape, **defines}, OPTIONS + limit))
 
         def enqueue(device: Device, kernel: Any, size: Any, local: Any, values: Any, *, wait: bool = False) -> None:
             del device, wait

@@ -118,6 +118,12 @@ def subgroup_ways(device: cl.Device) -> list[dict[str, object]]:
     ]
 
 
+def register_limit(device: cl.Device, registers: int) -> str:
+    """Build option for at most this many registers per work-item; empty for a driver without one."""
+    offered = "cl_nv_compiler_options" in device.extensions.split()
+    return f"-cl-nv-maxrregcount={registers}" if offered else ""
+
+
 def misnames_processors(device: cl.Device) -> bool:
     """True for PoCL 3.0, whose compiler may refuse the processor name that it has found itself."""
     return str(device.platform.version).startswith("OpenCL 3.0 PoCL 3.0")
