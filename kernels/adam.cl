@@ -3,8 +3,8 @@
 //
 // The step zeroes the gradients it has used, because project_grad writes only the rows of visible Gaussians.
 //
-// Owner: A work-item owns LANES consecutive elements (adam), LANES rows (adam_visible), an element (add_view) or a row
-//   (join_view).
+// Owner: A work-item owns ABREAST consecutive elements (adam), ABREAST rows (adam_visible), an element (add_view) or a
+//   row (join_view).
 // Launch: One work-item for each of these, in groups of 64; work-items past the end do nothing.
 // Buffers: The group's parameters in its own units, their gradients, the moments `first` and `second`; `readback`
 //   (READBACK_SIZE) counts refused elements. The scalars are those of Step. Shapes are above each kernel.
@@ -13,50 +13,53 @@
 #include "shared/lanes.h"
 #include "shared/adam.h"
 
-// Steps the group as a flat array, LANES elements per work-item. parameters, gradients, first, second (n).
+// Steps the group as a flat array, ABREAST elements per work-item. parameters, gradients, first, second (n).
 __kernel void adam(const ulong n, const float rate, const float root, const float beta1, const float beta2,
                    const float epsilon, const float limit2, __global uint *readback, __global float *parameters,
                    __global float *gradients, __global float *first, __global float *second) {
   const Step s = {rate, root, beta1, beta2, epsilon, limit2, readback};
   const Stepped model = {parameters, first, second};
-  const ulong i = get_global_id(0) * (ulong)LANES;
-  if (i + LANES <= n && step_vector(i, LOADL(gradients + i), (intL)(-1), s, model)) {
-    STOREL((floatL)(0.0f), gradients + i);
+  const ulong i = get_global_id(0) * (ulong)ABREAST;
+  if (i + ABREAST <= n && step_vector(i, LOADA(gradients + i), (intA)(-1), s, model)) {
+    STOREA((floatA)(0.0f), gradients + i);
     return;
   }
-  for (ulong k = i; k < min(i + (ulong)LANES, n); ++k) {
+  for (ulong k = i; k < min(i + (ulong)ABREAST, n); ++k) {
     step_element(k, gradients[k], s, model);
     gradients[k] = 0.0f;
   }
 }
 
 #ifdef WIDTH
-// Steps only the rows of visible Gaussians (OptimiserConfig.sparse), LANES rows per work-item. All other gradients are
-// zero already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
+// Steps only the rows of visible Gaussians (OptimiserConfig.sparse), ABREAST rows per work-item. All other gradients
+// are zero already. tile_counts (n): 0 where hidden; parameters, gradients, first, second (n, WIDTH).
 __kernel void adam_visible(const uint n, const float rate, const float root, const float beta1, const float beta2,
                            const float epsilon, const float limit2, __global uint *readback,
                            __global const uint *tile_counts, __global float *parameters, __global float *gradients,
                            __global float *first, __global float *second) {
   const Step s = {rate, root, beta1, beta2, epsilon, limit2, readback};
   const Stepped model = {parameters, first, second};
-  const uint row = get_global_id(0) * LANES;
+  const uint row = get_global_id(0) * ABREAST;
   if (row >= n) return;
-  int visible[LANES], some = 0;
-  for (uint lane = 0; lane < LANES; ++lane) {
+  int visible[ABREAST], some = 0;
+  for (uint lane = 0; lane < ABREAST; ++lane) {
     visible[lane] = row + lane < n && tile_counts[row + lane] > 0 ? -1 : 0;
     some |= visible[lane];
   }
   if (!some) return;
   const size_t begin = (size_t)row * WIDTH, end = (size_t)n * WIDTH;
   for (uint k = 0; k < WIDTH; ++k) {
-    const size_t i = begin + k * LANES;
-    IntLanes taken;
-    for (uint lane = 0; lane < LANES; ++lane) taken.lane[lane] = visible[(k * LANES + lane) / WIDTH];
-    if (n - row >= LANES && step_vector(i, LOADL(gradients + i), taken.all, s, model)) {
-      STOREL((floatL)(0.0f), gradients + i);
+    const size_t i = begin + k * ABREAST;
+    union {
+      intA all;
+      int lane[ABREAST];
+    } taken;
+    for (uint lane = 0; lane < ABREAST; ++lane) taken.lane[lane] = visible[(k * ABREAST + lane) / WIDTH];
+    if (n - row >= ABREAST && step_vector(i, LOADA(gradients + i), taken.all, s, model)) {
+      STOREA((floatA)(0.0f), gradients + i);
       continue;
     }
-    for (uint lane = 0; lane < LANES && i + lane < end; ++lane)
+    for (uint lane = 0; lane < ABREAST && i + lane < end; ++lane)
       if (taken.lane[lane]) {
         step_element(i + lane, gradients[i + lane], s, model);
         gradients[i + lane] = 0.0f;

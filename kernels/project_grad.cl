@@ -106,8 +106,23 @@ __kernel void project_grad(const uint n, const int coefficients, __constant floa
 #else
 
 #define BLOCKS (ROWS / LANES)
-#define ROW_ALIGNED __attribute__((aligned(4 * LANES)))
+#define ROW_ALIGNED __attribute__((aligned(4 * ABREAST)))
 #define SH_FLOATS (3 * SH_HIGHER) // floats in a Gaussian's higher SH bands
+// The model's arrays: number, name, floats in a row, gradients, and constants of the step.
+#ifdef NO_SH_REST
+#define ARRAYS 5
+#define SH_REST(EACH)
+#else
+#define ARRAYS 6
+#define SH_REST(EACH) EACH(5, sh_rest, sh_width, by_sh_rest, root_sh_rest, limit2_sh)
+#endif
+#define MODEL(EACH)                                                                                                    \
+  EACH(0, means, 3, by_mean, root, limit2)                                                                             \
+  EACH(1, quaternions, 4, by_quaternion, root, limit2)                                                                 \
+  EACH(2, log_scales, 3, by_log_scale, root, limit2)                                                                   \
+  EACH(3, opacity_logits, 1, by_opacity, root, limit2)                                                                 \
+  EACH(4, sh_dc, 3, by_sh_dc, root, limit2_sh)                                                                         \
+  SH_REST(EACH)
 
 #if LANES > 1
 // Adam's step of LANES rows, or fewer at the end of n. gradients (LANES, width): zero in rows that are not `shown`.
@@ -140,6 +155,16 @@ static inline void step_rows(const uint n, const uint first_row, const uint widt
     step_element(begin + i, gradients[i], s, model);
   }
 }
+#else
+#define ROLLED _Pragma("unroll 1")
+// A group's step of an array of the model. gradients (rows, width); the numbers as in Step. A group keeps these in
+// local memory: so many pointers do not fit into the scalar registers of AMD's GPUs.
+typedef struct {
+  Stepped model;
+  __local const float *gradients;
+  uint width;
+  float rate, root, limit2;
+} GroupStep;
 #endif
 
 __kernel void
@@ -191,78 +216,68 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
       for (int k = 0; k < 3; ++k) by_sh_dc[3 * i + k] = one ? SH_CONSTANT * d.colour[k].lane[lane] : 0.0f;
     }
   }
-#define STEP_GROUP(group, width, gradients, root, limit2)                                                              \
+#define STEP_ARRAY(number, group, width, gradients, root, limit2)                                                      \
   {                                                                                                                    \
     STEP_OF(group, root, limit2)                                                                                       \
     for (uint block = 0; block < blocks; ++block)                                                                      \
       step_rows(n, begin + block * LANES, width, shown + block * LANES, gradients + block * LANES * (width), s,        \
                 model);                                                                                                \
   }
-  STEP_GROUP(means, 3, by_mean, root, limit2)
-  STEP_GROUP(quaternions, 4, by_quaternion, root, limit2)
-  STEP_GROUP(log_scales, 3, by_log_scale, root, limit2)
-  STEP_GROUP(opacity_logits, 1, by_opacity, root, limit2)
-  STEP_GROUP(sh_dc, 3, by_sh_dc, root, limit2_sh)
-#ifndef NO_SH_REST
-  STEP_GROUP(sh_rest, sh_width, by_sh_rest, root_sh_rest, limit2_sh)
-#endif
+  MODEL(STEP_ARRAY)
 
 #else // LANES == 1
   // The gradients of a group's Gaussians, row by row; then its items walk the model's arrays side by side.
-  __local float by_mean[3 * ROWS], by_quaternion[4 * ROWS], by_log_scale[3 * ROWS];
-  __local float by_opacity[ROWS], by_colour[3 * ROWS], basis[SH_HIGHER * ROWS];
+  __local float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
+  __local float by_opacity[ROWS] ROW_ALIGNED, by_sh_dc[3 * ROWS] ROW_ALIGNED, by_sh_rest[SH_FLOATS * ROWS] ROW_ALIGNED;
   __local int in_view[ROWS];
-  const uint me = get_local_id(0), items = get_local_size(0), first_row = get_global_id(0) - me;
-  const uint rows = first_row < n && !readback[READBACK_STOPPED] ? min(items, n - first_row) : 0;
+  __local GroupStep steps[ARRAYS];
+  const uint me = get_local_id(0), first_row = get_global_id(0) - me;
+  const uint rows = first_row < n && !readback[READBACK_STOPPED] ? min((uint)get_local_size(0), n - first_row) : 0;
+  const uint own = ABREAST * me, stride = ABREAST * get_local_size(0);
+  const int aligned = first_row % ABREAST == 0; // but where a driver allows less than ABREAST items in a group
+#define GROUP_STEP(number, group, columns, by, root, limit2)                                                           \
+  steps[number] = (GroupStep){{group, first_##group, second_##group}, by, columns, rate_##group, root, limit2};
+  if (me == 0) {
+    MODEL(GROUP_STEP)
+  }
+  __local float *own_sh_rest = by_sh_rest + sh_width * me;
   int any = 0, shown[1] = {0};
   if (me < rows)
     any = gradients_of(n, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
-                       quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, shown, &d PENALTY_WEIGHTS);
+                       quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, own_sh_rest, shown,
+                       &d PENALTY_WEIGHTS);
   in_view[me] = shown[0];
   UNROLL for (int k = 0; k < 3; ++k) by_mean[3 * me + k] = any ? d.mean[k].all : 0.0f;
   UNROLL for (int k = 0; k < 4; ++k) by_quaternion[4 * me + k] = any ? d.quaternion[k].all : 0.0f;
   UNROLL for (int k = 0; k < 3; ++k) by_log_scale[3 * me + k] = any ? d.scale[k].all : 0.0f;
   by_opacity[me] = any ? d.opacity.all : 0.0f;
-  UNROLL for (int k = 0; k < 3; ++k) by_colour[3 * me + k] = any ? d.colour[k].all : 0.0f;
+  UNROLL for (int k = 0; k < 3; ++k) by_sh_dc[3 * me + k] = any ? SH_CONSTANT * d.colour[k].all : 0.0f;
 #ifndef NO_SH_REST
-  FOR_HIGHER(k, SH_USED(coefficients)) basis[SH_HIGHER * me + k - 1] = any ? d.basis[k].all : 0.0f;
+  for (uint k = any ? 3 * (SH_USED(coefficients) - 1) : 0; k < sh_width; ++k) own_sh_rest[k] = 0.0f;
 #endif
   barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // a row is read by one item and written by several
 #ifdef SPARSE
-#define TAKEN(row) in_view[row]
+#define TAKEN(k) -in_view[(k) / width]
 #else
-#define TAKEN(row) 1
+#define TAKEN(k) -1
 #endif
-#define STEP_GROUP(group, width, gradient, limit2)                                                                     \
-  {                                                                                                                    \
-    STEP_OF(group, root, limit2)                                                                                       \
-    for (uint k = me; k < width * rows; k += items)                                                                    \
-      if (TAKEN(k / width)) step_element((size_t)(width) * first_row + k, gradient, s, model);                         \
-  }
-  STEP_GROUP(means, 3, by_mean[k], limit2)
-  STEP_GROUP(quaternions, 4, by_quaternion[k], limit2)
-  STEP_GROUP(log_scales, 3, by_log_scale[k], limit2)
-  STEP_GROUP(opacity_logits, 1, by_opacity[k], limit2)
-  STEP_GROUP(sh_dc, 3, SH_CONSTANT * by_colour[k], limit2_sh)
-#ifndef NO_SH_REST
-  if (sh_width == 0) return;
-  STEP_OF(sh_rest, root_sh_rest, limit2_sh)
-  uint row = me / sh_width, column = me % sh_width;
-  const uint rows_on = items / sh_width, columns_on = items % sh_width;
-  for (uint k = me; k < sh_width * rows; k += items) {
-    const uint coefficient = column / 3;
-    const float g = in_view[row] && (int)coefficient + 1 < SH_USED(coefficients)
-                        ? basis[SH_HIGHER * row + coefficient] * by_colour[3 * row + column - 3 * coefficient]
-                        : 0.0f;
-    if (TAKEN(row)) step_element((size_t)sh_width * first_row + k, g, s, model);
-    row += rows_on;
-    column += columns_on;
-    if (column >= sh_width) {
-      column -= sh_width;
-      ++row;
+  ROLLED for (int number = 0; number < ARRAYS; ++number) { // a loop for each array would be six times the code
+    const GroupStep step = steps[number];
+    const Step s = {step.rate, step.root, beta1, beta2, epsilon, step.limit2, readback};
+    const uint width = step.width, count = rows * width, whole = aligned ? count : 0;
+    const size_t begin = (size_t)width * first_row, at = begin + own;
+    Stepped model = {step.model.parameters + at, step.model.first + at, step.model.second + at};
+    uint left = 0; // bits of the vectors with a refused element or an element past the last row
+    ROLLED for (uint k = own, bit = 1; k < count; k += stride, bit += bit) {
+      const floatA g = *(__local const floatA *)(step.gradients + k);
+      const intA taken = (intA)(TAKEN(k), TAKEN(k + 1), TAKEN(k + 2), TAKEN(k + 3));
+      if (ANYA(taken) && (k + ABREAST > whole || !step_vector(0, g, taken, s, model))) left |= bit;
+      model.parameters += stride, model.first += stride, model.second += stride;
     }
+    for (uint k = own; left != 0; k += stride, left >>= 1)
+      for (uint i = k; (left & 1) && i < min(k + ABREAST, count); ++i)
+        if (TAKEN(i)) step_element(begin + i, step.gradients[i], s, step.model);
   }
-#endif
 #endif
 }
 #endif

@@ -60,7 +60,7 @@ def adam(
     counts = readback.buffer  # an array would count as traffic, but this is written only on a fault
     config = step.config
     beta1, beta2, epsilon = config.beta1, config.beta2, config.epsilon
-    lanes = device.shape.lanes
+    abreast = max(device.shape.lanes, 4)  # ABREAST in adam.h
     for group, about in PARAMETER_GROUPS.items():
         if group == "sh_rest" and not step.updates_sh_rest:
             continue
@@ -72,11 +72,11 @@ def adam(
             continue
         if config.sparse:
             kernel = device.kernels("adam", {"WIDTH": size // rows}).adam_visible
-            launch_items(device, kernel, -(-rows // lanes), rows, *constants, tile_counts, *arrays)
+            launch_items(device, kernel, -(-rows // abreast), rows, *constants, tile_counts, *arrays)
         else:
             kernel = device.kernels("adam").adam
             # SH coefficients need an index of more than 32 bits from 95 million Gaussians.
-            launch_items(device, kernel, -(-size // lanes), np.uint64(size), *constants, *arrays)
+            launch_items(device, kernel, -(-size // abreast), np.uint64(size), *constants, *arrays)
 
 
 @stage("adam", add_view=1, join_view=1)

@@ -1,4 +1,4 @@
-// Adam's step, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for LANES consecutive
+// Adam's step, (42) of docs/gradients.md (Kingma and Ba 2015, algorithm 1), for one element and for ABREAST consecutive
 // elements.
 //
 // No parameter and no moment becomes NaN or infinite here. An element stays unchanged if its new values would be NaN or
@@ -7,6 +7,24 @@
 // gradient, the moments, or only the step itself. Broken moments restart from zero. In the other cases the second
 // moment becomes infinite and the first 0: every step is then refused until the host has repaired the row
 // (docs/decisions/0016-never-a-nan.md).
+
+// Elements that a work-item steps at once: a vector of the shape, or else four. Memory is then read 16 bytes at a time,
+// three times before the first use, because a GPU waits here for memory.
+#if LANES > 1
+#define ABREAST LANES
+#define fmaA fmaL
+#define ANYA(m) any_lane(m)
+#define LOADA LOADL
+#define STOREA STOREL
+#else
+#define ABREAST 4
+#define fmaA fma
+#define ANYA(m) (((m).x | (m).y | (m).z | (m).w) != 0)
+#define LOADA(p) (*(__global const float4 *)(p))
+#define STOREA(x, p) (*(__global float4 *)(p) = (x))
+#endif
+typedef CAT(float, ABREAST) floatA;
+typedef CAT(int, ABREAST) intA;
 
 // Constants of a step, and the counters of refused elements. rate: the learning rate / (1 - beta1^t); root: 1 / sqrt(1
 // - beta2^t).
@@ -19,13 +37,6 @@ typedef struct {
 typedef struct {
   __global float *parameters, *first, *second;
 } Stepped;
-
-// The change to subtract from a vector of parameters; *m and *v become the new moments.
-static inline floatL change(floatL g, Step s, floatL *m, floatL *v) {
-  *m = fmaL((floatL)(s.beta1), *m, (1.0f - s.beta1) * g);
-  *v = fmaL((floatL)(s.beta2), *v, (1.0f - s.beta2) * (g * g));
-  return s.rate * *m / fmaL(sqrt(*v), (floatL)(s.root), (floatL)(s.epsilon));
-}
 
 // Refuses the step of an element; p, g, m and v are its values before the step.
 static inline void refuse(size_t i, Step s, float p, float g, float m, float v, __global float *first,
@@ -49,7 +60,7 @@ static inline void refuse(size_t i, Step s, float p, float g, float m, float v, 
 #define RARE static inline
 #endif
 
-// Takes Adam's step for element i along its gradient g, like `change`.
+// Takes Adam's step for element i along its gradient g.
 RARE void step_element(size_t i, float g, Step s, Stepped model) {
   const float before = model.parameters[i], m_before = model.first[i], v_before = model.second[i];
   const float m = fma1(s.beta1, m_before, (1.0f - s.beta1) * g);
@@ -66,19 +77,21 @@ RARE void step_element(size_t i, float g, Step s, Stepped model) {
   model.parameters[i] = p;
 }
 
-// The step of the `taken` elements from i on. Returns 0 and stores nothing if any has to be refused. The second moment
-// is a square like p * p, so one test of their sum checks both.
-static inline int step_vector(size_t i, floatL g, intL taken, Step s, Stepped model) {
-  const floatL before = LOADL(model.parameters + i), m_before = LOADL(model.first + i);
-  const floatL v_before = LOADL(model.second + i);
-  floatL m = m_before, v = v_before;
-  const floatL by = change(g, s, &m, &v);
-  const floatL p = before - (taken ? by : (floatL)(0.0f));
+// The step of the `taken` ones of ABREAST elements from i on, a multiple of 4 unless LANES > 1. Returns 0 and stores
+// nothing if any has to be refused. The second moment is a square like p * p, so one test of their sum checks both. It
+// is inlined at once, as AMD's compiler else leaves Step in memory.
+__attribute__((always_inline)) static inline int step_vector(size_t i, floatA g, intA taken, Step s, Stepped model) {
+  const floatA before = LOADA(model.parameters + i), m_before = LOADA(model.first + i);
+  const floatA v_before = LOADA(model.second + i);
+  const floatA m = fmaA((floatA)(s.beta1), m_before, (1.0f - s.beta1) * g);
+  const floatA v = fmaA((floatA)(s.beta2), v_before, (1.0f - s.beta2) * (g * g));
+  const floatA by = s.rate * m / fmaA(sqrt(v), (floatA)(s.root), (floatA)(s.epsilon));
+  const floatA p = before - (taken ? by : (floatA)(0.0f));
 #ifndef UNGUARDED
-  if (ANYL(~MASKL(fmaL(p, p, v) < s.limit2) & taken)) return 0;
+  if (ANYA(~(fmaA(p, p, v) < s.limit2) & taken)) return 0;
 #endif
-  STOREL(taken ? m : m_before, model.first + i);
-  STOREL(taken ? v : v_before, model.second + i);
-  STOREL(p, model.parameters + i);
+  STOREA(taken ? m : m_before, model.first + i);
+  STOREA(taken ? v : v_before, model.second + i);
+  STOREA(p, model.parameters + i);
   return 1;
 }

@@ -3,11 +3,13 @@
 // tangent.h; the defines are those of project_grad.cl.
 
 // Address space of the gradients of the higher SH bands: global for an array of all Gaussians, private for a
-// work-item's. With one lane project_step computes them from basis and colour instead.
+// work-item's, local for a group's.
 #if !defined(ADAM)
 #define SH_GRADIENT __global float
 #elif LANES > 1
 #define SH_GRADIENT float
+#else
+#define SH_GRADIENT __local float
 #endif
 
 // Loops over the SH coefficients after the first, up to `used`.
@@ -27,10 +29,10 @@
 #define PENALTY_WEIGHTS
 #endif
 
-// Gradients with respect to the parameters of LANES Gaussians. The gradient with respect to an SH coefficient is its
-// basis value times the gradient with respect to the colour. `colour` is red, green and blue, each zero where clamped.
+// Gradients with respect to the parameters of LANES Gaussians, but for the higher SH bands. `colour` is red, green and
+// blue, each zero where clamped.
 typedef struct {
-  Lanes mean[3], quaternion[4], scale[3], opacity, colour[3], basis[16];
+  Lanes mean[3], quaternion[4], scale[3], opacity, colour[3];
 } Gradients;
 
 // Gradients of the visible rows among LANES rows from first_row on. Returns 0 if none is visible. Sets `shown` (LANES)
@@ -48,10 +50,7 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
 #ifdef LENS
                                __global float *by_lens,
 #endif
-#ifdef SH_GRADIENT
-                               SH_GRADIENT *d_sh_rest,
-#endif
-                               int *shown, Gradients *d PENALTY_PARAMETERS) {
+                               SH_GRADIENT *d_sh_rest, int *shown, Gradients *d PENALTY_PARAMETERS) {
   uint row[LANES];
   for (uint lane = 0; lane < LANES; ++lane) row[lane] = first_row + lane < n ? first_row + lane : n - 1;
   const uint lanes_used = n - first_row < LANES ? n - first_row : LANES;
@@ -279,8 +278,8 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
   vx = (floatL)(SEEN_ALONG(vx, length, camera[CAMERA_R20]));
   vy = (floatL)(SEEN_ALONG(vy, length, camera[CAMERA_R21]));
   vz = (floatL)(SEEN_ALONG(vz, length, camera[CAMERA_R22]));
-  Lanes weight[16];
-  sh_basis(SH_USED(coefficients), vx, vy, vz, &d->basis[0].all);
+  Lanes basis[16], weight[16];
+  sh_basis(SH_USED(coefficients), vx, vy, vz, &basis[0].all);
   for (uint lane = 0; lane < lanes_used; ++lane) {
     const size_t i = first_row + lane;
     if (!shown[lane]) continue;
@@ -292,12 +291,10 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     d->colour[1].lane[lane] = d_colour.y;
     d->colour[2].lane[lane] = d_colour.z;
     __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
-#ifdef SH_GRADIENT
     SH_GRADIENT *d_f = d_sh_rest + 3 * (coefficients - 1) * lane;
-#endif
     FOR_HIGHER(k, SH_USED(coefficients)) {
-#if defined(SH_GRADIENT) && !defined(NO_SH_REST) // OptimiserConfig.sh_rest_every
-      const float along = d->basis[k].lane[lane];
+#ifndef NO_SH_REST // OptimiserConfig.sh_rest_every
+      const float along = basis[k].lane[lane];
       d_f[0] = along * d_colour.x;
       d_f[1] = along * d_colour.y;
       d_f[2] = along * d_colour.z;

@@ -305,6 +305,7 @@ def test_rules_have_the_kernels_own_sizes(items: int) -> None:
     assert run.batch == defined("shared/blocks.h", "BATCH")
     assert run.loss_rows == defined("loss.cl", "ROWS")
     assert defined("sort_radix.cl", "RUN") == gpu_rules.PER_ITEM
+    assert f"#define ABREAST {gpu_rules.ABREAST}\n" in (kernel_root() / "shared/adam.h").read_text()
 
 
 def test_rounds_of_a_launch() -> None:
@@ -365,13 +366,37 @@ def test_ceilings() -> None:
     assert told.endswith("501 instructions of a warp for a pair, expected at most 500")
     (told,) = broken([*good, row("sort_radix", stack=8)])
     assert told == "sort_radix, 1x64, sm_89: 8 bytes of stack and 0 of spills, expected none"
-    assert broken([*good, row("project_grad", stack=8, target="gfx1100")]) == []
+    assert broken([*good, row("sort_radix", stack=8, target="gfx1100")]) == []
     assert len(broken([*good, row("blend", spills=4, target="gfx1100")])) == 1
     assert broken([*good, row("blend", unknown="a loop")]) == ["a loop"]
-    (told,) = broken([*good, row("project_step", registers=97)])
-    assert told == "project_step, 1x64, sm_89: 97 registers, expected at most 96"
-    assert broken([*good, row("project_step", registers=97, target="gfx1100")]) == []
     assert "sort_radix: no kernel file of a step" in broken(good[:-1])[0]
+
+
+def adams_loop(loads: int, size: int, name: str = "LDG.E.128") -> Loop:
+    lines = kernel_source("project_grad").splitlines()
+    (line,) = [number for number in range(1, len(lines) + 1) if gpu_rules.ADAM.matches(number, lines)]
+    body = [Instruction(name, "global", source=line)] * loads + [Instruction("FADD", "fp32", source=line)]
+    body += [Instruction(name, "global", source=line)] * (size - len(body))
+    return Loop([], set(), [Loop([Block(body=body)], {line})])
+
+
+@pytest.mark.parametrize(
+    ("whole", "changes", "told"),
+    [
+        (adams_loop(3, 200), {}, ""),
+        (adams_loop(3, 201), {}, "50.25 instructions of Adam per element, expected at most 50"),
+        (adams_loop(2, 200), {}, "2 loads of 16 bytes before Adam's arithmetic, expected 3"),
+        (adams_loop(3, 200, "LDG.E"), {}, "0 loads of 16 bytes before Adam's arithmetic, expected 3"),
+        (adams_loop(3, 200), {"registers": 97}, "97 registers, expected at most 96"),
+        (adams_loop(3, 3383), {"target": "gfx1100"}, "3383 instructions, expected at most 3382"),
+    ],
+)
+def test_ceilings_of_the_step(whole: Loop, changes: dict[str, Any], told: str) -> None:
+    source = Source("project_grad", ("-DITEMS=64", "-DLANES=1", "-DADAM"))
+    step = Row(source, built(whole, **{"kernel": "project_step", **changes}), 64, 0, None)
+    others = [row(stem) for stem in NO_STACK if stem != "project_grad"]
+    target = changes.get("target", "sm_89")
+    assert broken([*others, step]) == ([f"project_step, 1x64, {target}: {told}"] if told else [])
 
 
 @pytest.mark.parametrize(("most", "told"), [(12, 0), (11.9, 2)])

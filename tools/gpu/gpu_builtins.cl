@@ -37,6 +37,7 @@ __attribute__((overloadable, always_inline, convergent)) void barrier(cl_mem_fen
 BUILTIN float fma(float a, float b, float c) { return __builtin_fmaf(a, b, c); }
 BUILTIN float mad(float a, float b, float c) { return a * b + c; }
 BUILTIN float sqrt(float x) { return __builtin_sqrtf(x); }
+BUILTIN float4 sqrt(float4 x) { return (float4)(sqrt(x.x), sqrt(x.y), sqrt(x.z), sqrt(x.w)); }
 BUILTIN float fabs(float x) { return __builtin_fabsf(x); }
 BUILTIN float ceil(float x) { return __builtin_ceilf(x); }
 BUILTIN float floor(float x) { return __builtin_floorf(x); }

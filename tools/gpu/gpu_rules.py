@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from clsplat.device.launch import DEFAULT_GROUP_ITEMS
 from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, PLAIN_SLOTS
 
 if TYPE_CHECKING:
@@ -207,9 +208,17 @@ def _group_sum(rounds: Rounds) -> Rule:
     return Rule("for (uint i = get_local_id(0); i < count; i += ITEMS) sum += values[i];", rounds, mark=("global", 1))
 
 
-def _stepped(group: str, width: int) -> Rule:
-    return Rule(f"STEP_GROUP({group}, {width}, ", lambda run: width, mark=("global", 6))
+def _abreast(run: Run) -> float:
+    """Rounds per wave of Adam over the arrays of a group's rows, ABREAST elements an item."""
+    widths = (3, 4, 3, 1, 3, 3 * _bands(run))
+    rounds = (math.ceil(DEFAULT_GROUP_ITEMS * width / ABREAST / run.wave) for width in widths)
+    return sum(rounds) * run.wave / DEFAULT_GROUP_ITEMS
 
+
+ABREAST = 4
+"""Elements that an item steps at once: ABREAST in adam.h."""
+ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _abreast, mark=("global", 6))
+"""Adam's loop in `project_step`."""
 
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
     "target": (),
@@ -280,15 +289,11 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
             lambda run: _UNEVEN * run.addends,
             mark=("global", PLAIN_SLOTS.floats),
         ),
-        _stepped("means", 3),
-        _stepped("quaternions", 4),
-        _stepped("log_scales", 3),
-        _stepped("opacity_logits", 1),
-        _stepped("sh_dc", 3),
-        Rule("for (uint k = me; k < sh_width * rows; k += items)", lambda run: 3 * _bands(run), mark=("global", 6)),
-        Rule("first[i] = 0.0f;", _never, part=True),  # only for a refused step
-        Rule("second[i] = again ? 0.0f", _never, part=True),
-        Rule("atomic_inc(s.readback", _never, part=True),
+        Rule("for (uint k = any ?", lambda run: 3 * _bands(run), mark=("shared", 1)),
+        Rule("for (int number = 0; number < ARRAYS; ++number)", lambda run: 6),
+        ADAM,
+        Rule("for (uint k = own; left != 0;", _never),  # only for refused steps and the last row
+        Rule("for (uint i = k; (left & 1)", _never),
     ),
     "density_statistics": (),
 }

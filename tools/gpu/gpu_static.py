@@ -29,6 +29,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ from gpu_intel import IntelBuilt, compiled_for_intel, ocloc
 from gpu_loops import UnknownLoopError, by_pair, cost_of, loop_table, rules_of, unused_rules
 from gpu_model import Stage, predict
 from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, trained_and_picture, write_page
-from gpu_rules import BY_PAIR, WALK, Rule, Run
+from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule, Run
 from measuring import plain_parser, require, tool
 
 from clsplat.progress import aligned
@@ -55,14 +56,20 @@ CHECKED = (("1x64", "1x32g"), ("sm_89", "sm_90", "gfx1100", "gfx90a"))
 """Shapes and targets that have ceilings."""
 NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
-NO_SCRATCH = ("blend", "blend_grad")
+NO_SCRATCH = ("blend", "blend_grad", "project_grad")
 """Kernel files that must use no stack memory and no spills on AMD's GPUs."""
 MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
 """Maximum number of a warp's instructions per pair, on NVIDIA's GPUs."""
 MOST_BY_GAUSSIAN = 500
 """Maximum number of a warp's instructions per pair there, for blend_grad with a Gaussian per item."""
+MOST_AN_ELEMENT = 50
+"""Maximum number of instructions per element of the model in Adam's loop, on NVIDIA's GPUs."""
 MOST_REGISTERS = {"project_step": 96}
 """Maximum number of registers on NVIDIA's GPUs."""
+LOADS_AHEAD = 3
+"""Loads of 16 bytes in Adam's loop before it uses the first on NVIDIA's GPUs: parameters and both moments."""
+MOST_INSTRUCTIONS = {"gfx1100": {"project_step": 3382}, "gfx90a": {"project_step": 3268}}
+"""Maximum number of instructions of whole kernels: those before Adam by fours."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +209,23 @@ def loops_of(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
+def broken_loop(row: Row) -> list[str]:
+    """Descriptions of exceeded ceilings of Adam's loop, if the kernel has it."""
+    loops = [loop for _, loop in row.built.whole.walk() if ADAM.opens(loop, row.source.lines)]
+    found = []
+    for loop in sorted(loops, key=lambda each: each.size)[-1:]:  # the others are jumps that ptxas adds
+        if loop.size > MOST_AN_ELEMENT * ABREAST:
+            found.append(
+                f"{loop.size / ABREAST:g} instructions of Adam per element, expected at most {MOST_AN_ELEMENT}"
+            )
+        body = (each for block in loop.blocks for each in block.body)
+        before = takewhile(lambda each: each.kind != "fp32", body)
+        ahead = sum(each.name.startswith("LDG.E.128") for each in before)
+        if ahead < LOADS_AHEAD:
+            found.append(f"{ahead} loads of 16 bytes before Adam's arithmetic, expected {LOADS_AHEAD}")
+    return found
+
+
 def broken(rows: Sequence[Row]) -> list[str]:
     """Descriptions of exceeded ceilings."""
     found = []
@@ -214,9 +238,14 @@ def broken(rows: Sequence[Row]) -> list[str]:
         most = MOST_BY_GAUSSIAN if row.source.by_gaussian else MOST_A_PAIR.get(built.kernel)
         if most is not None and built.target.startswith("sm_") and row.a_pair is not None and row.a_pair > most:
             found.append(f"{where}: {row.a_pair:.0f} instructions of a warp for a pair, expected at most {most}")
-        most = MOST_REGISTERS.get(built.kernel)
-        if most is not None and built.target.startswith("sm_") and built.registers > most:
-            found.append(f"{where}: {built.registers} registers, expected at most {most}")
+        most = MOST_INSTRUCTIONS.get(built.target, {}).get(built.kernel)
+        if most is not None and (number := row.told()["instructions"]) > most:
+            found.append(f"{where}: {number} instructions, expected at most {most}")
+        if built.target.startswith("sm_"):
+            most = MOST_REGISTERS.get(built.kernel)
+            if most is not None and built.registers > most:
+                found.append(f"{where}: {built.registers} registers, expected at most {most}")
+            found += [f"{where}: {text}" for text in broken_loop(row)]
         if row.unknown:
             found.append(row.unknown)
     stems = {row.source.stem for row in rows}
