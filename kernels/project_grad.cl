@@ -230,6 +230,11 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   __local float by_mean[3 * ROWS] ROW_ALIGNED, by_quaternion[4 * ROWS] ROW_ALIGNED, by_log_scale[3 * ROWS] ROW_ALIGNED;
   __local float by_opacity[ROWS] ROW_ALIGNED, by_sh_dc[3 * ROWS] ROW_ALIGNED, by_sh_rest[SH_FLOATS * ROWS] ROW_ALIGNED;
   __local int in_view[ROWS];
+#ifdef SPARSE
+#define TAKEN(k, width) -in_view[(k) / (width)]
+#else
+#define TAKEN(k, width) -1
+#endif
   __local GroupStep steps[ARRAYS];
   const uint me = get_local_id(0), first_row = get_global_id(0) - me;
   const uint rows = first_row < n && !readback[READBACK_STOPPED] ? min((uint)get_local_size(0), n - first_row) : 0;
@@ -240,13 +245,31 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
   if (me == 0) {
     MODEL(GROUP_STEP)
   }
-  __local float *own_sh_rest = by_sh_rest + sh_width * me;
+  in_view[me] = me < rows && tile_counts[first_row + me] > 0;
+#ifdef SPARSE
+  barrier(CLK_LOCAL_MEM_FENCE);
+#endif
+  // Items read the SH coefficients side by side: a row an item, each access would touch a line of memory for each.
+  __global const float *from = sh_rest + (size_t)sh_width * first_row;
+  const uint floats = sh_width * rows, whole_floats = aligned ? floats / ABREAST * ABREAST : 0;
+#define WANTED(k) ((k) < whole_floats && (TAKEN(k, sh_width) | TAKEN((k) + ABREAST - 1, sh_width)))
+  for (uint k = own; k < whole_floats; k += 4 * stride) { // four loads, then their stores
+    floatA ahead[4];
+    UNROLL for (uint i = 0; i < 4; ++i) {
+      if (WANTED(k + i * stride)) ahead[i] = LOADA(from + k + i * stride);
+    }
+    UNROLL for (uint i = 0; i < 4; ++i) {
+      if (WANTED(k + i * stride)) *(__local floatA *)(by_sh_rest + k + i * stride) = ahead[i];
+    }
+  }
+  for (uint k = whole_floats + me; k < floats; k += stride / ABREAST) by_sh_rest[k] = from[k];
+  barrier(CLK_LOCAL_MEM_FENCE);
+  __local float *own_sh_rest = by_sh_rest + sh_width * me; // gradients replace the coefficients
   int any = 0, shown[1] = {0};
   if (me < rows)
     any = gradients_of(n, first_row + me, coefficients, camera, tile_counts, first_slots, slots, splats, means,
                        quaternions, log_scales, opacity_logits, sh_rest, VIEW_ARRAYS, own_sh_rest, shown,
                        &d PENALTY_WEIGHTS);
-  in_view[me] = shown[0];
   UNROLL for (int k = 0; k < 3; ++k) by_mean[3 * me + k] = any ? d.mean[k].all : 0.0f;
   UNROLL for (int k = 0; k < 4; ++k) by_quaternion[4 * me + k] = any ? d.quaternion[k].all : 0.0f;
   UNROLL for (int k = 0; k < 3; ++k) by_log_scale[3 * me + k] = any ? d.scale[k].all : 0.0f;
@@ -255,12 +278,7 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
 #ifndef NO_SH_REST
   for (uint k = any ? 3 * (SH_USED(coefficients) - 1) : 0; k < sh_width; ++k) own_sh_rest[k] = 0.0f;
 #endif
-  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); // a row is read by one item and written by several
-#ifdef SPARSE
-#define TAKEN(k) -in_view[(k) / width]
-#else
-#define TAKEN(k) -1
-#endif
+  barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);     // a row is read by one item and written by several
   ROLLED for (int number = 0; number < ARRAYS; ++number) { // a loop for each array would be six times the code
     const GroupStep step = steps[number];
     const Step s = {step.rate, step.root, beta1, beta2, epsilon, step.limit2, readback};
@@ -270,13 +288,13 @@ project_step(const uint n, const int coefficients, __constant float *camera, __g
     uint left = 0; // bits of the vectors with a refused element or an element past the last row
     ROLLED for (uint k = own, bit = 1; k < count; k += stride, bit += bit) {
       const floatA g = *(__local const floatA *)(step.gradients + k);
-      const intA taken = (intA)(TAKEN(k), TAKEN(k + 1), TAKEN(k + 2), TAKEN(k + 3));
+      const intA taken = (intA)(TAKEN(k, width), TAKEN(k + 1, width), TAKEN(k + 2, width), TAKEN(k + 3, width));
       if (ANYA(taken) && (k + ABREAST > whole || !step_vector(0, g, taken, s, model))) left |= bit;
       model.parameters += stride, model.first += stride, model.second += stride;
     }
     for (uint k = own; left != 0; k += stride, left >>= 1)
       for (uint i = k; (left & 1) && i < min(k + ABREAST, count); ++i)
-        if (TAKEN(i)) step_element(begin + i, step.gradients[i], s, step.model);
+        if (TAKEN(i, width)) step_element(begin + i, step.gradients[i], s, step.model);
   }
 #endif
 }

@@ -10,6 +10,7 @@
 #define SH_GRADIENT float
 #else
 #define SH_GRADIENT __local float
+#define SH_IN_PLACE // these rows hold the coefficients before
 #endif
 
 // Loops over the SH coefficients after the first, up to `used`.
@@ -290,9 +291,15 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
     d->colour[0].lane[lane] = d_colour.x;
     d->colour[1].lane[lane] = d_colour.y;
     d->colour[2].lane[lane] = d_colour.z;
-    __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
     SH_GRADIENT *d_f = d_sh_rest + 3 * (coefficients - 1) * lane;
+#ifdef SH_IN_PLACE
+    __local const float *f = d_f;
+#else
+    __global const float *f = sh_rest + (size_t)3 * (coefficients - 1) * i;
+#endif
     FOR_HIGHER(k, SH_USED(coefficients)) {
+      weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
+      f += 3;
 #ifndef NO_SH_REST // OptimiserConfig.sh_rest_every
       const float along = basis[k].lane[lane];
       d_f[0] = along * d_colour.x;
@@ -300,8 +307,6 @@ static inline int gradients_of(const uint n, const uint first_row, const int coe
       d_f[2] = along * d_colour.z;
       d_f += 3;
 #endif
-      weight[k].lane[lane] = fma1(d_colour.x, f[0], fma1(d_colour.y, f[1], d_colour.z * f[2]));
-      f += 3;
     }
   }
   floatL d_v[3];

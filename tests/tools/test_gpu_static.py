@@ -25,7 +25,7 @@ from gpu_intel import read_intel
 from gpu_loops import UnknownLoopError, cost_of, rules_of, unused_rules
 from gpu_model import Stage, predict
 from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, WALK, Rule, Run
-from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, Row, broken, sources_of
+from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, SH_READ, Row, broken, sources_of
 
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import ClsplatError
@@ -372,12 +372,15 @@ def test_ceilings() -> None:
     assert "sort_radix: no kernel file of a step" in broken(good[:-1])[0]
 
 
-def adams_loop(loads: int, size: int, name: str = "LDG.E.128") -> Loop:
-    lines = kernel_source("project_grad").splitlines()
-    (line,) = [number for number in range(1, len(lines) + 1) if gpu_rules.ADAM.matches(number, lines)]
+def adams_loop(loads: int, size: int, name: str = "LDG.E.128", scattered: int = 0) -> Loop:
+    """scattered: loads of SH coefficients before the loop."""
+    lines = list(enumerate(kernel_source("project_grad").splitlines(), 1))
+    (line,) = [number for number, text in lines if gpu_rules.ADAM.text in text]
+    (read,) = [number for number, text in lines if SH_READ in text]
     body = [Instruction(name, "global", source=line)] * loads + [Instruction("FADD", "fp32", source=line)]
     body += [Instruction(name, "global", source=line)] * (size - len(body))
-    return Loop([], set(), [Loop([Block(body=body)], {line})])
+    before = [Instruction("LDG.E", "global", source=read)] * scattered + [Instruction("LDS", "shared", source=read)]
+    return Loop([Block(body=before)], set(), [Loop([Block(body=body)], {line})])
 
 
 @pytest.mark.parametrize(
@@ -387,8 +390,9 @@ def adams_loop(loads: int, size: int, name: str = "LDG.E.128") -> Loop:
         (adams_loop(3, 201), {}, "50.25 instructions of Adam per element, expected at most 50"),
         (adams_loop(2, 200), {}, "2 loads of 16 bytes before Adam's arithmetic, expected 3"),
         (adams_loop(3, 200, "LDG.E"), {}, "0 loads of 16 bytes before Adam's arithmetic, expected 3"),
+        (adams_loop(3, 200, scattered=45), {}, "45 loads of SH coefficients a row an item, expected none"),
         (adams_loop(3, 200), {"registers": 97}, "97 registers, expected at most 96"),
-        (adams_loop(3, 3383), {"target": "gfx1100"}, "3383 instructions, expected at most 3382"),
+        (adams_loop(3, 3382), {"target": "gfx1100"}, "3383 instructions, expected at most 3382"),
     ],
 )
 def test_ceilings_of_the_step(whole: Loop, changes: dict[str, Any], told: str) -> None:

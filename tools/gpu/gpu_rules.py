@@ -208,16 +208,18 @@ def _group_sum(rounds: Rounds) -> Rule:
     return Rule("for (uint i = get_local_id(0); i < count; i += ITEMS) sum += values[i];", rounds, mark=("global", 1))
 
 
-def _abreast(run: Run) -> float:
-    """Rounds per wave of Adam over the arrays of a group's rows, ABREAST elements an item."""
-    widths = (3, 4, 3, 1, 3, 3 * _bands(run))
-    rounds = (math.ceil(DEFAULT_GROUP_ITEMS * width / ABREAST / run.wave) for width in widths)
-    return sum(rounds) * run.wave / DEFAULT_GROUP_ITEMS
+def _abreast(run: Run, width: float) -> float:
+    """Rounds per wave over a group's rows of this width, ABREAST elements an item."""
+    return math.ceil(DEFAULT_GROUP_ITEMS * width / ABREAST / run.wave) * run.wave / DEFAULT_GROUP_ITEMS
+
+
+def _adam(run: Run) -> float:
+    return sum(_abreast(run, width) for width in (3, 4, 3, 1, 3, 3 * _bands(run)))
 
 
 ABREAST = 4
 """Elements that an item steps at once: ABREAST in adam.h."""
-ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _abreast, mark=("global", 6))
+ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _adam, mark=("global", 6))
 """Adam's loop in `project_step`."""
 
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
@@ -289,6 +291,10 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
             lambda run: _UNEVEN * run.addends,
             mark=("global", PLAIN_SLOTS.floats),
         ),
+        Rule(
+            "for (uint k = own; k < whole_floats;", lambda run: _abreast(run, 3 * _bands(run) / 4), mark=("global", 4)
+        ),
+        Rule("for (uint k = whole_floats + me;", _never),  # only for the last row
         Rule("for (uint k = any ?", lambda run: 3 * _bands(run), mark=("shared", 1)),
         Rule("for (int number = 0; number < ARRAYS; ++number)", lambda run: 6),
         ADAM,

@@ -68,6 +68,9 @@ MOST_REGISTERS = {"project_step": 96}
 """Maximum number of registers on NVIDIA's GPUs."""
 LOADS_AHEAD = 3
 """Loads of 16 bytes in Adam's loop before it uses the first on NVIDIA's GPUs: parameters and both moments."""
+SH_READ = "fma1(d_colour.x, f[0]"
+"""Part of the line in which an item of `project_step` reads its row of SH coefficients. A load from global memory would
+touch a line for each item there; a group copies its rows to local memory, in loads of 16 bytes side by side."""
 MOST_INSTRUCTIONS = {"gfx1100": {"project_step": 3382}, "gfx90a": {"project_step": 3268}}
 """Maximum number of instructions of whole kernels: those before Adam by fours."""
 
@@ -223,6 +226,11 @@ def broken_loop(row: Row) -> list[str]:
         ahead = sum(each.name.startswith("LDG.E.128") for each in before)
         if ahead < LOADS_AHEAD:
             found.append(f"{ahead} loads of 16 bytes before Adam's arithmetic, expected {LOADS_AHEAD}")
+    lines = row.source.lines
+    reads = [each for _, loop in row.built.whole.walk() for block in loop.blocks for each in block.body if each.source]
+    scattered = sum(each.kind == "global" and SH_READ in lines[each.source - 1] for each in reads)
+    if row.built.kernel == "project_step" and scattered:
+        found.append(f"{scattered} loads of SH coefficients a row an item, expected none")
     return found
 
 
