@@ -199,7 +199,7 @@ _SASS_LABEL = re.compile(r"^(\.[\w$]+):")
 _SASS_SOURCE = re.compile(r'^\s*//## File "[^"]*", line (\d+)')
 _SECTION = re.compile(r"^\.text\.([\w$]+):")
 _GCN_LINE = re.compile(r"^\s+(?P<name>[a-z][a-z0-9]*_\w+)(?P<rest>[^;]*)")
-_GCN_LABEL = re.compile(r"^(\.L\w+|\w+):")
+_GCN_LABEL = re.compile(r"^(\.LBB\w+|\w+):")
 _GCN_SOURCE = re.compile(r"^\s+\.loc\s+\d+\s+(\d+)")
 
 

@@ -118,7 +118,7 @@ def _share(loop: Loop, lines: Sequence[str], parts: Sequence[Rule], run: Run, us
         sources = {each.source for each in block.body}
         inside = [rule for rule in parts if any(rule.matches(number, lines) for number in sources)]
         used.update(inside)
-        factor = min((rule.rounds(run) for rule in inside), default=1)
+        factor = inside[0].rounds(run) if inside else 1
         for each in block.body:
             counts[each.kind] += factor  # type: ignore[assignment]
     return counts
