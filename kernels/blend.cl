@@ -2,7 +2,8 @@
 //
 // Owner: A group owns a tile. On a CPU (ITEMS == 1) one work-item walks the tile's Gaussians, and for each Gaussian
 //   only the open cells that its ellipse reaches. On a GPU (LANES == 1) each work-item has its own pixels, and the
-//   group fetches Gaussians in batches, as in Kerbl et al. Both give the same bits.
+//   group fetches Gaussians in batches, as in Kerbl et al.; then each warp walks those that reach its blocks. Both give
+//   the same bits.
 // Launch: One group of ITEMS work-items for each tile of a band or of the whole image, in row-major order from
 //   first_tile on.
 // Buffers: ranges (tiles, 2), gaussian_from_sorted (pairs), splats (n, SPLAT_SIZE) in pixels, background (3), with RAYS
@@ -48,22 +49,34 @@
 #define COUNT(statements)
 #endif
 
-// `t` is the transmittance of open pixels, and 0 in finished pixels, whose final transmittance is in `kept`. With t = 0
-// every weight is 0 there, and no test is needed.
+// `t` is the transmittance of open pixels. Finished pixels get no weight without a test of their own. On a CPU t is 0
+// there, and their final transmittance is in `kept`, which is rarely written. On a GPU, for fewer instructions, t is
+// minus the final transmittance, which is always under TRANSMITTANCE_MIN.
 typedef struct {
-  floatL t, kept, red, green, blue;
+  floatL t;
+#if ITEMS == 1
+  floatL kept;
+#endif
+  floatL red, green, blue;
   intL stop;
 #ifdef NEARNESS
   floatL near;
 #endif
 } Pixels;
+#if ITEMS == 1
+#define T_AT_FIRST(inside) (inside) ? one : zero, one
+#define T_AT_END(p) ((p).t > 0.0f ? (p).t : (p).kept)
+#else
+#define T_AT_FIRST(inside) (inside) ? one : -one
+#define T_AT_END(p) fabs((p).t)
+#endif
 
-// Adds the tile's i-th pair to a cell that it reaches. Returns true if this finishes the cell's last open pixel.
-// TRANSMITTANCE_MIN is from math.h.
-static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, float c_green,
+// Adds the tile's i-th pair to a cell. On a CPU it returns true if this finishes the cell's last open pixel. `zero` is
+// that of exp2_by; TRANSMITTANCE_MIN is from math.h.
+static inline int add_gaussian(Pixels *p, floatL power, int i, int zero, float c_red, float c_green,
                                float c_blue NEAR_PARAMETER) {
   const floatL before = p->t;
-  floatL alpha = exp2L(power);
+  floatL alpha = exp2_by(power, zero);
   alpha = alpha < ALPHA_MAX ? alpha : (floatL)(ALPHA_MAX);
   alpha = power >= LOG2_ALPHA_MIN ? alpha : (floatL)(0.0f);
   const floatL after = fmaL(-before, alpha, before);
@@ -75,12 +88,18 @@ static inline int add_gaussian(Pixels *p, floatL power, int i, float c_red, floa
 #ifdef NEARNESS
   p->near = fmaL(weight, (floatL)(c_near), p->near);
 #endif
+#if ITEMS == 1
   p->t = AS_FLOATL(AS_INTL(after) & goes_on);
   const intL ended = AS_INTL(before) & ~goes_on; // the bits of `before` where the pixel is finished now, else 0
   if (!ANYL(ended)) return 0;
   p->kept = ended != 0 ? before : p->kept;
   p->stop = ended != 0 ? (intL)(i) : p->stop;
   return !ANYL(p->t > 0.0f);
+#else
+  p->t = goes_on ? after : -fabs(before);
+  p->stop = goes_on ? p->stop : min(p->stop, i); // pairs come in order
+  return 0;
+#endif
 }
 
 GROUP __kernel void blend(const int first_tile, const int tiles_x, const int width, const int height,
@@ -115,7 +134,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
     const floatL x = (floatL)(tile_x) + PIXELS_X(cell), y = (floatL)(tile_y) + PIXELS_Y(cell);
     const intL inside = MASKL(x < (floatL)(width)) & MASKL(y < (floatL)(height));
     const floatL zero = (floatL)(0.0f), one = (floatL)(1.0f);
-    const Pixels p = {inside ? one : zero, one, zero, zero, zero, inside ? (intL)(end) : (intL)(-1)};
+    const Pixels p = {T_AT_FIRST(inside), zero, zero, zero, inside ? (intL)(end) : (intL)(-1)};
     pixels[cell] = p;
 #ifdef NEARNESS
     pixels[cell].near = zero;
@@ -145,7 +164,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       const uint contributes = CONTRIBUTES(reached);
       if (contributes) {
         RECORD(cells |= contributes << FIRST_RECORDED(cell);)
-        if (add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue NEAR_ARGUMENT)) CLOSE_CELL(open, cell);
+        if (add_gaussian(pixels + cell, power, i, 0, c_red, c_green, c_blue NEAR_ARGUMENT)) CLOSE_CELL(open, cell);
         COUNT(added -= reached & MASKL(pixels[cell].t > 0.0f);)
       }
     }
@@ -153,39 +172,52 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   }
   RECORD(for (; i < end; ++i) cells_from_sorted[i] = 0;)
 #else
-#define OPEN_CELLS(open)                                                                                               \
-  int open = 0; /* the bits of a positive number, or 0 */                                                              \
-  ALL_CELLS(cell) open |= AS_INTL(pixels[cell].t);
+#define BLEND(cell, power)                                                                                             \
+  add_gaussian(pixels + cell, power, i, zero, c_red, c_green, c_blue NEAR_ARGUMENT);                                   \
+  COUNT(added += power >= LOG2_ALPHA_MIN && pixels[cell].t > 0.0f;)
   __local Staged staged[BATCH];
-  __local int busy[2]; // number of items with an open pixel, for this batch and the next
-  if (ITEM < 2) busy[ITEM] = 0;
+  __local uint marks[WARPS * BATCH / 4] __attribute__((aligned(16))), lists[WARPS * LIST];
+  __local int open_in[BLOCKS]; // number of open pixels of each block
+  __local uint *list = lists + WARP * LIST;
+  const int zero = min(pixels[0].stop + 1, 0); // see exp2_by
+  for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
   BARRIER_LOCAL();
-  for (int batch = begin, turn = 0; batch < end; batch += BATCH, turn ^= 1) {
-    const int count = min(BATCH, end - batch);
-    for (int j = ITEM; j < BATCH; j += ITEMS)
-      stage(staged + j, gaussian_from_sorted[min(batch + j, end - 1)], 0, splats, tile_x, tile_y);
-    OPEN_CELLS(open)
-    if (GOES_ON(open)) atomic_inc(busy + turn);
+  for (int batch = begin; batch < end; batch += BATCH) { // count open pixels, fetch, list; then walk without barriers
+    ALL_CELLS(cell) if (GOES_ON(pixels[cell].t > 0.0f)) atomic_inc(open_in + cell * WARPS + WARP);
     BARRIER_LOCAL();
-    if (busy[turn] == 0) break;
-    if (ITEM == 0) busy[turn ^ 1] = 0;
-    for (int j = 0; j < count; ++j) { // no early exit: Intel's CPU runtime reads memory for items that left
-      OPEN_CELLS(open)
-      const int i = batch + j;
-      SPLAT_STAGED(staged[j])
+
+    const uint live = blocks_above(0, open_in);
+    if (live == 0) break;
+    for (int j = ITEM; j < BATCH; j += ITEMS) {
+      const uint gaussian = gaussian_from_sorted[min(batch + j, end - 1)];
+      mark(marks, j, stage(staged + j, gaussian, 0, batch + j < end ? live : 0, splats, tile_x, tile_y));
+    }
+    BARRIER_LOCAL();
+
+    const int count = list_marked(marks, staged, list);
+    for (int block = ITEM; block < BLOCKS; block += ITEMS) open_in[block] = 0;
+    BARRIER_LOCAL();
+
+    uint next = list[0];
+    for (int k = 1; k <= count; ++k) {
+      const uint entry = next;
+      next = list[k]; // read ahead, so that nothing waits for it
+      const int i = batch + PAIR_OF(entry);
+      SPLAT_STAGED(staged[PAIR_OF(entry)])
       NEAR_HERE(s.near)
-      const uint blocks = GOES_ON(open) ? FROM_OWN(s.blocks) : 0;
-      FOR_CELLS(cell, blocks) {
-        const floatL power = LOG2_ALPHA(splat, cell);
-        COUNT(evaluated += LANES;)
-        const intL reached = MASKL(power >= LOG2_ALPHA_MIN);
-        if (CONTRIBUTES(reached)) {
-          add_gaussian(pixels + cell, power, i, c_red, c_green, c_blue NEAR_ARGUMENT);
-          COUNT(added -= reached & MASKL(pixels[cell].t > 0.0f);)
+      const uint reach = FROM_OWN(s.blocks);
+      COUNT(evaluated += entry & DENSE ? OWNED : popcount(reach & OF_FIRST_WARP);)
+      if (entry & DENSE) {
+        ALL_CELLS(cell) { BLEND(cell, LOG2_ALPHA(splat, cell)) } // alpha is 0 in pixels that are not reached
+      } else {
+        FOR_CELLS(cell, reach) {
+          const floatL power = LOG2_ALPHA(splat, cell);
+          if (power >= LOG2_ALPHA_MIN && pixels[cell].t > 0.0f) {
+            BLEND(cell, power)
+          }
         }
       }
     }
-    BARRIER_LOCAL();
   }
 #endif
 
@@ -204,7 +236,7 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
   ALL_CELLS(cell) {
     const size_t pixel = CELL_IN_PLANE(cell);
     const Pixels p = pixels[cell];
-    const floatL at_end = p.t > 0.0f ? p.t : p.kept;
+    const floatL at_end = T_AT_END(p);
     const floatL left = p.stop >= 0 ? at_end : (floatL)(0.0f);
     STORE_CELL(float, fmaL(left, (floatL)(background[0]), p.red), image + pixel, stride);
     STORE_CELL(float, fmaL(left, (floatL)(background[1]), p.green), image + plane + pixel, stride);

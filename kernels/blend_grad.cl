@@ -347,7 +347,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   Walker walker = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, begin - 1, 0, 0};
   for (int turn = last; turn > (last > begin ? begin - ITEMS : begin); turn -= ITEMS) { // the last turn adds no pairs
     const int next = max(turn - 1 - ITEM, begin);
-    stage(staged + ITEM, gaussian_from_sorted[next], slot_from_sorted[next], splats, tile_x, tile_y);
+    stage(staged + ITEM, gaussian_from_sorted[next], slot_from_sorted[next], ALL_BLOCKS, splats, tile_x, tile_y);
     for (int round = 0; round < ITEMS; ++round) {
       if (round == ITEM) {
         if (walker.i >= begin) {
@@ -383,7 +383,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     const int count = min(BATCH, batch - begin); // number of pairs before `batch`, from the last one on
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
-      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], splats, tile_x, tile_y);
+      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], ALL_BLOCKS, splats, tile_x, tile_y);
     }
     BARRIER_LOCAL();
     for (int first = 0; first < count; first += TOGETHER) {

@@ -61,7 +61,7 @@ GROUP __kernel void values(const int first_tile, const int tiles_x, const int wi
   for (int batch = begin; batch < last; batch += BATCH) {
     const int count = min(BATCH, last - batch);
     for (int j = ITEM; j < BATCH; j += ITEMS)
-      stage(staged + j, gaussian_from_sorted[min(batch + j, last - 1)], 0, splats, tile_x, tile_y);
+      stage(staged + j, gaussian_from_sorted[min(batch + j, last - 1)], 0, ALL_BLOCKS, splats, tile_x, tile_y);
     BARRIER_LOCAL();
     for (int j = 0; j < count; ++j) {
       SPLAT_STAGED(staged[j])

@@ -182,7 +182,7 @@ GROUP SUBGROUPED __kernel void values_grad(const int first_tile, const int tiles
     const int count = min(BATCH, batch - begin); // of the pairs before `batch`, last one first
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
-      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], splats, tile_x, tile_y);
+      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], ALL_BLOCKS, splats, tile_x, tile_y);
     }
     BARRIER_LOCAL();
     for (int turn = 0; turn < count; turn += TOGETHER) {

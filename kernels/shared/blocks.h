@@ -1,7 +1,8 @@
 // cells.h for a group of ITEMS work-items that share a tile. A cell is one pixel of a block of 8 x 4 pixels. Each block
 // has 32 items, one per pixel, so that items that run together skip a block together; groups of fewer items have lower
 // blocks. Item i owns pixel i % 32 of the blocks i / 32, i / 32 + ITEMS / 32, ...: its cells 0, 1, ... Splats pass
-// through local memory in batches, each with the blocks that its ellipse reaches.
+// through local memory in batches, each with the blocks that its ellipse reaches. Items that own the same blocks are a
+// warp here, whether or not the device runs 32 items together.
 #if LANES > 1
 #error "a group of work-items has one pixel a vector"
 #endif
@@ -12,6 +13,8 @@
 #define BLOCK_ROWS (TILE / BLOCK_H)
 #define OWNED (TILE * TILE / ITEMS)
 #define ITEM ((int)get_local_id(0))
+#define WARPS (ITEMS / BLOCK_ITEMS)
+#define WARP (ITEM / BLOCK_ITEMS)
 
 #if ITEMS < BLOCK_COLUMNS * 32
 #define CELL_X(cell) ((cell) % BLOCK_COLUMNS * BLOCK_W + ITEM % BLOCK_W)
@@ -43,16 +46,20 @@ typedef int Open; // number of the item's cells with an open pixel
 
 // A set of blocks, with one bit for each block, from the item's first block on.
 typedef uint Reach;
-#define ALL_BLOCKS (0xffffffffu >> (32 - BLOCK_COLUMNS * BLOCK_ROWS))
-#define FROM_OWN(blocks) ((blocks) >> (ITEM / BLOCK_ITEMS))
-#define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * (ITEMS / BLOCK_ITEMS)) & 1)
+#define BLOCKS (BLOCK_COLUMNS * BLOCK_ROWS)
+#define ALL_BLOCKS (0xffffffffu >> (32 - BLOCKS))
+#define OF_FIRST_WARP (ALL_BLOCKS / ((1u << WARPS) - 1)) // every WARPS-th bit
+#define FROM_OWN(blocks) ((blocks) >> WARP)
+#define FOR_CELLS(cell, reach) ALL_CELLS(cell) if ((reach) >> (cell * WARPS) & 1)
 
 // All blocks, without a test: for kernels that take one splat at a time, where testing would cost more than the pixels.
 static inline Reach reach_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 
 #if defined(RAYS) || (defined(NO_ROW_SKIP) && defined(NO_COLUMN_SKIP))
+#define ALL_REACHED 1
 static inline uint blocks_of(__global const float *splat, int tile_x, int tile_y) { return ALL_BLOCKS; }
 #else
+#define ALL_REACHED 0
 // The right edge of an ellipse, relative to its mean, over the offsets [d0, d1] in y (docs/gradients.md, (47)). It may
 // be slightly too large, as the square root is up to 0.2 % too large.
 static inline float block_edge(float d0, float d1, float tangent, float half_w, float l12, float l22, float inverse_l11,
@@ -112,8 +119,9 @@ typedef struct {
 #endif
 } __attribute__((aligned(16))) Staged;
 
-static inline void stage(__local Staged *place, uint gaussian, uint slot, __global const float *splats, int tile_x,
-                         int tile_y) {
+// Stages a splat. Returns those of the blocks `among` that it reaches.
+static inline uint stage(__local Staged *place, uint gaussian, uint slot, uint among, __global const float *splats,
+                         int tile_x, int tile_y) {
   __global const float *splat = splats + (size_t)SPLAT_SIZE * gaussian;
   Staged s;
   s.mx = FROM_TILE(splat, X, tile_x);
@@ -125,7 +133,7 @@ static inline void stage(__local Staged *place, uint gaussian, uint slot, __glob
   s.red = splat[SPLAT_RED];
   s.green = splat[SPLAT_GREEN];
   s.blue = splat[SPLAT_BLUE];
-  s.blocks = blocks_of(splat, tile_x, tile_y);
+  s.blocks = blocks_of(splat, tile_x, tile_y) & among;
   s.gaussian = gaussian;
   s.slot = slot;
 #ifdef NEARNESS
@@ -133,6 +141,53 @@ static inline void stage(__local Staged *place, uint gaussian, uint slot, __glob
   for (int k = 0; k < 3; ++k) s.unused[k] = 0;
 #endif
   *place = s;
+  return s.blocks;
+}
+
+// The blocks whose number is above `floor`.
+static inline uint blocks_above(int floor, __local const int *numbers) {
+  uint blocks = 0;
+  _Pragma("unroll") for (int block = 0; block < BLOCKS; ++block) blocks |= (uint)(numbers[block] > floor) << block;
+  return blocks;
+}
+
+// A warp can walk a list of only the pairs of a batch that reach one of its blocks. First each pair is marked for each
+// warp, then the marked pairs are listed in order.
+#define LIST (BATCH + 1) // room of a warp's list; the last place is read ahead, and not used
+
+// Marks the j-th pair of a batch for the warps of the blocks: a byte for each pair, 1 or 0.
+static inline void mark(__local uint *marks, int j, uint blocks) {
+  _Pragma("unroll") for (int warp = 0; warp < WARPS; ++warp)((__local uchar *)marks)[warp * BATCH + j] =
+      (blocks >> warp & OF_FIRST_WARP) != 0;
+}
+
+// An entry of a list: the pair's number in its batch, and DENSE if it reaches more than SPARSE of the warp's blocks. It
+// is then quicker to take all of the item's cells without a branch.
+#define DENSE 0x80000000u
+#define PAIR_OF(entry) ((int)((entry) & ~DENSE))
+#if ALL_REACHED
+#define SPARSE OWNED
+#else
+#define SPARSE (OWNED / 2)
+#endif
+
+// Lists the marked pairs of the item's warp. Returns their number.
+static inline int list_marked(__local const uint *marks, __local const Staged *staged, __local uint *list) {
+  const int lane = ITEM % BLOCK_ITEMS;
+  int count = 0;
+  _Pragma("unroll") for (int first = 0; first < BATCH; first += BLOCK_ITEMS) {
+    uint marked = 0; // a bit for each of BLOCK_ITEMS pairs; a product's upper byte has the bits of four bytes
+    _Pragma("unroll") for (int four = 0; four < BLOCK_ITEMS; four += 4) marked |=
+        marks[(WARP * BATCH + first + four) / 4] * 0x01020408u >> 24 << four;
+    const uint until = marked << (31 - lane); // those up to the item's pair
+    if (until >> 31) {
+      const int j = first + lane;
+      const int reached = popcount(FROM_OWN(staged[j].blocks) & OF_FIRST_WARP);
+      list[count + popcount(until) - 1] = j | (reached > SPARSE ? DENSE : 0);
+    }
+    count += popcount(marked);
+  }
+  return count;
 }
 
 // Gives a staged splat the names that LOG2_ALPHA and the kernels use for a splat in global memory.

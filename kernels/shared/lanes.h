@@ -156,16 +156,21 @@ static inline float8 sums8(floatS x0, floatS x1, floatS x2, floatS x3, floatS x4
 // 2^23. The polynomial is minimax of degree 5 on [-1/2, 1/2] and is 1 at 0. The exponent is set by an integer addition.
 // A lane under -126 gets an arbitrary number. The polynomial is in Estrin's order, because blending's speed depends on
 // its longest dependency chain.
-static inline floatL exp2L(floatL x) {
+//
+// An instruction of a GPU has room for one constant. NVIDIA's compiler moves a second one into a register before each
+// use, unless it depends on a variable: `zero` is one that is always 0, and 0 itself where that does not matter.
+#define IN_REGISTER(constant) ((floatL)(as_float(as_int(constant) + zero)))
+static inline floatL exp2_by(floatL x, int zero) {
   const floatL t = x + 12582912.0f;
   const floatL f = x + (12582912.0f - t);
   const floatL f2 = f * f;
-  const floatL low = fmaL(f, (floatL)(6.931469025e-1f), (floatL)(1.0f));
-  const floatL middle = fmaL(f, (floatL)(5.550900067e-2f), (floatL)(2.402225277e-1f));
-  const floatL high = fmaL(f, (floatL)(1.321160340e-3f), (floatL)(9.671293494e-3f));
+  const floatL low = fmaL(f, (floatL)(6.931469025e-1f), IN_REGISTER(1.0f));
+  const floatL middle = fmaL(f, IN_REGISTER(5.550900067e-2f), (floatL)(2.402225277e-1f));
+  const floatL high = fmaL(f, IN_REGISTER(1.321160340e-3f), (floatL)(9.671293494e-3f));
   const floatL p = fmaL(f2, fmaL(f2, high, middle), low);
   return AS_FLOATL(AS_INTL(p) + (AS_INTL(t) << 23));
 }
+static inline floatL exp2L(floatL x) { return exp2_by(x, 0); }
 
 // One element of `width`-wide rows for each of LANES items: row[0] to row[LANES - 1].
 #define ROW_(array, width, field, lane) (array)[(size_t)(width) * row[lane] + (field)]

@@ -361,7 +361,7 @@ def test_ceilings() -> None:
     good = [row(stem, MOST_A_PAIR.get(stem)) for stem in NO_STACK]
     assert broken(good) == []
     (told,) = broken([*good, row("blend_grad", MOST_A_PAIR["blend_grad"] + 1)])
-    assert told == "blend_grad, 1x64, sm_89: 951 instructions of a warp for a pair, expected at most 950"
+    assert told == "blend_grad, 1x64, sm_89: 601 instructions of a warp for a pair, expected at most 600"
     (told,) = broken([*good, row("blend_grad", MOST_BY_GAUSSIAN + 1, more=("-DBY_GAUSSIAN",))])
     assert told.endswith("501 instructions of a warp for a pair, expected at most 500")
     (told,) = broken([*good, row("sort_radix", stack=8)])

@@ -109,7 +109,8 @@ class Rule:
 
     ends: parts of other lines, from which some compiler jumps back to the loop's head.
     function: a part of the head of the function with the line, if several functions have such a line.
-    part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it.
+    part: True for a branch that contains the line; rounds is then the fraction of its loop's rounds that take it. Of
+    several such rules the first counts.
     mark: number of instructions of a class in a round, such as ("shared", 2). A loop with more of them is unrolled.
     inner: True if rounds are per round of the enclosing loop.
     """
@@ -155,9 +156,12 @@ _BEFORE_PAIRS = (
 )
 BY_PAIR: dict[str, tuple[Rule, ...]] = {
     "blend": (
-        Rule("for (int batch = begin", lambda run: run.batches, ends=("if (busy[turn] == 0) break;",)),
+        Rule("for (int batch = begin", lambda run: run.batches, ends=("if (live == 0) break;",)),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
-        Rule("for (int j = 0; j < count", lambda run: 1),
+        Rule("for (int k = 1; k <= count; ++k)", lambda run: 1),
+        Rule("ALL_CELLS(cell) { BLEND(", lambda run: 1, part=True),  # an ellipse that reaches every block
+        Rule("const floatL power = LOG2_ALPHA(", lambda run: 0, part=True),
+        Rule("p->t = goes_on ? after : -fabs(before);", lambda run: 0, part=True),
     ),
     "blend_grad": (
         *_BEFORE_PAIRS,

@@ -58,7 +58,7 @@ NO_STACK = ("blend", "blend_grad", "project_grad", "sort_radix")
 """Kernel files that must use no stack memory and no spills on NVIDIA's GPUs."""
 NO_SCRATCH = ("blend", "blend_grad", "project_grad")
 """Kernel files that must use no stack memory and no spills on AMD's GPUs."""
-MOST_A_PAIR = {"blend": 350, "blend_grad": 950}
+MOST_A_PAIR = {"blend": 290, "blend_grad": 600}
 """Maximum number of a warp's instructions per pair, on NVIDIA's GPUs."""
 MOST_BY_GAUSSIAN = 500
 """Maximum number of a warp's instructions per pair there, for blend_grad with a Gaussian per item."""
