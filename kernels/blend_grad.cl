@@ -182,7 +182,7 @@ static inline void add_gradients(floatS *sums, const Pixels *p, uint place, floa
   FOR_CELLS(cell, reach) {                                                                                             \
     ALPHA_IN(cell)                                                                                                     \
     if (CONTRIBUTES(taken)) {                                                                                          \
-      const floatL alpha = AS_FLOATL(AS_INTL(exp2L(power)) & taken);                                                   \
+      const floatL alpha = AS_FLOATL(AS_INTL(exp2_by(power, zero)) & taken);                                           \
       const Share share = take_out(&pixels, cell, alpha, c_red, c_green, c_blue NEAR_ARGUMENT);                        \
       add_gradients(sums, &pixels, cell, share.g, share.weight, u, v, W11, W12, W22);                                  \
     }                                                                                                                  \
@@ -303,6 +303,7 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
   }
 
 #if ITEMS == 1
+  const int zero = 0;
   for (int i = last - 1; i >= begin; --i) {
     PREFETCH(splats + (size_t)SPLAT_SIZE * gaussian_from_sorted[i - AHEAD > begin ? i - AHEAD : begin]);
     PREFETCH(slots + (size_t)SLOT_STRIDE * slot_from_sorted[i - AHEAD > begin ? i - AHEAD : begin]);
@@ -377,30 +378,42 @@ GROUP SUBGROUPED __kernel void blend_grad(const int first_tile, const int tiles_
     }
   }
 #else
+  const int zero = min(pixels.stop[0] + 1, 0); // see exp2_by
   __local Staged staged[BATCH];
+  __local int lasts[BLOCKS]; // the largest stop of each block
   __local float rows[TOGETHER * SLOT_STRIDE * ROW] __attribute__((aligned(16)));
+  for (int block = ITEM; block < BLOCKS; block += ITEMS) lasts[block] = begin;
+  BARRIER_LOCAL();
+  ALL_CELLS(cell) atomic_max(lasts + cell * WARPS + WARP, pixels.stop[cell]);
+  BARRIER_LOCAL();
   for (int batch = last; batch > begin; batch -= BATCH) {
     const int count = min(BATCH, batch - begin); // number of pairs before `batch`, from the last one on
     for (int j = ITEM; j < BATCH; j += ITEMS) {
       const int i = max(batch - 1 - j, begin);
-      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], ALL_BLOCKS, splats, tile_x, tile_y);
+      const uint live = blocks_above(i, lasts);
+      stage(staged + j, gaussian_from_sorted[i], slot_from_sorted[i], live, splats, tile_x, tile_y);
     }
     BARRIER_LOCAL();
     for (int first = 0; first < count; first += TOGETHER) {
       const int together = min(TOGETHER, count - first);
       for (int j = 0; j < together; ++j) {
         const int i = batch - 1 - first - j;
-        SPLAT_STAGED(staged[first + j])
-        NEAR_HERE(s.near)
-        float sums[SLOT_STRIDE];
-        for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
-        TAKE_PAIR(FROM_OWN(s.blocks))
-        leave_sums(sums, rows + j * (SLOT_STRIDE * ROW));
+        const uint reach = FROM_OWN(staged[first + j].blocks) & OF_FIRST_WARP;
+        if (reach || SUBGROUP > 1) { // an exchange needs every item
+          SPLAT_STAGED(staged[first + j])
+          NEAR_HERE(s.near)
+          float sums[SLOT_STRIDE];
+          for (int field = 0; field < SLOT_STRIDE; ++field) sums[field] = 0.0f;
+          TAKE_PAIR(reach)
+          leave_sums(sums, rows + j * (SLOT_STRIDE * ROW));
+        }
       }
       BARRIER_LOCAL();
-      for (int row = ITEM; row < together * SLOT_STRIDE; row += ITEMS)
-        slots[(size_t)SLOT_STRIDE * staged[first + row / SLOT_STRIDE].slot + row % SLOT_STRIDE] =
-            row_sum(rows + row * ROW);
+      for (int row = ITEM; row < together * SLOT_STRIDE; row += ITEMS) {
+        const int j = first + row / SLOT_STRIDE;
+        slots[(size_t)SLOT_STRIDE * staged[j].slot + row % SLOT_STRIDE] =
+            row_sum_of(rows + row * ROW, staged[j].blocks);
+      }
       BARRIER_LOCAL();
     }
   }

@@ -22,6 +22,11 @@ DOUBLED(32, 64)
 DOUBLED(64, 128)
 DOUBLED(128, 256)
 
+// The sum of a warp's part of a row.
+static inline float warp_sum(__local const float *part) {
+  return BLOCK_ITEMS == 8 ? sum_of_8(part) : BLOCK_ITEMS == 16 ? sum_of_16(part) : sum_of_32(part);
+}
+
 // The sum of a row.
 static inline float row_sum(__local const float *row) {
   return PARTS == 1     ? sum_of_1(row)
@@ -33,6 +38,20 @@ static inline float row_sum(__local const float *row) {
          : PARTS == 64  ? sum_of_64(row)
          : PARTS == 128 ? sum_of_128(row)
                         : sum_of_256(row);
+}
+
+// The sum of a row that only the warps of these blocks have left, with the bits that zeros of the others would give.
+static inline float row_sum_of(__local const float *row, uint blocks) {
+#if SUBGROUP > 1
+  return row_sum(row);
+#else
+  float sums[WARPS];
+  _Pragma("unroll") for (int warp = 0; warp < WARPS; ++warp) sums[warp] =
+      blocks >> warp & OF_FIRST_WARP ? warp_sum(row + warp * BLOCK_ITEMS) : 0.0f;
+  _Pragma("unroll") for (int step = 1; step < WARPS; step *= 2)
+      _Pragma("unroll") for (int warp = 0; warp < WARPS; warp += 2 * step) sums[warp] += sums[warp + step];
+  return sums[0];
+#endif
 }
 
 #if SUBGROUP > 1

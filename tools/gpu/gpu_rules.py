@@ -165,6 +165,7 @@ BY_PAIR: dict[str, tuple[Rule, ...]] = {
     ),
     "blend_grad": (
         *_BEFORE_PAIRS,
+        Rule("atomic_max(lasts", lambda run: 0),  # once a tile: AMD's compiler loops over a wave's items
         Rule("for (int batch = last", lambda run: run.batches),
         Rule("for (int j = ITEM; j < BATCH; j += ITEMS)", lambda run: run.fetches),
         Rule("for (int first = 0; first < count; first += TOGETHER)", lambda run: 1 / run.together),
