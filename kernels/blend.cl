@@ -206,8 +206,8 @@ GROUP __kernel void blend(const int first_tile, const int tiles_x, const int wid
       SPLAT_STAGED(staged[PAIR_OF(entry)])
       NEAR_HERE(s.near)
       const uint reach = FROM_OWN(s.blocks);
-      COUNT(evaluated += entry & DENSE ? OWNED : popcount(reach & OF_FIRST_WARP);)
-      if (entry & DENSE) {
+      COUNT(evaluated += IS_DENSE(entry) ? OWNED : popcount(reach & OF_FIRST_WARP);)
+      if (IS_DENSE(entry)) {
         ALL_CELLS(cell) { BLEND(cell, LOG2_ALPHA(splat, cell)) } // alpha is 0 in pixels that are not reached
       } else {
         FOR_CELLS(cell, reach) {

@@ -170,6 +170,7 @@ static inline void mark(__local uint *marks, int j, uint blocks) {
 #else
 #define SPARSE (OWNED / 2)
 #endif
+#define IS_DENSE(entry) (SPARSE == 0 || (SPARSE < OWNED && ((entry) & DENSE)))
 
 // Lists the marked pairs of the item's warp. Returns their number.
 static inline int list_marked(__local const uint *marks, __local const Staged *staged, __local uint *list) {
