@@ -4,16 +4,18 @@
 //
 // Owner: A group owns blocks of one channel. With ITEMS == 1 it goes down a block ROWS rows at a time and keeps the
 //   derivatives of LOSS_RING rows; rows shared with other blocks are recomputed. Otherwise a block is ROWS x COLUMNS
-//   pixels, and the image's derivatives are written between two launches.
-// Launch: With ITEMS == 1 any number of groups, which share the blocks; otherwise a group of ITEMS for each block.
-//   Blocks are numbered across, then down, then by channel.
-// Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; partials: with ITEMS == 1
-//   (groups, LOSS_RING, 3, field), otherwise (3 derivatives, 3 channels, height, stride); gradient (3, rows, stride), 0
-//   right of the image; sums (3, ...) of SSIM, of |image - target| and of its square: one per block, or per row of a
-//   block with ITEMS == 1.
-// Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79).
+//   pixels in PARTS parts, of which an item takes one or several, and the image's derivatives are written between two
+//   launches.
+// Launch: With ITEMS == 1 any number of groups, which share the blocks; otherwise a grid of groups of at most PARTS
+//   items, for the blocks across and down and the channels. Blocks are numbered in this order.
+// Buffers: image, target (3, rows, stride): colour, padded to whole tiles with zeros; with PHOTOGRAPH the target is
+//   (height, width, 3), bytes or floats; partials: with ITEMS == 1 (groups, LOSS_RING, 3, field), otherwise (3
+//   channels, strips of COLUMNS columns, height, 3 derivatives, COLUMNS), so that a column's addresses are constants
+//   apart; gradient (3, rows, stride), 0 right of the image; sums (3, ...) of SSIM, of |image - target| and of its
+//   square: one per block, or per row of a block with ITEMS == 1.
+// Equations: docs/gradients.md, (17) to (21) in the forms (78) and (79); with several items (188) and (189).
 //
-// In bright, flat pictures E[x^2] - E[x]^2 cancels to nothing. So a window sums differences from its centre pixel
+// In bright, flat pictures E[x^2] - E[x]^2 cancels to nothing. So a window sums differences from one of its own pixels
 // (docs/gradients.md, section 12): variances are sums of small squares, and the gradient is a sum of differences too.
 #if ITEMS == 1 && LANES == 8 && defined(FMA_BY_CONTRACTION)
 #undef LANES // Two vectors at once: a window's sum is a chain of dependent additions.
@@ -22,6 +24,7 @@
 #include "shared/math.h"
 #include "shared/lanes.h"
 #include "shared/group.h"
+#include "shared/photograph.h"
 
 #define TAPS 11
 #define REACH 5
@@ -31,22 +34,17 @@ __constant float window[TAPS] = {1.02838008e-3f, 7.59875814e-3f, 3.60007721e-2f,
                                  2.13005538e-1f, 2.66011725e-1f, 2.13005538e-1f, 1.09360690e-1f,
                                  3.60007721e-2f, 7.59875814e-3f, 1.02838008e-3f};
 
+#define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
+
+#if ITEMS == 1
 // Number of columns beyond either side of a block that a window reaches, rounded up to whole vectors.
 #define MARGIN ((REACH + LANES - 1) / LANES * LANES)
-#if ITEMS == 1
 #define ROWS LOSS_ROWS
-#define COLUMNS LOSS_COLUMNS // largest number of columns of a block
-#define NEAR_MARGIN (2 * MARGIN)
 #define RING_ROW(y) ((y) & (LOSS_RING - 1))
-#else
-#define ROWS (ITEMS < 32 ? 1 : ITEMS > 256 ? 16 : ITEMS / 16)
-#define COLUMNS LOSS_GROUP_COLUMNS
-#define NEAR_MARGIN MARGIN
-#define RING_ROW(y) (y)
-#endif
 
-// Local memory `near`: five fields of ROWS rows of a block, with margins.
-#define NEAR_WIDTH (COLUMNS + 2 * NEAR_MARGIN)
+// Local memory `near`: five fields of ROWS rows of a block, with margins. A block has LOSS_COLUMNS columns at most.
+#define NEAR_MARGIN (2 * MARGIN)
+#define NEAR_WIDTH (LOSS_COLUMNS + 2 * NEAR_MARGIN)
 #define NEAR_FIELD (ROWS * NEAR_WIDTH)
 #if LANES == 1
 #define LOAD_NEAR(p) (*(p))
@@ -65,27 +63,14 @@ typedef struct {
   uint pitch;
   int x_partials, x0, x1, width, height, stride;
 } Block;
-#define PIXEL_AT(block, x, y) ((uint)(block).stride * (uint)(y) + (uint)(x))
 #define PARTIALS_AT(block, x, y) ((block).pitch * (uint)RING_ROW(y) + (uint)((x) - (block).x_partials))
 
-// FOR_VECTORS and VECTOR loop over the item's vectors in `rows` rows, with `margin` columns on either side; they define
-// x, row and `near_at`. A single item takes vertical windows column by column, because neighbouring rows share pixels,
-// and horizontal windows one row at a time (LINES).
-#if ITEMS == 1
-#define LINES 1
+// FOR_VECTORS and VECTOR loop over the vectors in `rows` rows, with `margin` columns on either side; they define x, row
+// and `near_at`. Vertical windows are taken column by column, because neighbouring rows share pixels.
 #define FOR_VECTORS(block, margin, rows)                                                                               \
   for (int x = (block).x0 - (margin); x < (block).x1 + (margin); x += LANES)                                           \
     for (int row = 0; row < (rows); ++row)
 #define VECTOR(block) __local float *near_at = near + (row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN);
-#else
-#define LINES ROWS
-#define FOR_VECTORS(block, margin, rows)                                                                               \
-  const int x_first = (block).x0 - (margin), across = ((block).x1 - (block).x0 + 2 * (margin)) / LANES;                \
-  for (int i = get_local_id(0); i < (rows) * across; i += ITEMS)
-#define VECTOR(block)                                                                                                  \
-  const int row = ROWS == 1 ? 0 : i / across, x = x_first + (i - row * across) * LANES;                                \
-  __local float *near_at = near + (row * NEAR_WIDTH + x - (block).x0 + NEAR_MARGIN);
-#endif
 #define OUTSIDE(block, x, y) ((x) < 0 || (x) >= (block).stride || (y) < 0 || (y) >= (block).height)
 
 // The taps [result.x, result.y) of a window around row y that are inside the image.
@@ -133,7 +118,7 @@ static inline void moments(const Block block, const int margin, const int y, __l
 // block's own columns.
 static inline float derivatives(const Block block, const int margin, const int y, __local float *near) {
   floatL total = (floatL)(0.0f);
-  FOR_VECTORS(block, margin, LINES) {
+  FOR_VECTORS(block, margin, 1) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) continue;
     const uint here = PIXEL_AT(block, x, y + row);
@@ -211,7 +196,7 @@ static inline void adjoint_moments(const Block block, const int margin, const in
 static inline float2 differences(const Block block, const int y, const float l1_scale, const float ssim_scale,
                                  __local float *near, __global float *gradient) {
   floatL absolute = (floatL)(0.0f), squares = absolute;
-  FOR_VECTORS(block, 0, LINES) {
+  FOR_VECTORS(block, 0, 1) {
     VECTOR(block)
     if (OUTSIDE(block, x, y + row)) continue;
     const uint here = PIXEL_AT(block, x, y + row);
@@ -236,7 +221,6 @@ static inline float2 differences(const Block block, const int y, const float l1_
   return (float2)(sumL(absolute), sumL(squares));
 }
 
-#if ITEMS == 1
 // image, target -> gradient, sums. Blocks are block_rows x columns, at most COLUMNS wide; field: at least columns + 2
 // MARGIN.
 GROUP __kernel void loss(const int width, const int height, const int stride, const int plane, const int columns,
@@ -277,54 +261,303 @@ GROUP __kernel void loss(const int width, const int height, const int stride, co
   }
 }
 #else
-// The group's sum of `value`, added in a fixed tree. Only the group's first item gets it; the others get 0.
-static inline float sum_of_group(const float value, __local float *scratch) {
-  const int item = get_local_id(0);
-  barrier(CLK_LOCAL_MEM_FENCE);
-  scratch[item] = value;
-  for (int step = ITEMS / 2; step > 0; step /= 2) {
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (item < step) scratch[item] += scratch[item + step];
+// A part is a column of the block, or of the margins on either side, in vertical windows, and a run of RUN pixels in
+// horizontal ones. Windows slide over values in registers, and sum differences from one pixel that all windows of the
+// part contain: the middle one of a column or, across, of a cell of ROWS x RUN pixels. The bits do not depend on ITEMS.
+#if ITEMS > LOSS_PARTS
+#undef ITEMS
+#define ITEMS LOSS_PARTS
+#endif
+#define ROWS LOSS_GROUP_ROWS
+#define COLUMNS LOSS_GROUP_COLUMNS
+#define PARTS LOSS_PARTS // COLUMNS + 2 * REACH, a power of four
+#define RUN 6
+#define RUNS (COLUMNS / RUN) // of a row; ROWS * RUNS <= PARTS
+#define TALL (ROWS + 2 * REACH)
+#define WIDE (RUN + 2 * REACH)
+#define INLINE inline __attribute__((always_inline)) // PoCL does not inline long functions, and garbles their results
+#define FOR_PARTS(part, count) for (int part = get_local_id(0) % ITEMS; part < (count); part += ITEMS)
+
+// The middle pixel of the cell of pixel (x, y), which is inside the image.
+#define MIDDLE_X(block, x) min((x) / RUN * RUN + RUN / 2, (block).width - 1)
+#define MIDDLE_Y(block, y) min((y) / ROWS * ROWS + ROWS / 2, (block).height - 1)
+
+// Local memory `near`: fields of ROWS x PARTS values.
+#define FIELD (ROWS * PARTS)
+#define SUMS (PARTS + PARTS / 2) // of a block's parts, and room to add them up
+
+// Pixel (x0, y0) is the first of the block. partials: the channel's, a strip of COLUMNS columns for each block across:
+// (strips, height, 3, COLUMNS).
+typedef struct {
+  __global const float *image;
+  __global const source_t *target;
+  __global float *partials;
+  int width, height, stride, x0, y0;
+} Block;
+
+#ifdef PHOTOGRAPH
+#define TARGET_STEP 3
+#define TARGET_ROW(block) (3 * (block).width)
+#define TARGET_CHANNEL(plane) 1
+#else
+#define TARGET_STEP 1
+#define TARGET_ROW(block) ((block).stride)
+#define TARGET_CHANNEL(plane) (size_t)(plane)
+#endif
+#define IMAGE_AT(block, x, y) ((block).image + ((long)(block).stride * (y) + (x)))
+#define TARGET_AT(block, x, y) ((block).target + ((long)TARGET_ROW(block) * (y) + TARGET_STEP * (x)))
+#define PARTIALS_AT(block, x, y)                                                                                       \
+  ((block).partials + ((long)((x) / COLUMNS * (block).height + (y)) * (3 * COLUMNS) + (x) % COLUMNS))
+
+static inline Block block_of_group(const int width, const int height, const int stride, const int plane,
+                                   __global const float *image, __global const source_t *target,
+                                   __global float *partials) {
+  const size_t channel = get_group_id(2);
+  Block block;
+  block.width = width, block.height = height, block.stride = stride;
+  block.x0 = get_group_id(0) * COLUMNS, block.y0 = get_group_id(1) * ROWS;
+  block.image = image + plane * channel;
+  block.target = target + TARGET_CHANNEL(plane) * channel;
+  block.partials = partials + 3 * COLUMNS * height * get_num_groups(0) * channel;
+  return block;
+}
+#define BLOCKS (get_num_groups(0) * get_num_groups(1) * get_num_groups(2))
+#define BLOCK_NUMBER ((get_group_id(2) * get_num_groups(1) + get_group_id(1)) * get_num_groups(0) + get_group_id(0))
+
+// Defines x and y of the first of the TALL pixels of a part's column, and which of them are inside the image. The block
+// has a row inside, so that of rows before it only those above the image are outside, and of the others those below.
+#define COLUMN_OF_PART(block, part)                                                                                    \
+  const int x = (block).x0 - REACH + (part), y = (block).y0 - REACH, column_inside = x >= 0 && x < (block).width;      \
+  const int above = column_inside ? -y : TALL, below = column_inside ? (block).height - y : 0;
+#define ROW_INSIDE(i) ((i) < REACH ? (i) >= above : (i) < below)
+
+// Defines row, x and y of a part's run; skips it if it is outside the block, or outside the image of this `width`.
+#define RUN_OF_PART(block, part, width)                                                                                \
+  const int run = (part) % RUNS * RUN, row = (part) / RUNS, x = (block).x0 + run, y = (block).y0 + row;                \
+  if (row >= ROWS || x >= (width) || y >= (block).height) continue;
+
+// Adds weight * value to sums[k] for each window k of `count`: `place` is the value's place in the first window.
+#define ADD_TO_WINDOWS(sums, count, place, value)                                                                      \
+  UNROLL for (int k = 0; k < (count); ++k) {                                                                           \
+    if ((place) - k >= 0 && (place) - k < TAPS) sums[k] = fma1(window[(place) - k], value, sums[k]);                   \
   }
-  return item == 0 ? scratch[0] : 0.0f;
+#define ZEROS(sums, count) UNROLL for (int k = 0; k < (count); ++k) sums[k] = 0.0f;
+
+// near = vertical windows: means of image and target, the sum of their variances, and the covariance.
+static INLINE void moments(const Block block, __local float *near) {
+  FOR_PARTS(part, PARTS) {
+    COLUMN_OF_PART(block, part)
+    __global const float *image = IMAGE_AT(block, x, y);
+    __global const source_t *target = TARGET_AT(block, x, y);
+    float p[TALL], q[TALL], mean1[ROWS], mean2[ROWS], squares[ROWS], products[ROWS];
+    UNROLL for (int i = 0; i < TALL; ++i, image += block.stride, target += TARGET_ROW(block)) {
+      p[i] = q[i] = 0.0f;
+      if (ROW_INSIDE(i)) p[i] = *image, q[i] = SAMPLE(*target);
+    }
+    ZEROS(mean1, ROWS)
+    ZEROS(mean2, ROWS)
+    ZEROS(squares, ROWS)
+    ZEROS(products, ROWS)
+    const float p0 = p[TALL / 2], q0 = q[TALL / 2];
+    UNROLL for (int i = 0; i < TALL; ++i) {
+      const float e1 = p[i] - p0, e2 = q[i] - q0, square = fma1(e1, e1, e2 * e2), product = e1 * e2;
+      ADD_TO_WINDOWS(mean1, ROWS, i, e1)
+      ADD_TO_WINDOWS(mean2, ROWS, i, e2)
+      ADD_TO_WINDOWS(squares, ROWS, i, square)
+      ADD_TO_WINDOWS(products, ROWS, i, product)
+    }
+    UNROLL for (int row = 0; row < ROWS; ++row) {
+      __local float *out = near + (row * PARTS + part);
+      const float off1 = mean1[row], off2 = mean2[row];
+      out[0] = p0 + off1;
+      out[FIELD] = q0 + off2;
+      out[2 * FIELD] = fma1(-off1, off1, fma1(-off2, off2, squares[row]));
+      out[3 * FIELD] = fma1(-off1, off2, products[row]);
+    }
+  }
 }
 
-#define BLOCK_OF_GROUP                                                                                                 \
-  const int across = (stride + COLUMNS - 1) / COLUMNS, down = (height + ROWS - 1) / ROWS, group = get_group_id(0);     \
-  const int channel = group / (down * across), y = group / across % down * ROWS;                                       \
-  Block block;                                                                                                         \
-  block.width = width, block.height = height, block.stride = stride;                                                   \
-  block.image = image + (size_t)plane * channel, block.target = target + (size_t)plane * channel;                      \
-  block.pitch = stride, block.field = (size_t)3 * stride * height, block.x_partials = 0;                               \
-  block.partials = partials + (size_t)stride * height * channel;                                                       \
-  block.x0 = group % across * COLUMNS, block.x1 = block.x0 + COLUMNS;
+// 1 / x for positive x whose reciprocal is in float's range: three steps of Newton's method from a start that is up to
+// 12 % off. Its error is under 2 ulp, and its bits are the same on every device.
+static inline float reciprocal(const float x) {
+  const float a = as_float(0x7ef311c7u - as_uint(x)), b = fma1(a, fma1(-x, a, 1.0f), a),
+              c = fma1(b, fma1(-x, b, 1.0f), b);
+  return fma1(c, fma1(-x, c, 1.0f), c);
+}
+
+// near -> partials: the derivatives of SSIM with respect to the image's mean (relative to the cell's middle pixel), to
+// its variance (doubled), and to the covariance. parts = the parts' sums of SSIM.
+static INLINE void derivatives(const Block block, __local const float *near, __local float *parts) {
+  FOR_PARTS(part, PARTS) {
+    parts[part] = 0.0f;
+    RUN_OF_PART(block, part, block.width)
+    __local const float *in = near + (row * PARTS + run);
+    float mean1[RUN], mean2[RUN], variances[RUN], covariance[RUN], total = 0.0f;
+    ZEROS(mean1, RUN)
+    ZEROS(mean2, RUN)
+    ZEROS(variances, RUN)
+    ZEROS(covariance, RUN)
+    const int middle_x = MIDDLE_X(block, x), middle_y = MIDDLE_Y(block, block.y0);
+    const float p0 = *IMAGE_AT(block, middle_x, middle_y), q0 = SAMPLE(*TARGET_AT(block, middle_x, middle_y));
+    UNROLL for (int i = 0; i < WIDE; ++i) {
+      const float e1 = in[i] - p0, e2 = in[i + FIELD] - q0;
+      const float square = fma1(e1, e1, fma1(e2, e2, in[i + 2 * FIELD]));
+      const float product = fma1(e1, e2, in[i + 3 * FIELD]);
+      ADD_TO_WINDOWS(mean1, RUN, i, e1)
+      ADD_TO_WINDOWS(mean2, RUN, i, e2)
+      ADD_TO_WINDOWS(variances, RUN, i, square)
+      ADD_TO_WINDOWS(covariance, RUN, i, product)
+    }
+    __global float *out = PARTIALS_AT(block, x, y);
+    UNROLL for (int k = 0; k < RUN; ++k) {
+      const float off1 = mean1[k], off2 = mean2[k], mu1 = p0 + off1, mu2 = q0 + off2, apart = mu2 - mu1;
+      const float a = fma1(mu1 + mu1, mu2, C1), b = fma1(2.0f, fma1(-off1, off2, covariance[k]), C2);
+      const float c = fma1(mu1, mu1, fma1(mu2, mu2, C1));
+      const float d = fma1(-off1, off1, fma1(-off2, off2, variances[k])) + C2;
+      const float inverse = reciprocal(c * d), by_a = b * inverse, ssim = a * by_a;
+      const float by_covariance = 2.0f * a * inverse, by_variance = -2.0f * ssim * (c * inverse);
+      const float by_mu = 2.0f * by_a * fma1(mu1 * (d * inverse), apart * apart, apart);
+      if (x + k < block.width) {
+        total += ssim;
+        out[k] = fma1(-off1, by_variance, fma1(-off2, by_covariance, by_mu));
+        out[k + COLUMNS] = by_variance;
+        out[k + 2 * COLUMNS] = by_covariance;
+      }
+    }
+    parts[part] = total;
+  }
+}
+
+// near = vertical windows of the partials. The first also takes in the other two of the cells above and below, times
+// the differences of their middle pixels from that of the block's cell. These follow, of image and target.
+static INLINE void adjoint_moments(const Block block, __local float *near) {
+  FOR_PARTS(part, PARTS) {
+    COLUMN_OF_PART(block, part)
+    __global const float *partials = PARTIALS_AT(block, x, y);
+    float means[TALL], variances[TALL], covariances[TALL];
+    UNROLL for (int i = 0; i < TALL; ++i, partials += 3 * COLUMNS) {
+      means[i] = variances[i] = covariances[i] = 0.0f;
+      if (ROW_INSIDE(i)) means[i] = *partials, variances[i] = partials[COLUMNS], covariances[i] = partials[2 * COLUMNS];
+    }
+    float p[3], q[3];
+    ZEROS(p, 3)
+    ZEROS(q, 3)
+    UNROLL for (int cell = 0; cell < 3; ++cell) {
+      const int cell_y = block.y0 + (cell - 1) * ROWS;
+      if (!column_inside || cell_y < 0 || cell_y >= block.height) continue;
+      p[cell] = *IMAGE_AT(block, MIDDLE_X(block, x), MIDDLE_Y(block, cell_y));
+      q[cell] = SAMPLE(*TARGET_AT(block, MIDDLE_X(block, x), MIDDLE_Y(block, cell_y)));
+    }
+    float by_mean[ROWS], by_variance[ROWS], by_covariance[ROWS];
+    ZEROS(by_mean, ROWS)
+    ZEROS(by_variance, ROWS)
+    ZEROS(by_covariance, ROWS)
+    UNROLL for (int i = 0; i < TALL; ++i) {
+      const float v = variances[i], c = covariances[i];
+      float m = means[i];
+      if (i < REACH) m = fma1(p[1] - p[0], v, fma1(q[1] - q[0], c, m));
+      if (i >= REACH + ROWS) m = fma1(p[1] - p[2], v, fma1(q[1] - q[2], c, m));
+      ADD_TO_WINDOWS(by_mean, ROWS, i, m)
+      ADD_TO_WINDOWS(by_variance, ROWS, i, v)
+      ADD_TO_WINDOWS(by_covariance, ROWS, i, c)
+    }
+    UNROLL for (int row = 0; row < ROWS; ++row) {
+      __local float *out = near + (row * PARTS + part);
+      out[0] = by_mean[row];
+      out[FIELD] = by_variance[row];
+      out[2 * FIELD] = by_covariance[row];
+    }
+    near[3 * FIELD + part] = p[1];
+    near[3 * FIELD + PARTS + part] = q[1];
+  }
+}
+
+// near -> gradient, one plane. parts = the parts' sums of |image - target|, then of its square. l1_scale and ssim_scale
+// are the loss weights divided by the number of pixels and channels.
+static INLINE void differences(const Block block, const float l1_scale, const float ssim_scale,
+                               __local const float *near, __global float *gradient, __local float *parts) {
+  FOR_PARTS(part, PARTS) {
+    parts[part] = parts[SUMS + part] = 0.0f;
+    RUN_OF_PART(block, part, block.stride)
+    __local const float *in = near + (row * PARTS + run), *middle = near + (3 * FIELD + run);
+    const float p0 = middle[REACH], q0 = middle[REACH + PARTS]; // of this cell; then less those of the cells beside it
+    const float p_left = p0 - middle[REACH - 1], q_left = q0 - middle[REACH - 1 + PARTS];
+    const float p_right = p0 - middle[REACH + RUN], q_right = q0 - middle[REACH + RUN + PARTS];
+    float by_mean[RUN], by_variance[RUN], by_covariance[RUN], absolute = 0.0f, squares = 0.0f;
+    ZEROS(by_mean, RUN)
+    ZEROS(by_variance, RUN)
+    ZEROS(by_covariance, RUN)
+    UNROLL for (int i = 0; i < WIDE; ++i) {
+      const float v = in[i + FIELD], c = in[i + 2 * FIELD];
+      float m = in[i];
+      if (i < REACH) m = fma1(p_left, v, fma1(q_left, c, m));
+      if (i >= REACH + RUN) m = fma1(p_right, v, fma1(q_right, c, m));
+      ADD_TO_WINDOWS(by_mean, RUN, i, m)
+      ADD_TO_WINDOWS(by_variance, RUN, i, v)
+      ADD_TO_WINDOWS(by_covariance, RUN, i, c)
+    }
+    __global const float *image = IMAGE_AT(block, x, y);
+    __global const source_t *target = TARGET_AT(block, x, y);
+    __global float *out = gradient + PIXEL_AT(block, x, y);
+    UNROLL for (int k = 0; k < RUN; ++k) {
+      float p = 0.0f, q = 0.0f;
+      if (x + k < block.width) p = image[k], q = SAMPLE(target[TARGET_STEP * k]);
+      const float ssim = fma1(p - p0, by_variance[k], fma1(q - q0, by_covariance[k], by_mean[k]));
+      const float difference = p - q;
+      const float sign = difference > 0.0f ? l1_scale : (difference < 0.0f ? -l1_scale : 0.0f);
+      const float g = fma1(-ssim_scale, ssim, sign);
+      absolute += as_float(as_int(difference) & 0x7fffffff); // fabs is a call in PoCL 3.0
+      squares = fma1(difference, difference, squares);
+      if (x + k < block.stride) out[k] = x + k < block.width ? g : 0.0f;
+    }
+    parts[part] = absolute;
+    parts[SUMS + part] = squares;
+  }
+}
+
+// Adds up the parts' sums of `fields` fields, SUMS apart, each in a fixed tree of which TOP is the place of the whole.
+// Only the group's first item may read that before the next barrier.
+#define TOP (PARTS + PARTS / 4 + PARTS / 16)
+static INLINE void add_parts(__local float *parts, const int fields) {
+  UNROLL for (int count = PARTS / 4; count > 0; count /= 4) {
+    barrier(CLK_LOCAL_MEM_FENCE);
+    FOR_PARTS(part, count) {
+      UNROLL for (int field = 0; field < fields; ++field) {
+        const float4 four = *(__local const float4 *)(parts + SUMS * field + 4 * part);
+        parts[SUMS * field + 4 * count + part] = (four.x + four.y) + (four.z + four.w);
+      }
+    }
+    parts += 4 * count;
+  }
+}
 
 // image, target -> partials, sums[0].
 GROUP __kernel void loss_ssim(const int width, const int height, const int stride, const int plane,
-                              __global const float *image, __global const float *target, __global float *partials,
+                              __global const float *image, __global const source_t *target, __global float *partials,
                               __global float *sums) {
-  __local float near[5 * NEAR_FIELD], scratch[ITEMS];
-  BLOCK_OF_GROUP
-  moments(block, MARGIN, y, near);
+  __local float near[4 * FIELD] __attribute__((aligned(16))), parts[SUMS] __attribute__((aligned(16)));
+  const Block block = block_of_group(width, height, stride, plane, image, target, partials);
+  moments(block, near);
   barrier(CLK_LOCAL_MEM_FENCE);
-  const float ssim = sum_of_group(derivatives(block, 0, y, near), scratch);
-  if (get_local_id(0) == 0) sums[group] = ssim;
+  derivatives(block, near, parts);
+  add_parts(parts, 1);
+  if (get_local_id(0) == 0) sums[BLOCK_NUMBER] = parts[TOP];
 }
 
 // image, target, partials -> gradient, sums[1], sums[2].
 GROUP __kernel void loss_grad(const int width, const int height, const int stride, const int plane,
                               const float l1_scale, const float ssim_scale, __global const float *image,
-                              __global const float *target, __global float *partials, __global float *gradient,
+                              __global const source_t *target, __global float *partials, __global float *gradient,
                               __global float *sums) {
-  __local float near[5 * NEAR_FIELD], scratch[ITEMS];
-  BLOCK_OF_GROUP
-  adjoint_moments(block, MARGIN, y, near);
+  __local float near[3 * FIELD + 2 * PARTS] __attribute__((aligned(16))), parts[2 * SUMS] __attribute__((aligned(16)));
+  const Block block = block_of_group(width, height, stride, plane, image, target, partials);
+  adjoint_moments(block, near);
   barrier(CLK_LOCAL_MEM_FENCE);
-  const float2 errors = differences(block, y, l1_scale, ssim_scale, near, gradient + (size_t)plane * channel);
-  const float absolute = sum_of_group(errors.x, scratch), squares = sum_of_group(errors.y, scratch);
+  differences(block, l1_scale, ssim_scale, near, gradient + plane * get_group_id(2), parts);
+  add_parts(parts, 2);
   if (get_local_id(0) == 0) {
-    sums[get_num_groups(0) + group] = absolute;
-    sums[2 * get_num_groups(0) + group] = squares;
+    sums[BLOCKS + BLOCK_NUMBER] = parts[TOP];
+    sums[2 * BLOCKS + BLOCK_NUMBER] = parts[SUMS + TOP];
   }
 }
 #endif

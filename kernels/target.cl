@@ -9,14 +9,7 @@
 //   its stop (rows, stride) becomes -1, as in padding, so that blend_grad skips the pixel.
 // Equations: alpha c + (1 - alpha) background.
 #include "shared/math.h"
-
-#ifdef BYTES
-typedef uchar source_t;
-#define SAMPLE(x) ((float)(x) * (1.0f / 255.0f)) // the same bits as OpenImageIO
-#else
-typedef float source_t;
-#define SAMPLE(x) (x)
-#endif
+#include "shared/photograph.h"
 
 #if LANES > 1
 #define OWNED TILE

@@ -119,10 +119,13 @@ def launch_items(device: Device, kernel: Kernel, items: int, *arguments: Any) ->
         _enqueue(device, kernel, (size,), local, arguments)
 
 
-def launch_groups(device: Device, kernel: Kernel, groups: int, items: int, *arguments: Any) -> None:
-    """Launch `groups` work-groups of `items` work-items. 0 groups launch nothing."""
-    if groups > 0:
-        _enqueue(device, kernel, (groups * items,), (items,), arguments)
+def launch_groups(
+    device: Device, kernel: Kernel, groups: int | tuple[int, int, int], items: int, *arguments: Any
+) -> None:
+    """Launch `groups` work-groups of `items` work-items, or a grid of such groups. 0 groups launch nothing."""
+    first, *further = groups if isinstance(groups, tuple) else (groups,)
+    if all((first, *further)):
+        _enqueue(device, kernel, (first * items, *further), (items, *(1 for _ in further)), arguments)
 
 
 def launch_grid(device: Device, kernel: Kernel, size: tuple[int, ...], *arguments: Any) -> None:

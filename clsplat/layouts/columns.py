@@ -14,16 +14,20 @@ from clsplat.optimisation.density_rules import FRESH, UNWANTED, USELESS
 TILE = 16
 """Side of a tile in pixels (Kerbl et al. 2023, section 6)."""
 
-LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_COLUMNS = 2, 640, 32
+LOSS_ROWS, LOSS_COLUMNS, LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS = 2, 640, 7, 54
 """Block sizes of the loss kernel.
 
 LOSS_ROWS: rows that a work-group of one item processes together, as their windows share pixels.
 LOSS_COLUMNS: maximum number of columns of such a work-group's block.
-LOSS_GROUP_COLUMNS: maximum number of columns of a block for a work-group of several items.
+LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS: rows and columns of a block for a work-group of several items.
 
-Five fields of a block must fit in 32 KiB of local memory. A block has LOSS_ROWS rows, or up to sixteen if the
-work-group has several items.
+Five fields of a block must fit in 32 KiB of local memory. A group's block has as many columns with its margins as parts
+(LOSS_PARTS), and its rows hold 63 runs of six pixels: nearly every part has work in both directions.
 """
+
+LOSS_PARTS = 64
+"""Parts of a block for a work-group of several items, and the most items of such a group: LOSS_GROUP_COLUMNS and five
+columns on either side."""
 
 LOSS_RING = 16
 """Rows of derivatives that a work-group of one item stores.
@@ -191,7 +195,8 @@ def header() -> str:
     lines += [f"#define TILE {TILE}", f"#define LOSS_RING {LOSS_RING}", f"#define DEEP_LEVELS {DEEP_LEVELS}"]
     lines.append(f"#define DEEP_PICTURES {DEEP_PICTURES}")
     lines += [f"#define LOSS_ROWS {LOSS_ROWS}", f"#define LOSS_COLUMNS {LOSS_COLUMNS}"]
-    lines.append(f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}")
+    lines += [f"#define LOSS_GROUP_ROWS {LOSS_GROUP_ROWS}", f"#define LOSS_GROUP_COLUMNS {LOSS_GROUP_COLUMNS}"]
+    lines.append(f"#define LOSS_PARTS {LOSS_PARTS}")
     lines += [f"#define POSE_ROWS {POSE_ROWS}u", f"#define SUM_ROWS {SUM_ROWS}u"]
     lines += [f"#define FRESH {FRESH:#x}u", f"#define UNWANTED {UNWANTED}f", f"#define USELESS {USELESS}f"]
     layouts = {"CAMERA": CAMERA, "SPLAT": SPLAT, "RAY": RAY, "SLOT": SLOT, "READBACK": READBACK}

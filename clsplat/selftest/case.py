@@ -102,6 +102,7 @@ class Case:
     frozen: inputs from a frozen scene, each of which the self-test launches; None if it has no such stage.
     digested: names of the results in the self-test's digest, in order.
     by_shape: True if the kernels or their launches depend on the kernel shape.
+    own_bits_of_groups: True if the digested results have other bits in shapes of several items than in those of one.
     """
 
     sizes: Sequence[Any]
@@ -111,6 +112,7 @@ class Case:
     frozen: Callable[[CaseBench], Sequence[Inputs]] | None = None
     digested: tuple[str, ...] = ()
     by_shape: bool = True
+    own_bits_of_groups: bool = False
 
     def errors(self, device: Device, given: Inputs, work: Workspace | None = None) -> dict[str, Deviation]:
         """Launch the kernels on the inputs; the errors by name."""

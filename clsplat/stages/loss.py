@@ -14,9 +14,10 @@ from clsplat.device.buffers import DeviceArray, Workspace
 from clsplat.device.context import Device
 from clsplat.device.launch import launch_groups
 from clsplat.device.profile import stage
-from clsplat.layouts.columns import LOSS_COLUMNS, LOSS_GROUP_COLUMNS, LOSS_RING, TILE
-from clsplat.stages.blend import Blended
+from clsplat.layouts.columns import LOSS_COLUMNS, LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS, LOSS_RING, TILE
+from clsplat.stages.blend import Blended, tile_items
 from clsplat.stages.loss_terms import Compared, LossTerm
+from clsplat.stages.target import is_photograph, sample_defines
 
 LOSS_PIXEL_BYTES = 12
 """Bytes of the image's gradient, per pixel with padding."""
@@ -30,7 +31,7 @@ class _Blocks:
     """Blocks of pixels that the groups work on.
 
     rows, columns: size of a block, pixels.
-    groups: number of blocks.
+    groups: number of groups, or of blocks across, down and of all channels, if each has a group.
     field: floats between two derivatives of a row, in groups that keep derivatives.
     partials, sums: floats of these arrays.
 
@@ -39,7 +40,7 @@ class _Blocks:
 
     rows: int
     columns: int
-    groups: int
+    groups: int | tuple[int, int, int]
     field: int
     partials: int
     sums: int
@@ -47,10 +48,11 @@ class _Blocks:
 
 def _blocks(device: Device, height: int, stride: int) -> _Blocks:
     shape = device.shape
-    if shape.items > 1:
-        rows = min(max(shape.items // 16, 1), 16)  # as in loss.cl
-        groups = 3 * -(-height // rows) * -(-stride // LOSS_GROUP_COLUMNS)
-        return _Blocks(rows, LOSS_GROUP_COLUMNS, groups, 0, partials=9 * height * stride, sums=3 * groups)
+    if tile_items(device) > 1:
+        rows, columns = LOSS_GROUP_ROWS, LOSS_GROUP_COLUMNS
+        across, down = -(-stride // columns), -(-height // rows)
+        partials, sums = 9 * height * across * columns, 9 * down * across
+        return _Blocks(rows, columns, (across, down, 3), 0, partials, sums)
     columns = -(-stride // (-(-stride // LOSS_COLUMNS) * TILE)) * TILE
     across = -(-stride // columns)
     rows = max(-(-height * across // shape.chunks), _MIN_BLOCK_ROWS)  # gives at most three blocks per chunk
@@ -125,13 +127,14 @@ def loss(
 ) -> Loss:
     """Compute (1 - weight) L1 + weight (1 - SSIM) of planes (3, rows, stride), whose padding must be zero.
 
+    target: such planes, or where several items share a tile a photograph (height, width, 3), uint8 or float32.
     turn: number of the array of sums to use, so that earlier sums can still be read.
     kept: number of pixels that count; the means are over these, and other pixels are zero in both images.
     blended: the render, which is needed only if there are terms.
     terms: loss terms to add. Each has a plane of the gradient after the colours, and its own partial sums.
     """
     _, rows, stride = image.shape
-    every, blocks, items = 3 * width * height, _blocks(device, height, stride), device.shape.items
+    every, blocks, items = 3 * width * height, _blocks(device, height, stride), tile_items(device)
     samples = every if kept is None else max(3 * kept, 1)
     partials = work.array("loss_partials", (blocks.partials,))
     gradient = work.array("image_gradient", (3 + len(terms), rows, stride))
@@ -139,12 +142,15 @@ def loss(
     sums = work.array(f"loss_sums{turn or ''}", (own + each * len(terms),) if terms else (3, own // 3))
     sizes, pictures, results = (width, height, stride, rows * stride), (image, target), (partials, gradient, sums)
     weights = ((1 - weight) / samples, weight / samples)
+    defines: dict[str, object] = {"ITEMS": items}
     if items == 1:
-        kernel = device.kernels("loss").loss
+        kernel = device.kernels("loss", defines).loss
         block = (blocks.columns, blocks.rows, blocks.field)
         launch_groups(device, kernel, blocks.groups, 1, *sizes, *block, *weights, *pictures, *results)
     else:
-        kernels = device.kernels("loss")
+        if is_photograph(target):
+            defines |= {"PHOTOGRAPH": True, **sample_defines(target)}
+        kernels, items = device.kernels("loss", defines), min(items, LOSS_PARTS)
         launch_groups(device, kernels.loss_ssim, blocks.groups, items, *sizes, *pictures, partials, sums)
         launch_groups(device, kernels.loss_grad, blocks.groups, items, *sizes, *weights, *pictures, *results)
     further = []

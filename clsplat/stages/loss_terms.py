@@ -24,7 +24,8 @@ DEPTH_PIXEL_BYTES = 17
 class Compared:
     """A render and its photograph, as `stages.loss.loss` hands them to a term.
 
-    target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha.
+    target: planes (3 or 4, rows, stride) of the photograph; the fourth is its alpha. Terms that do not want it may get
+    the photograph itself.
     gradient: planes (3 + terms, rows, stride); each term writes its own plane.
     sums: all partial sums of the loss; each term writes `rows / TILE * stride` of them.
     pixels: number of pixels that count.
@@ -102,7 +103,7 @@ class DepthTerm(LossTerm):
 
     def launch(self, compared: Compared, plane: int, first: int) -> None:
         """Send the known depths, and launch depth_loss.cl."""
-        blended, (_, rows, stride) = compared.blended, compared.target.shape
+        blended, (_, rows, stride) = compared.blended, compared.gradient.shape
         assert blended.nearness is not None, "blended with nearness"
         aims = compared.work.array("depth_aims", (2, rows, stride))
         aims.send(self.planes)

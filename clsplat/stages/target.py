@@ -13,7 +13,7 @@ from clsplat.device.context import Device
 from clsplat.device.launch import launch_grid
 from clsplat.device.profile import stage
 from clsplat.layouts.columns import TILE
-from clsplat.stages.blend import Blended
+from clsplat.stages.blend import Blended, tile_items
 from clsplat.stages.device_camera import padded_size
 
 SOURCE_PIXEL_BYTES = 16
@@ -22,6 +22,16 @@ MASK_PIXEL_BYTES = 4
 """The most bytes per pixel of a photograph's mask."""
 TARGET_PIXEL_BYTES = 12 + SOURCE_PIXEL_BYTES
 """Bytes per pixel with padding: three planes, and the photograph."""
+
+
+def is_photograph(array: DeviceArray) -> bool:
+    """True for a photograph (H, W, 3), which has colours only. Planes are at least a tile wide."""
+    return array.shape[-1] == 3
+
+
+def sample_defines(photograph: DeviceArray) -> dict[str, object]:
+    """Defines of kernels that read a photograph: kernels/shared/photograph.h."""
+    return {"BYTES": True} if photograph.dtype == np.uint8 else {}
 
 
 @stage("target")
@@ -33,11 +43,14 @@ def target(
     blended: Blended | None = None,
     *,
     alpha: bool = False,
+    in_planes: bool = True,
 ) -> DeviceArray:
     """Convert image (H, W, 3 to 5), uint8 or float32 with straight alpha, to planes (3, rows, stride) over the
     background.
 
     alpha: add a fourth plane, the alpha.
+    in_planes: False if only `stages.loss.loss` reads the result. It is then the photograph itself, on the device, where
+    the loss can read that: where several items share a tile (`tile_items`), without alpha and mask.
 
     A fifth channel is a mask, 0 where a pixel does not count. Such pixels become zero in the planes and also in the
     render `blended`, which this changes, and the gradient of blending skips them. An image on the host is uploaded
@@ -52,9 +65,11 @@ def target(
         source = work.array("target_source", image.shape, image.dtype)
         source.send(np.ascontiguousarray(image))
     height, width, channels = source.shape
+    if not (in_planes or alpha) and is_photograph(source) and tile_items(device) > 1:
+        return source
     rows, stride = padded_size(width, height)
     planes = work.array("target", (3 + alpha, rows, stride))
-    defines = {"BYTES": True} if source.dtype == np.uint8 else {}
+    defines = sample_defines(source)
     render: tuple[DeviceArray, ...] = ()
     if channels == 5:
         assert blended is not None, "a mask also changes the render"

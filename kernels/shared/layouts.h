@@ -5,7 +5,9 @@
 #define DEEP_PICTURES 16
 #define LOSS_ROWS 2
 #define LOSS_COLUMNS 640
-#define LOSS_GROUP_COLUMNS 32
+#define LOSS_GROUP_ROWS 7
+#define LOSS_GROUP_COLUMNS 54
+#define LOSS_PARTS 64
 #define POSE_ROWS 64u
 #define SUM_ROWS 64u
 #define FRESH 0x80000000u

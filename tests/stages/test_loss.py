@@ -14,9 +14,10 @@ from clsplat.device.buffers import DeviceArray, Workspace, upload
 from clsplat.device.context import Device
 from clsplat.images.reading import read_image
 from clsplat.reference.loss import l1_dssim
-from clsplat.selftest.case import Inputs
+from clsplat.selftest.case import Inputs, faults
 from clsplat.selftest.cases.loss import LOSS_CASE
 from clsplat.selftest.harness import planes_of
+from clsplat.stages.blend import tile_items
 from clsplat.stages.loss import loss, scratch_bytes
 from clsplat.stages.target import target
 
@@ -78,10 +79,10 @@ def noise(device: Device, width: int, height: int) -> list[DeviceArray]:
 
 @pytest.mark.parametrize("size", [(50, 135), (1100, 40), (1024, 12)], ids=str)
 def test_however_many_blocks_it_has_the_same_bits(shaped_device: Device, size: tuple[int, int]) -> None:
-    """Against one lane and few blocks: what is worked out for two of them is the same in both."""
+    """Against one lane and few blocks, or few items: what is worked out for two of them is the same in both."""
     width, height = size
-    held = []
-    for device in (shaped_device.with_shape(lanes=1, items=1, chunks=1), shaped_device.with_shape(chunks=64)):
+    held, items = [], min(tile_items(shaped_device), 16)
+    for device in (shaped_device.with_shape(lanes=1, items=items, chunks=1), shaped_device.with_shape(chunks=64)):
         result = loss(device, Workspace(device), *noise(device, width, height), width, height, 0.2)
         held.append((result.gradient.get()[:, :height], result.read()))
     assert_same_bits(held[1][0], held[0][0])
@@ -94,8 +95,17 @@ def test_launches_and_memory(shaped_device: Device) -> None:
     pictures = noise(shaped_device, 70, 100)
     with device.recorder.recording(wait=False) as stages:
         result = loss(device, Workspace(device), *pictures, 70, 100, 0.2)
-    assert stages["loss"].launches == (1 if device.shape.items == 1 else 2)
+    assert stages["loss"].launches == (1 if tile_items(device) == 1 else 2)
     assert device.memory.peak == scratch_bytes(device, 100, 80) + result.gradient.nbytes
+
+
+@pytest.mark.parametrize("width", range(1, 66))
+def test_every_width_up_to_two_blocks(default_device: Device, width: int) -> None:
+    """In a shape of several items, of as many rows as columns and of one row."""
+    device = default_device.with_shape(lanes=1, items=64)
+    for height in (1, width):
+        given = LOSS_CASE.random(np.random.default_rng(width), (width, height))
+        assert faults(LOSS_CASE.errors(device, given)) == []
 
 
 @pytest.mark.parametrize(("brightness", "ripple"), [(0.95, 0.01), (10.0, 0.01), (100.0, 0.1)])

@@ -8,6 +8,7 @@ import re
 import subprocess
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,22 @@ from gpu_intel import read_intel
 from gpu_loops import UnknownLoopError, cost_of, rules_of, unused_rules
 from gpu_model import Stage, predict
 from gpu_rules import BY_ITEM, BY_PAIR, EVERYWHERE, WALK, Rule, Run
-from gpu_static import FRAMES, MOST_A_PAIR, MOST_BY_GAUSSIAN, NO_STACK, SH_READ, Row, broken, sources_of
+from gpu_static import (
+    FRAMES,
+    MOST_A_PAIR,
+    MOST_A_SAMPLE,
+    MOST_BY_GAUSSIAN,
+    NO_STACK,
+    SH_READ,
+    Row,
+    broken,
+    loss_faults,
+    sources_of,
+)
 
 from clsplat.device.source import kernel_root, kernel_source
 from clsplat.errors import ClsplatError
-from clsplat.layouts.columns import PLAIN_SLOTS
+from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS, PLAIN_SLOTS
 
 SASS = """
 .text.walk:
@@ -272,10 +284,10 @@ def test_rules_that_no_loop_has_are_told() -> None:
     used = {"scan_chunks": (*BY_ITEM["scan_chunks"][:1], *EVERYWHERE)}
     (told,) = unused_rules(used)
     assert told.startswith("scan_chunks: no loop of it is that of the rule `for (uint base = begin;")
-    used = {"scan_chunks": (*BY_ITEM["scan_chunks"], *EVERYWHERE), "target": ()}
+    used = {"scan_chunks": (*BY_ITEM["scan_chunks"], *EVERYWHERE), "ranges": ()}
     assert unused_rules(used) == []  # of a rule for every kernel, one has the loop
     used["scan_chunks"] = BY_ITEM["scan_chunks"]
-    assert [told.partition(":")[0] for told in unused_rules(used)] == ["scan_chunks", "target"]
+    assert [told.partition(":")[0] for told in unused_rules(used)] == ["scan_chunks", "ranges"]
 
 
 def test_rules_are_of_lines_that_kernels_have() -> None:
@@ -303,7 +315,6 @@ def test_rules_have_the_kernels_own_sizes(items: int) -> None:
         known = {"SUBGROUP": one.subgroup, "SLOT_STRIDE": fields}
         assert one.together == defined("blend_grad.cl", "TOGETHER", **known)
     assert run.batch == defined("shared/blocks.h", "BATCH")
-    assert run.loss_rows == defined("loss.cl", "ROWS")
     assert defined("sort_radix.cl", "RUN") == gpu_rules.PER_ITEM
     assert f"#define ABREAST {gpu_rules.ABREAST}\n" in (kernel_root() / "shared/adam.h").read_text()
 
@@ -401,6 +412,17 @@ def test_ceilings_of_the_step(whole: Loop, changes: dict[str, Any], told: str) -
     others = [row(stem) for stem in NO_STACK if stem != "project_grad"]
     target = changes.get("target", "sm_89")
     assert broken([*others, step]) == ([f"project_step, 1x64, {target}: {told}"] if told else [])
+
+
+def test_ceilings_of_the_loss() -> None:
+    half = {t: most * LOSS_GROUP_ROWS * LOSS_GROUP_COLUMNS / LOSS_PARTS / 2 for t, most in MOST_A_SAMPLE.items()}
+    good = [replace(row("loss", target=target), a_wave=half[target]) for target in half for _ in range(2)]
+    assert loss_faults(good) == []
+    assert loss_faults([*good, row("target", target="sm_89")]) == ["loss, sm_89: 3 launches, expected 2"]
+    dear = [*good[1:], replace(good[0], a_wave=half["sm_89"] + 1)]
+    assert loss_faults(dear) == ["loss, sm_89: 450.2 instructions a sample, expected at most 450"]
+    spilt = [*good[:-1], row("loss", target="gfx90a", stack=8)]
+    assert loss_faults(spilt) == ["loss, gfx90a: stack or spills, expected none"]
 
 
 @pytest.mark.parametrize(("most", "told"), [(12, 0), (11.9, 2)])

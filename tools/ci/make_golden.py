@@ -65,7 +65,7 @@ SHAPES = (
     *("4x1", "8x1", "8x16", "16x1"),
 )
 """Shapes whose gradients get a digest: defaults of devices, and shapes that the tests use."""
-ORDERED = ("/blend_grad", "/values")
+ORDERED = ("/loss", "/masks", "/blend_grad", "/values")
 """Stages in which the order of sums depends on the shape."""
 
 

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from clsplat.device.launch import DEFAULT_GROUP_ITEMS
-from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, PLAIN_SLOTS
+from clsplat.layouts.columns import LOSS_PARTS, PLAIN_SLOTS
 
 if TYPE_CHECKING:
     from gpu_assembly import Loop
 
 PER_ITEM = 16
 """Keys per item in a tile of the radix sort: RUN in sort_radix.cl."""
-WINDOW, REACH = 11, 5
-"""Number of taps of the loss's window, and its radius."""
 _UNEVEN = 2
 """Estimated ratio of a wave's rounds, which are those of its longest item, to the rounds of an average item, if
 neighbouring Gaussians have all sizes."""
@@ -89,11 +87,6 @@ class Run:
     def sums_before(self) -> float:
         """Rounds in which a wave adds up the sums of the groups before its own."""
         return math.ceil(self.groups / 2 / self.items)
-
-    @property
-    def loss_rows(self) -> int:
-        """Rows in a block of the loss: ROWS in loss.cl."""
-        return min(max(self.items // 16, 1), 16)
 
     def shared(self, count: float) -> float:
         """Average rounds per wave of a group whose items share `count` elements."""
@@ -201,8 +194,8 @@ def _side(run: Run) -> float:
     return _UNEVEN * math.sqrt(run.addends)
 
 
-def _loss(columns: int, rounds: int = 1) -> Rounds:
-    return lambda run: rounds * run.shared(run.loss_rows * (LOSS_GROUP_COLUMNS + columns))
+def _parts(run: Run) -> float:
+    return LOSS_PARTS / run.items
 
 
 def _never(run: Run) -> float:  # noqa: ARG001  # one of the rounds
@@ -228,7 +221,6 @@ ADAM = Rule("for (uint k = own, bit = 1; k < count; k += stride, bit += bit)", _
 """Adam's loop in `project_step`."""
 
 BY_ITEM: dict[str, tuple[Rule, ...]] = {
-    "target": (),
     "project": (
         Rule("for (int ty = e->tile_y0; ty < e->tile_y1; ++ty)", _side, ends=("count += x1 - x0;",), mark=("fp32", 60)),
         Rule("for (int k = 1; k < used; ++k, rest += 3)", _bands, mark=("global", 3)),
@@ -277,18 +269,13 @@ BY_ITEM: dict[str, tuple[Rule, ...]] = {
         Rule("for (uint i = item; i < count; i += ITEMS) {", _of_item),
     ),
     "ranges": (),
-    "loss_ssim": (
-        Rule("FOR_VECTORS(block, margin, ROWS)", _loss(2 * REACH), function=" moments("),
-        Rule("for (int tap = 0; tap < taps.x; ++tap) beyond", _never),  # only at the picture's edges
-        Rule("for (int tap = taps.y; tap < TAPS; ++tap) beyond", _never),
-        Rule("for (int tap = taps.x; tap < taps.y;", _loss(2 * REACH, WINDOW), mark=("global", 2)),
-        Rule("FOR_VECTORS(block, margin, LINES)", _loss(0), function=" derivatives("),
-        Rule("for (int tap = 0; tap < TAPS; ++tap) {", _loss(0, WINDOW), mark=("shared", 5)),
+    "loss_ssim": (  # loops in groups of fewer items than parts
+        Rule("FOR_PARTS(part, PARTS) {", _parts, function=" moments("),
+        Rule("FOR_PARTS(part, PARTS) {", _parts, function=" derivatives("),
     ),
     "loss_grad": (
-        Rule("FOR_VECTORS(block, margin, ROWS)", _loss(2 * REACH)),
-        Rule("for (int tap = taps.x; tap < taps.y;", _loss(2 * REACH, WINDOW), mark=("global", 5)),
-        Rule("FOR_VECTORS(block, 0, LINES)", _loss(0)),
+        Rule("FOR_PARTS(part, PARTS) {", _parts, function=" adjoint_moments("),
+        Rule("FOR_PARTS(part, PARTS) {", _parts, function=" differences("),
     ),
     "project_step": (
         Rule(

@@ -46,6 +46,7 @@ from gpu_page import PAGE, Predictions, missed_goals, stale_tables, tables_of, t
 from gpu_rules import ABREAST, ADAM, BY_PAIR, WALK, Rule, Run
 from measuring import plain_parser, require, tool
 
+from clsplat.layouts.columns import LOSS_GROUP_COLUMNS, LOSS_GROUP_ROWS, LOSS_PARTS
 from clsplat.progress import aligned
 
 SHAPES = ("1x32", "1x64", "1x128", "1x256")
@@ -60,6 +61,9 @@ NO_SCRATCH = ("blend", "blend_grad", "project_grad")
 """Kernel files that must use no stack memory and no spills on AMD's GPUs."""
 MOST_A_PAIR = {"blend": 290, "blend_grad": 600}
 """Maximum number of a warp's instructions per pair, on NVIDIA's GPUs."""
+MOST_A_SAMPLE = {"sm_89": 450, "sm_90": 450, "gfx1100": 540, "gfx90a": 540}
+"""Maximum number of instructions of the loss for a pixel and channel, of all items of a block. On these targets the
+loss uses no stack memory and no spills, and it has two launches."""
 MOST_BY_GAUSSIAN = 500
 """Maximum number of a warp's instructions per pair there, for blend_grad with a Gaussian per item."""
 MOST_AN_ELEMENT = 50
@@ -78,7 +82,8 @@ MOST_INSTRUCTIONS = {"gfx1100": {"project_step": 3382}, "gfx90a": {"project_step
 @dataclass(frozen=True)
 class Row:
     """A kernel for a target and shape. pair: instructions per pair by class, or None if it has no pairs. rules: the
-    rules of its loops. unknown: the reason if a loop has no rule."""
+    rules of its loops. unknown: the reason if a loop has no rule. a_wave: instructions that a wave runs of a kernel
+    without pairs."""
 
     source: Source
     built: Built
@@ -87,6 +92,7 @@ class Row:
     pair: Counter[str] | None
     rules: frozenset[Rule] = frozenset()
     unknown: str = ""
+    a_wave: float = 0
 
     @property
     def a_pair(self) -> float | None:
@@ -164,15 +170,16 @@ def compiled(
 def row_of(source: Source, built: Built, launch: tuple[int, int] | None) -> Row:
     """The row of a kernel. launch: items per group and shared memory, if the kernel is launched."""
     items, more_shared = launch or (source.items if built.kernel in BY_PAIR else 64, 0)
-    pair, rules, unknown = None, frozenset[Rule](), ""
+    pair, rules, unknown, a_wave = None, frozenset[Rule](), "", 0.0
     if launch or built.kernel in BY_PAIR:
         run = Run(source.items, ARCHITECTURES[built.target].wave, source.subgroup)
         try:
             cost = cost_of(built, source.lines, WALK if source.by_gaussian else rules_of(built.kernel), run)
             rules, pair = cost.rules, by_pair(cost, run) if built.kernel in BY_PAIR else None
+            a_wave = (cost.once + cost.rounds).total()
         except UnknownLoopError as error:
             unknown = str(error)
-    return Row(source, built, items, more_shared, pair, rules, unknown)
+    return Row(source, built, items, more_shared, pair, rules, unknown, a_wave)
 
 
 def table(rows: Sequence[Row]) -> list[str]:
@@ -265,6 +272,28 @@ def broken(rows: Sequence[Row]) -> list[str]:
     return found
 
 
+def loss_faults(rows: Sequence[Row]) -> list[str]:
+    """Descriptions of exceeded ceilings of the loss, with what else reads the photograph, in the shape 1x64."""
+    found = []
+    for target, most in MOST_A_SAMPLE.items():
+        launched = [
+            row
+            for row in rows
+            if (row.source.shape, row.built.target) == ("1x64", target) and row.source.stem in ("target", "loss")
+        ]
+        if len(launched) != 2:
+            found.append(f"loss, {target}: {len(launched)} launches, expected 2")
+        found += [
+            f"{row.built.kernel}, {target}: stack or spills, expected none"
+            for row in launched
+            if row.built.stack or row.built.spills
+        ]
+        a_sample = sum(row.a_wave for row in launched) * LOSS_PARTS / (LOSS_GROUP_ROWS * LOSS_GROUP_COLUMNS)
+        if a_sample > most:
+            found.append(f"loss, {target}: {a_sample:.1f} instructions a sample, expected at most {most}")
+    return found
+
+
 @tool("gpu_static")
 def main(arguments: Sequence[str]) -> int:
     """Compile, count and print."""
@@ -320,7 +349,7 @@ def check(frames: Sequence[Mapping[str, Any]], jobs: int) -> int:
     rows, predictions = counted(frames, jobs)
     shapes, targets = CHECKED
     held = [row for row in rows if row.source.shape in shapes and row.built.target in targets]
-    found = broken(held) + missed_goals(predictions, frames)
+    found = broken(held) + loss_faults(rows) + missed_goals(predictions, frames)
     tables = tables_of(rows, predictions, frames, compilers())
     if stale := stale_tables(PAGE.read_text("utf-8"), tables):
         found.append(f"{PAGE.name}: of older kernels in {', '.join(stale)}; python tools/gpu/gpu_static.py --page")

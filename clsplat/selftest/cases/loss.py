@@ -12,7 +12,7 @@ from clsplat.device.context import Device
 from clsplat.reference.depth import depth_loss
 from clsplat.reference.loss import alpha_loss, l1_dssim, masked_l1_dssim
 from clsplat.selftest.case import Arrays, Case, Inputs, Read, Wanted, exactly
-from clsplat.selftest.harness import CaseBench, cropped, planes_of
+from clsplat.selftest.harness import Array, CaseBench, cropped, planes_of
 from clsplat.selftest.scenes import evenly
 from clsplat.stages.blend import Blended
 from clsplat.stages.device_camera import padded_size
@@ -29,13 +29,15 @@ MIN_LOSS_DIFFERENCE = 1e-6
 
 
 def random_pictures(rng: Generator, size: Size) -> tuple[Float32, Float32]:
-    """A render and a photograph (H, W, 3): noise, flat, dark, nearly the same."""
+    """A render and a photograph (H, W, 3): noise, flat, dark, nearly the same; often of bytes."""
     width, height = size
     y = rng.random((height, width, 3)) ** rng.choice([0.2, 1.0, 8.0])
     if rng.random() < 0.3:
         y[:] = rng.random(3)
     apart = 10 ** rng.uniform(-4, 0)
     x = np.clip(y + rng.normal(0, apart, y.shape), 0, 1.5)
+    if rng.random() < 0.5:
+        y = np.rint(y * 255).astype(np.uint8) * np.float32(1 / 255)
     return x.astype(np.float32), np.clip(y, 0, 1).astype(np.float32)
 
 
@@ -56,9 +58,21 @@ def _read(result: Loss, size: Size) -> Arrays:
 
 
 def _launch(device: Device, work: Workspace, given: Inputs) -> Read:
+    """Compare with planes, then with the photograph itself, where kernels read it."""
+    size, background = given.size, upload(device, np.zeros(3, np.float32))
     image, photograph = (upload(device, planes_of(each)) for each in (given.image, given.photograph))
-    result = loss(device, work, image, photograph, *given.size, given.weight)
-    return lambda: _read(result, given.size)
+    first = _read(loss(device, work, image, photograph, *size, given.weight), size)
+
+    def again(source: Array) -> float:
+        """Number of values that are not the same with this photograph."""
+        as_loaded = target(device, work, source, background, in_planes=False)
+        second = _read(loss(device, work, image, as_loaded, *size, given.weight), size)
+        return float(sum(np.count_nonzero(second[name] != first[name]) for name in first))
+
+    levels = np.rint(given.photograph * 255).astype(np.uint8)
+    exact = bool((levels * np.float32(1 / 255) == given.photograph).all())
+    differing = [again(source) for source in (given.photograph, levels)[: 1 + exact]]
+    return lambda: {**first, "photograph": np.array(differing)}
 
 
 def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
@@ -71,12 +85,16 @@ def _twin(given: Inputs, got: Arrays) -> dict[str, Wanted]:
         "beside": exactly(np.zeros_like(got["beside"])),
         "loss": Wanted(np.array([value]), 1e-6, max(1.0, value)),  # sums of partial sums
         "squared error": Wanted(np.array([squared]), 1e-5, squared),
+        "photograph": exactly(np.zeros_like(got["photograph"])),
     }
 
 
 LOSS_CASE = Case(
-    # below and over the window's 11, vectors of 16 columns, blocks of 32 columns or rows
-    sizes=((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65)),
+    # below and over the window's 11, vectors of 16 columns, blocks of 32 rows, and of 7 x 54 pixels with 5 around
+    sizes=(
+        *((1, 1), (1, 40), (40, 1), (11, 11), (15, 17), (16, 5), (17, 33), (5, 16), (63, 40), (33, 65)),
+        *((54, 7), (55, 8), (53, 6), (59, 12), (60, 13), (64, 2), (65, 14), (109, 9)),
+    ),
     random=lambda rng, size: _given(*random_pictures(rng, size), float(rng.choice([0.0, 0.2, 0.2]))),
     launch=_launch,
     twin=_twin,
@@ -84,6 +102,7 @@ LOSS_CASE = Case(
         _given(cropped(bench.blended.image.get(), bench.camera), cropped(bench.frozen.photograph, bench.camera))
     ],
     digested=("planes",),
+    own_bits_of_groups=True,
 )
 
 
@@ -151,6 +170,7 @@ MASKS_CASE = Case(
     twin=_twin_of_masks,
     frozen=_frozen_masks,
     digested=("planes",),
+    own_bits_of_groups=True,
 )
 
 

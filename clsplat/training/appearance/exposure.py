@@ -70,6 +70,7 @@ class ViewGains(ViewPart):
     step: int
     rate: float
     place: int = 0
+    changes_target = True
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewGains:
         """The same gains on another device, made from `values`, to apply them and to compute their gradient."""

@@ -21,7 +21,7 @@ from clsplat.stages.device_gaussians import AnyGaussians, DeviceGaussians, HostG
 from clsplat.stages.loss import Loss, loss
 from clsplat.stages.noise import noise
 from clsplat.stages.project import Slots, project_grad, project_step, step_numbers
-from clsplat.stages.target import target
+from clsplat.stages.target import is_photograph, target
 from clsplat.training.density import StatisticsNeeds
 from clsplat.training.step.inputs import StepRows, ViewInputs, ViewRows
 from clsplat.training.step.loss_terms import loss_terms
@@ -121,7 +121,8 @@ class GradientStep:
         work, photograph, size = self.rasterizer.work, inputs.photograph, (inputs.camera.width, inputs.camera.height)
         terms = loss_terms(self.config, inputs)
         alpha = any(term.wants_alpha for term in terms)
-        planes = target(self.device, work, photograph, frame.background, frame.blended, alpha=alpha)
+        changed = any(part.changes_target for part in inputs.parts)
+        planes = target(self.device, work, photograph, frame.background, frame.blended, alpha=alpha, in_planes=changed)
         image = frame.blended.image
         for part in inputs.parts:
             image = part.compare(work, image, planes, size)
@@ -141,7 +142,7 @@ class GradientStep:
             )
 
         keys = tuple(term.key for term in terms)
-        if None in keys:
+        if None in keys or is_photograph(planes):  # each photograph has a buffer of its own
             return compared()
         return self.replayed(of, (frame.listed, image.buffer, inputs.kept, keys, self.turn), compared)
 

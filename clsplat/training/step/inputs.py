@@ -87,6 +87,8 @@ class ViewPart:
 
     wants_gradients = False
     """True if `add_rows` reads the rows' gradients."""
+    changes_target = False
+    """True if `compare` changes the photograph in `target`."""
 
     def on(self, device: Device, values: NDArray[np.float32]) -> ViewPart:  # noqa: ARG002
         """The same part on another device, made from `values`, for `compare` and `gradient` there."""
@@ -99,6 +101,7 @@ class ViewPart:
     def compare(self, work: Workspace, image: DeviceArray, target: DeviceArray, size: tuple[int, int]) -> DeviceArray:  # noqa: ARG002
         """Give the image the photograph's colours, or give the photograph in `target` the image's colours, in place.
 
+        target: planes (3 or 4, rows, stride), if some part of the view changes them.
         Returns the image to compare.
         """
         return image

@@ -1,0 +1,8 @@
+// A photograph as it is loaded, interleaved: bytes with BYTES, otherwise floats. SAMPLE makes a colour of a sample.
+#ifdef BYTES
+typedef uchar source_t;
+#define SAMPLE(x) ((float)(x) * (1.0f / 255.0f)) // the same bits as OpenImageIO
+#else
+typedef float source_t;
+#define SAMPLE(x) (x)
+#endif
